@@ -1,0 +1,1 @@
+"""Built-in pipelines, shipped as YAML files beside this module."""

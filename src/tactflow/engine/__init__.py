@@ -1,0 +1,1 @@
+"""The dataflow engine: frames, stages, links, planning, running. Knows nothing of vision."""

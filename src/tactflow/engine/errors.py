@@ -1,0 +1,33 @@
+"""Every error tactflow raises on purpose.
+
+TactflowError
++-- ConfigError        the command line or the pipeline file is wrong (exit 2)
++-- StageError         a stage or a sink failed (exit 3)
++-- SourceError        the source failed or could not be opened (exit 4)
+"""
+
+from __future__ import annotations
+
+
+class TactflowError(Exception):
+    """An error with a message for the user: what is wrong, what was expected, what to try."""
+
+    exit_code = 3
+
+
+class ConfigError(TactflowError):
+    """The command line or the pipeline file is wrong; nothing was started."""
+
+    exit_code = 2
+
+
+class StageError(TactflowError):
+    """A stage or a sink failed."""
+
+    exit_code = 3
+
+
+class SourceError(TactflowError):
+    """The source failed or could not be opened."""
+
+    exit_code = 4

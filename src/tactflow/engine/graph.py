@@ -1,0 +1,130 @@
+"""A validated pipeline: nodes and the edges between their ports. Built by `config`, read by `plan` and `run`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from tactflow.engine.stage import Memory, Ports, StageParams
+
+Kind = Literal["source", "stage", "sink"]
+FullPolicy = Literal["block", "latest", "drop_oldest"]
+ErrorAction = Literal["stop", "skip_frame", "disable"]
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A place in a pipeline file (line and column count from 1), or the command-line option behind a value."""
+
+    file: str
+    line: int
+    column: int
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """A stage or sink class that `use:` can name.
+
+    name : what `use:` says. origin : where it comes from, for people ("built-in", "plug-in NAME VERSION",
+    a file, a module). memory : always "pure" for sources and sinks.
+    """
+
+    name: str
+    kind: Kind
+    cls: type
+    params: type[StageParams]
+    ports: Ports
+    memory: Memory
+    origin: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ref:
+    """An output port of a node."""
+
+    node: str
+    port: str
+
+    def __str__(self) -> str:
+        return f"{self.node}.{self.port}"
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """Runs a stage only while a signal is True.
+
+    signal : the boolean port. reason : why outputs are absent while it is closed.
+    otherwise : "absent" makes the outputs `Absent(reason)`; "repeat" gives the last outputs again (absent if
+    there are none yet). hold : frames for which the gate stays open after the signal fell.
+    at_least_every : opens the gate anyway after this many frames closed; None for never.
+    """
+
+    signal: Ref
+    reason: str
+    otherwise: Literal["absent", "repeat"] = "absent"
+    hold: int = 0
+    at_least_every: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Queue:
+    """The bounded queue in front of a node's segment; None leaves the choice to the planner."""
+
+    capacity: int | None = None
+    when_full: FullPolicy | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OnError:
+    """What a failing stage or sink does. budget : frames that may be skipped before the run stops."""
+
+    action: ErrorAction = "stop"
+    budget: int = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One stage or sink of a pipeline.
+
+    inputs : every input port of the component -> the output it is connected to, or None for an optional
+    input that nothing provides. segment : name given in the file, or None. max_rate : a sink's limit in Hz.
+    """
+
+    id: str
+    component: Component
+    params: StageParams
+    inputs: Mapping[str, Ref | None]
+    mark: Mark
+    gates: Sequence[Gate] = ()
+    segment: str | None = None
+    queue: Queue = Queue()
+    on_error: OnError = OnError()
+    max_rate: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """A pipeline that is known to be right. `nodes` is ordered so that every input comes before its user."""
+
+    file: str
+    directory: Path
+    sensor: str
+    nodes: Mapping[str, Node]
+    skipping: bool = True
+    opencv_threads: int | None = None
+    warnings: Sequence[str] = field(default_factory=list[str])
+
+    @property
+    def source(self) -> Node:
+        """The node that captures frames."""
+        return next(node for node in self.nodes.values() if node.component.kind == "source")
+
+    @property
+    def sinks(self) -> Sequence[Node]:
+        """The nodes that publish or write."""
+        return [node for node in self.nodes.values() if node.component.kind == "sink"]

@@ -1,0 +1,32 @@
+"""The vocabulary of ports: what the built-in stages and sinks say to each other.
+
+Besides these arrays and signals, `Frame` and the dataclasses of `tactflow.vision` (`Contact`, `Markers`,
+`Flow`, ...) are port types; their port is named after them: `frame`, `contact`, `markers`, `flow`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.stage import ArrayPort, SignalPort
+
+Image = Annotated[NDArray[np.uint8], ArrayPort("image", ("H", "W", 3), "uint8", "grey levels, BGR")]
+"""The processed frame."""
+
+MarkerMask = Annotated[NDArray[np.uint8], ArrayPort("marker_mask", ("H", "W"), "uint8", "0 or 255")]
+"""255 where a marker covers the gel."""
+
+Unmarked = Annotated[NDArray[np.uint8], ArrayPort("unmarked", ("H", "W", 3), "uint8", "grey levels, BGR")]
+"""The processed frame without its markers."""
+
+ContactMask = Annotated[NDArray[np.uint8], ArrayPort("contact_mask", ("H", "W"), "uint8", "0 or 255")]
+"""255 where something touches the gel."""
+
+Picture = Annotated[NDArray[np.uint8], ArrayPort("annotated", ("H", "W", 3), "uint8", "grey levels, BGR")]
+"""The processed frame with the results drawn on it."""
+
+Touching = Annotated[bool, SignalPort("touching", closed="no_contact")]
+"""True while something touches the gel."""

@@ -1,0 +1,1 @@
+"""What capture opens: simulated sensors, files, folders, cameras, streams."""

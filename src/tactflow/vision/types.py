@@ -1,0 +1,106 @@
+"""What the vision functions return.
+
+Coordinates are pixels of the processed frame, x right, y down, with the centre of the top-left pixel at
+(0, 0). Angles are degrees, counter-clockwise as seen on the screen from the +x axis, in (-90, 90].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.floating[Any]]
+
+
+class MarkerStatus(IntEnum):
+    """How a marker's position is known."""
+
+    TRACKED = 0
+    """Seen in this frame."""
+    INFERRED = 1
+    """Not seen in this frame; placed from its neighbours."""
+    LOST = 2
+    """The position is the last known or inferred one; do not trust it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipse:
+    """An ellipse.
+
+    center : (x, y), px. axes : full lengths (major, minor), px, major >= minor > 0.
+    angle : of the major axis, degrees in (-90, 90]; None for a circle.
+    """
+
+    center: tuple[float, float]
+    axes: tuple[float, float]
+    angle: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Geometry of the contact region.
+
+    area : of the convex hull, px^2, >= 0.
+    center : centroid (x, y) of the contact region itself, px.
+    angle : principal axis of the region, degrees in (-90, 90]; None where the region has no direction.
+    slope : dy/dx of that axis in image coordinates (y down), -tan(angle); None where vertical or undirected.
+    hull : (N, 2) float64, vertices of the convex hull in order, px.
+    ellipse : fitted ellipse, or None where none can be fitted.
+    confidence : of the direction, in [0, 1]: 0 for a disc, towards 1 for a line.
+    region_area : number of pixels of the region, px^2.
+    """
+
+    area: float
+    center: tuple[float, float]
+    angle: float | None
+    slope: float | None
+    hull: NDArray[np.float64]
+    ellipse: Ellipse | None
+    confidence: float = 0.0
+    region_area: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Markers:
+    """The markers of the reference frame, now. Index i is the same physical marker for the whole run.
+
+    origin : (N, 2) float64, position in the reference frame, px.
+    position : (N, 2) float64, position in this frame, px. Finite for every status.
+    status : (N,) uint8, values of `MarkerStatus`.
+    stderr : (N,) float64, standard error of each coordinate of `position`, px; NaN where unknown.
+    """
+
+    origin: NDArray[np.float64]
+    position: NDArray[np.float64]
+    status: NDArray[np.uint8]
+    stderr: NDArray[np.float64]
+
+    @property
+    def displacement(self) -> NDArray[np.float64]:
+        """(N, 2) float64, position - origin, px."""
+        return self.position - self.origin
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """Mean displacement of the markers inside the contact.
+
+    mean : (dx, dy), px, over `count` markers; None when count is 0.
+    count : number of markers inside.
+    stderr : (dx, dy) standard error of the mean, px; None when unknown (fewer than 2 markers).
+    rotation : in-plane rotation of the markers (twist), degrees, counter-clockwise as seen on the screen;
+        None with fewer than 3 markers or where they do not span a plane.
+    divergence : relative areal growth of the marker pattern (press), 1; None where rotation is None.
+    residual : RMS of what mean, rotation and divergence leave unexplained, px; None where rotation is None.
+    """
+
+    mean: tuple[float, float] | None
+    count: int
+    stderr: tuple[float, float] | None = None
+    rotation: float | None = None
+    divergence: float | None = None
+    residual: float | None = None
