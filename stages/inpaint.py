@@ -1,0 +1,32 @@
+"""Stage `inpaint`: the processed frame without its markers."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from tactflow.engine.stage import StageParams
+from tactflow.ports import Image, MarkerMask, Unmarked
+from tactflow.vision.inpaint import SEED_RADIUS, remove_markers
+
+
+class Inpaint:
+    """Fill the markers from their surroundings (seed function `inpaint`)."""
+
+    memory = "pure"
+
+    class Params(StageParams):
+        """method : how markers are filled. radius : the neighbourhood they are filled from."""
+
+        method: Literal["normalized", "telea", "ns", "none"] = Field(
+            "normalized", description="normalized averages the gel around; telea and ns are OpenCV's, slow"
+        )
+        radius: float = Field(SEED_RADIUS, gt=0, le=100, description="neighbourhood, processed px")
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+
+    def process(self, image: Image, marker_mask: MarkerMask) -> Unmarked:
+        """The image with its markers filled."""
+        return remove_markers(image, marker_mask, method=self._params.method, radius=self._params.radius)
