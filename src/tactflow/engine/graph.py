@@ -1,4 +1,4 @@
-"""A validated pipeline: nodes and the edges between their ports. Built by `config`, read by `plan` and `run`."""
+"""A validated pipeline: nodes and the edges between their ports. Built by `config`, read by `plan`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ErrorAction = Literal["stop", "skip_frame", "disable"]
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A place in a pipeline file (line and column count from 1), or the command-line option behind a value."""
+    """A place in a pipeline file (line and column from 1), or the command-line option behind a value."""
 
     file: str
     line: int

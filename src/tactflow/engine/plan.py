@@ -1,0 +1,187 @@
+"""From a pipeline to segments and links.
+
+Stages of one segment call each other directly in one thread; between segments stands a `Link`. By default:
+capture | compute | each threaded sink. Any node may be given a segment of its own in the pipeline file.
+
+Every link hands over the whole tick, so a segment needs links only from the segments directly before it
+(the transitive reduction of the segment graph): whatever lies further up is in the tick already. That
+also leaves a single place where a live source drops frames: in front of the first segment after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import FullPolicy, Node, Pipeline
+
+CAPTURE = "capture"
+COMPUTE = "compute"
+BLOCK_CAPACITY = 4
+
+
+@dataclass(frozen=True, slots=True)
+class LinkPlan:
+    """A link to be made: from one segment to another."""
+
+    producer: str
+    consumer: str
+    capacity: int
+    when_full: FullPolicy
+
+    @property
+    def name(self) -> str:
+        """The link's id in statistics and pictures."""
+        return f"{self.producer}->{self.consumer}"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How a pipeline is run.
+
+    segments : name -> node ids in order of evaluation; the source's segment comes first.
+    links : between segments. pruned : stages that are not built because no sink needs them.
+    ancestors : segment -> all segments whose values it can rely on.
+    """
+
+    pipeline: Pipeline
+    segments: Mapping[str, Sequence[str]]
+    links: Sequence[LinkPlan]
+    pruned: Sequence[Node]
+    ancestors: Mapping[str, frozenset[str]]
+
+    def segment_of(self, node_id: str) -> str:
+        """The segment that runs a node."""
+        return next(name for name, nodes in self.segments.items() if node_id in nodes)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know before the run."""
+        return [
+            f"{node.mark}  {node.id}: not run, because no sink needs what it makes" for node in self.pruned
+        ]
+
+
+def dependencies(node: Node) -> set[str]:
+    """Ids of the nodes whose outputs a node reads, as inputs or as gates."""
+    return {ref.node for ref in node.inputs.values() if ref} | {gate.signal.node for gate in node.gates}
+
+
+def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
+    """Prune what no sink needs, cut the rest into segments, and choose the links between them.
+
+    live : the source does not wait; its frames are dropped rather than delayed.
+
+    Raises
+    ------
+    ConfigError
+        If the segments named in the file depend on each other in a circle, or a queue is given to a node
+        that shares its segment with the node before it.
+    """
+    needed = _needed(pipeline)
+    pruned = [node for node in pipeline.nodes.values() if node.id not in needed]
+    nodes = [node for node in pipeline.nodes.values() if node.id in needed]
+    names = {node.id: _segment_name(node) for node in nodes}
+    source = names[pipeline.source.id]
+    members: dict[str, list[str]] = {source: []}
+    for node in nodes:
+        members.setdefault(names[node.id], []).append(node.id)
+
+    before: dict[str, set[str]] = {name: set() for name in members}
+    for node in nodes:
+        mine = names[node.id]
+        before[mine] |= {names[other] for other in dependencies(node)} - {mine}
+        if mine != source and not dependencies(node):
+            before[mine].add(source)
+    _refuse_circles(pipeline, before, members)
+
+    ancestors = {name: frozenset(_ancestors(name, before)) for name in members}
+    links: list[LinkPlan] = []
+    for consumer, producers in before.items():
+        direct = producers - {a for producer in producers for a in ancestors[producer]}
+        links.extend(
+            _link(pipeline, producer, consumer, members[consumer], source, live=live)
+            for producer in sorted(direct, key=list(members).index)
+        )
+    _refuse_idle_queues(pipeline, members)
+    return Plan(pipeline, members, links, pruned, ancestors)
+
+
+def _needed(pipeline: Pipeline) -> set[str]:
+    """The source, every sink, and all that they read from."""
+    needed = {pipeline.source.id}
+    pending = [sink.id for sink in pipeline.sinks]
+    while pending:
+        node_id = pending.pop()
+        if node_id not in needed:
+            needed.add(node_id)
+            pending.extend(dependencies(pipeline.nodes[node_id]))
+    return needed
+
+
+def _segment_name(node: Node) -> str:
+    if node.segment:
+        return node.segment
+    if node.component.kind == "source":
+        return CAPTURE
+    own = node.component.kind == "sink" and getattr(node.component.cls, "threaded", False)
+    return node.id if own else COMPUTE
+
+
+def _ancestors(name: str, before: Mapping[str, Iterable[str]]) -> set[str]:
+    seen: set[str] = set()
+    pending = list(before[name])
+    while pending:
+        other = pending.pop()
+        if other not in seen:
+            seen.add(other)
+            pending.extend(before[other])
+    return seen
+
+
+def _refuse_circles(
+    pipeline: Pipeline, before: Mapping[str, set[str]], members: Mapping[str, list[str]]
+) -> None:
+    for name in before:
+        if name in _ancestors(name, before):
+            others = sorted(
+                o for o in before if name in _ancestors(o, before) and o in _ancestors(name, before)
+            )
+            where = pipeline.nodes[members[name][0]].mark
+            raise ConfigError(
+                f"{where}  segments {', '.join(others)} feed each other in a circle, so none could start; "
+                f"segment {name} holds {', '.join(members[name])}: move one of them to another segment"
+            )
+
+
+def _link(
+    pipeline: Pipeline, producer: str, consumer: str, members: Sequence[str], source: str, *, live: bool
+) -> LinkPlan:
+    nodes = [pipeline.nodes[node_id] for node_id in members]
+    capacity: int | None = None
+    policy: FullPolicy | None = None
+    for node in nodes:
+        capacity = capacity or node.queue.capacity
+        policy = policy or node.queue.when_full
+    if policy is None:
+        policy = "block"
+        if live and all(node.component.kind == "sink" for node in nodes):
+            if all(getattr(node.component.cls, "when_live", "block") == "latest" for node in nodes):
+                policy = "latest"
+        elif live and producer == source:
+            policy = "latest"
+    return LinkPlan(producer, consumer, capacity or BLOCK_CAPACITY, policy)
+
+
+def _refuse_idle_queues(pipeline: Pipeline, members: Mapping[str, Sequence[str]]) -> None:
+    for nodes in members.values():
+        queued = [n for n in (pipeline.nodes[i] for i in nodes) if n.queue.capacity or n.queue.when_full]
+        if len(queued) > 1:
+            raise ConfigError(
+                f"{queued[1].mark}  {queued[1].id}: queue: segment has a queue already, given at "
+                f"{queued[0].mark} by {queued[0].id}; a segment has one queue in front of it"
+            )
+        for node in queued:
+            if node.component.kind == "source":
+                raise ConfigError(f"{node.mark}  {node.id}: queue: nothing comes before the source")
