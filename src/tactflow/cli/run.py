@@ -1,0 +1,194 @@
+"""`tactflow run`: run a pipeline to the end of its source."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from tactflow.cli.pipelines import find_pipeline
+from tactflow.engine.config import load_pipeline
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.run import Progress as RunProgress
+from tactflow.engine.run import Runner, RunResult
+
+HELP = "run a pipeline"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `run`."""
+    parser.add_argument(
+        "pipeline", nargs="?", metavar="PIPELINE", help="default: ./pipeline.yaml, else the packaged one"
+    )
+    parser.add_argument("--source", metavar="SRC", help="replaces the source of the pipeline's capture stage")
+    parser.add_argument(
+        "--jsonl", metavar="PATH", help="also write one result message a frame ('-': standard output)"
+    )
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="a.b.c=VALUE",
+        help="override one value of the pipeline file; repeatable; null removes a whole stage or sink",
+    )
+    parser.add_argument("--max-frames", type=_positive, metavar="N", help="stop after N frames")
+    parser.add_argument(
+        "--realtime",
+        action="store_true",
+        help="play a recording at its own pace, dropping frames like a camera",
+    )
+    parser.add_argument("--stats", metavar="PATH", help="write run statistics as JSON at exit")
+    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
+    parser.add_argument(
+        "--check", action="store_true", help="check every array against its port type (slower)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started."""
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    runner = Runner(_load(args), max_frames=args.max_frames, check=args.check)
+    _refuse_unwritable(args.stats)
+    with _logging_to(console), _signals(runner):
+        for warning in (*runner.pipeline.warnings, *runner.plan.warnings):
+            logging.getLogger("tactflow").warning("%s", warning)
+        with _progress_display(console, runner, shown=not args.quiet) as on_progress:
+            result = runner.run(on_progress)
+    if args.stats:
+        Path(args.stats).write_text(json.dumps(result.stats, indent=1) + "\n", encoding="utf-8")
+    if result.error is not None:
+        print(f"tactflow: {result.error}", file=sys.stderr)
+    if not args.quiet:
+        console.print(_summary(result, runner))
+    return result.exit_code
+
+
+def _load(args: argparse.Namespace) -> Any:
+    source_values: dict[str, Any] = {}
+    if args.source is not None:
+        source_values["source"] = args.source
+    if args.realtime:
+        source_values["realtime"] = True
+    extra_sinks: dict[str, dict[str, Any]] = {}
+    if args.jsonl is not None:
+        extra_sinks["--jsonl"] = {"use": "jsonl", "path": args.jsonl}
+    return load_pipeline(
+        find_pipeline(args.pipeline),
+        overrides=args.overrides,
+        extra_sinks=extra_sinks,
+        source_values=source_values,
+    )
+
+
+def _positive(text: str) -> int:
+    value = int(text) if text.isdecimal() else 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"required a whole number from 1, got {text!r}")
+    return value
+
+
+def _refuse_unwritable(path: str | None) -> None:
+    """Find out before the run, not after it, that the statistics cannot be written."""
+    if path is None:
+        return
+    try:
+        with open(path, "a", encoding="utf-8"):
+            pass
+    except OSError as error:
+        raise ConfigError(f"--stats {path}: cannot be written: {error.strerror}") from None
+
+
+@contextmanager
+def _logging_to(console: Console) -> Iterator[None]:
+    """Show the program's notes and warnings on standard error while the run lasts."""
+    logger = logging.getLogger("tactflow")
+    handler: logging.Handler
+    if console.is_terminal:
+        handler = RichHandler(console=console, show_time=False, show_path=False, markup=False)
+    else:
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(logging.Formatter("tactflow: %(levelname)s: %(message)s"))
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+@contextmanager
+def _signals(runner: Runner) -> Iterator[None]:
+    """One Ctrl-C or SIGTERM drains the pipeline; a second one ends it at once; a third is not caught."""
+    caught = 0
+
+    def handle(number: int, _: FrameType | None) -> None:
+        nonlocal caught
+        caught += 1
+        if caught == 1:
+            runner.stop("signal")
+            return
+        signal.signal(number, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _progress_display(
+    console: Console, runner: Runner, *, shown: bool
+) -> Iterator[Callable[[RunProgress], None] | None]:
+    """A line that counts frames, on a terminal only."""
+    if not shown or not console.is_terminal:
+        yield None
+        return
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed} frames, {task.fields[rate]:.0f}/s, {task.fields[dropped]} dropped"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as display:
+        task = display.add_task(runner.pipeline.sensor, total=None, rate=0.0, dropped=0)
+
+        def update(now: RunProgress) -> None:
+            total = runner.max_frames or getattr(runner.source, "total", None)
+            rate = now.frames / now.elapsed_s if now.elapsed_s > 0 else 0.0
+            display.update(task, completed=now.frames, total=total, rate=rate, dropped=now.dropped)
+
+        yield update
+
+
+def _summary(result: RunResult, runner: Runner) -> str:
+    stats = result.stats
+    lines = [
+        f"{stats['frames']} frames in {stats['wall_s']:.1f} s, {stats['dropped']} dropped ({stats['end']})"
+    ]
+    touching = next((s for name, s in stats["signals"].items() if name.endswith(".touching")), None)
+    if touching is not None:
+        lines.append(f"contacts: {touching['rises']} ({touching['true']} frames with contact)")
+    latency = stats["latency_ms"]
+    if latency["p50"] is not None:
+        lines.append(f"latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")
+    for name, node in runner.nodes.items():
+        target = getattr(node.instance, "description", None)
+        if node.is_sink and target:
+            lines.append(f"{name}: {target}")
+    return "\n".join(lines)
