@@ -1,0 +1,148 @@
+"""Time of alternatives, measured so that they can be compared.
+
+Two habits make ratios trustworthy on a machine that other programs share: alternatives take turns frame by
+frame (A B A B ...), so that a slow moment hits all of them alike; and the process's own CPU time is kept
+beside the wall time, which counts what others did.
+
+The unit "copy" is the median time in which the same machine, in the same run, copies one raw frame of
+800 x 600 x 3 bytes. It carries results from one machine to another far better than milliseconds do.
+"""
+
+from __future__ import annotations
+
+import gc
+import statistics
+import time
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+
+RAW_SHAPE = (600, 800, 3)
+"""Shape of the raw frame whose copy is the unit of time."""
+
+
+@dataclass(slots=True)
+class Samples:
+    """Times of one alternative, s."""
+
+    cpu: list[float] = field(default_factory=list[float])
+    wall: list[float] = field(default_factory=list[float])
+
+    def add(self, cpu: float, wall: float) -> None:
+        """Add one measured call."""
+        self.cpu.append(cpu)
+        self.wall.append(wall)
+
+    def summary(self) -> dict[str, float]:
+        """`cpu_ms_p50`, `cpu_ms_p99`, `wall_ms_p50`, `wall_ms_p99` and `count`; empty without samples."""
+        if not self.cpu:
+            return {}
+        cpu = 1e3 * np.asarray(self.cpu)
+        wall = 1e3 * np.asarray(self.wall)
+        return {
+            "cpu_ms_p50": float(np.median(cpu)),
+            "cpu_ms_p99": float(np.percentile(cpu, 99)),
+            "wall_ms_p50": float(np.median(wall)),
+            "wall_ms_p99": float(np.percentile(wall, 99)),
+            "count": float(cpu.size),
+        }
+
+
+def timed(call: Callable[[], Any], samples: Samples) -> Any:
+    """Call once, add its time to `samples`, and return what it returned."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    result = call()
+    samples.add(time.process_time() - cpu, time.perf_counter() - wall)
+    return result
+
+
+class quiet:  # noqa: N801  (a context manager that reads as an adverb)
+    """One OpenCV thread and no garbage collection inside the `with` block; both are restored after it."""
+
+    def __enter__(self) -> None:
+        self._threads = cv2.getNumThreads()
+        self._collecting = gc.isenabled()
+        cv2.setNumThreads(1)
+        gc.collect()
+        gc.disable()
+
+    def __exit__(self, *_: object) -> None:
+        cv2.setNumThreads(self._threads)
+        if self._collecting:
+            gc.enable()
+
+
+def interleaved(
+    alternatives: Mapping[str, Callable[[Any], Any]],
+    inputs: Iterable[tuple[Hashable, Any]],
+    *,
+    give_up_after: float = float("inf"),
+    see: Callable[[str, Hashable, Any, Any], None] | None = None,
+) -> dict[str, dict[Hashable, Samples]]:
+    """Give every input to every alternative in turn and time each call.
+
+    Parameters
+    ----------
+    alternatives : name -> callable of one input.
+    inputs : (kind, input) pairs; times are kept apart by kind (for instance with and without contact).
+    give_up_after : s. An alternative whose calls took longer than this in total is left out from then on, so
+        that one slow method cannot use up the time of all others.
+    see : called outside the timed part with (name, kind, input, result).
+
+    Returns
+    -------
+    name -> kind -> samples.
+    """
+    times: dict[str, dict[Hashable, Samples]] = {name: {} for name in alternatives}
+    spent = dict.fromkeys(alternatives, 0.0)
+    with quiet():
+        for kind, value in inputs:
+            for name, call in alternatives.items():
+                if spent[name] > give_up_after:
+                    continue
+                samples = times[name].setdefault(kind, Samples())
+                result = timed(lambda call=call, value=value: call(value), samples)  # type: ignore[misc]
+                spent[name] += samples.wall[-1]
+                if see is not None:
+                    see(name, kind, value, result)
+    return times
+
+
+class CopyUnit:
+    """The machine's own yardstick, to be taken again and again during a run.
+
+    `take` measures one copy of a raw frame and one pass that reads and writes every byte once (the least
+    that any method which looks at the whole frame can cost); `copy_ms` and `touch_ms` are the medians.
+    """
+
+    def __init__(self) -> None:
+        # Several buffers, so that the copy comes from memory as a camera's frame does, not from the cache.
+        self._frames = [np.full(RAW_SHAPE, value, dtype=np.uint8) for value in range(8)]
+        self._out = np.empty(RAW_SHAPE, dtype=np.uint8)
+        self._copies: list[float] = []
+        self._touches: list[float] = []
+
+    def take(self, repeats: int = 1) -> None:
+        """Measure `repeats` times."""
+        for _ in range(repeats):
+            frame = self._frames[len(self._copies) % len(self._frames)]
+            start = time.perf_counter()
+            np.copyto(self._out, frame)
+            middle = time.perf_counter()
+            cv2.bitwise_not(frame, dst=self._out)
+            end = time.perf_counter()
+            self._copies.append(middle - start)
+            self._touches.append(end - middle)
+
+    @property
+    def copy_ms(self) -> float:
+        """Median time of one copy, ms."""
+        return 1e3 * statistics.median(self._copies)
+
+    @property
+    def touch_ms(self) -> float:
+        """Median time to read and write every byte of the raw frame once, ms."""
+        return 1e3 * statistics.median(self._touches)

@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactflow.bench import metrics
+
+GRID = np.array([(x, y) for y in range(0, 100, 20) for x in range(0, 100, 20)], dtype=np.float64)
+SQUARE = np.array([(0, 0), (10, 0), (10, 10), (0, 10)], dtype=np.float64)
+ALL = np.ones(len(GRID), dtype=bool)
+NONE = np.zeros(len(GRID), dtype=bool)
+
+
+def test_the_pitch_of_a_square_grid_is_its_spacing() -> None:
+    assert metrics.grid_pitch(GRID) == 20
+
+
+def test_one_point_has_no_pitch() -> None:
+    with pytest.raises(ValueError, match="at least 2 points"):
+        metrics.grid_pitch(GRID[:1])
+
+
+def test_markers_at_their_true_places_have_no_identity_errors() -> None:
+    errors = metrics.identity_errors(GRID, GRID, ALL, NONE, 20)
+    assert errors.wrong_percent == 0
+    assert errors.lost_percent == 0
+
+
+def test_two_markers_that_swapped_are_both_wrong() -> None:
+    position = GRID.copy()
+    position[[3, 4]] = position[[4, 3]]
+    errors = metrics.identity_errors(position, GRID, ALL, NONE, 20)
+    assert list(np.flatnonzero(errors.wrong)) == [3, 4]
+    assert errors.wrong_percent == pytest.approx(100 * 2 / 25)
+
+
+def test_a_marker_over_half_a_pitch_away_is_wrong_even_in_the_open() -> None:
+    position = GRID.copy()
+    position[0] = (-11, 0)  # away from every other marker
+    assert list(np.flatnonzero(metrics.identity_errors(position, GRID, ALL, NONE, 20).wrong)) == [0]
+    position[0] = (-9, 0)
+    assert not metrics.identity_errors(position, GRID, ALL, NONE, 20).wrong.any()
+
+
+def test_a_marker_declared_lost_is_lost_and_not_wrong() -> None:
+    position = GRID.copy()
+    position[0] = (500, 500)
+    lost = NONE.copy()
+    lost[0] = True
+    errors = metrics.identity_errors(position, GRID, ALL, lost, 20)
+    assert errors.wrong_percent == 0
+    assert errors.lost_percent == pytest.approx(4)
+
+
+def test_markers_that_cannot_be_seen_are_not_judged() -> None:
+    position = GRID.copy()
+    position[0] = (500, 500)
+    visible = ALL.copy()
+    visible[0] = False
+    errors = metrics.identity_errors(position, GRID, visible, NONE, 20)
+    assert errors.wrong_percent == 0
+    assert np.count_nonzero(errors.visible) == 24
+
+
+def test_no_markers_give_no_identity_errors() -> None:
+    errors = metrics.identity_errors(np.zeros((0, 2)), np.zeros((0, 2)), NONE[:0], NONE[:0], 20)
+    assert errors.wrong_percent == 0
+
+
+def test_detection_counts_a_point_between_two_dots_once() -> None:
+    points = np.array([(10.0, 1.0)])
+    found = metrics.detection(points, np.array([(0.0, 0.0), (20.0, 0.0)]), radius=15)
+    assert found.recall == 0.5
+    assert found.precision == 1
+
+
+def test_detection_counts_spurious_and_missing_points() -> None:
+    points = np.vstack([GRID[:20] + np.array((0.3, 0.4)), [(500.0, 500.0)] * 5])
+    found = metrics.detection(points, GRID, radius=10)
+    assert found.recall == pytest.approx(20 / 25)
+    assert found.precision == pytest.approx(20 / 25)
+    assert found.errors == pytest.approx(np.full(20, 0.5))
+
+
+def test_detection_of_nothing_where_nothing_is_is_perfect() -> None:
+    found = metrics.detection(np.zeros((0, 2)), np.zeros((0, 2)), radius=10)
+    assert (found.recall, found.precision, found.errors.size) == (1, 1, 0)
+
+
+def test_iou_of_two_squares_that_share_a_quarter() -> None:
+    # 25 in common of 100 + 100 - 25.
+    assert metrics.convex_iou(SQUARE, SQUARE + 5) == pytest.approx(25 / 175)
+
+
+def test_iou_does_not_depend_on_the_sense_of_the_vertices() -> None:
+    assert metrics.convex_iou(SQUARE[::-1], SQUARE + 5) == pytest.approx(25 / 175)
+
+
+def test_iou_far_from_the_origin_is_the_same() -> None:
+    # Offsets of 1e6 leave 10 digits of float64; the areas keep at least 8 of them.
+    assert metrics.convex_iou(SQUARE + 1e6, SQUARE + 1e6 + 5) == pytest.approx(25 / 175, rel=1e-8)
+
+
+def test_polygons_that_do_not_touch_share_nothing() -> None:
+    assert metrics.convex_iou(SQUARE, SQUARE + 50) == 0
+
+
+def test_a_point_shares_nothing_with_a_square() -> None:
+    assert metrics.convex_iou(SQUARE[:1], SQUARE) == 0
+
+
+@given(st.floats(-8, 8), st.floats(-8, 8), st.floats(0, 3), st.integers(3, 12), st.integers(3, 12))
+def test_iou_of_polygons_agrees_with_counting_pixels(
+    dx: float, dy: float, turn: float, corners_a: int, corners_b: int
+) -> None:
+    def polygon(count: int, phase: float, x: float, y: float) -> np.ndarray:
+        angle = phase + np.arange(count) * 2 * np.pi / count
+        return np.stack([x + 10 * np.cos(angle), y + 10 * np.sin(angle)], axis=1)
+
+    def inside(p: np.ndarray, grid: np.ndarray) -> np.ndarray:
+        edge = np.roll(p, -1, axis=0) - p
+        offset = grid[:, None, :] - p[None]
+        return np.all(edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0] >= 0, axis=1)
+
+    a, b = polygon(corners_a, 0, 0, 0), polygon(corners_b, turn, dx, dy)
+    axis = np.arange(-22, 22, 0.4)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    in_a, in_b = inside(a, grid), inside(b, grid)
+    counted = np.count_nonzero(in_a & in_b) / np.count_nonzero(in_a | in_b)
+    # Counting errs by about the boundary's length times a third of the sample distance, over the area of
+    # the smaller polygon (130 px^2 for a triangle): 60 * 0.13 / 130 = 0.06.
+    assert metrics.convex_iou(a, b) == pytest.approx(counted, abs=0.06)
+
+
+def test_masks_of_different_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match="one shape"):
+        metrics.mask_iou(np.zeros((2, 2)), np.zeros((2, 3)))
+
+
+def test_empty_masks_are_equal() -> None:
+    assert metrics.mask_iou(np.zeros((2, 2)), np.zeros((2, 2))) == 1
+
+
+@pytest.mark.parametrize(
+    ("angle", "truth", "expected"),
+    [(89, -89, 2), (-90 + 1e-9, 90, 0), (0, 90, 90), (45, -45, 90), (10, 12, 2)],
+)
+def test_directions_are_compared_across_the_seam(angle: float, truth: float, expected: float) -> None:
+    assert metrics.angle_error(angle, truth) == pytest.approx(expected, abs=1e-6)
+
+
+def test_psnr_of_a_constant_offset() -> None:
+    image = np.full((4, 4, 3), 100, dtype=np.uint8)
+    mask = np.full((4, 4), 255, dtype=np.uint8)
+    assert metrics.masked_mae(image, image + 5, mask) == 5
+    assert metrics.masked_psnr(image, image + 5, mask) == pytest.approx(20 * np.log10(255 / 5))
+    assert metrics.masked_psnr(image, image, mask) == 100
+    assert metrics.masked_mae(image, image, mask * 0) is None
+
+
+def test_two_markers_on_one_dot_are_both_counted() -> None:
+    position = GRID.copy()
+    position[1] = position[0] + 2
+    assert metrics.shared_dots(position, ALL, pitch=20) == 2
+    trusted = ALL.copy()
+    trusted[1] = False
+    assert metrics.shared_dots(position, trusted, pitch=20) == 0
+
+
+def test_a_marker_that_moves_unlike_its_neighbours_is_a_jump() -> None:
+    pairs = metrics.neighbours(GRID)
+    flow = np.tile((12.0, 0.0), (25, 1))  # all together: over half a pitch, but no jump
+    assert metrics.flow_jumps(flow, ALL, pairs, 20) == 0
+    flow[12] = (23.0, 0.0)
+    assert metrics.flow_jumps(flow, ALL, pairs, 20) == 1
+
+
+def test_neighbours_of_a_grid_are_the_eight_around() -> None:
+    pairs = metrics.neighbours(GRID)
+    degree = np.bincount(pairs.ravel(), minlength=25)
+    assert degree[12] == 8
+    assert degree[0] == 3
