@@ -33,8 +33,8 @@ def load_pipeline(
 
     path : the file.
     overrides : `a.b.c=VALUE` as given to `--set`; VALUE is YAML, null for a whole sink or stage removes it.
-    extra_sinks : wanted id -> settings of a sink to add, as `--ID` on the command line does; an id that is
-        taken gets a number.
+    extra_sinks : option of the command line, such as "--jsonl" -> settings of the sink it adds. The sink's id
+        is the option's name, with a number if that is taken.
     extra_stage_values : stage id -> parameters that replace those of the file.
     source_values : parameters of the source stage, as `--NAME` on the command line sets them.
 
@@ -136,7 +136,8 @@ def _replaced(item: Item | None, keys: Sequence[str], value: Item, mark: Mark, p
 
 
 def _add_sinks(root: Item, extra: Mapping[str, Mapping[str, Any]]) -> Item:
-    for wanted, settings in extra.items():
+    for option, settings in extra.items():
+        wanted = option.lstrip("-")
         mark = Mark(f"--{wanted}", 0, 0)
         taken = {
             id_

@@ -248,7 +248,10 @@ def _component(cls: type, name: str, origin: str) -> Component:
                 f"{place}: {cls.__name__}.Params.{key}: that name is a key of the pipeline file"
             )
     try:
-        inspect.signature(cls).bind(None)
+        signature = inspect.signature(cls)
+        signature.bind(
+            None, **{word: None for word in ("sensor", "directory") if word in signature.parameters}
+        )
     except (TypeError, ValueError):
         raise ConfigError(
             f"{place}: {cls.__name__} must be built from its parameters: __init__(self, params)"

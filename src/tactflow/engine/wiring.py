@@ -211,8 +211,8 @@ class _Wiring:
         if reason is not None:
             self._problems.add(
                 mark,
-                f"{path}: the input {port.name} takes {describe_type(port.annotation)}, but {ref} ({giver.mark}) "
-                f"gives {describe_type(output.annotation)}: {reason}",
+                f"{path}: the input {port.name} takes {describe_type(port.annotation)}, but {ref} "
+                f"({giver.mark}) gives {describe_type(output.annotation)}: {reason}",
             )
 
     def _dangling(self, port: Port, user: Draft) -> str:
@@ -257,8 +257,8 @@ class _Wiring:
             kind = describe_type(giver.outputs[ref.port].annotation)
             self._problems.add(
                 item.mark,
-                f"{signal_path}: a gate takes a signal (a bool port such as touching), but {ref} ({giver.mark}) "
-                f"gives {kind}",
+                f"{signal_path}: a gate takes a signal (a bool port such as touching), but {ref} "
+                f"({giver.mark}) gives {kind}",
             )
             return
         draft.gates.append(Gate(ref, reason or signal.closed, otherwise, hold or 0, at_least_every))
@@ -277,7 +277,7 @@ def check_keys(entries: Mapping[str, Entry], known: Sequence[str], path: str, pr
 def choice(
     entries: Mapping[str, Entry], key: str, choices: Sequence[str], path: str, problems: Problems
 ) -> str | None:
-    """The value of `key` if it is one of `choices`; None if it is not given or (reported) wrong."""
+    """The value of `key` if it is one of `choices`; None if it is not given or wrong."""
     entry = entries.get(key)
     if entry is None:
         return None
@@ -305,7 +305,7 @@ def whole(entries: Mapping[str, Entry], key: str, least: int, path: str, problem
 
 
 def word(entries: Mapping[str, Entry], key: str, path: str, problems: Problems) -> str | None:
-    """The value of `key` if it is a word of letters, digits, `_` and `-`; None if it is not given or wrong."""
+    """The value of `key` if it is a word (see `is_word`); None if it is null, not given or wrong."""
     entry = entries.get(key)
     if entry is None or entry.item.content is None:
         return None
