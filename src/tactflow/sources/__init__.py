@@ -1,1 +1,64 @@
-"""What capture opens: simulated sensors, files, folders, cameras, streams."""
+"""What capture opens: simulated sensors, files, folders, cameras, streams.
+
+`open_source("recordings/wedge")` gives a `Source`: call `read()` until it returns None, then `close()`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources.base import Source
+from tactflow.sources.devices import Camera, CameraRequest, Stream
+from tactflow.sources.files import open_recording
+
+__all__ = ["KINDS", "CameraRequest", "Source", "open_source"]
+
+KINDS = (
+    "sim:NAME (simulated sensor), a camera index or /dev/videoN, a video file, a folder or glob of images, "
+    "a .npy file, an http://, rtsp:// or udp:// stream"
+)
+"""What a source can be, for messages."""
+
+_STREAMS = frozenset(["http", "https", "rtsp", "udp"])
+
+
+def open_source(
+    spec: str,
+    *,
+    directory: Path | None = None,
+    fps: float | None = None,
+    camera: CameraRequest | None = None,
+) -> Source:
+    """Open a source of frames.
+
+    Parameters
+    ----------
+    spec : `sim:NAME?frames=300&seed=7`, a camera index, `/dev/videoN`, a video file, a folder or glob of
+        images, a `.npy` file, or an `http://`, `rtsp://`, `udp://` stream.
+    directory : where a relative path is looked for if it is not in the current directory.
+    fps : rate of recordings that do not know their own (images, arrays), frames per second; 30 by default.
+    camera : size, rate and format to ask a camera for.
+
+    Raises
+    ------
+    SourceError
+        If it cannot be opened; the message says what to try.
+    """
+    spec = spec.strip()
+    if not spec:
+        raise SourceError(f"the source is empty; required one of: {KINDS}")
+    if spec.startswith("sim:"):
+        from tactflow.sources.simulated import open_simulated
+
+        return open_simulated(spec)
+    scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]+)://", spec)
+    if scheme is not None:
+        if scheme[1].lower() in _STREAMS:
+            return Stream(spec)
+        hint = f"; for a file, leave out {scheme[0]}" if scheme[1].lower() == "file" else ""
+        raise SourceError(f"{spec}: unknown kind of source {scheme[0]}{hint}; required one of: {KINDS}")
+    if spec.isdecimal() or spec.startswith(("/dev/video", "/dev/v4l/")):
+        return Camera(spec, camera)
+    return open_recording(spec, directory, fps)

@@ -1,0 +1,210 @@
+"""JSON Lines: one result message per frame, one line each."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import stat
+import sys
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+from pydantic import Field, model_validator
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Tick
+from tactflow.engine.stage import StageParams
+from tactflow.message import encode_message
+from tactflow.ports import Image
+from tactflow.vision.types import Contact, Flow, Markers
+
+log = logging.getLogger("tactflow")
+
+
+class Jsonl:
+    """Writes result messages to a file or to standard output, complete lines only.
+
+    Lines reach a file at least every `flush` seconds of frames and at the end, and standard output at once.
+    When the reader of standard output goes away, the sink falls silent and wants nothing more.
+    """
+
+    threaded = False
+    when_live = "block"
+    observer = False
+
+    class Params(StageParams):
+        """Where to write, and what to do with a file that is there already."""
+
+        path: str = Field(
+            "results.jsonl", min_length=1, description="file, relative to the current directory; - is stdout"
+        )
+        overwrite: bool = Field(False, description="replace an existing file")
+        append: bool = Field(False, description="continue an existing file")
+        flush: float = Field(
+            0.5, ge=0, description="longest time that lines wait before they reach the file, s; 0 is at once"
+        )
+        detail: bool = Field(
+            False, description="also write confidence, standard errors, rotation, divergence, residual"
+        )
+
+        @model_validator(mode="after")
+        def _one_of_both(self) -> Jsonl.Params:
+            if self.overwrite and self.append:
+                raise ValueError("overwrite and append exclude each other")
+            return self
+
+    def __init__(self, params: Params, sensor: str = "main", directory: Path | None = None) -> None:
+        """Prepare; nothing is opened yet. Messages carry the sensor's name themselves."""
+        del sensor, directory
+        self.params = params
+        self._name = "standard output" if params.path == "-" else params.path
+        self._file: BinaryIO | None = None
+        self._pending: list[bytes] = []
+        self._flushed = 0.0
+        self._complete: int | None = None
+        self._lines = 0
+
+    def open(self) -> None:
+        """Open or create the file, and its folder.
+
+        Raises
+        ------
+        StageError
+            If the file exists and neither `overwrite` nor `append` is set, or it cannot be written.
+        """
+        if self.params.path == "-":
+            self._file = sys.stdout.buffer
+            return
+        path = Path(self.params.path).expanduser()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self._open_file(path)
+        except OSError as error:
+            raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        self._flushed = time.monotonic()
+
+    def _open_file(self, path: Path) -> BinaryIO:
+        regular = not path.exists() or stat.S_ISREG(path.stat().st_mode)
+        if not regular:
+            return open(path, "wb", buffering=0)
+        if path.exists() and path.stat().st_size > 0 and not (self.params.overwrite or self.params.append):
+            raise StageError(
+                f"{path}: this file exists; set overwrite: true to replace it, append: true to continue it, "
+                "or give another path"
+            )
+        file = open(path, "wb" if self.params.overwrite else "r+b" if path.exists() else "xb", buffering=0)
+        try:
+            self._complete = _continue_at(file, path) if self.params.append and file.readable() else 0
+        except BaseException:
+            file.close()
+            raise
+        return file
+
+    def wants(self) -> bool:
+        """False once the reader of standard output has gone away."""
+        return self._file is not None
+
+    def counters(self) -> dict[str, int]:
+        """lines : written so far."""
+        return {"lines": self._lines}
+
+    def write(
+        self,
+        tick: Tick,
+        image: Image | None,
+        contact: Contact | None,
+        flow: Flow | None,
+        markers: Markers | None,
+    ) -> None:
+        """Add one line.
+
+        Raises
+        ------
+        StageError
+            If the file cannot be written, for instance because the disk is full. The file then ends with the
+            last line that fitted.
+        """
+        if self._file is None:
+            return
+        self._pending.append(encode_message(tick, image, contact, flow, markers, detail=self.params.detail))
+        now = time.monotonic()
+        if self.params.path == "-" or now - self._flushed >= self.params.flush:
+            self._flushed = now
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is left and close the file."""
+        try:
+            self._flush()
+        finally:
+            if self._file is not None and self.params.path != "-":
+                self._file.close()
+            self._file = None
+
+    def _flush(self) -> None:
+        if self._file is None or not self._pending:
+            return
+        lines, self._pending = self._pending, []
+        data = memoryview(b"\n".join([*lines, b""]))
+        written = 0
+        try:
+            # An unbuffered file may take only a part, and says why at the next attempt.
+            while written < len(data):
+                written += self._file.write(data[written:])
+            self._file.flush()
+        except OSError as error:
+            if self.params.path == "-" and error.errno in (errno.EPIPE, errno.ECONNRESET):
+                self._reader_left()
+                return
+            self._cut_at_complete_line(data[:written])
+            raise StageError(
+                f"{self._name}: cannot be written: {error.strerror or error}; "
+                f"the {self._lines} lines written before are complete"
+            ) from error
+        self._lines += len(lines)
+        if self._complete is not None:
+            self._complete += len(data)
+
+    def _cut_at_complete_line(self, written: memoryview) -> None:
+        """After a failed write, leave the file with complete lines only."""
+        kept = bytes(written).rfind(b"\n") + 1
+        self._lines += bytes(written).count(b"\n")
+        if self._file is not None and self._complete is not None:
+            self._complete += kept
+            self._file.truncate(self._complete)
+            self._file.seek(self._complete)
+
+    def _reader_left(self) -> None:
+        log.debug("standard output was closed by its reader")
+        self._file = None
+        # Python flushes standard output once more at exit; there it must find somebody who listens.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def _continue_at(file: BinaryIO, path: Path) -> int:
+    """Seek to the end of the last complete line, completing or cutting off what follows it; its offset."""
+    end = file.seek(0, os.SEEK_END)
+    tail = b""
+    start = end
+    while start > 0 and b"\n" not in tail:
+        step = min(start, 65536)
+        start = file.seek(start - step)
+        tail = (file.read(step) or b"") + tail
+    rest = tail[tail.rfind(b"\n") + 1 :]
+    if rest:
+        try:
+            json.loads(rest)
+        except ValueError:
+            end -= len(rest)
+            file.truncate(end)
+            log.warning("%s: its last line was cut off (%d bytes) and has been removed", path, len(rest))
+        else:
+            file.seek(end)
+            file.write(b"\n")
+            end += 1
+    return file.seek(end)

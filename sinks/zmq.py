@@ -1,0 +1,181 @@
+"""ZeroMQ: result messages for subscribers in other processes."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import threading
+import time
+from pathlib import Path
+
+import zmq
+from pydantic import Field
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Tick
+from tactflow.engine.stage import StageParams
+from tactflow.message import encode_message
+from tactflow.ports import Image
+from tactflow.vision.types import Contact, Flow, Markers
+
+log = logging.getLogger("tactflow")
+
+
+class Zmq:
+    """Publishes one message per frame: `tactflow.<sensor>`, a space, the JSON of `tactflow.frame/1`.
+
+    Knows who listens: while nobody has subscribed to this sensor, nothing is wanted and nothing encoded.
+    A subscriber that does not keep up loses messages; it never slows the run.
+    """
+
+    threaded = True
+    when_live = "latest"
+    observer = False
+
+    class Params(StageParams):
+        """Where to publish, and how much may wait for a slow subscriber."""
+
+        endpoint: str = Field(
+            "tcp://127.0.0.1:5556",
+            description="address to bind: tcp://127.0.0.1:PORT for this machine only (* picks a free port), "
+            "tcp://*:PORT for the network, ipc:///path",
+        )
+        queue: int = Field(
+            8,
+            ge=1,
+            description="messages that may wait for each subscriber; more bridges its pauses, fewer keep it "
+            "fresher",
+        )
+        send_buffer: int = Field(
+            32768,
+            ge=1024,
+            description="kernel send buffer per subscriber, bytes; large ones hold seconds of stale messages",
+        )
+        linger: float = Field(
+            1.0, ge=0, le=60, description="time to deliver the last messages at the end of a run, s"
+        )
+        wait_for_subscriber: float = Field(
+            0.0, ge=0, description="wait at most this long for a subscriber before the first frame, s"
+        )
+        detail: bool = Field(
+            False, description="also send confidence, standard errors, rotation, divergence, residual"
+        )
+
+    def __init__(self, params: Params, sensor: str = "main", directory: Path | None = None) -> None:
+        """Prepare; nothing is bound yet.
+
+        Parameters
+        ----------
+        sensor : names the topic.
+        """
+        del directory
+        self.params = params
+        self.endpoint = params.endpoint
+        self._topic = f"tactflow.{sensor} ".encode()
+        # Sockets belong to one thread at a time: `wants` is called by another thread than `write`.
+        self._lock = threading.Lock()
+        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._socket: zmq.Socket[bytes] | None = None
+        self._subscriptions: set[bytes] = set()
+        self._wanted = False
+        self._serialised = 0
+
+    def open(self) -> None:
+        """Bind the socket; afterwards `endpoint` is the real address.
+
+        Raises
+        ------
+        StageError
+            If the address is taken or cannot be bound.
+        """
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        socket = context.socket(zmq.XPUB)
+        socket.sndhwm = self.params.queue
+        socket.setsockopt(zmq.SNDBUF, self.params.send_buffer)
+        try:
+            socket.bind(self.params.endpoint)
+        except zmq.ZMQError as error:
+            socket.close(linger=0)
+            context.term()
+            raise StageError(_bind_problem(self.params.endpoint, error)) from error
+        self._context, self._socket = context, socket
+        self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        log.info("publishing %s on %s", self._topic.decode().strip(), self.endpoint)
+        self._wait_for_subscriber(self.params.wait_for_subscriber)
+
+    def _wait_for_subscriber(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while not self.wants() and (left := deadline - time.monotonic()) > 0:
+            assert self._socket is not None
+            self._socket.poll(max(int(min(left, 0.1) * 1000), 1))
+
+    def wants(self) -> bool:
+        """Whether anybody has subscribed to this sensor. From any thread; takes about 2 us."""
+        # While a message is being sent, the last answer is good enough.
+        if self._lock.acquire(blocking=False):
+            try:
+                self._read_subscriptions()
+            finally:
+                self._lock.release()
+        return self._wanted
+
+    def counters(self) -> dict[str, int]:
+        """serialised : messages encoded. subscriptions : distinct ones now."""
+        return {"serialised": self._serialised, "subscriptions": len(self._subscriptions)}
+
+    def write(
+        self,
+        tick: Tick,
+        image: Image | None,
+        contact: Contact | None,
+        flow: Flow | None,
+        markers: Markers | None,
+    ) -> None:
+        """Send one message to whoever has subscribed; never waits."""
+        if not self.wants():
+            return
+        body = encode_message(tick, image, contact, flow, markers, detail=self.params.detail)
+        self._serialised += 1
+        with self._lock:
+            if self._socket is not None:
+                self._socket.send(self._topic + body, zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Deliver what is under way, for at most `linger` seconds, and free the address."""
+        with self._lock:
+            socket, context = self._socket, self._context
+            self._socket = self._context = None
+            self._wanted = False
+        if socket is not None:
+            socket.close(linger=int(self.params.linger * 1000))
+        if context is not None:
+            context.term()
+
+    def _read_subscriptions(self) -> None:
+        if self._socket is None:
+            return
+        try:
+            while True:
+                event = self._socket.recv(zmq.NOBLOCK)
+                if event[:1] == b"\x01":
+                    self._subscriptions.add(event[1:])
+                elif event[:1] == b"\x00":
+                    self._subscriptions.discard(event[1:])
+        except zmq.Again:
+            pass
+        # A subscription is a prefix of the message; it may be longer than the topic.
+        topic = self._topic
+        self._wanted = any(topic.startswith(s) or s.startswith(topic) for s in self._subscriptions)
+
+
+def _bind_problem(endpoint: str, error: zmq.ZMQError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return (
+            f"{endpoint} is in use: another tactflow run, or another program, publishes there. End it, choose "
+            "another address (--set sinks.zmq.endpoint=tcp://127.0.0.1:5557) or publish nothing "
+            "(--set sinks.zmq=null)"
+        )
+    return (
+        f"{endpoint} cannot be bound: {error.strerror}; required an address of this machine such as "
+        "tcp://127.0.0.1:5556, tcp://*:5556 or ipc:///tmp/tactflow"
+    )

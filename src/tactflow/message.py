@@ -1,0 +1,254 @@
+"""The result message `tactflow.frame/1`: what sinks publish about one frame, and its JSON Schema.
+
+Numbers are written with full precision (the shortest decimal that reads back as the same double); nothing
+is rounded.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic.json_schema import GenerateJsonSchema
+
+from tactflow.engine.frame import Tick
+from tactflow.ports import Image
+from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
+
+SCHEMA = "tactflow.frame/1"
+STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
+"""The word for each value of `MarkerStatus`."""
+
+_OPTIONS = orjson.OPT_SERIALIZE_NUMPY
+
+
+def encode_message(
+    tick: Tick,
+    image: Image | None,
+    contact: Contact | None,
+    flow: Flow | None,
+    markers: Markers | None,
+    *,
+    detail: bool = False,
+) -> bytes:
+    """The result message of one frame, as JSON in UTF-8 on a single line without a line end.
+
+    Parameters
+    ----------
+    tick : the frame, and why values are missing.
+    image : (H, W, 3) uint8, the processed frame, of which only the size is told; None stands for the raw one.
+    contact, flow, markers : results in pixels of the processed frame; None becomes null.
+    detail : also tell `contact.confidence`, `flow.stderr`, `flow.rotation`, `flow.divergence`,
+        `flow.residual` and `markers.stderr`.
+
+    Raises
+    ------
+    ValueError
+        If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
+    """
+    frame = tick.frame
+    pixels = frame.image if image is None else image
+    return orjson.dumps(
+        {
+            "schema": SCHEMA,
+            "sensor": frame.sensor,
+            "seq": frame.seq,
+            "t": _number(frame.t, "t"),
+            "size": [pixels.shape[1], pixels.shape[0]],
+            "contact": None if contact is None else _contact(contact, detail),
+            "flow": None if flow is None else _flow(flow, detail),
+            "markers": None if markers is None else _markers(markers, detail),
+            "skipped": dict(tick.skipped),
+        },
+        option=_OPTIONS,
+    )
+
+
+def build_message(
+    tick: Tick,
+    image: Image | None,
+    contact: Contact | None,
+    flow: Flow | None,
+    markers: Markers | None,
+    *,
+    detail: bool = False,
+) -> dict[str, Any]:
+    """The same message as plain dicts, lists and numbers: what a subscriber gets after parsing it."""
+    message: dict[str, Any] = orjson.loads(encode_message(tick, image, contact, flow, markers, detail=detail))
+    return message
+
+
+def _contact(contact: Contact, detail: bool) -> dict[str, Any]:
+    ellipse = contact.ellipse
+    result: dict[str, Any] = {
+        "area": _number(contact.area, "contact.area"),
+        "center": _pair(contact.center, "contact.center"),
+        "angle": _optional(contact.angle, "contact.angle"),
+        "slope": _optional(contact.slope, "contact.slope"),
+        "hull": _points(contact.hull, "contact.hull"),
+        "ellipse": None
+        if ellipse is None
+        else {
+            "center": _pair(ellipse.center, "contact.ellipse.center"),
+            "axes": _pair(ellipse.axes, "contact.ellipse.axes"),
+            "angle": _optional(ellipse.angle, "contact.ellipse.angle"),
+        },
+    }
+    if detail:
+        result["confidence"] = _number(contact.confidence, "contact.confidence")
+    return result
+
+
+def _flow(flow: Flow, detail: bool) -> dict[str, Any]:
+    result: dict[str, Any] = {
+        "mean": None if flow.mean is None else _pair(flow.mean, "flow.mean"),
+        "count": int(flow.count),
+    }
+    if detail:
+        result["stderr"] = None if flow.stderr is None else _pair(flow.stderr, "flow.stderr")
+        result["rotation"] = _optional(flow.rotation, "flow.rotation")
+        result["divergence"] = _optional(flow.divergence, "flow.divergence")
+        result["residual"] = _optional(flow.residual, "flow.residual")
+    return result
+
+
+def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
+    result: dict[str, Any] = {
+        "origin": _points(markers.origin, "markers.origin"),
+        "position": _points(markers.position, "markers.position"),
+        "status": [STATUS_NAMES[value] for value in markers.status.tolist()],
+    }
+    if detail:
+        stderr = np.ascontiguousarray(markers.stderr, np.float64)
+        if np.isinf(stderr).any():
+            raise ValueError("markers.stderr: required finite numbers or NaN (unknown), got an infinite one")
+        # The encoder writes NaN as null.
+        result["stderr"] = stderr
+    return result
+
+
+def _number(value: float, name: str) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{name}: required a finite number, got {number}")
+    return number
+
+
+def _optional(value: float | None, name: str) -> float | None:
+    return None if value is None else _number(value, name)
+
+
+def _pair(pair: tuple[float, float], name: str) -> list[float]:
+    return [_number(pair[0], name), _number(pair[1], name)]
+
+
+def _points(points: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    # The encoder takes contiguous arrays only.
+    points = np.ascontiguousarray(points, np.float64)
+    # A sum is finite only if every summand is: one pass, no temporary. (It could overflow for finite summands
+    # only beyond 1e300, which is no pixel.)
+    if not math.isfinite(points.sum()):
+        raise ValueError(f"{name}: required finite numbers, got NaN or infinity")
+    return points
+
+
+# -- the schema ----------------------------------------------------------------------------------------------
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Point = tuple[_Finite, _Finite]
+_Angle = Annotated[float, Field(gt=-90, le=90, allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class _EllipseModel(_Strict):
+    """Ellipse fitted to the contact."""
+
+    center: _Point = Field(description="(x, y), px")
+    axes: tuple[_Positive, _Positive] = Field(description="full lengths (major, minor), px")
+    angle: _Angle | None = Field(description="of the major axis, degrees; null for a circle")
+
+
+class _ContactModel(_Strict):
+    """Geometry of the contact region."""
+
+    area: float = Field(ge=0, description="of the convex hull, px^2")
+    center: _Point = Field(description="centroid of the contact region, px")
+    angle: _Angle | None = Field(
+        description="principal axis, degrees, counter-clockwise as seen; null where there is no direction"
+    )
+    slope: _Finite | None = Field(
+        description="dy/dx of that axis, y down; null where it is vertical or there is no direction"
+    )
+    hull: list[_Point] = Field(description="vertices of the convex hull in order, px")
+    ellipse: _EllipseModel | None = Field(description="null where none can be fitted")
+    confidence: float = Field(
+        0.0, ge=0, le=1, description="of the direction: 0 a disc, towards 1 a line (detail)"
+    )
+
+
+class _FlowModel(_Strict):
+    """Mean displacement of the markers inside the contact."""
+
+    mean: _Point | None = Field(description="(dx, dy), px; null when count is 0")
+    count: int = Field(ge=0, description="number of markers inside the contact")
+    stderr: _Point | None = Field(None, description="standard error of mean, px; null when unknown (detail)")
+    rotation: _Finite | None = Field(
+        None, description="twist, degrees, counter-clockwise as seen; null when unknown (detail)"
+    )
+    divergence: _Finite | None = Field(
+        None, description="relative growth in area of the marker pattern; null when unknown (detail)"
+    )
+    residual: _Finite | None = Field(
+        None,
+        description="RMS of what mean, rotation, divergence leave, px; null when unknown (detail)",
+    )
+
+
+class _MarkersModel(_Strict):
+    """The markers; index i is the same physical marker for the whole run."""
+
+    origin: list[_Point] = Field(description="positions in the reference frame, px")
+    position: list[_Point] = Field(description="positions now, px")
+    status: list[Literal["tracked", "inferred", "lost"]] = Field(description="how each position is known")
+    stderr: list[Annotated[float, Field(ge=0)] | None] = Field(
+        default_factory=list, description="standard error of each position, px; null when unknown (detail)"
+    )
+
+
+class _Message(_Strict):
+    """What tactflow says about one processed frame."""
+
+    model_config = ConfigDict(title=SCHEMA)
+
+    schema_: Literal["tactflow.frame/1"] = Field(alias="schema")
+    sensor: str = Field(description="name of the sensor")
+    seq: int = Field(ge=0, description="index of the frame at the source; a dropped frame leaves a gap")
+    t: _Finite = Field(description="capture time, s: from the start of a recording, or Unix time if live")
+    size: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] = Field(
+        description="(width, height) of the processed frame, px"
+    )
+    contact: _ContactModel | None = Field(description="null when nothing touches the gel")
+    flow: _FlowModel | None = Field(description="null when there is no contact")
+    markers: _MarkersModel | None = Field(description="null when markers were not computed")
+    skipped: dict[str, str] = Field(description="port -> why this frame did not need it")
+
+
+class _NoDefaults(GenerateJsonSchema):
+    """Leaves defaults out: a field that a message lacks was not asked for; it has no value."""
+
+    def default_schema(self, schema: Any) -> dict[str, Any]:
+        return self.generate_inner(schema["schema"])
+
+
+def message_schema() -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of the result message; fields marked (detail) are optional."""
+    schema = _Message.model_json_schema(by_alias=True, schema_generator=_NoDefaults)
+    return {"$schema": GenerateJsonSchema.schema_dialect, **schema}

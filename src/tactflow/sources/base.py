@@ -1,0 +1,182 @@
+"""What every source has in common: the interface, and pixels as the pipeline expects them."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+
+log = logging.getLogger("tactflow")
+
+BgrImage = NDArray[np.uint8]
+
+
+class Source(Protocol):
+    """Frames, one after the other.
+
+    live : the frames come when they want to (cameras, streams); a recording waits until it is read.
+    fps : frames per second, or None where nothing is known.
+    size : (width, height) of the frames, px, or None before the first one.
+    total : number of frames, or None where it is unknown or endless.
+    description : one line for people.
+    """
+
+    live: bool
+    fps: float | None
+    size: tuple[int, int] | None
+    total: int | None
+    description: str
+
+    def read(self) -> tuple[BgrImage, float] | None:
+        """The next frame and its time, or None at the end.
+
+        Returns
+        -------
+        image : (H, W, 3) uint8 BGR; the caller must not write to it.
+        t : s; from the start for a recording, Unix time for a live source.
+
+        Raises
+        ------
+        SourceError
+            If the next frame cannot be read.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the file or device. May be called twice."""
+        ...
+
+
+class Normaliser:
+    """Brings whatever a source delivers to (H, W, 3) uint8 BGR of one constant size.
+
+    Gray, BGRA and 16-bit frames are converted, with one note in the log per kind of conversion.
+
+    Parameters
+    ----------
+    name : what the source is called in notes and errors.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.size: tuple[int, int] | None = None
+        self._noted: set[str] = set()
+
+    def __call__(self, image: NDArray[Any], name: str | None = None) -> BgrImage:
+        """Convert one frame.
+
+        Parameters
+        ----------
+        image : (H, W) or (H, W, C) with C in 1, 3, 4; uint8 or uint16.
+        name : the file the frame comes from, where it has one of its own.
+
+        Raises
+        ------
+        SourceError
+            If the pixels are of another kind, or the frame is not as large as the ones before it.
+        """
+        where = name or self.name
+        height, width = image.shape[:2]
+        if self.size is None:
+            self.size = (width, height)
+        elif self.size != (width, height):
+            raise SourceError(
+                f"{where}: this frame is {width} x {height} pixels, the ones before it are "
+                f"{self.size[0]} x {self.size[1]}; a source must keep its size. "
+                "Remove the odd frame, or run the two recordings one after the other"
+            )
+        if image.dtype == np.uint16:
+            if self._note("16 bit", "16-bit values are scaled to 8 bit (divided by 257)") and image.size:
+                peak = int(image.max())
+                if 0 < peak < 4096:
+                    log.warning(
+                        "%s: no value above %d: a sensor with %d bits in a 16-bit file? It will be dark; "
+                        "multiply the values by %d beforehand",
+                        where,
+                        peak,
+                        max(peak.bit_length(), 10),
+                        1 << (16 - max(peak.bit_length(), 10)),
+                    )
+            image = cv2.convertScaleAbs(image, alpha=255.0 / 65535.0)
+        elif image.dtype != np.uint8:
+            raise SourceError(f"{where}: required 8- or 16-bit unsigned pixels, got {image.dtype}")
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        if image.ndim not in (2, 3) or channels not in (1, 3, 4):
+            raise SourceError(f"{where}: required 1, 3 or 4 channels, got an image of shape {image.shape}")
+        if channels == 3:
+            return image if image.flags.c_contiguous else np.ascontiguousarray(image)
+        if channels == 1:
+            self._note("gray", "gray frames are given three equal channels")
+            return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+        self._note("alpha", "the fourth channel (alpha) is ignored")
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2BGR), np.uint8)
+
+    def _note(self, kind: str, text: str) -> bool:
+        if kind in self._noted:
+            return False
+        self._noted.add(kind)
+        log.info("%s: %s", self.name, text)
+        return True
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV's and FFmpeg's own messages off standard error: ours say the same more clearly."""
+    # FFmpeg reads this once, when OpenCV opens the first file with it.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def find_path(spec: str, directory: Path | None) -> Path:
+    """Where a path of a command line or a pipeline file points to.
+
+    Parameters
+    ----------
+    spec : absolute, or relative to the current directory or else to `directory`; `~` is expanded.
+    directory : the pipeline file's folder, or None.
+
+    Raises
+    ------
+    SourceError
+        If nothing is there; names files whose names are close.
+    """
+    path = Path(spec).expanduser()
+    candidates = [path]
+    if directory is not None and not path.is_absolute():
+        candidates.append(directory / path)
+    for candidate in candidates:
+        if candidate.exists():
+            return candidate
+    raise SourceError(f"{spec}: no such file or folder{_near(candidates)}")
+
+
+def _near(candidates: list[Path]) -> str:
+    for path in candidates:
+        folder, wanted = path.parent, path.name
+        # Climb to the first folder that exists, so that a typo in the middle of a path is found too.
+        while not folder.is_dir() and folder.parent != folder:
+            folder, wanted = folder.parent, folder.name
+        if not folder.is_dir():
+            continue
+        try:
+            names = sorted(entry.name for entry in folder.iterdir())
+        except OSError:
+            continue
+        close = difflib.get_close_matches(wanted, names, n=3, cutoff=0.6)
+        if close:
+            return "; did you mean " + " or ".join(str(folder / name) for name in close) + "?"
+    return f" (looked in {', '.join(dict.fromkeys(str(path.parent.absolute()) for path in candidates))})"

@@ -1,0 +1,336 @@
+"""Recordings: image folders and globs, .npy arrays, video files."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources.base import BgrImage, Normaliser, find_path, log, quiet_opencv
+
+IMAGE_SUFFIXES = frozenset(
+    [
+        ".avif",
+        ".bmp",
+        ".jp2",
+        ".jpe",
+        ".jpeg",
+        ".jpg",
+        ".pbm",
+        ".pgm",
+        ".png",
+        ".pnm",
+        ".ppm",
+        ".tif",
+        ".tiff",
+    ]
+    + [".webp"]
+)
+DEFAULT_FPS = 30.0
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sorting key for which cal-2 comes before cal-10, and upper case does not matter."""
+    return [
+        (0, int(part), part) if part.isdecimal() else (1, 0, part.casefold())
+        for part in re.split(r"(\d+)", name)
+        if part
+    ]
+
+
+def read_image(path: Path) -> NDArray[Any]:
+    """Decode an image file as it is stored, without changing depth or channels.
+
+    Returns
+    -------
+    image : (H, W) or (H, W, C), any depth.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read, is not an image, or is cut off. OpenCV fills the missing part of a
+        truncated JPEG with gray and says nothing to the caller, so its end is looked for here.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not data:
+        raise SourceError(f"{path}: the file is empty")
+    if _cut_off(data):
+        raise SourceError(f"{path}: the image is cut off ({len(data)} bytes); copy it again or remove it")
+    image: NDArray[Any] | None
+    try:
+        with quiet_opencv():
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise SourceError(f"{path}: not an image that OpenCV can read, or a damaged one")
+    return image
+
+
+def _cut_off(data: bytes) -> bool:
+    if data.startswith(b"\xff\xd8\xff"):
+        # Behind the last start-of-scan marker there must be an end-of-image marker. Neither can occur
+        # inside compressed data, and an embedded thumbnail brings both.
+        return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return b"IEND" not in data
+    return False
+
+
+class ImageFiles:
+    """A recording made of one image file per frame.
+
+    Parameters
+    ----------
+    files : in the order they are played.
+    description : one line for people.
+    fps : frames per second; the time of frame i is i / fps.
+    """
+
+    live = False
+
+    def __init__(self, files: Sequence[Path], description: str, fps: float | None = None) -> None:
+        self.fps: float | None = fps or DEFAULT_FPS
+        self.total: int | None = len(files)
+        self._rate = fps or DEFAULT_FPS
+        self._files = files
+        self._index = 0
+        self._normalise = Normaliser(description)
+        self._first: BgrImage | None = self._load(0)
+        self.size = self._normalise.size
+        self.description = f"{description}, {len(files)} images"
+
+    def _load(self, index: int) -> BgrImage:
+        path = self._files[index]
+        return self._normalise(read_image(path), str(path))
+
+    def read(self) -> tuple[BgrImage, float] | None:
+        """The next image and its time; see `Source.read`."""
+        index = self._index
+        if index >= len(self._files):
+            return None
+        self._index += 1
+        if self._first is not None:
+            image, self._first = self._first, None
+        else:
+            image = self._load(index)
+        return image, index / self._rate
+
+    def close(self) -> None:
+        """Read no more."""
+        self._index = len(self._files)
+        self._first = None
+
+
+def open_folder(folder: Path, fps: float | None = None) -> ImageFiles:
+    """All images of a folder, in natural order; hidden files and other kinds of files are left out."""
+    try:
+        entries = sorted(folder.iterdir(), key=lambda entry: natural_key(entry.name))
+    except OSError as error:
+        raise SourceError(f"{folder}: cannot be read: {error.strerror or error}") from error
+    files = [
+        entry
+        for entry in entries
+        if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
+    ]
+    if not files:
+        raise SourceError(f"{folder}: no images in this folder{_what_is_there(entries)}")
+    return ImageFiles(files, str(folder), fps)
+
+
+def _what_is_there(entries: Sequence[Path]) -> str:
+    if not entries:
+        return "; it is empty"
+    names = ", ".join(entry.name + ("/" if entry.is_dir() else "") for entry in entries[:5])
+    more = f" and {len(entries) - 5} more" if len(entries) > 5 else ""
+    hint = "; name one of its folders" if any(entry.is_dir() for entry in entries) else ""
+    return f"; it holds {names}{more}{hint}"
+
+
+def open_glob(pattern: str, directory: Path | None = None, fps: float | None = None) -> ImageFiles:
+    """All files that match a pattern (`*`, `?`, `[...]`, `**`), in natural order.
+
+    The pattern is relative to the current directory, or to `directory` if nothing matches there.
+    """
+    expanded = str(Path(pattern).expanduser())
+    for base in (None, directory):
+        found = [Path(base or "", name) for name in glob.glob(expanded, root_dir=base, recursive=True)]
+        files = sorted((path for path in found if path.is_file()), key=lambda path: natural_key(str(path)))
+        if files:
+            return ImageFiles(files, pattern, fps)
+    raise SourceError(
+        f"{pattern}: no file matches this pattern; quote it on a command line so that the shell leaves it alone"
+    )
+
+
+class ArrayFile:
+    """A .npy file: uint8, N x H x W x 3 BGR or N x H x W gray; memory-mapped, never loaded whole.
+
+    Frames of a BGR array are views of the file, not copies.
+
+    Parameters
+    ----------
+    path : the file.
+    fps : frames per second; the time of frame i is i / fps.
+    """
+
+    live = False
+
+    def __init__(self, path: Path, fps: float | None = None) -> None:
+        self._frames: NDArray[Any] | None = _map_array(path)
+        self.fps: float | None = fps or DEFAULT_FPS
+        self._rate = fps or DEFAULT_FPS
+        self._index = 0
+        self._normalise = Normaliser(str(path))
+        count, height, width = self._frames.shape[:3]
+        self.total: int | None = count
+        self.size: tuple[int, int] | None = (width, height)
+        self.description = f"{path}, {count} frames"
+
+    def read(self) -> tuple[BgrImage, float] | None:
+        """The next frame and its time; see `Source.read`."""
+        if self._frames is None or self._index >= len(self._frames):
+            return None
+        index = self._index
+        self._index += 1
+        return self._normalise(self._frames[index]), index / self._rate
+
+    def close(self) -> None:
+        """Read no more; the file stays mapped for as long as a frame of it is in use."""
+        self._frames = None
+
+
+def _map_array(path: Path) -> NDArray[Any]:
+    wanted = "required a uint8 array of N x H x W x 3 (BGR) or N x H x W (gray)"
+    try:
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, EOFError) as error:
+        if "mmap length" in str(error) or "file size" in str(error):
+            raise SourceError(
+                f"{path}: the file is cut off: it holds fewer bytes than its header promises; copy it again"
+            ) from error
+        raise SourceError(f"{path}: not a .npy array that can be mapped ({error}); {wanted}") from error
+    if not isinstance(mapped, np.ndarray):
+        mapped.close()
+        raise SourceError(f"{path}: a .npz archive; save its array with np.save; {wanted}")
+    array = np.asarray(mapped)
+    got = f"got {array.dtype} of shape {' x '.join(map(str, array.shape)) or '()'}"
+    if array.dtype not in (np.uint8, np.uint16):
+        raise SourceError(f"{path}: {wanted}, {got}")
+    if array.ndim == 3 and array.shape[2] in (3, 4):
+        raise SourceError(f"{path}: {wanted}, {got}; a single image? Save it as array[None]")
+    if array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in (1, 3, 4)) or 0 in array.shape:
+        raise SourceError(f"{path}: {wanted}, {got}")
+    return array
+
+
+class VideoFile:
+    """A video file, read by OpenCV's FFmpeg.
+
+    A frame's time is the file's own time stamp, from 0 at the first frame; where stamps are missing or do not
+    grow, one frame's duration is added instead.
+
+    Parameters
+    ----------
+    path : the file.
+    fps : frames per second if the file does not say.
+    """
+
+    live = False
+
+    def __init__(self, path: Path, fps: float | None = None) -> None:
+        if path.stat().st_size == 0:
+            raise SourceError(f"{path}: the file is empty")
+        with quiet_opencv():
+            self._capture: cv2.VideoCapture | None = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        if not self._capture.isOpened():
+            raise SourceError(
+                f"{path}: neither a video that OpenCV can open, nor an image, nor a .npy array; "
+                "an .mp4 or .avi that was not closed properly cannot be opened either"
+            )
+        said = self._capture.get(cv2.CAP_PROP_FPS)
+        self._rate = said if 0 < said < 1e4 else fps or DEFAULT_FPS
+        self.fps: float | None = self._rate
+        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.total: int | None = count if count > 0 else None
+        self.size: tuple[int, int] | None = (
+            int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
+            int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+        )
+        self._path = path
+        self._normalise = Normaliser(str(path))
+        self._index = 0
+        self._first_stamp = 0.0
+        self._t = 0.0
+        self.description = f"{path}, {self.size[0]} x {self.size[1]} at {self._rate:g} fps"
+
+    def read(self) -> tuple[BgrImage, float] | None:
+        """The next frame and its time; see `Source.read`."""
+        if self._capture is None:
+            return None
+        with quiet_opencv():
+            there, image = self._capture.read()
+        if not there:
+            self._end()
+            return None
+        stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+        if self._index == 0:
+            self._first_stamp = stamp
+        else:
+            since_first = stamp - self._first_stamp
+            self._t = since_first if since_first > self._t else self._t + 1.0 / self._rate
+        self._index += 1
+        return self._normalise(image), self._t
+
+    def _end(self) -> None:
+        if self._index == 0:
+            raise SourceError(f"{self._path}: the video holds no frame that can be decoded; is it damaged?")
+        if self.total is not None and self._index < self.total:
+            log.warning(
+                "%s: ended after %d of %d frames; the file may be damaged",
+                self._path,
+                self._index,
+                self.total,
+            )
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+
+def open_recording(
+    spec: str, directory: Path | None = None, fps: float | None = None
+) -> ImageFiles | ArrayFile | VideoFile:
+    """Open a file, folder or glob by what it is.
+
+    Raises
+    ------
+    SourceError
+        If it is not there, or not a recording.
+    """
+    if glob.has_magic(spec) and not Path(spec).expanduser().exists():
+        return open_glob(spec, directory, fps)
+    path = find_path(spec, directory)
+    if path.is_dir():
+        return open_folder(path, fps)
+    suffix = path.suffix.lower()
+    if suffix in (".npy", ".npz"):
+        return ArrayFile(path, fps)
+    if suffix in IMAGE_SUFFIXES:
+        return ImageFiles([path], str(path), fps)
+    return VideoFile(path, fps)

@@ -1,0 +1,208 @@
+"""Capture: frames from a simulated sensor, a recording, a camera or a stream."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from tactflow.engine.errors import SourceError
+from tactflow.engine.frame import Frame
+from tactflow.engine.stage import StageParams
+
+# A recording played at its own pace that falls further behind than this (a laptop was asleep, the process
+# was halted) continues from there, instead of rushing through what it missed.
+MAX_BACKLOG = 0.5
+
+
+class Capture:
+    """Reads frames and says which of them show the untouched gel.
+
+    Recordings are handed over as fast as they are taken, or, with `realtime`, at their own pace and then
+    like a live camera. `retake` and `stop` may be called from another thread.
+    """
+
+    class Params(StageParams):
+        """What to capture, and which frames are the reference."""
+
+        source: str = Field(
+            "sim:press",
+            description="sim:NAME?query, camera index or /dev/videoN, video file, folder or glob of images, .npy "
+            "file, http:// rtsp:// udp:// stream",
+        )
+        realtime: bool = Field(
+            False, description="play a recording at its own pace, with a live camera's drop policy"
+        )
+        reference: int | str = Field(
+            1,
+            description="which frames show the untouched gel: the first N, N >= 1 (more average out noise), or an "
+            "image file that is shown to the stages before the first frame",
+        )
+        skip: int = Field(
+            0, ge=0, description="frames thrown away at the start, while a camera's exposure settles"
+        )
+        width: int | None = Field(None, ge=1, description="ask the camera for this width, px")
+        height: int | None = Field(None, ge=1, description="ask the camera for this height, px")
+        fps: float | None = Field(
+            None,
+            gt=0,
+            le=10_000,
+            description="ask the camera for this rate; for images and arrays, their rate (30 if not given); "
+            "frames per second",
+        )
+        format: str | None = Field(
+            None,
+            pattern=r"^[ -~]{4}$",
+            description="ask the camera for this pixel format, four characters: MJPG, YUYV, ...",
+        )
+
+        @field_validator("source", mode="before")
+        @classmethod
+        def _index_is_text(cls, value: object) -> object:
+            return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+        @field_validator("reference", mode="before")
+        @classmethod
+        def _at_least_one_frame(cls, value: object) -> object:
+            if isinstance(value, bool) or not isinstance(value, int | str) or value == "":
+                raise ValueError(f"required a number of frames or an image file, got {value!r}")
+            if isinstance(value, int) and value < 1:
+                raise ValueError(f"required at least 1 frame, got {value}")
+            return value
+
+    def __init__(self, params: Params, sensor: str = "main", directory: Path | None = None) -> None:
+        """Prepare; nothing is opened yet.
+
+        Parameters
+        ----------
+        sensor : name given to every frame.
+        directory : where relative paths are looked for if they are not in the current directory.
+        """
+        self.params = params
+        self.live = params.realtime
+        self.total: int | None = None
+        self.description = params.source
+        self._sensor = sensor
+        self._directory = directory
+        self._source: Any = None
+        self._reference_image: NDArray[np.uint8] | None = None
+        self._stop = threading.Event()
+        self._retake = threading.Event()
+
+    def open(self) -> None:
+        """Open the source; afterwards `live`, `total` and `description` are known.
+
+        Raises
+        ------
+        SourceError
+            If the source or the reference image cannot be opened.
+        """
+        from tactflow.sources import CameraRequest, open_source
+
+        p = self.params
+        request = CameraRequest(p.width, p.height, p.fps, p.format)
+        self._reference_image = self._load_reference()
+        self._source = open_source(p.source, directory=self._directory, fps=p.fps, camera=request)
+        self.live = self._source.live or p.realtime
+        self.total = None if self._source.total is None else max(self._source.total - p.skip, 0)
+        self.description = self._source.description
+
+    def _load_reference(self) -> NDArray[np.uint8] | None:
+        if isinstance(self.params.reference, int):
+            return None
+        from tactflow.sources.base import Normaliser, find_path
+        from tactflow.sources.files import read_image
+
+        path = find_path(self.params.reference, self._directory)
+        return Normaliser(str(path))(read_image(path))
+
+    def close(self) -> None:
+        """Give the source back."""
+        self._stop.set()
+        if self._source is not None:
+            self._source.close()
+
+    def stop(self) -> None:
+        """End `frames()` soon; wakes it if it waits for the time of the next frame."""
+        self._stop.set()
+
+    def retake(self) -> None:
+        """Make the next frames the new reference, in a new epoch: as many as at the start, 1 after an image."""
+        self._retake.set()
+
+    def frames(self) -> Iterator[Frame]:
+        """Every frame of the source, in order, until its end or `stop()`.
+
+        Raises
+        ------
+        SourceError
+            If a frame cannot be read, or the reference image is not as large as the frames.
+        """
+        if self._source is None:
+            self.open()
+        count = self.params.reference if isinstance(self.params.reference, int) else 1
+        references_left = count if self._reference_image is None else 0
+        pace = _Pace(self._stop) if self.params.realtime and not self._source.live else None
+        epoch = 0
+        seq = -1
+        while not self._stop.is_set():
+            item = self._source.read()
+            if item is None:
+                return
+            image, t = item
+            seq += 1
+            if seq < self.params.skip:
+                continue
+            image = _read_only(image)
+            if pace is not None and not pace.wait_for(t):
+                return
+            if seq == self.params.skip and self._reference_image is not None:
+                yield self._reference_frame(image, t)
+            if self._retake.is_set():
+                self._retake.clear()
+                epoch += 1
+                references_left = count
+            reference = references_left > 0
+            references_left -= reference
+            yield Frame(self._sensor, seq, t, image, time.perf_counter(), reference, epoch)
+
+    def _reference_frame(self, first: NDArray[np.uint8], t: float) -> Frame:
+        image = self._reference_image
+        assert image is not None
+        if image.shape != first.shape:
+            raise SourceError(
+                f"{self.params.reference}: the reference image is {image.shape[1]} x {image.shape[0]} pixels, the "
+                f"frames of {self.params.source} are {first.shape[1]} x {first.shape[0]}; they must be equally large"
+            )
+        return Frame(self._sensor, -1, t, _read_only(image), time.perf_counter(), reference=True)
+
+
+class _Pace:
+    """Waits until a recording's frames are due, counted from the first one, so that delays do not add up."""
+
+    def __init__(self, stop: threading.Event) -> None:
+        self._stop = stop
+        self._start: float | None = None
+
+    def wait_for(self, t: float) -> bool:
+        """Wait until time t of the recording; False if stopped meanwhile."""
+        now = time.perf_counter()
+        if self._start is None:
+            self._start = now - t
+        wait = self._start + t - now
+        if wait < -MAX_BACKLOG:
+            self._start = now - t
+        return not (self._stop.wait(wait) if wait > 0 else self._stop.is_set())
+
+
+def _read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if image.flags.writeable:
+        image = image.view()
+        image.flags.writeable = False
+    return image
