@@ -57,7 +57,8 @@ def contact_geometry(
     min_area : px^2; blobs (8-connected, holes filled) with fewer pixels are ignored. Larger is safer against
         specks and misses small contacts.
     max_gap : px; blobs whose nearest pixels are at most this far apart (to within 1 px and 2 %) belong
-        together, also by way of others; the group with the most pixels is the contact. None: all blobs are one contact.
+        together, also by way of others; the group with the most pixels is the contact. None: all blobs are
+        one contact.
     method : "moments" describes the region itself. "seed" is the original's `get_convex_hull_area`,
         `regress_line` and `get_all_contour`: its line through the hull's vertices gives angle and slope, the
         middle of that line across the picture is the centre, the ellipse is fitted to the contour points.
