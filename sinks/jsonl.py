@@ -10,7 +10,7 @@ import stat
 import sys
 import time
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 from pydantic import Field, model_validator
 
@@ -89,13 +89,14 @@ class Jsonl:
     def _open_file(self, path: Path) -> BinaryIO:
         regular = not path.exists() or stat.S_ISREG(path.stat().st_mode)
         if not regular:
-            return open(path, "wb", buffering=0)
+            return path.open("wb", buffering=0)
         if path.exists() and path.stat().st_size > 0 and not (self.params.overwrite or self.params.append):
             raise StageError(
                 f"{path}: this file exists; set overwrite: true to replace it, append: true to continue it, "
                 "or give another path"
             )
-        file = open(path, "wb" if self.params.overwrite else "r+b" if path.exists() else "xb", buffering=0)
+        mode: Literal["wb", "r+b", "xb"] = "wb" if self.params.overwrite else "r+b" if path.exists() else "xb"
+        file = path.open(mode, buffering=0)
         try:
             self._complete = _continue_at(file, path) if self.params.append and file.readable() else 0
         except BaseException:

@@ -154,6 +154,8 @@ class Zmq:
     def _read_subscriptions(self) -> None:
         if self._socket is None:
             return
+        if not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            return
         try:
             while True:
                 event = self._socket.recv(zmq.NOBLOCK)
@@ -171,8 +173,8 @@ class Zmq:
 def _bind_problem(endpoint: str, error: zmq.ZMQError) -> str:
     if error.errno == errno.EADDRINUSE:
         return (
-            f"{endpoint} is in use: another tactflow run, or another program, publishes there. End it, choose "
-            "another address (--set sinks.zmq.endpoint=tcp://127.0.0.1:5557) or publish nothing "
+            f"{endpoint} is in use: another tactflow run, or another program, publishes there. End it, "
+            "choose another address (--set sinks.zmq.endpoint=tcp://127.0.0.1:5557) or publish nothing "
             "(--set sinks.zmq=null)"
         )
     return (

@@ -33,16 +33,16 @@ class Capture:
 
         source: str = Field(
             "sim:press",
-            description="sim:NAME?query, camera index or /dev/videoN, video file, folder or glob of images, .npy "
-            "file, http:// rtsp:// udp:// stream",
+            description="sim:NAME?query, camera index or /dev/videoN, video file, folder or glob of images, "
+            ".npy file, http:// rtsp:// udp:// stream",
         )
         realtime: bool = Field(
             False, description="play a recording at its own pace, with a live camera's drop policy"
         )
         reference: int | str = Field(
             1,
-            description="which frames show the untouched gel: the first N, N >= 1 (more average out noise), or an "
-            "image file that is shown to the stages before the first frame",
+            description="which frames show the untouched gel: the first N, N >= 1 (more average out noise), "
+            "or an image file that is shown to the stages before the first frame",
         )
         skip: int = Field(
             0, ge=0, description="frames thrown away at the start, while a camera's exposure settles"
@@ -133,7 +133,7 @@ class Capture:
         self._stop.set()
 
     def retake(self) -> None:
-        """Make the next frames the new reference, in a new epoch: as many as at the start, 1 after an image."""
+        """Make the next frames the new reference, in a new epoch: as many as at the start."""
         self._retake.set()
 
     def frames(self) -> Iterator[Frame]:
@@ -177,8 +177,9 @@ class Capture:
         assert image is not None
         if image.shape != first.shape:
             raise SourceError(
-                f"{self.params.reference}: the reference image is {image.shape[1]} x {image.shape[0]} pixels, the "
-                f"frames of {self.params.source} are {first.shape[1]} x {first.shape[0]}; they must be equally large"
+                f"{self.params.reference}: the reference is {image.shape[1]} x {image.shape[0]} pixels, the "
+                f"frames of {self.params.source} are {first.shape[1]} x {first.shape[0]}; "
+                "they must be equally large"
             )
         return Frame(self._sensor, -1, t, _read_only(image), time.perf_counter(), reference=True)
 

@@ -29,7 +29,7 @@ class CameraRequest:
 
 
 class _ArrivalClock:
-    """Unix time that never steps back: the system's clock at the start plus what a monotonic clock counted."""
+    """Unix time that never steps back: the system's clock at the start plus a monotonic clock."""
 
     def __init__(self) -> None:
         self._offset = time.time() - time.perf_counter()
@@ -138,7 +138,10 @@ def _camera_hint(device: str) -> str:
     if not os.path.exists(wanted):
         return f"{wanted} does not exist; {others}"
     if not os.access(wanted, os.R_OK | os.W_OK):
-        return f"no permission for {wanted}; add yourself to its group: sudo usermod -aG video $USER, and log in again"
+        return (
+            f"no permission for {wanted}; add yourself to its group (sudo usermod -aG video $USER) "
+            "and log in again"
+        )
     return (
         "another program may be using it, or it only carries metadata "
         f"(many cameras show two devices, of which one has pictures); {others}"
@@ -218,6 +221,6 @@ class Stream:
 def _stream_hint(url: str) -> str:
     parts = urlsplit(url)
     if parts.scheme == "udp":
-        return f"is a sender running that sends MPEG-TS to port {parts.port or '(no port given)'} of this machine?"
+        return f"does anything send MPEG-TS to port {parts.port or '(no port given)'} of this machine?"
     host = f"{parts.hostname or '(no host given)'}{f':{parts.port}' if parts.port else ''}"
     return f"is {host} switched on and reachable, and is this the address of a video (try it in a player)?"

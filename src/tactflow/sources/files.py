@@ -16,22 +16,7 @@ from tactflow.engine.errors import SourceError
 from tactflow.sources.base import BgrImage, Normaliser, find_path, log, quiet_opencv
 
 IMAGE_SUFFIXES = frozenset(
-    [
-        ".avif",
-        ".bmp",
-        ".jp2",
-        ".jpe",
-        ".jpeg",
-        ".jpg",
-        ".pbm",
-        ".pgm",
-        ".png",
-        ".pnm",
-        ".ppm",
-        ".tif",
-        ".tiff",
-    ]
-    + [".webp"]
+    [".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"]
 )
 DEFAULT_FPS = 30.0
 
@@ -168,9 +153,7 @@ def open_glob(pattern: str, directory: Path | None = None, fps: float | None = N
         files = sorted((path for path in found if path.is_file()), key=lambda path: natural_key(str(path)))
         if files:
             return ImageFiles(files, pattern, fps)
-    raise SourceError(
-        f"{pattern}: no file matches this pattern; quote it on a command line so that the shell leaves it alone"
-    )
+    raise SourceError(f"{pattern}: no file matches this pattern; on a command line, quote it")
 
 
 class ArrayFile:
