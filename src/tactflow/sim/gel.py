@@ -1,0 +1,110 @@
+"""The gel: where an indenter touches it, what its surface looks like, and how its markers move.
+
+Contact. A soft surface gives way before it is touched: around a ball pressed by d it sinks, and at the rim of
+the contact it has sunk by d / 2 (Hertz; Johnson, Contact Mechanics, 1985, ch. 4), so that the contact radius is
+sqrt(R d) and not the sqrt(2 R d) of the geometric overlap. The same rule is used for every shape: the contact is
+where the indenter reaches deeper than half of its depth, and there the gel's surface is the indenter's surface.
+Around it the surface decays smoothly to rest, as the pyramid of Gaussians of Taxim (Si and Yuan, "Taxim: An
+Example-based Simulation Model for GelSight Tactile Sensors", RA-L 2022) makes it, but in closed form: with
+s = d / 2 it is s exp(reached / s - 1), which joins the contact with the same value and slope.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.sim.shapes import Array, Shape
+
+SINK_IN = 0.5
+"""Share of the depth by which the gel has sunk at the rim of a contact."""
+TOUCH_DEPTH = 0.25
+"""Depth below which an indenter does not count as touching, px."""
+SHEAR_SPREAD = 110.0
+"""How far around a contact the gel follows its shear and twist, px (standard deviation of a Gaussian)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """One indenter at one moment.
+
+    x, y : its origin in gel coordinates, px. angle : rotation, radians, clockwise on the screen (y down).
+    depth : px, 0 when it is off the gel.
+    shear : (sx, sy) by which the gel under it has been dragged, px. twist : the same for rotation, radians.
+    dilation : largest displacement by which the press pushes the gel apart, px.
+    """
+
+    shape: Shape
+    x: float
+    y: float
+    angle: float
+    depth: float
+    shear: tuple[float, float] = (0.0, 0.0)
+    twist: float = 0.0
+    dilation: float = 0.0
+
+    @property
+    def touching(self) -> bool:
+        """Whether it is pressed deep enough to count."""
+        return self.depth > TOUCH_DEPTH
+
+
+def reached(press: Press, x: Array, y: Array) -> Array:
+    """Depth the indenter reaches below the untouched surface at (x, y), px; negative where it stays above."""
+    cos, sin = np.float32(np.cos(press.angle)), np.float32(np.sin(press.angle))
+    dx, dy = x - np.float32(press.x), y - np.float32(press.y)
+    gap = press.shape.gap(dx * cos + dy * sin, dy * cos - dx * sin)
+    return np.asarray(np.float32(press.depth) - gap, dtype=np.float32)
+
+
+def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_]:
+    """Where the gel is in contact: bool, of the shape of x and y (float32 gel coordinates, px)."""
+    mask = np.zeros(x.shape, dtype=np.bool_)
+    for press in presses:
+        if press.touching:
+            mask |= reached(press, x, y) > SINK_IN * press.depth
+    return mask
+
+
+def surface(press: Press, depth: Array) -> Array:
+    """How far the gel's surface has sunk, px >= 0, from the depth that `reached` gives."""
+    sink = np.float32(SINK_IN * press.depth)
+    outside = sink * np.exp(np.minimum(depth, sink) / sink - np.float32(1.0))
+    return np.maximum(depth, outside)
+
+
+def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 2) float64 displacement, px, of gel points whose rest positions (N, 2) are given.
+
+    Press pushes the gel apart, shear drags it along, twist turns it about the contact, each with a Gaussian decay
+    around the contact, after FOTS (Zhao et al., RA-L 2024). Shear and twist act in full within the push's spread
+    around the shape and fade with `SHEAR_SPREAD` beyond; all fade together with the depth when the contact
+    is released. Bounded slopes (shear below 1.5 times the spread) keep the map free of folds.
+    """
+    moved = np.zeros_like(rest)
+    for press in presses:
+        if press.depth <= 0:
+            continue
+        grip = min(1.0, press.depth / (0.3 * press.shape.depth))
+        grip = grip * grip * (3.0 - 2.0 * grip)
+        center = np.array([press.x - press.shear[0] * grip, press.y - press.shear[1] * grip])
+        angle = press.angle - press.twist * grip
+        cos, sin = np.cos(angle), np.sin(angle)
+        own_axes = np.array([[cos, -sin], [sin, cos]])
+        offset = rest - center
+        local = offset @ own_axes
+        if press.dilation:
+            strength = press.dilation * press.depth / press.shape.depth
+            moved += strength * press.shape.push(local) @ own_axes.T
+        if press.shear != (0.0, 0.0) or press.twist:
+            away = local[:, None, :] - press.shape.sources[None, :, :]
+            distance = np.sqrt(np.min(np.sum(away * away, axis=-1), axis=1))
+            beyond = np.maximum(distance - press.shape.spread, 0.0)
+            weight = np.exp(-(beyond**2) / (2.0 * SHEAR_SPREAD**2))[:, None] * grip
+            turn = press.twist
+            rotation = np.array([[np.cos(turn) - 1.0, -np.sin(turn)], [np.sin(turn), np.cos(turn) - 1.0]])
+            moved += weight * (np.asarray(press.shear) + offset @ rotation.T)
+    return moved

@@ -1,0 +1,115 @@
+"""How the gel is lit: the untouched gel, and how its light changes where the surface tilts.
+
+Three coloured lights graze the gel from three sides, so that each colour channel answers to the slope of the
+surface in one direction: photometric stereo as in GelSight (Yuan, Dong and Adelson, "GelSight: High-Resolution
+Robot Tactile Sensors for Estimating Geometry and Force", Sensors 2017). With the elevation e of a light and its
+horizontal direction t, a Lambertian surface of slope g answers (1 - cot(e) g . t) / sqrt(1 + |g|^2), 1 at rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.sim.shapes import Array
+
+
+@dataclass(frozen=True)
+class Light:
+    """A named sensor.
+
+    azimuth : of the blue, green and red light, degrees, counter-clockwise as seen on the screen.
+    level : grey level of the untouched gel at the centre, blue, green, red.
+    falloff : how much brighter the gel is near a light than far from it, 0 for even light.
+    slope_gain : cotangent of the lights' elevation; more makes a tilted surface more colourful.
+    ambient : share of the light that comes from everywhere, in [0, 1].
+    brightening : grey levels by which all channels rise in a contact of full depth.
+    """
+
+    description: str
+    azimuth: tuple[float, float, float]
+    level: tuple[float, float, float]
+    falloff: float
+    slope_gain: float
+    ambient: float
+    brightening: float
+
+    def tilt(self) -> NDArray[np.float32]:
+        """(3, 2) float32: change of a channel's relative light per unit slope in x and y."""
+        angle = np.radians(np.asarray(self.azimuth))
+        toward = np.stack([np.cos(angle), -np.sin(angle)], axis=1)
+        return np.asarray(-toward * self.slope_gain, dtype=np.float32)
+
+
+LIGHTS = {
+    "photometric": Light(
+        "three coloured lights; a contact answers with colour",
+        (325.0, 80.0, 205.0), (122.0, 136.0, 118.0), 0.5, 1.45, 0.25, 0.0,
+    ),
+    "bright": Light(
+        "white light; a contact brightens in all channels",
+        (325.0, 80.0, 205.0), (98.0, 104.0, 100.0), 0.12, 0.10, 0.5, 58.0,
+    ),
+    "mixed": Light(
+        "coloured lights, and a contact brightens too",
+        (325.0, 80.0, 205.0), (106.0, 114.0, 104.0), 0.35, 0.7, 0.35, 36.0,
+    ),
+}  # fmt: skip
+
+
+def untouched_gel(
+    light: Light,
+    x: Array,
+    y: Array,
+    center: tuple[float, float],
+    half_diagonal: float,
+    dim: float = 1.0,
+) -> NDArray[np.float32]:
+    """(H, W, 3) float32 grey levels, BGR, of the gel at rest, at gel coordinates x, y (H, W), px."""
+    angle = np.radians(np.asarray(light.azimuth))
+    image = np.empty((*x.shape, 3), np.float32)
+    for channel in range(3):
+        along = (x - center[0]) * np.cos(angle[channel]) - (y - center[1]) * np.sin(angle[channel])
+        distance = (1.8 - along / half_diagonal) / 1.8
+        image[..., channel] = light.level[channel] * dim * distance ** (-light.falloff * 1.4)
+    return image
+
+
+def texture(shape: tuple[int, int], strength: float, seed: int) -> NDArray[np.float32]:
+    """(H, W, 1) float32: the grain of the gel's coating, relative, standard deviation `strength` / 100."""
+    draw = np.random.default_rng([seed, 0x7465]).standard_normal(shape, dtype=np.float32)
+    grain = np.asarray(cv2.GaussianBlur(draw, (0, 0), 1.6), dtype=np.float32)
+    grain += 2.0 * np.asarray(cv2.GaussianBlur(draw, (0, 0), 9.0), dtype=np.float32)
+    grain *= strength / 100.0 / float(grain.std())
+    return grain[..., None] + np.float32(1.0)
+
+
+def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
+    """(h, w, 3) float32: light of a deformed surface relative to the surface at rest, >= 0.
+
+    depth : (h, w) float32, how far the surface has sunk, px, sampled every `step` px.
+    """
+    slope_x = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
+    slope_y = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
+    upright = (1.0 - light.ambient) / np.sqrt(slope_x * slope_x + slope_y * slope_y + np.float32(1.0))
+    channels = []
+    for gain_x, gain_y in light.tilt():
+        lit = slope_x * gain_x + slope_y * gain_y + np.float32(1.0)
+        np.maximum(lit, 0, out=lit)
+        lit *= upright
+        lit += np.float32(light.ambient)
+        channels.append(lit)
+    return np.asarray(cv2.merge(channels), dtype=np.float32)
+
+
+def highlight(depth: Array, step: float, strength: float) -> Array:
+    """(h, w) float32 grey levels: the mirror image of a lamp on the slope that faces it."""
+    slope_x = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
+    slope_y = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
+    off = (slope_x - np.float32(0.13)) ** 2 + (slope_y - np.float32(0.16)) ** 2
+    return np.asarray(
+        np.exp(off * np.float32(-1.0 / (2 * 0.035**2))) * np.float32(150.0 * strength), np.float32
+    )

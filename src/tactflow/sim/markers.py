@@ -1,0 +1,150 @@
+"""Markers on the gel: where they are printed, and how they are drawn with exact sub-pixel centres.
+
+A marker is drawn by evaluating its shape, blurred by the lens, at each pixel's centre. The edge is a logistic
+ramp of `EDGE` px standard deviation, close to that of a Gaussian point spread: smooth enough that sampling it at
+whole pixels moves its centre of gravity by less than 1e-4 px, wherever it lies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+EDGE = 0.8
+"""Standard deviation of the lens blur at a marker's edge, px."""
+SHAPES = ("round", "square", "doubled")
+FIXED_POINT = 64.0
+"""Integer steps of the canvas per grey level."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What is printed on the gel.
+
+    rest : (N, 2) float64 positions on the untouched gel, px. contrast : (N,) in [0, 1], 1 for a fresh marker.
+    group : (N,) int; markers of the same group never overlap.
+    """
+
+    rest: NDArray[np.float64]
+    contrast: NDArray[np.float64]
+    group: NDArray[np.int64]
+    pitch: float
+    radius: float
+
+
+def layout(
+    columns: int,
+    rows: int,
+    size: tuple[int, int],
+    *,
+    pitch: float = 0.0,
+    radius: float = 0.0,
+    jitter: float = 0.0,
+    missing: float = 0.0,
+    worn: float = 0.0,
+    seed: int = 0,
+) -> Layout:
+    """A grid of markers, centred.
+
+    columns, rows : 0 for a gel without markers. size : (width, height) of the gel, px.
+    pitch, radius : px; 0 fits the grid to the gel, and the radius to the pitch.
+    jitter : standard deviation of each coordinate, in pitches. missing : fraction that was never printed.
+    worn : fraction that has faded to between 35 and 80 % of its contrast.
+    """
+    width, height = size
+    pitch = pitch or min(width / (max(columns, 1) + 0.7), height / (max(rows, 1) + 0.7))
+    radius = radius or 0.135 * pitch
+    rng = np.random.default_rng([seed, 0x6D61])
+    across = (np.arange(columns) - (columns - 1) / 2.0) * pitch + (width - 1) / 2.0
+    down = (np.arange(rows) - (rows - 1) / 2.0) * pitch + (height - 1) / 2.0
+    rest = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    # No printer and no mould is perfect: a hundredth of a pitch keeps centres off special sub-pixel phases.
+    rest = rest + rng.normal(0.0, 0.01, rest.shape) * pitch
+    rest += np.clip(rng.normal(0.0, 1.0, rest.shape), -1.5, 1.5) * (jitter * pitch)
+    parity = np.stack(np.meshgrid(np.arange(columns) % 2, np.arange(rows) % 2), axis=-1).reshape(-1, 2)
+    contrast = np.where(rng.random(len(rest)) < worn, rng.uniform(0.35, 0.8, len(rest)), 1.0)
+    kept = rng.random(len(rest)) >= missing
+    group = parity[:, 0] + 2 * parity[:, 1]
+    return Layout(rest[kept], contrast[kept], group[kept].astype(np.int64), pitch, radius)
+
+
+def _ramp(inside: NDArray[np.float32], edge: float) -> NDArray[np.float32]:
+    return np.asarray(
+        np.float32(0.5) + np.float32(0.5) * np.tanh(inside * np.float32(0.851 / edge)), np.float32
+    )
+
+
+def coverage(
+    x: NDArray[np.float32], y: NDArray[np.float32], radius: float, shape: str, edge: float = EDGE
+) -> NDArray[np.float32]:
+    """How much of a pixel at offset (x, y) from a marker's centre the marker covers, in [0, 1]."""
+    r = np.float32(radius)
+    if shape == "square":
+        return _ramp(r - np.abs(x), edge) * _ramp(r - np.abs(y), edge)
+    if shape == "doubled":
+        half = np.float32(0.95 * radius)
+        small = np.float32(0.72 * radius)
+        left = _ramp(small - np.hypot(x + half, y), edge)
+        right = _ramp(small - np.hypot(x - half, y), edge)
+        return np.asarray(1 - (1 - left) * (1 - right), np.float32)
+    return _ramp(r - np.hypot(x, y), edge)
+
+
+def half_patch(radius: float, shape: str, scale: float = 1.0) -> int:
+    """Pixels around a marker's centre, to each side, outside which it leaves no trace."""
+    extent = {"round": 1.0, "square": 1.4143, "doubled": 1.68}[shape]
+    return int(np.ceil(radius * extent * scale + 5.0 * EDGE)) + 1
+
+
+def draw(
+    canvas: NDArray[np.int16],
+    centers: NDArray[np.float64],
+    strength: NDArray[np.float64],
+    group: NDArray[np.int64],
+    *,
+    radius: float,
+    shape: str,
+    half: int,
+    bright: float | None,
+    deform: NDArray[np.float64] | None = None,
+) -> None:
+    """Paint markers onto a padded canvas, in place.
+
+    canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT`.
+    centers : (N, 2) positions without the padding, px. strength : (N,) in [0, 1], how opaque each is.
+    bright : grey level of a bright marker, or None for a dark one, which lets 12 % of the light through.
+    deform : (N, 2, 2), from offsets in the image to offsets on the gel; None where they are equal.
+    """
+    padded_height, padded_width = canvas.shape[:2]
+    anchor = np.rint(centers).astype(np.int64)
+    # A marker whose centre is outside still shows if its rim reaches in. Where its patch leaves the padding, the
+    # indices are clamped to the outermost padding, which nobody sees.
+    reachable = np.all(anchor > -half, axis=1)
+    reachable &= (anchor[:, 0] < padded_width - half) & (anchor[:, 1] < padded_height - half)
+    span = np.arange(-half, half + 1)
+    flat = canvas.reshape(-1, 3)
+    for number in np.unique(group):
+        chosen = np.flatnonzero(reachable & (group == number) & (strength > 0))
+        if not len(chosen):
+            continue
+        fraction = (centers[chosen] - anchor[chosen]).astype(np.float32)
+        dx = span.astype(np.float32)[None, None, :] - fraction[:, 0, None, None]
+        dy = span.astype(np.float32)[None, :, None] - fraction[:, 1, None, None]
+        if deform is not None:
+            m = deform[chosen].astype(np.float32)[:, :, :, None, None]
+            dx, dy = m[:, 0, 0] * dx + m[:, 0, 1] * dy, m[:, 1, 0] * dx + m[:, 1, 1] * dy
+        opaque = coverage(dx, dy, radius, shape) * strength[chosen].astype(np.float32)[:, None, None]
+        rows = anchor[chosen, 1, None] + half + span
+        columns = anchor[chosen, 0, None] + half + span
+        np.clip(rows, 0, padded_height - 1, out=rows)
+        np.clip(columns, 0, padded_width - 1, out=columns)
+        index = (rows[:, :, None] * padded_width + columns[:, None, :]).ravel()
+        opaque = opaque.reshape(-1, 1)
+        under = flat[index].astype(np.float32)
+        if bright is None:
+            under *= np.float32(1.0) - np.float32(0.88) * opaque
+        else:
+            under += (np.float32(bright * FIXED_POINT) - under) * opaque
+        flat[index] = np.rint(under, out=under).astype(np.int16)

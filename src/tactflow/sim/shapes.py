@@ -1,0 +1,185 @@
+"""Indenters: the gap between an indenter's surface and the plane through its lowest point.
+
+A shape knows nothing of where it is: coordinates are its own, in raw pixels, with the lowest point(s) at
+gap 0. Pressed by a depth d, it reaches `d - gap` below the untouched surface of the gel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """An indenter.
+
+    gap : (x, y) float32 arrays, px -> height of the surface above the lowest point, px, >= 0.
+    reach : distance from the origin beyond which nothing of it touches or moves the gel visibly, px.
+    depth : full depth, px: what a relative depth of 1 means for this shape.
+    sources : (K, 2) float64, px; the gel is pushed away from these points (press dilates the gel).
+    spread : px; how far the push reaches.
+    """
+
+    name: str
+    gap: Callable[[Array, Array], Array]
+    reach: float
+    depth: float
+    sources: NDArray[np.float64]
+    spread: float
+    dilation: float = field(default=1.0)
+
+    def __post_init__(self) -> None:
+        # A push of strength 1 shall move the most displaced point of the gel by 1.
+        line = np.linspace(-self.reach, self.reach, 41)
+        grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        largest = float(np.sqrt(np.max(np.sum(self._push(grid) ** 2, axis=1))))
+        object.__setattr__(self, "dilation", 1.0 / max(largest, 1e-12))
+
+    def _push(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        away = points[:, None, :] - self.sources[None, :, :]
+        weight = np.exp(-np.sum(away * away, axis=-1) / (2.0 * self.spread**2))
+        return np.asarray(np.einsum("nkc,nk->nc", away, weight), dtype=np.float64)
+
+    def push(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Dilation of the gel at points (N, 2), scaled so that its largest value is 1.
+
+        The sum over sources C of (M - C) exp(-|M - C|^2 / 2 spread^2) is the dilation of FOTS (Zhao et al.,
+        "FOTS: A Fast Optical Tactile Simulator for Sim2Real Learning of Tactile-Motor Robot Manipulation
+        Skills", RA-L 2024).
+        """
+        return self._push(points) * self.dilation
+
+
+def _segment(half_length: float, count: int) -> NDArray[np.float64]:
+    return np.stack([np.linspace(-half_length, half_length, count), np.zeros(count)], axis=1)
+
+
+def sphere(radius: float = 130.0, depth: float = 20.0) -> Shape:
+    """A ball of `radius` px."""
+
+    def gap(x: Array, y: Array) -> Array:
+        squared = np.minimum(x * x + y * y, np.float32(radius**2))
+        return np.asarray(np.float32(radius) - np.sqrt(np.float32(radius**2) - squared), dtype=np.float32)
+
+    contact = float(np.sqrt(radius * depth))
+    return Shape("sphere", gap, 3.2 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
+
+
+def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0, bend: float = 0.0) -> Shape:
+    """A cylinder of `radius` px along x with rounded ends.
+
+    bend : degrees by which the direction turns from end to end of a cable of 800 px; 0 is straight.
+    """
+    curvature = np.radians(bend) / 800.0
+
+    def gap(x: Array, y: Array) -> Array:
+        if abs(curvature) > 1e-9:
+            turn = np.float32(1.0 / curvature)
+            # The centre line is an arc through the origin about (0, turn): unroll it to a straight line.
+            from_center = np.hypot(x, y - turn)
+            along = np.arctan2(x, np.sign(turn) * (turn - y)) * abs(turn)
+            across = from_center - abs(turn)
+        else:
+            along, across = x, y
+        beyond = np.maximum(np.abs(along) - np.float32(half_length), 0)
+        squared = np.minimum(beyond * beyond + across * across, np.float32(radius**2))
+        return np.asarray(np.float32(radius) - np.sqrt(np.float32(radius**2) - squared), dtype=np.float32)
+
+    sources = _segment(half_length, 24)
+    if abs(curvature) > 1e-9:
+        arc = sources[:, 0] * curvature
+        sources = np.stack([np.sin(arc), 1.0 - np.cos(arc)], axis=1) / curvature
+    contact = float(np.sqrt(radius * depth))
+    return Shape("cable", gap, half_length + 4 * contact, depth, sources, 1.3 * contact)
+
+
+def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0) -> Shape:
+    """A rounded knife edge along x whose flanks rise with `slope`."""
+
+    def gap(x: Array, y: Array) -> Array:
+        beyond = np.maximum(np.abs(x) - np.float32(half_length), 0)
+        away = np.sqrt(beyond * beyond + y * y + np.float32(9.0)) - np.float32(3.0)
+        return np.asarray(away * np.float32(slope), dtype=np.float32)
+
+    return Shape("edge", gap, half_length + 90, depth, _segment(half_length, 12), 45.0)
+
+
+def _flank(outside: Array) -> Array:
+    # A chamfer with a rounded foot: no crease in the shading where the flat ends.
+    return np.asarray(np.sqrt(outside * outside + np.float32(4.0)) - np.float32(2.0), dtype=np.float32)
+
+
+def box(
+    half_width: float = 85.0, half_height: float = 52.0, corner: float = 8.0, depth: float = 12.0
+) -> Shape:
+    """A flat punch with rounded corners."""
+
+    def gap(x: Array, y: Array) -> Array:
+        dx = np.abs(x) - np.float32(half_width - corner)
+        dy = np.abs(y) - np.float32(half_height - corner)
+        outside = np.hypot(np.maximum(dx, 0), np.maximum(dy, 0)) - np.float32(corner)
+        return _flank(np.maximum(outside, 0))
+
+    sources = _segment(max(half_width - half_height, 0.0), 5)
+    return Shape("box", gap, float(np.hypot(half_width, half_height)) + 70, depth, sources, 1.1 * half_height)
+
+
+def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape:
+    """A torus: `radius` of its centre line, `tube` radius."""
+
+    def gap(x: Array, y: Array) -> Array:
+        across = np.hypot(x, y) - np.float32(radius)
+        squared = np.minimum(across * across, np.float32(tube**2))
+        return np.asarray(np.float32(tube) - np.sqrt(np.float32(tube**2) - squared), dtype=np.float32)
+
+    return Shape("ring", gap, radius + 3.2 * float(np.sqrt(tube * depth)), depth, np.zeros((1, 2)), radius)
+
+
+def text(words: str = "TACT", depth: float = 11.0) -> Shape:
+    """Raised letters, 3.4 times the size of OpenCV's plain font."""
+    scale, thickness, margin = 3.4, 11, 60
+    (width, height), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
+    canvas = np.full((height + 2 * margin, width + 2 * margin), 255, np.uint8)
+    place = (margin, margin + height)
+    cv2.putText(canvas, words, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0.0,), thickness, cv2.LINE_8)
+    distance = cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # Distances to pixels step by whole pixels along the letters' edges; the surface shall not.
+    field = np.asarray(cv2.GaussianBlur(distance, (0, 0), 1.2), dtype=np.float32)
+    center_x, center_y = np.float32((field.shape[1] - 1) / 2), np.float32((field.shape[0] - 1) / 2)
+
+    def gap(x: Array, y: Array) -> Array:
+        shape = x.shape
+        map_x = np.ascontiguousarray(x + center_x).reshape(len(x), -1)
+        map_y = np.ascontiguousarray(y + center_y).reshape(len(y), -1)
+        outside = cv2.remap(
+            field,
+            map_x,
+            map_y,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(float(margin),),
+        )
+        return _flank(np.asarray(outside, dtype=np.float32).reshape(shape))
+
+    reach = float(np.hypot(width, height)) / 2 + margin
+    return Shape("text", gap, reach, depth, _segment(width / 2 - height / 2, 5), 60.0)
+
+
+def screw(
+    radius: float = 62.0, half_length: float = 190.0, thread: float = 34.0, depth: float = 16.0
+) -> Shape:
+    """A threaded rod along x: ridges every `thread` px, slightly inclined."""
+    smooth = cable(radius, half_length, depth)
+
+    def gap(x: Array, y: Array) -> Array:
+        ridge = np.cos((x + np.float32(0.16) * y) * np.float32(2 * np.pi / thread))
+        return np.asarray(smooth.gap(x, y) + np.float32(2.4) * (1 - ridge), dtype=np.float32)
+
+    return Shape("screw", gap, smooth.reach, depth, _segment(half_length, 12), smooth.spread)

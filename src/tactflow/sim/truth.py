@@ -1,0 +1,156 @@
+"""What a simulated frame really shows, in raw or in processed coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.sim.camera import Camera
+from tactflow.sim.gel import Press, in_contact
+
+NO_DIRECTION = 0.02
+"""Anisotropy (difference over sum of the principal second moments) below which a region has no direction."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The truth about one frame. Coordinates as in `tactflow.vision.types`.
+
+    touching : whether the contact covers at least one pixel of the frame.
+    contact_mask : (H, W) bool, true where the gel is in contact at the pixel's centre.
+    center : (x, y) centroid of the contact region, px; None without a contact.
+    angle : principal direction of the region, degrees in (-90, 90]; None for a disc and without a contact.
+    hull : (N, 2) float64, vertices of the convex hull of the region's pixel centres, in order; (0, 2) without.
+    area : of that hull, px^2.
+    origin : (N, 2) float64, markers on the untouched gel. position : (N, 2) float64, now. Markers that were
+        never printed are not listed.
+    visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, and not vanished.
+    mean_flow : (dx, dy), mean displacement of the visible markers whose position lies in the contact, px; None
+        where there are none.
+    """
+
+    touching: bool
+    contact_mask: NDArray[np.bool_]
+    center: tuple[float, float] | None
+    angle: float | None
+    hull: NDArray[np.float64]
+    area: float
+    origin: NDArray[np.float64]
+    position: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+    mean_flow: tuple[float, float] | None
+    _render: Callable[[], NDArray[np.uint8]] = field(repr=False, compare=False)
+
+    @cached_property
+    def unmarked(self) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 BGR: the frame without markers, dirt and noise. Rendered when first asked for."""
+        return self._render()
+
+
+def pixel_mapping(mapping: Any) -> Any:
+    """The coordinate mapping itself, from a mapping or from a preprocessor that has one."""
+    return getattr(mapping, "mapping", mapping)
+
+
+def principal_angle(mask: NDArray[np.bool_]) -> float | None:
+    """Direction of the larger second moment of a region, degrees in (-90, 90]; None where it has none."""
+    rows, columns = np.nonzero(mask)
+    if len(rows) < 2:
+        return None
+    x, y = columns - columns.mean(), rows - rows.mean()
+    xx, yy, xy = float(np.mean(x * x)), float(np.mean(y * y)), float(np.mean(x * y))
+    if np.hypot(xx - yy, 2 * xy) <= NO_DIRECTION * (xx + yy):
+        return None
+    # The sign turns the angle of image coordinates (y down) into one that is counter-clockwise on the screen.
+    angle = -0.5 * float(np.degrees(np.arctan2(2 * xy, xx - yy)))
+    return 90.0 if angle <= -90.0 else angle
+
+
+@lru_cache(maxsize=8)
+def _pixel_centres(
+    camera: Camera, size: tuple[int, int], mapping: Any
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Gel coordinates (H, W) of each pixel's centre, and whether the raw frame covers it."""
+    width, height = size if mapping is None else mapping.size
+    grid = (
+        np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
+    )
+    raw = grid if mapping is None else np.asarray(mapping.to_raw(grid), dtype=np.float64)
+    seen = np.all((raw >= -0.5) & (raw <= np.array(size) - 0.5), axis=1).reshape(height, width)
+    mapped = camera.to_gel(raw).astype(np.float32).reshape(height, width, 2)
+    return np.ascontiguousarray(mapped[..., 0]), np.ascontiguousarray(mapped[..., 1]), seen
+
+
+def measure(
+    pressed: Sequence[Press],
+    camera: Camera,
+    origin: NDArray[np.float64],
+    position: NDArray[np.float64],
+    shown: NDArray[np.bool_],
+    size: tuple[int, int],
+    mapping: Any,
+    clean: Callable[[], NDArray[np.uint8]],
+) -> Truth:
+    """Put the truth together.
+
+    origin, position : (N, 2) float64 raw pixels. shown : (N,) bool, false where a marker has vanished.
+    mapping : see `Scene.truth`. clean : renders the raw frame without markers and noise.
+    """
+    to = pixel_mapping(mapping)
+    gel_x, gel_y, seen = _pixel_centres(camera, size, to)
+    height, width = gel_x.shape
+    mask = in_contact(pressed, gel_x, gel_y) & seen
+    center = angle = None
+    hull, area = np.empty((0, 2)), 0.0
+    touching = bool(mask.any())
+    if touching:
+        rows, columns = np.nonzero(mask)
+        center = (float(columns.mean()), float(rows.mean()))
+        angle = principal_angle(mask)
+        points = np.stack([columns, rows], axis=1).astype(np.int32)
+        hull = cv2.convexHull(points).reshape(-1, 2).astype(np.float64)
+        area = float(cv2.contourArea(hull.astype(np.float32)))
+    if to is not None:
+        origin = np.asarray(to.to_processed(origin), dtype=np.float64)
+        position = np.asarray(to.to_processed(position), dtype=np.float64)
+    nearest = np.rint(position).astype(np.int64)
+    inside = (nearest[:, 0] >= 0) & (nearest[:, 1] >= 0) & (nearest[:, 0] < width) & (nearest[:, 1] < height)
+    visible = shown & inside
+    mean_flow = None
+    touched = np.zeros(len(position), dtype=np.bool_)
+    touched[visible] = mask[nearest[visible, 1], nearest[visible, 0]]
+    if touched.any():
+        moved = (position - origin)[touched].mean(axis=0)
+        mean_flow = (float(moved[0]), float(moved[1]))
+
+    def render() -> NDArray[np.uint8]:
+        image = clean()
+        if mapping is None:
+            return image
+        if callable(mapping):
+            return np.asarray(getattr(mapping(image), "image", mapping(image)), dtype=np.uint8)
+        return _resampled(image, mapping)
+
+    return Truth(touching, mask, center, angle, hull, area, origin, position, visible, mean_flow, render)
+
+
+def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
+    """The image in processed pixels: the mean of 2 x 2 bilinear samples of each processed pixel."""
+    width, height = mapping.size
+    total = np.zeros((height, width, 3), np.float32)
+    grid = (
+        np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
+    )
+    for shift in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
+        raw = np.asarray(mapping.to_raw(grid + shift), dtype=np.float32).reshape(height, width, 2)
+        sampled = cv2.remap(
+            image, raw, np.empty(0, np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        total += sampled
+    return np.rint(total / 4.0).astype(np.uint8)
