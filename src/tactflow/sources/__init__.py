@@ -50,9 +50,9 @@ def open_source(
     if not spec:
         raise SourceError(f"the source is empty; required one of: {KINDS}")
     if spec.startswith("sim:"):
-        from tactflow.sources.simulated import open_simulated
+        from tactflow.sources.simulated import Simulated
 
-        return open_simulated(spec)
+        return Simulated(spec)
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]+)://", spec)
     if scheme is not None:
         if scheme[1].lower() in _STREAMS:
