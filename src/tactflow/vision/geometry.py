@@ -194,11 +194,15 @@ class Preprocessor:
             raise ValueError(f"required downsample to be 1, 2, 4, 8, ..., got {downsample}")
         if method not in ("area", "pyramid"):
             raise ValueError(f"required method to be 'area' or 'pyramid', got {method!r}")
-        lens = _lens(camera_matrix, distortion, fisheye)
+        lens = check_lens(camera_matrix, distortion, fisheye)
         matrix = np.eye(3)
         size = (int(width), int(height))
         if homography is not None:
-            matrix, size = _homography(*homography)
+            source, destination, target = homography
+            if len(target) != 2 or min(target) < 1:
+                raise ValueError(f"required a homography size (width, height) >= 1, got {tuple(target)}")
+            matrix = find_homography(source, destination)
+            size = (int(target[0]), int(target[1]))
         if crop is not None:
             x, y, size = _crop(crop, size)
             matrix = _shift(-x, -y) @ matrix
@@ -390,7 +394,12 @@ def _rotation(rotate: int, size: tuple[int, int]) -> FloatArray:
     return np.eye(3)
 
 
-def _lens(camera_matrix: ArrayLike | None, distortion: ArrayLike | None, fisheye: bool) -> Lens | None:
+def check_lens(camera_matrix: ArrayLike | None, distortion: ArrayLike | None, fisheye: bool) -> Lens | None:
+    """The lens of a calibration, or None where neither matrix nor coefficients are given.
+
+    camera_matrix : (3, 3), px. distortion : 4, 5, 8, 12 or 14 coefficients; fisheye: 4.
+    Raises ValueError where only one of them is given, or where they do not have these forms.
+    """
     if camera_matrix is None and distortion is None:
         if fisheye:
             raise ValueError("required camera_matrix and distortion with fisheye, got neither")
@@ -416,9 +425,12 @@ def _lens(camera_matrix: ArrayLike | None, distortion: ArrayLike | None, fisheye
     return Lens(matrix, coefficients, fisheye)
 
 
-def _homography(
-    source: ArrayLike, destination: ArrayLike, size: Sequence[int]
-) -> tuple[FloatArray, tuple[int, int]]:
+def find_homography(source: ArrayLike, destination: ArrayLike) -> FloatArray:
+    """The homography that takes four points to four points.
+
+    source, destination : (4, 2), px, in the same order. Returns (3, 3) float64. Raises ValueError where three
+    points lie on a line, or where one outline is crossed and the other is not.
+    """
     ends = []
     for name, points in (("source", source), ("destination", destination)):
         corners = np.array(points, dtype=np.float64)
@@ -433,8 +445,6 @@ def _homography(
                     f"required {name} points of which no three lie on a line, got {corners.tolist()}"
                 )
         ends.append(corners)
-    if len(size) != 2 or min(size) < 1:
-        raise ValueError(f"required a homography size (width, height) >= 1, got {tuple(size)}")
     rows = []
     for (x, y), (u, v) in zip(ends[0], ends[1], strict=True):
         rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y])
@@ -450,7 +460,7 @@ def _homography(
             "required source and destination points in the same order around their outline, "
             f"got {ends[0].tolist()} to {ends[1].tolist()}"
         )
-    return matrix, (int(size[0]), int(size[1]))
+    return matrix
 
 
 def _crop(crop: Sequence[int], size: tuple[int, int]) -> tuple[int, int, tuple[int, int]]:

@@ -1,0 +1,46 @@
+"""Stage `hull`: geometry of the contact region."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from tactflow.engine.frame import Absent
+from tactflow.engine.stage import StageParams
+from tactflow.ports import ContactMask
+from tactflow.vision.hull import contact_geometry
+from tactflow.vision.types import Contact
+
+
+class Hull:
+    """Hull, area, centroid, direction and ellipse of the contact.
+
+    Seed functions `get_all_contour`, `get_convex_hull_area` and `regress_line`.
+    """
+
+    memory = "pure"
+
+    class Params(StageParams):
+        """Which blobs of the mask are the contact, and how it is described."""
+
+        min_area: float = Field(
+            20.0, ge=0, description="smaller blobs are ignored, px^2; too large misses light contacts"
+        )
+        max_gap: float | None = Field(
+            None, ge=0, description="blobs farther apart than this are not one contact, px; null: all are"
+        )
+        method: Literal["moments", "seed"] = Field(
+            "moments", description="seed: the original's line through the hull's vertices, all blobs together"
+        )
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+
+    def process(self, contact_mask: ContactMask) -> Contact | Absent:
+        """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
+        params = self._params
+        contact = contact_geometry(
+            contact_mask, min_area=params.min_area, max_gap=params.max_gap, method=params.method
+        )
+        return Absent("no_contact") if contact is None else contact

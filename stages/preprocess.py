@@ -1,0 +1,98 @@
+"""Stage `preprocess`: from the raw frame to the processed one."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, NamedTuple, Self
+
+from pydantic import Field, model_validator
+
+from tactflow.engine.frame import Frame
+from tactflow.engine.stage import StageParams
+from tactflow.ports import Image
+from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
+
+Point = Annotated[list[float], Field(min_length=2, max_length=2)]
+Corners = Annotated[list[Point], Field(min_length=4, max_length=4)]
+Pixels = Annotated[int, Field(ge=1, le=32767)]
+
+
+class Undistort(StageParams):
+    """A lens calibration from `cv2.calibrateCamera`, or from `cv2.fisheye.calibrate`."""
+
+    camera_matrix: list[list[float]] = Field(
+        description="3 x 3, raw px: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+    )
+    distortion: list[float] = Field(description="coefficients, 1: 4, 5, 8, 12 or 14 of them; fisheye: 4")
+    fisheye: bool = Field(False, description="whether the coefficients are of the fisheye model")
+
+    @model_validator(mode="after")
+    def _usable(self) -> Self:
+        check_lens(self.camera_matrix, self.distortion, self.fisheye)
+        return self
+
+
+class Homography(StageParams):
+    """Four points of the undistorted raw frame and where they go."""
+
+    source: Corners = Field(alias="from", description="four points [x, y], undistorted raw px")
+    destination: Corners = Field(alias="to", description="where they go, [x, y], px of the result")
+    size: tuple[Pixels, Pixels] = Field(description="width and height of the result, px, 1 to 32767")
+
+    @model_validator(mode="after")
+    def _usable(self) -> Self:
+        find_homography(self.source, self.destination)
+        return self
+
+
+class Preprocessed(NamedTuple):
+    """image : the processed frame. mapping : between its pixels and those of the raw frame."""
+
+    image: Image
+    mapping: PixelMapping
+
+
+class Preprocess:
+    """Straighten, cut, turn and shrink the frame in one pass (seed function `get_processed_frame`)."""
+
+    memory = "pure"
+
+    class Params(StageParams):
+        """The steps, in the order in which they are done; a step that is not given is left out."""
+
+        undistort: Undistort | None = Field(None, description="take out the lens")
+        homography: Homography | None = Field(None, description="rectify: four points go to four points")
+        crop: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Pixels, Pixels] | None = Field(
+            None,
+            description="keep [x, y, width, height], px of the rectified frame (without homography: raw px)",
+        )
+        rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
+        downsample: Literal[1, 2, 4, 8, 16] = Field(1, description="factor by which both sides shrink")
+        method: Literal["area", "pyramid"] = Field(
+            "area", description="how to shrink: area is faster; pyramid (cv2.pyrDown) is the original's"
+        )
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+        self._preprocessor: Preprocessor | None = None
+
+    def process(self, frame: Frame) -> Preprocessed:
+        """The processed frame; all frames must have the size of the first."""
+        if self._preprocessor is None:
+            height, width = frame.image.shape[:2]
+            self._preprocessor = self._build(width, height)
+        return Preprocessed(self._preprocessor(frame.image), self._preprocessor.mapping)
+
+    def _build(self, width: int, height: int) -> Preprocessor:
+        params = self._params
+        lens, plane = params.undistort, params.homography
+        return Preprocessor(
+            (width, height),
+            rotate=params.rotate,
+            downsample=params.downsample,
+            method=params.method,
+            crop=params.crop,
+            camera_matrix=lens.camera_matrix if lens else None,
+            distortion=lens.distortion if lens else None,
+            fisheye=lens.fisheye if lens else False,
+            homography=(plane.source, plane.destination, plane.size) if plane else None,
+        )
