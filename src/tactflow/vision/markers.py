@@ -1,0 +1,304 @@
+"""Find the printed marks of a gel: sub-pixel centres, their size, their polarity and their neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Polarity = Literal["auto", "dark", "bright"]
+FloatArray = NDArray[np.float64]
+
+_SCALE_RATIO: Final = 1.6
+# A difference of Gaussians with widths s and 1.6 s answers a disc of radius r most strongly at s = r / 1.83
+# (measured on rendered discs of radius 2 to 12 px).
+_RADIUS_PER_SIGMA: Final = 1.83
+_NO_MARKERS: Final = "0 markers found: is the sensor marker-less? then use pipelines/markerless.yaml"
+
+
+class NoMarkersError(ValueError):
+    """The image shows no marks that could be tracked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """The marks of an image.
+
+    centers : (N, 2) float64, px. dot_radius : of a disc that answers like the marks, px.
+    polarity : whether the marks are darker or brighter than the gel.
+    pitch : median distance of a mark to its nearest neighbour, px; with one mark, eight radii.
+    edges : (E, 2) int64, pairs of neighbouring marks, each pair once, smaller index first.
+    """
+
+    centers: FloatArray
+    dot_radius: float
+    polarity: Literal["dark", "bright"]
+    pitch: float
+    edges: NDArray[np.int64]
+
+
+def to_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 BGR, or (H, W) uint8, to (H, W) uint8 luma; raises ValueError on anything else."""
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise ValueError(
+            f"required image to be (H, W, 3) or (H, W) uint8, got shape {image.shape}, dtype {image.dtype}"
+        )
+    if min(image.shape[:2]) < 1:
+        raise ValueError(f"required a non-empty image, got shape {image.shape}")
+    if image.ndim == 2:
+        return np.ascontiguousarray(image)
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def detect_markers(
+    image: NDArray[np.uint8],
+    *,
+    dot_radius: float | None = None,
+    polarity: Polarity = "auto",
+) -> Detection:
+    """Find the marks of a gel, whatever their size, shape and arrangement.
+
+    The image is filtered with differences of Gaussians over a range of scales; the scale and polarity with
+    the strongest family of spots (many, alike, evenly spaced) win, and spots that do not fit the family (weak
+    ones, ones between the others, lonely ones, ones cut by the border) are left out.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8 BGR or (H, W) uint8, grey levels.
+    dot_radius : of a mark, px, 1 to a quarter of the shorter side; None finds it. For marks made of several
+        spots, the radius of the whole mark.
+    polarity : "dark" or "bright" against the gel; "auto" takes the stronger family.
+
+    Returns
+    -------
+    Detection : centres ordered by rows, top to bottom, left to right.
+
+    Raises
+    ------
+    NoMarkersError : nothing looks like a family of marks.
+    ValueError : the image or a parameter is not of that kind.
+
+    References
+    ----------
+    Lindeberg, "Feature detection with automatic scale selection", IJCV 30 (1998); Lowe, "Distinctive image
+    features from scale-invariant keypoints", IJCV 60 (2004), for the difference of Gaussians. Seed function
+    `marker_center`.
+    """
+    gray = to_gray(image).astype(np.float32)
+    shortest = min(gray.shape)
+    if dot_radius is not None and not 1.0 <= dot_radius <= max(1.0, shortest / 4):
+        raise ValueError(f"required dot_radius 1 to {max(1.0, shortest / 4):g} px, got {dot_radius:g}")
+    if polarity not in ("auto", "dark", "bright"):
+        raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
+    if shortest < 8:
+        raise NoMarkersError(_NO_MARKERS)
+    polarities: tuple[Literal["dark", "bright"], ...] = (
+        ("dark", "bright") if polarity == "auto" else (polarity,)
+    )
+    best: tuple[float, float, Literal["dark", "bright"], FloatArray] | None = None
+    for sigma in _sigmas(dot_radius, shortest):
+        response = _difference_of_gaussians(gray, sigma)
+        for sign in polarities:
+            signed = response if sign == "dark" else -response
+            peaks, strength = _peaks(signed, sigma)
+            kept = _family(peaks, strength, gray.shape, sigma * _RADIUS_PER_SIGMA)
+            if len(kept) == 0:
+                continue
+            score = _score(peaks[kept], strength[kept])
+            if best is None or score > best[0]:
+                best = (score, sigma, sign, peaks[kept])
+    if best is None:
+        raise NoMarkersError(_NO_MARKERS)
+    _, sigma, found, peaks = best
+    radius = sigma * _RADIUS_PER_SIGMA
+    centers = refine_centers(gray if found == "dark" else 255 - gray, peaks, radius)
+    centers = centers[_reading_order(centers, radius)]
+    distances = _nearest(centers, 1)[0]
+    pitch = float(np.median(distances[:, 0])) if len(centers) > 1 else 8 * radius
+    return Detection(centers, radius, found, pitch, neighbour_graph(centers, 2.6 * pitch))
+
+
+def refine_centers(gray: NDArray[np.float32], centers: FloatArray, radius: float) -> FloatArray:
+    """Centroid of what is darker than its surroundings, in a window that follows it.
+
+    The surroundings are a plane through the rim of the window, so a slope of the light does not pull.
+
+    Parameters
+    ----------
+    gray : (H, W) float32, grey levels; marks are dark.
+    centers : (N, 2) float64, starting points, px, right to about a radius.
+    radius : of a mark, px.
+
+    Returns
+    -------
+    centers : (N, 2) float64, px; where there is nothing dark, the starting point.
+    """
+    reach = int(np.ceil(1.9 * radius + 1.5))
+    axis = np.arange(-reach, reach + 1)
+    grid_x, grid_y = (part.ravel().astype(np.float64) for part in np.meshgrid(axis, axis))
+    padded = cv2.copyMakeBorder(gray, reach, reach, reach, reach, cv2.BORDER_REPLICATE).astype(np.float64)
+    height, width = gray.shape
+    result = np.array(centers, np.float64)
+    limits = np.array([width - 1, height - 1])
+    for _ in range(4):
+        corner = np.clip(np.rint(result).astype(np.int64), 0, limits)
+        patches = padded[
+            corner[:, 1, None] + (grid_y + reach).astype(np.int64),
+            corner[:, 0, None] + (grid_x + reach).astype(np.int64),
+        ]
+        x = grid_x + corner[:, :1] - result[:, :1]
+        y = grid_y + corner[:, 1:] - result[:, 1:]
+        distance = np.hypot(x, y)
+        rim = np.clip(distance - 1.4 * radius, 0, 1) * np.clip(1.9 * radius + 1.5 - distance, 0, 1)
+        basis = np.stack([np.ones_like(x), x, y], axis=1)
+        weighted = basis * rim[:, None]
+        normal = weighted @ basis.transpose(0, 2, 1)
+        plane = np.linalg.solve(normal, weighted @ patches[:, :, None])
+        darkness = np.maximum((basis.transpose(0, 2, 1) @ plane)[:, :, 0] - patches, 0)
+        darkness *= np.clip(1.6 * radius + 0.5 - distance, 0, 1)
+        total = darkness.sum(axis=1)
+        good = total > 1e-3
+        move = np.zeros_like(result)
+        move[good, 0] = (darkness * x).sum(axis=1)[good] / total[good]
+        move[good, 1] = (darkness * y).sum(axis=1)[good] / total[good]
+        result += np.clip(move, -radius, radius)
+        if np.abs(move).max(initial=0) < 1e-3:
+            break
+    return result
+
+
+def neighbour_graph(centers: FloatArray, longest: float) -> NDArray[np.int64]:
+    """Which marks are neighbours: a beta-skeleton, free of diagonals on square grids.
+
+    Two marks are neighbours unless a third lies (nearly) inside the circle whose diameter they are.
+
+    Parameters
+    ----------
+    centers : (N, 2) float64, px. longest : neighbours are no farther apart than this, px.
+
+    Returns
+    -------
+    edges : (E, 2) int64, each pair once, smaller index first, sorted.
+
+    References
+    ----------
+    Gabriel and Sokal, "A new statistical approach to geographic variation analysis", Systematic Zoology 18
+    (1969); Kirkpatrick and Radke, "A framework for computational morphology" (1985).
+    """
+    count = len(centers)
+    if count < 2:
+        return np.zeros((0, 2), np.int64)
+    distances, near = _nearest(centers, min(12, count - 1))
+    squared = distances**2
+    between = ((centers[near][:, :, None] - centers[near][:, None, :]) ** 2).sum(axis=3)
+    # A tenth more than a right angle's sum of squares still blocks: a skewed square has no diagonals then.
+    blocked = squared[:, None, :] + between < 1.1 * squared[:, :, None]
+    blocked &= ~np.eye(near.shape[1], dtype=bool)
+    keep = ~blocked.any(axis=2) & (distances <= longest)
+    first = np.repeat(np.arange(count), keep.sum(axis=1))
+    pairs = np.sort(np.column_stack([first, near[keep]]), axis=1)
+    return np.unique(pairs, axis=0).astype(np.int64)
+
+
+def _sigmas(dot_radius: float | None, shortest: int) -> list[float]:
+    if dot_radius is not None:
+        return [dot_radius / _RADIUS_PER_SIGMA]
+    largest = max(1.2, shortest / 16)
+    count = 1 + int(np.floor(np.log(largest / 0.9) / np.log(1.2)))
+    return [0.9 * 1.2**index for index in range(count)]
+
+
+def _difference_of_gaussians(gray: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """Positive on dark spots."""
+    wide = cv2.GaussianBlur(gray, (0, 0), _SCALE_RATIO * sigma, borderType=cv2.BORDER_REPLICATE)
+    narrow = cv2.GaussianBlur(gray, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(wide - narrow, np.float32)
+
+
+def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, FloatArray]:
+    """Local maxima, refined to sub-pixels by a parabola along each axis: positions (N, 2), strengths (N,)."""
+    size = 2 * max(1, round(1.5 * sigma)) + 1
+    highest = cv2.dilate(response, np.ones((size, size), np.uint8))
+    rows, columns = np.nonzero((response >= highest) & (response > 1.0))
+    inside = (
+        (rows > 0) & (columns > 0) & (rows < response.shape[0] - 1) & (columns < response.shape[1] - 1)
+    )
+    rows, columns = rows[inside], columns[inside]
+    value = response[rows, columns].astype(np.float64)
+    points = np.column_stack([columns, rows]).astype(np.float64)
+    for axis, (step_y, step_x) in enumerate(((0, 1), (1, 0))):
+        before = response[rows - step_y, columns - step_x]
+        after = response[rows + step_y, columns + step_x]
+        bend = before + after - 2 * value
+        points[:, axis] += np.where(bend < -1e-6, 0.5 * (before - after) / np.minimum(bend, -1e-6), 0.0)
+    return points, value
+
+
+def _family(
+    peaks: FloatArray, strength: FloatArray, shape: tuple[int, ...], radius: float
+) -> NDArray[np.int64]:
+    """Indices of the peaks that belong to one family of marks."""
+    if len(peaks) == 0:
+        return np.zeros(0, np.int64)
+    height, width = shape
+    margin = 0.8 * radius
+    inside = (peaks[:, 0] >= margin) & (peaks[:, 0] <= width - 1 - margin)
+    inside &= (peaks[:, 1] >= margin) & (peaks[:, 1] <= height - 1 - margin)
+    kept = np.flatnonzero(inside)
+    order = kept[np.argsort(-strength[kept], kind="stable")][:4000]
+    if len(order) == 0:
+        return order
+    # Strengths of marks are alike, those of dirt and grain are a tail: cut at a part of the typical one,
+    # which is found from the top down so that the tail's length does not matter.
+    ranked = strength[order]
+    typical = ranked[0]
+    for _ in range(8):
+        members = ranked[ranked > 0.35 * typical]
+        typical = float(np.median(members))
+    kept = order[(ranked > 0.35 * typical) & (ranked > 2.0)]
+    if len(kept) < 3:
+        return kept
+    for _ in range(3):
+        distances, near = _nearest(peaks[kept], min(4, len(kept) - 1))
+        pitch = float(np.median(distances[:, 0]))
+        between = (distances[:, 0] < 0.55 * pitch) & (strength[kept] < strength[kept][near[:, 0]])
+        lonely = distances[:, min(1, distances.shape[1] - 1)] > 2.3 * pitch
+        if not (between | lonely).any():
+            break
+        kept = kept[~(between | lonely)]
+        if len(kept) < 3:
+            break
+    return kept
+
+
+def _score(peaks: FloatArray, strength: FloatArray) -> float:
+    """How much a family looks like marks: strong, many, alike, evenly spaced."""
+    count = len(peaks)
+    typical = float(np.median(strength))
+    even = 0.5
+    if count >= 4:
+        nearest = _nearest(peaks, 1)[0][:, 0]
+        pitch = float(np.median(nearest))
+        even = 1.0 / (1.0 + 4.0 * float(np.mean(np.minimum(np.abs(nearest / pitch - 1.0), 1.0))))
+    return typical * even**2 * float(np.sqrt(min(count, 100)))
+
+
+def _nearest(points: FloatArray, count: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Distances to and indices of the `count` nearest other points, nearest first: two (N, count) arrays."""
+    count = min(count, len(points) - 1)
+    if count < 1:
+        return np.zeros((len(points), 0)), np.zeros((len(points), 0), np.int64)
+    squared = ((points[:, None] - points[None]) ** 2).sum(axis=2)
+    np.fill_diagonal(squared, np.inf)
+    near = np.argsort(squared, axis=1, kind="stable")[:, :count]
+    return np.sqrt(np.take_along_axis(squared, near, axis=1)), near
+
+
+def _reading_order(centers: FloatArray, radius: float) -> NDArray[np.int64]:
+    """Order by rows: a new row begins where the next centre lies a radius lower than the one before."""
+    by_height = np.argsort(centers[:, 1], kind="stable")
+    rows = np.concatenate([[0], np.cumsum(np.diff(centers[by_height, 1]) > radius)])
+    return by_height[np.lexsort((centers[by_height, 0], rows))]
