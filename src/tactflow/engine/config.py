@@ -300,8 +300,9 @@ def _on_error(draft: Draft, problems: Problems) -> OnError:
     actions: tuple[ErrorAction, ...] = get_args(ErrorAction)
     entry = draft.item.entries.get("on_error")
     if entry is None:
-        preset = getattr(draft.component.cls, "on_error", "stop") if draft.component else "stop"
-        return OnError(next((known for known in actions if known == preset), "stop"))
+        # A picture for people must never stop the run.
+        observer = draft.component is not None and getattr(draft.component.cls, "observer", False)
+        return OnError("disable" if observer else "stop")
     path = f"{draft.path}.on_error"
     if isinstance(entry.item.content, dict):
         settings = entry.item.content

@@ -44,8 +44,7 @@ def resolve(use: str, section: Section, directory: Path) -> Component:
     if not separator and _is_file(use):
         file, name = use, ""
     if _is_file(file):
-        path = (directory / file).resolve()
-        component = _component(_find_class(_load_file(path, file), name, section), use, file)
+        component = _component(_find_class(_load_file(directory, file), name, section), use, file)
     elif separator:
         component = _component(_find_class(_load_module(file), name, section), use, f"module {file}")
     else:
@@ -159,12 +158,15 @@ def _load_module(name: str, owner: str = "") -> ModuleType:
         raise ConfigError(_failure(name, error)) from None
 
 
-def _load_file(path: Path, shown: str) -> ModuleType:
+def _load_file(directory: Path, file: str) -> ModuleType:
     """Run a Python file as a module of its own, once for each version of the file."""
     try:
+        path = (directory / file).resolve()
         source = path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"cannot read {shown}: {error.strerror} ({path})") from None
+        raise ConfigError(f"cannot read {file}: {error.strerror} ({path})") from None
+    except ValueError as error:
+        raise ConfigError(f"cannot read {file!r}: {error}") from None
     digest = hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:16]
     name = f"tactflow_file_{path.stem}_{digest}"
     if name in sys.modules:
@@ -177,7 +179,7 @@ def _load_file(path: Path, shown: str) -> ModuleType:
         exec(compile(source, str(path), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
         del sys.modules[name]
-        raise ConfigError(_failure(shown, error, str(path))) from None
+        raise ConfigError(_failure(file, error, str(path))) from None
     return module
 
 

@@ -16,6 +16,7 @@ from tactflow.engine.graph import Mark
 _LINE_BREAK = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 _MAX_VALUES = 100_000
 _MAX_SHOWN = 150
+_MAX_MESSAGE = 2000
 
 
 @dataclass(slots=True)
@@ -108,7 +109,8 @@ class Problems:
 
     def _block(self, mark: Mark, message: str) -> str:
         # A place has two blanks after it; an option reads as a sentence.
-        head = f"{mark}  {message}" if mark.line else f"{mark}: {message}"
+        message = _one_line(message)
+        head = f"{mark}  {message}" if mark.line else f"{_one_line(str(mark))}: {message}"
         lines = self.lines.get(mark.file, [])
         if not 0 < mark.line <= len(lines):
             return head
@@ -118,6 +120,12 @@ class Problems:
         indent = "".join("\t" if letter == "\t" else " " for letter in line[: column - start])
         visible = "".join(letter if letter.isprintable() or letter == "\t" else "?" for letter in line)
         return f"{head}\n    {visible}\n    {indent}^"
+
+
+def _one_line(text: str) -> str:
+    """Text from a file, safe to print: no line breaks or control characters, not endless."""
+    text = "".join(letter if letter.isprintable() else " " for letter in text)
+    return text if len(text) <= _MAX_MESSAGE else text[:_MAX_MESSAGE] + " ..."
 
 
 class _Loader(yaml.SafeLoader):
@@ -271,7 +279,10 @@ class _Converter:
 
     def _scalar(self, node: yaml.ScalarNode) -> Any:
         try:
-            return self._loader.construct_object(node)
+            value = self._loader.construct_object(node)
+            # An escape such as "\ud800" makes text that cannot be written anywhere.
+            str(value).encode()
+            return value
         except Exception:
             kind = node.tag.rpartition(":")[2]
             self._problems.add(self._mark(node), f"{node.value!r} is not a valid {kind}")
@@ -300,7 +311,8 @@ class _Converter:
 
     def _key(self, node: yaml.Node) -> str | None:
         if isinstance(node, yaml.ScalarNode) and node.tag == "tag:yaml.org,2002:str":
-            return str(node.value)
+            value = self._scalar(node)
+            return None if value is None else str(value)
         hint = (
             f"; put it in quotes if {node.value} is meant as text"
             if isinstance(node, yaml.ScalarNode)

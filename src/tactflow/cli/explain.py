@@ -1,0 +1,191 @@
+"""`tactflow explain`: why each stage runs, is skipped or is left out, and what it cost."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from tactflow.cli.options import add_pipeline, load_plan
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Gate, Node, Pipeline
+from tactflow.engine.plan import Plan, dependencies
+
+HELP = "why each stage runs, is skipped or is left out, and what it cost"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `explain`."""
+    add_pipeline(parser)
+    parser.add_argument(
+        "--stats", metavar="run.json", help="statistics of a run (tactflow run --stats), to show what it cost"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a paragraph for each stage and sink."""
+    statistics = None if args.stats is None else _read_statistics(Path(args.stats))
+    pipeline, plan = load_plan(args)
+    print("\n".join(explanation(pipeline, plan, statistics)))
+    return 0
+
+
+def explanation(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | None = None) -> Iterator[str]:
+    """Lines of the explanation.
+
+    statistics : content of a statistics file, or None.
+    """
+    skipping = "" if pipeline.skipping else ", skipping is off"
+    yield f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"
+    if statistics is not None:
+        yield _run_line(statistics)
+    users = _sinks_behind(pipeline)
+    pruned = {node.id for node in plan.pruned}
+    for node in pipeline.nodes.values():
+        yield ""
+        yield f"{node.id} ({node.mark})"
+        facts = _facts(node, pipeline, plan, users[node.id], node.id in pruned)
+        if statistics is not None and node.id not in pruned:
+            facts["statistics"] = _cost(node, statistics)
+        width = max(map(len, facts))
+        for name, text in facts.items():
+            yield f"  {name.ljust(width)}  {text}"
+
+
+def _facts(node: Node, pipeline: Pipeline, plan: Plan, users: list[str], pruned: bool) -> dict[str, str]:
+    facts: dict[str, str] = {}
+    if pruned:
+        facts["pruned because"] = "no sink needs what it makes"
+    elif node.component.kind == "source":
+        facts["runs because"] = "it captures the frames"
+    elif node.component.kind == "sink":
+        facts["runs because"] = "it is a sink" + _demand(node)
+    else:
+        facts["runs because"] = f"{_listed(users)} {'needs' if len(users) == 1 else 'need'} it"
+    if not pruned:
+        skips = [_gate(gate) for gate in node.gates] if pipeline.skipping else []
+        needed = [
+            f"{ref.node} gives no {ref.port}"
+            for port in node.component.ports.inputs
+            if not port.optional and (ref := node.inputs[port.name]) and _may_be_absent(ref.node, pipeline)
+        ]
+        if skips or needed:
+            facts["skipped when"] = "; ".join(skips + needed)
+    memory = "none (pure): runs only when something wants its result"
+    if node.component.memory == "stateful":
+        memory = "stateful: sees every frame that is not dropped"
+    if node.component.kind == "stage":
+        facts["memory"] = memory
+    if not pruned:
+        facts["segment"] = plan.segment_of(node.id)
+    name, origin = node.component.name, node.component.origin
+    facts["is"] = name if ":" in name or name == origin else f"{name} ({origin})"
+    return facts
+
+
+def _demand(node: Node) -> str:
+    rate = "" if node.max_rate is None else f", at most {node.max_rate:g} times a second"
+    own = "; it says for each frame whether it wants it" if hasattr(node.component.cls, "wants") else ""
+    return rate + own
+
+
+def _gate(gate: Gate) -> str:
+    text = f"{gate.signal} is false"
+    if gate.hold:
+        text += f" for more than {gate.hold} frames"
+    if gate.otherwise == "repeat":
+        text += " (its last outputs are repeated)"
+    else:
+        text += f" (its outputs are absent: {gate.reason})"
+    if gate.at_least_every is not None:
+        text += f", but it runs at least every {gate.at_least_every} frames"
+    return text
+
+
+def _may_be_absent(id_: str, pipeline: Pipeline) -> bool:
+    """True if a stage's outputs may be missing: it is gated, says so itself, or needs what may be missing."""
+    node = pipeline.nodes[id_]
+    if (node.gates and pipeline.skipping) or any(port.optional for port in node.component.ports.outputs):
+        return True
+    inputs = [node.inputs[port.name] for port in node.component.ports.inputs if not port.optional]
+    return any(_may_be_absent(ref.node, pipeline) for ref in inputs if ref is not None)
+
+
+def _sinks_behind(pipeline: Pipeline) -> dict[str, list[str]]:
+    """Node -> the sinks that need it, directly or not."""
+    behind: dict[str, list[str]] = {id_: [] for id_ in pipeline.nodes}
+    for sink in pipeline.sinks:
+        pending, seen = [sink.id], {sink.id}
+        while pending:
+            for other in dependencies(pipeline.nodes[pending.pop()]) - seen:
+                seen.add(other)
+                pending.append(other)
+                behind[other].append(sink.id)
+    return behind
+
+
+def _listed(words: list[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _run_line(statistics: Mapping[str, Any]) -> str:
+    latency = statistics["latency_ms"]
+    return (
+        f"the run: {statistics['frames']} frames in {statistics['wall_s']:.1f} s, "
+        f"{statistics['dropped']} dropped, latency p50 {_ms(latency['p50'])}, p99 {_ms(latency['p99'])}, end: {statistics['end']}"
+    )
+
+
+def _cost(node: Node, statistics: Mapping[str, Any]) -> str:
+    entry = {**statistics.get("sinks", {}), **statistics["stages"]}.get(node.id)
+    if entry is None:
+        return "not part of that run"
+    text = f"ran {entry['runs']} times"
+    if entry["runs"]:
+        text += f", p50 {_ms(entry['p50_ms'])}, p99 {_ms(entry['p99_ms'])}"
+    skips = ", ".join(f"{count} {reason}" for reason, count in entry["skips"].items() if count)
+    return text + (f"; skipped: {skips}" if skips else "")
+
+
+def _ms(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f} ms"
+
+
+def _read_statistics(path: Path) -> Mapping[str, Any]:
+    try:
+        data = json.loads(path.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"--stats {path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"--stats {path}: not JSON: {error}") from None
+    if not _are_statistics(data):
+        raise ConfigError(f"--stats {path}: not a statistics file; tactflow run --stats writes one")
+    assert isinstance(data, dict)
+    return data
+
+
+def _are_statistics(data: Any) -> bool:
+    """True if the parts shown here are there and have the right types."""
+    if not isinstance(data, dict) or not isinstance(data.get("stages"), dict):
+        return False
+    numbers = all(isinstance(data.get(key), int | float) for key in ("frames", "dropped", "wall_s"))
+    nodes = [*data["stages"].values(), *dict(data.get("sinks") or {}).values()]
+    return (
+        numbers
+        and "end" in data
+        and _is_pair(data.get("latency_ms"), "p50", "p99")
+        and all(
+            _is_pair(node, "p50_ms", "p99_ms")
+            and isinstance(node.get("runs"), int)
+            and isinstance(node.get("skips"), dict)
+            for node in nodes
+        )
+    )
+
+
+def _is_pair(value: Any, *keys: str) -> bool:
+    return isinstance(value, dict) and all(
+        key in value and isinstance(value[key], int | float | None) for key in keys
+    )

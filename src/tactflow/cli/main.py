@@ -1,0 +1,78 @@
+"""The program `tactflow`: finds the subcommand, runs it, and turns errors into messages and exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from tactflow import __version__
+from tactflow.engine.errors import TactflowError
+
+COMMANDS = {
+    "run": "run a pipeline",
+    "check": "validate a pipeline file without running it; prints every mistake at once",
+    "explain": "why each stage runs, is skipped or is left out, and what it cost",
+    "graph": "print a pipeline as a Mermaid flowchart",
+    "stages": "list the stages and sinks that can be used, their ports and parameters",
+    "listen": "print what a running tactflow publishes",
+    "sim": "write a simulated recording and its ground truth",
+    "schema": "print the JSON Schema of the result message or of a pipeline file",
+}
+"""Subcommand -> what it does. Its module in `tactflow.cli` is imported only when it is used."""
+
+
+def entry() -> None:
+    """Entry point of the console script."""
+    try:
+        code = main(sys.argv[1:])
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read our output has left. The interpreter flushes once more at exit: that must go nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    sys.exit(code)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the program with these arguments; returns its exit code."""
+    try:
+        args = _parse(argv)
+        return int(args.run(args))
+    except TactflowError as error:
+        print(f"tactflow: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return 130
+    except SystemExit as error:
+        return error.code if isinstance(error.code, int) else 0
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="tactflow",
+        description="From camera frames of a tactile sensor to contact geometry and marker flow.",
+        epilog="'tactflow COMMAND --help' explains one command.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"tactflow {__version__}")
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    wanted = next((word for word in argv if not word.startswith("-")), None)
+    if wanted is not None and wanted not in COMMANDS:
+        guess = difflib.get_close_matches(wanted, COMMANDS, n=1)
+        hint = f"did you mean {guess[0]}?" if guess else f"there are {', '.join(COMMANDS)}"
+        parser.error(f"there is no command {wanted}; {hint}")
+    for name, summary in COMMANDS.items():
+        command = subparsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        if name == wanted:
+            module = importlib.import_module(f"tactflow.cli.{name}")
+            module.add_arguments(command)
+            command.set_defaults(run=module.run)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    entry()

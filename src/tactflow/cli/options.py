@@ -1,0 +1,36 @@
+"""What the commands that read a pipeline file share."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from tactflow.cli.pipelines import find_pipeline
+from tactflow.engine.config import load_pipeline
+from tactflow.engine.graph import Pipeline
+from tactflow.engine.plan import Plan, make_plan
+
+
+def add_pipeline(parser: argparse.ArgumentParser) -> None:
+    """Declare PIPELINE and `--set`."""
+    parser.add_argument(
+        "pipeline", nargs="?", metavar="PIPELINE", help="default: ./pipeline.yaml, else the packaged one"
+    )
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="a.b.c=VALUE",
+        help="override one value of the pipeline file; repeatable; null removes a whole stage or sink",
+    )
+
+
+def load_plan(args: argparse.Namespace) -> tuple[Pipeline, Plan]:
+    """Read the pipeline that the arguments name and plan it; warnings go to standard error."""
+    pipeline = load_pipeline(find_pipeline(args.pipeline), overrides=args.overrides)
+    live = bool(getattr(pipeline.source.params, "realtime", False))
+    plan = make_plan(pipeline, live=live)
+    for warning in (*pipeline.warnings, *plan.warnings):
+        print(f"tactflow: warning: {warning}", file=sys.stderr)
+    return pipeline, plan
