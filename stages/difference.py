@@ -27,7 +27,9 @@ class Difference:
     class Params(StageParams):
         """method : how contact is told from no contact."""
 
-        method: Literal["colour", "seed"] = Field("colour", description="seed is the original rule")
+        method: Literal["noise", "colour", "seed"] = Field(
+            "noise", description="noise tests against the sensor's noise; seed is the original rule"
+        )
         distance: float = Field(
             24.0, gt=0, le=441, description="`colour`: change of colour that is contact, grey levels"
         )
