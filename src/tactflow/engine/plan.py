@@ -82,7 +82,7 @@ def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
     needed = _needed(pipeline)
     pruned = [node for node in pipeline.nodes.values() if node.id not in needed]
     nodes = [node for node in pipeline.nodes.values() if node.id in needed]
-    names = {node.id: _segment_name(node) for node in nodes}
+    names = _segment_names(nodes)
     source = names[pipeline.source.id]
     members: dict[str, list[str]] = {source: []}
     for node in nodes:
@@ -120,13 +120,32 @@ def _needed(pipeline: Pipeline) -> set[str]:
     return needed
 
 
-def _segment_name(node: Node) -> str:
-    if node.segment:
-        return node.segment
-    if node.component.kind == "source":
-        return CAPTURE
-    own = node.component.kind == "sink" and getattr(node.component.cls, "threaded", False)
-    return node.id if own else COMPUTE
+def _segment_names(nodes: Sequence[Node]) -> dict[str, str]:
+    """The segment of each node, given in order of evaluation.
+
+    A node that names none is run by the segment that its inputs reach last, so that it never makes two
+    segments wait for each other; where its inputs come from segments side by side, it gets its own.
+    """
+    names: dict[str, str] = {}
+    before: dict[str, set[str]] = {}
+    sources = {node.segment or CAPTURE for node in nodes if node.component.kind == "source"}
+    for node in nodes:
+        inputs = {names[other] for other in dependencies(node) if other in names}
+        earlier = inputs | {a for name in inputs for a in _ancestors(name, before)}
+        last = {name for name in inputs if not any(name in _ancestors(other, before) for other in inputs)}
+        if node.segment:
+            name = node.segment
+        elif node.component.kind == "source":
+            name = CAPTURE
+        elif node.component.kind == "sink" and getattr(node.component.cls, "threaded", False):
+            name = node.id
+        elif last <= sources:
+            name = COMPUTE
+        else:
+            name = last.pop() if len(last) == 1 else node.id
+        names[node.id] = name
+        before.setdefault(name, set()).update(earlier - {name})
+    return names
 
 
 def _ancestors(name: str, before: Mapping[str, Iterable[str]]) -> set[str]:

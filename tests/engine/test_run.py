@@ -1,0 +1,432 @@
+"""The engine's laws, shown on a graph of toy stages."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tactflow.engine.run import Runner, RunResult
+
+MakeRunner = Callable[..., Runner]
+
+COLLECT = {"out": {"use": "Collect"}}
+
+
+def rows(runner: Runner, sink: str = "out") -> list[Any]:
+    """What a collecting sink got."""
+    return list(runner.nodes[sink].instance.rows)
+
+
+def seen(runner: Runner, node: str) -> list[int]:
+    """The frames a node was called for."""
+    return list(runner.nodes[node].instance.seen)
+
+
+def ran(runner: Runner) -> RunResult:
+    """Run to the end, which must be a good one."""
+    result = runner.run()
+    assert result.error is None
+    assert result.exit_code == 0
+    return result
+
+
+# -- values -----------------------------------------------------------------------------------------------
+
+
+def test_every_frame_of_a_recording_reaches_a_lossless_sink_in_order(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(sinks={"out": {"use": "Collect"}, "far": {"use": "ThreadedCollect"}})
+    result = ran(runner)
+    assert [row[0] for row in rows(runner)] == list(range(20))
+    assert rows(runner, "far") == rows(runner)
+    assert result.stats["frames"] == 20
+    assert result.stats["dropped"] == 0
+    assert result.stats["end"] == "eos"
+    gated = [row[3] for row in rows(runner)]
+    assert gated == [i**2 + 0.5 if 3 <= i % 10 <= 6 else None for i in range(20)]
+    assert [row[4] for row in rows(runner)] == [{} if g is not None else {"gated": "idle"} for g in gated]
+
+
+@pytest.mark.parametrize("extra", ["far", "lazy", "rated", "small"])
+@pytest.mark.parametrize("skipping", [True, False])
+def test_an_observer_never_changes_values(toy_runner: MakeRunner, extra: str, skipping: bool) -> None:
+    """Every subset of the other sinks, threaded, uninterested, rate-limited or asking for less."""
+    sinks: dict[str, Any] = {
+        "out": {"use": "Collect"},
+        "far": {"use": "ThreadedCollect"},
+        "lazy": {"use": "Collect"},
+        "rated": {"use": "ThreadedCollect", "max_rate": 7},
+        "small": {"use": "OnlyLevel"},
+    }
+    gates = {"gated": {"when": {"signal": "active", "otherwise": "repeat", "hold": 1, "at_least_every": 5}}}
+    alone = toy_runner(gates, {"out": sinks["out"]}, skipping=skipping)
+    ran(alone)
+    others = [name for name in sinks if name not in ("out", extra)]
+    for size in range(len(others) + 1):
+        for subset in itertools.combinations(others, size):
+            chosen = {name: dict(sinks[name]) for name in ("out", extra, *subset)}
+            runner = toy_runner(gates, chosen, skipping=skipping)
+            ran(runner)
+            assert rows(runner) == rows(alone)
+            for name in {"far", "lazy", "rated"} & set(chosen):
+                assert set(map(str, rows(runner, name))) <= set(map(str, rows(alone)))
+
+
+SEGMENTS: dict[str, dict[str, dict[str, Any]]] = {
+    "three": {"heavy": {"segment": "b"}, "gated": {"segment": "b"}, "join": {"segment": "c"}},
+    "each": {name: {"segment": name} for name in ("level", "pulse", "heavy", "gated", "total", "join")},
+    "one": {name: {"segment": "capture"} for name in ("level", "pulse", "heavy", "gated", "total", "join")},
+    "tight": {
+        name: {"segment": name, "queue": {"capacity": 1, "when_full": "block"}}
+        for name in ("level", "pulse", "heavy", "gated", "total", "join")
+    },
+}
+
+
+@pytest.mark.parametrize("cut", SEGMENTS)
+@pytest.mark.parametrize("gate", [{}, {"hold": 2}, {"otherwise": "repeat"}, {"at_least_every": 3}])
+def test_how_a_graph_is_cut_into_segments_changes_no_value(
+    toy_runner: MakeRunner, cut: str, gate: dict[str, Any]
+) -> None:
+    stages: dict[str, Any] = {"gated": {"when": {"signal": "active", **gate}}}
+    default = toy_runner(stages)
+    ran(default)
+    for name, body in SEGMENTS[cut].items():
+        stages[name] = {**stages.get(name, {}), **body}
+    runner = toy_runner(stages)
+    ran(runner)
+    assert rows(runner) == rows(default)
+    assert len(runner.plan.segments) > 2 or cut == "one"
+
+
+def test_each_stage_in_its_own_segment_is_the_picture_of_the_graph(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(SEGMENTS["each"])
+    links = {link.name for link in runner.plan.links}
+    assert {"capture->level", "level->heavy", "level->total", "heavy->gated"} <= links
+    assert "capture->total" not in links, "the level's link brings the frame along"
+
+
+# -- skipping ---------------------------------------------------------------------------------------------
+
+
+def test_a_closed_gate_runs_nothing_that_only_its_stage_needs(toy_runner: MakeRunner) -> None:
+    runner = toy_runner()
+    result = ran(runner)
+    open_frames = [i for i in range(20) if 3 <= i % 10 <= 6]
+    assert seen(runner, "heavy") == seen(runner, "gated") == open_frames
+    assert result.stats["stages"]["gated"]["skips"] == {"idle": 12}
+    assert result.stats["stages"]["heavy"]["skips"] == {"no_demand": 12}
+    assert result.stats["signals"]["pulse.active"] == {"true": 8, "rises": 2}
+
+
+def test_a_closed_gate_spares_ancestors_in_other_segments_too(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(
+        {"heavy": {"segment": "b"}, "gated": {"segment": "c"}, "pulse": {"segment": "compute"}}
+    )
+    ran(runner)
+    assert seen(runner, "heavy") == [i for i in range(20) if 3 <= i % 10 <= 6]
+
+
+def test_switching_skipping_off_opens_every_gate(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(skipping=False)
+    ran(runner)
+    assert seen(runner, "gated") == list(range(20))
+
+
+@pytest.mark.parametrize(
+    ("gate", "expected"),
+    [
+        ({"hold": 2}, [3, 4, 5, 6, 7, 8, 13, 14, 15, 16, 17, 18]),
+        ({"at_least_every": 4}, [3, 4, 5, 6, 10, 13, 14, 15, 16]),
+        ({"hold": 0}, [3, 4, 5, 6, 13, 14, 15, 16]),
+    ],
+)
+def test_a_gate_holds_and_opens_at_least_every(
+    toy_runner: MakeRunner, gate: dict[str, Any], expected: list[int]
+) -> None:
+    runner = toy_runner({"gated": {"when": {"signal": "active", **gate}}})
+    ran(runner)
+    assert seen(runner, "gated") == expected
+
+
+def test_a_repeating_gate_gives_its_last_value_and_says_why(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(
+        {"gated": {"when": {"signal": "active", "otherwise": "repeat", "reason": "unchanged"}}}
+    )
+    ran(runner)
+    by_frame = {row[0]: row for row in rows(runner)}
+    assert by_frame[2][3] is None
+    assert by_frame[9][3] == by_frame[6][3] == 36.5
+    assert by_frame[9][4] == {"gated": "unchanged"}
+    assert by_frame[6][4] == {}
+
+
+def test_only_what_a_sink_wants_is_computed_but_memory_is_kept(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(sinks={"out": {"use": "Collect", "max_rate": 10}})
+    result = ran(runner)
+    assert seen(runner, "out") == [0, 5, 10, 15]
+    assert seen(runner, "join") == [0, 5, 10, 15]
+    assert seen(runner, "total") == list(range(20)), "a stateful stage sees every accepted frame"
+    assert result.stats["stages"]["join"]["skips"] == {"no_demand": 16}
+
+
+def test_with_no_one_interested_only_stateful_stages_run(toy_runner: MakeRunner) -> None:
+    runner = toy_runner()
+    type_of_sink: Any = runner.pipeline.nodes["out"].component.cls
+    type_of_sink.wanted = False
+    ran(runner)
+    assert seen(runner, "join") == []
+    assert seen(runner, "total") == list(range(20))
+
+
+def test_a_stage_that_no_sink_needs_is_not_built_and_the_user_is_told(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(sinks={"out": {"use": "OnlyLevel"}})
+    assert {node.id for node in runner.plan.pruned} == {"pulse", "heavy", "gated", "total", "join"}
+    assert "toy.yaml:" in runner.plan.warnings[0]
+    assert "no sink needs" in runner.plan.warnings[0]
+    ran(runner)
+    assert set(runner.nodes) == {"level", "out"}
+
+
+def test_an_absent_value_skips_who_requires_it_with_the_same_reason(toy_runner: MakeRunner) -> None:
+    stages = {"rare": {"use": "Rare"}, "heavy": {"in": {"level": "rare"}}, "gated": {"when": []}}
+    runner = toy_runner(stages)
+    result = ran(runner)
+    assert seen(runner, "heavy") == [i for i in range(20) if i % 3]
+    assert result.stats["stages"]["gated"]["skips"] == {"third": 7}
+    assert rows(runner)[3][4] == {"gated": "third"}
+
+
+# -- references -------------------------------------------------------------------------------------------
+
+
+def test_a_new_reference_resets_stateful_stages_between_two_frames(toy_runner: MakeRunner) -> None:
+    for cut in ({}, SEGMENTS["each"]):
+        runner = toy_runner({**cut, "capture": {"retake_at": 10}})
+        ran(runner)
+        totals = [row[2] for row in rows(runner)]
+        assert totals[9] == sum(range(10))
+        assert totals[19] == sum(range(10, 20))
+        assert runner.nodes["total"].instance.resets == 1
+
+
+def test_a_reference_image_is_seen_by_stateful_stages_and_by_no_sink(toy_runner: MakeRunner) -> None:
+    runner = toy_runner({"capture": {"preroll": True}})
+    result = ran(runner)
+    assert seen(runner, "total")[0] == -1
+    assert [row[0] for row in rows(runner)] == list(range(20))
+    assert result.stats["frames"] == 20
+
+
+# -- errors -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cut", [{}, SEGMENTS["each"]], ids=["default", "each"])
+@pytest.mark.parametrize("stage", ["level", "total", "join"])
+def test_a_stage_that_raises_ends_the_run_with_what_and_where(
+    toy_runner: MakeRunner, stage: str, cut: dict[str, Any]
+) -> None:
+    runner = toy_runner({**cut, stage: {**cut.get(stage, {}), "fail_at": 7}})
+    result = runner.run()
+    assert result.exit_code == 3
+    assert result.error is not None
+    assert f"{stage} failed at frame 7: ArithmeticError: cannot count 7" in result.error
+    assert "toys.py:" in result.error
+    assert "toy.yaml:" in result.error
+    assert "inputs: " in result.error
+    assert result.stats["end"].startswith(f"error: {stage} failed at frame 7")
+    if not cut:
+        assert [row[0] for row in rows(runner)] == list(range(7)), "what was done before is delivered"
+    for node in runner.nodes.values():
+        assert node.instance.closed == node.instance.opened == 1
+    assert runner.source.closed == 1
+
+
+def test_skipping_frames_has_a_budget(toy_runner: MakeRunner, caplog: pytest.LogCaptureFixture) -> None:
+    runner = toy_runner({"total": {"fail_at": 7, "on_error": {"action": "skip_frame", "budget": 2}}})
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        result = ran(runner)
+    assert rows(runner)[6][2] == 21
+    assert len(rows(runner)) == 20
+    assert rows(runner)[7][4]["total"] == "error"
+    assert result.stats["stages"]["total"]["errors"] == 1
+    assert "frame skipped (1 of 2)" in caplog.text
+
+    runner = toy_runner({"total": {"fail_from": 7, "on_error": {"action": "skip_frame", "budget": 2}}})
+    failed = runner.run()
+    assert failed.exit_code == 3
+    assert "budget of 2 skipped frames is used up" in str(failed.error)
+    assert [row[0] for row in rows(runner)] == list(range(9))
+
+
+def test_a_disabled_stage_lets_the_rest_go_on(toy_runner: MakeRunner) -> None:
+    runner = toy_runner({"gated": {"fail_at": 4, "on_error": "disable"}})
+    result = ran(runner)
+    assert [row[3] for row in rows(runner)].count(None) == 19
+    assert result.stats["stages"]["gated"]["skips"]["disabled"] == 7
+
+
+def test_a_failing_data_sink_ends_the_run_and_a_failing_viewer_does_not(toy_runner: MakeRunner) -> None:
+    result = toy_runner(sinks={"out": {"use": "Collect", "fail_at": 5}}).run()
+    assert result.exit_code == 3
+    assert "out failed at frame 5" in str(result.error)
+    runner = toy_runner(
+        sinks={
+            "out": {"use": "Collect"},
+            "view": {"use": "ThreadedCollect", "fail_at": 5, "on_error": "disable"},
+        }
+    )
+    ran(runner)
+    assert len(rows(runner)) == 20
+    assert len(rows(runner, "view")) == 5
+
+
+@pytest.mark.parametrize(
+    ("capture", "words"), [({"refuse": True}, "no such device"), ({"fail_at": 5}, "the cable came off")]
+)
+def test_a_failing_source_is_told_apart(toy_runner: MakeRunner, capture: dict[str, Any], words: str) -> None:
+    runner = toy_runner({"capture": capture})
+    result = runner.run()
+    assert result.exit_code == 4
+    assert words in str(result.error)
+    assert "capture" in str(result.error)
+    if "fail_at" in capture:
+        assert [row[0] for row in rows(runner)] == list(range(5))
+
+
+def test_an_error_while_closing_is_reported_and_the_others_are_closed(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(sinks={"bad": {"use": "BadClose"}, "out": {"use": "Collect"}})
+    result = runner.run()
+    assert result.exit_code == 3
+    assert "bad: closing failed: disk full" in str(result.error)
+    assert runner.nodes["out"].instance.closed == runner.source.closed == 1
+
+
+def test_what_cannot_be_opened_stops_the_run_and_what_was_opened_is_closed(toy_runner: MakeRunner) -> None:
+    runner = toy_runner()
+    cls: Any = runner.pipeline.nodes["join"].component.cls
+
+    def refuse(_: Any) -> None:
+        raise OSError("no licence")
+
+    cls.open = refuse
+    result = runner.run()
+    assert result.exit_code == 3
+    assert "join" in str(result.error)
+    assert "no licence" in str(result.error)
+    assert runner.nodes["level"].instance.closed == 1
+    assert runner.source.closed == 1
+
+
+# -- checks -----------------------------------------------------------------------------------------------
+
+
+def test_inputs_cannot_be_written_to_under_check(toy_runner: MakeRunner) -> None:
+    vandal = {"vandal": {"use": "Vandal"}, "heavy": {"in": {"level": "vandal"}}, "gated": {"when": []}}
+    result = toy_runner(vandal, check=True).run()
+    assert result.exit_code == 3
+    assert "read-only" in str(result.error)
+
+
+def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
+    stages = {
+        "bad": {"use": "BadShape"},
+        "vandal": {"use": "Vandal", "in": {"grid": "bad"}},
+        "gated": {"when": []},
+    }
+    result = toy_runner({**stages, "heavy": {"in": {"level": "vandal"}}}, check=True).run()
+    assert result.exit_code == 3
+    assert "port half: required shape (H, W) with H = 4, W = 6, got (2, 6)" in str(result.error)
+
+
+# -- live -------------------------------------------------------------------------------------------------
+
+
+def test_a_live_source_drops_rather_than_lags_and_counts_it(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(
+        {
+            "capture": {"realtime": True, "frames": 300, "pause": 0.001},
+            "heavy": {"seconds": 0.01},
+            "gated": {"when": []},
+        }
+    )
+    result = ran(runner)
+    got = [row[0] for row in rows(runner)]
+    assert got == sorted(set(got))
+    assert got[0] == 0, "the reference frame is never dropped"
+    assert result.stats["dropped"] > 0
+    assert len(got) + result.stats["dropped"] == 300
+    link = result.stats["links"]["capture->compute"]
+    assert link["policy"] == "latest"
+    assert link["drops"] + link["delivered"] == link["offered"] == 300
+
+
+def test_frames_that_one_branch_dropped_are_dropped_at_the_join(toy_runner: MakeRunner) -> None:
+    stages = {name: dict(body) for name, body in SEGMENTS["each"].items()}
+    stages["total"]["queue"] = {"capacity": 1, "when_full": "latest"}
+    stages["total"]["seconds"] = 0.005
+    runner = toy_runner({**stages, "capture": {"frames": 60}})
+    result = ran(runner)
+    got = [row[0] for row in rows(runner)]
+    assert got == sorted(set(got))
+    assert got == [i for i in seen(runner, "total") if i in set(got)]
+    for link in result.stats["links"].values():
+        assert link["offered"] == link["delivered"] + link["drops"]
+
+
+def test_the_run_stops_after_the_frames_asked_for(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(max_frames=6)
+    result = ran(runner)
+    assert [row[0] for row in rows(runner)] == list(range(6))
+    assert result.stats["end"] == "max_frames"
+
+
+def test_stopping_drains_what_is_under_way(toy_runner: MakeRunner) -> None:
+    runner = toy_runner({"capture": {"frames": 10_000, "pause": 0.001}, "heavy": {"seconds": 0.002}})
+    done: list[RunResult] = []
+    thread = threading.Thread(target=lambda: done.append(runner.run()))
+    thread.start()
+    while runner.progress().frames < 20:
+        time.sleep(0.005)
+    runner.stop("signal")
+    thread.join(20)
+    assert done[0].exit_code == 0
+    assert done[0].stats["end"] == "signal"
+    got = [row[0] for row in rows(runner)]
+    assert got == list(range(done[0].stats["frames"])), "every captured frame was finished"
+
+
+def test_a_stage_that_hangs_is_named(toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 0.2)
+    runner = toy_runner({"join": {"seconds": 60}, "capture": {"frames": 3}})
+    result = runner.run()
+    assert result.exit_code == 3
+    assert "compute (in join) hangs" in str(result.error)
+    runner.nodes["join"].instance.release.set()
+    for thread in runner._threads.values():
+        thread.join(5)
+
+
+# -- the graph --------------------------------------------------------------------------------------------
+
+
+def test_segments_that_feed_each_other_in_a_circle_are_refused(toy_runner: MakeRunner) -> None:
+    with pytest.raises(Exception, match="circle") as caught:
+        toy_runner({"level": {"segment": "a"}, "heavy": {"segment": "b"}, "gated": {"segment": "a"}})
+    assert "toy.yaml:" in str(caught.value)
+    assert type(caught.value).__name__ == "ConfigError"
+
+
+def test_statistics_have_the_promised_shape(toy_runner: MakeRunner) -> None:
+    stats = ran(toy_runner()).stats
+    assert {"frames", "dropped", "wall_s", "end", "stages", "links", "latency_ms"} <= set(stats)
+    for stage in stats["stages"].values():
+        assert {"runs", "skips", "p50_ms", "p99_ms"} <= set(stage)
+    for link in stats["links"].values():
+        assert {"policy", "capacity", "high_water", "drops", "blocked_s"} <= set(link)
+    assert stats["latency_ms"]["p50"] <= stats["latency_ms"]["p99"]

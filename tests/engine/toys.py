@@ -1,0 +1,230 @@
+"""A small graph of counting stages for the engine's tests. Copied beside each test's pipeline file."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.frame import Absent, Frame, Tick
+from tactflow.engine.stage import ArrayPort, SignalPort, StageParams
+
+Grid = Annotated[NDArray[np.uint8], ArrayPort("grid", ("H", "W"), "uint8", "1")]
+Active = Annotated[bool, SignalPort("active", closed="idle")]
+
+
+@dataclass(frozen=True)
+class Number:
+    value: float
+
+
+class Ramp:
+    """A source whose frame i shows the number i everywhere."""
+
+    class Params(StageParams):
+        source: str = "ramp"
+        realtime: bool = False
+        frames: int = 20
+        fail_at: int = -99
+        refuse: bool = False
+        pause: float = 0.0
+        retake_at: int = -1
+        preroll: bool = False
+
+    def __init__(self, params: Params, sensor: str) -> None:
+        self.params, self.sensor = params, sensor
+        self.live = params.realtime
+        self.stopped = threading.Event()
+        self.closed = 0
+
+    def open(self) -> None:
+        if self.params.refuse:
+            raise OSError("no such device")
+
+    def frames(self) -> Iterator[Frame]:
+        epoch = 0
+        if self.params.preroll:
+            yield self.frame(-1, 0)
+        for seq in range(self.params.frames):
+            if self.stopped.wait(self.params.pause):
+                return
+            if seq == self.params.fail_at:
+                raise OSError("the cable came off")
+            epoch += seq == self.params.retake_at
+            yield self.frame(seq, epoch)
+
+    def frame(self, seq: int, epoch: int) -> Frame:
+        image = np.full((4, 6, 3), max(seq, 0) % 256, np.uint8)
+        image.flags.writeable = False
+        return Frame(self.sensor, seq, seq / 50, image, time.perf_counter(), seq <= 0, epoch)
+
+    def stop(self) -> None:
+        self.stopped.set()
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class Counted:
+    """Counts calls and life-cycle events."""
+
+    memory = "pure"
+
+    class Params(StageParams):
+        fail_at: int = -99
+        fail_from: int = 10**9
+        seconds: float = 0.0
+
+    def __init__(self, params: Params) -> None:
+        self.params = params
+        self.seen: list[int] = []
+        self.opened = self.closed = self.resets = 0
+        self.release = threading.Event()
+
+    def open(self) -> None:
+        self.opened += 1
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def saw(self, seq: int) -> None:
+        if self.params.seconds:
+            self.release.wait(self.params.seconds)
+        if seq == self.params.fail_at or seq >= self.params.fail_from:
+            raise ArithmeticError(f"cannot count {seq}")
+        self.seen.append(seq)
+
+
+class LevelPorts(NamedTuple):
+    level: Number
+    grid: Grid
+
+
+class Level(Counted):
+    def process(self, frame: Frame) -> LevelPorts:
+        self.saw(frame.seq)
+        return LevelPorts(Number(float(frame.seq)), frame.image[:, :, 0].copy())
+
+
+class ActivePorts(NamedTuple):
+    active: Active
+
+
+class Pulse(Counted):
+    """True in frames 3 to 6 of every ten."""
+
+    def process(self, frame: Frame) -> ActivePorts:
+        self.saw(frame.seq)
+        return ActivePorts(3 <= frame.seq % 10 <= 6)
+
+
+class HeavyPorts(NamedTuple):
+    heavy: Number
+
+
+class Heavy(Counted):
+    def process(self, level: Number) -> HeavyPorts:
+        self.saw(int(level.value))
+        return HeavyPorts(Number(level.value**2))
+
+
+class GatedPorts(NamedTuple):
+    gated: Number
+
+
+class Gated(Counted):
+    def process(self, heavy: Number) -> GatedPorts:
+        self.saw(int(heavy.value**0.5))
+        return GatedPorts(Number(heavy.value + 0.5))
+
+
+class TotalPorts(NamedTuple):
+    total: Number
+
+
+class Total(Counted):
+    memory = "stateful"
+    value = 0.0
+
+    def process(self, level: Number) -> TotalPorts:
+        self.saw(int(level.value))
+        self.value += level.value
+        return TotalPorts(Number(self.value))
+
+    def reset(self) -> None:
+        self.value = 0.0
+        self.resets += 1
+
+
+class JoinPorts(NamedTuple):
+    joined: Number
+
+
+class Join(Counted):
+    def process(self, level: Number, total: Number, gated: Number | None) -> JoinPorts:
+        self.saw(int(level.value))
+        return JoinPorts(Number(level.value + 1000 * total.value + (gated.value if gated else -7.0)))
+
+
+class Rare(Counted):
+    """Gives nothing in every third frame."""
+
+    def process(self, level: Number) -> Number | Absent:
+        self.saw(int(level.value))
+        return Absent("third") if level.value % 3 == 0 else level
+
+
+class Vandal(Counted):
+    """Writes into its input, which a stage must not do."""
+
+    def process(self, grid: Grid) -> Number:
+        grid[0, 0] = 99
+        return Number(0.0)
+
+
+class BadShape(Counted):
+    def process(
+        self, grid: Grid
+    ) -> Annotated[NDArray[np.uint8], ArrayPort("half", ("H", "W"), "uint8", "1")]:
+        return grid[:2].copy()
+
+
+class Collect(Counted):
+    """A sink that keeps what it gets."""
+
+    wanted = True
+
+    def __init__(self, params: Counted.Params) -> None:
+        super().__init__(params)
+        self.rows: list[tuple[int, float | None, float | None, float | None, dict[str, str]]] = []
+
+    def write(self, tick: Tick, joined: Number | None, total: Number | None, gated: Number | None) -> None:
+        self.saw(tick.frame.seq)
+        values = (None if n is None else n.value for n in (joined, total, gated))
+        self.rows.append((tick.frame.seq, *values, dict(tick.skipped)))
+
+    def wants(self) -> bool:
+        return self.wanted
+
+
+class ThreadedCollect(Collect):
+    threaded = True
+    when_live = "latest"
+
+
+class OnlyLevel(Counted):
+    """A sink that asks for little."""
+
+    def write(self, tick: Tick, level: Number) -> None:  # noqa: ARG002 (the port must be asked for)
+        self.saw(tick.frame.seq)
+
+
+class BadClose(OnlyLevel):
+    def close(self) -> None:
+        super().close()
+        raise OSError("disk full")
