@@ -12,6 +12,7 @@ from tactflow.ports import Image
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
+Row = Annotated[list[float], Field(min_length=3, max_length=3)]
 Corners = Annotated[list[Point], Field(min_length=4, max_length=4)]
 Pixels = Annotated[int, Field(ge=1, le=32767)]
 
@@ -19,8 +20,8 @@ Pixels = Annotated[int, Field(ge=1, le=32767)]
 class Undistort(StageParams):
     """A lens calibration from `cv2.calibrateCamera`, or from `cv2.fisheye.calibrate`."""
 
-    camera_matrix: list[list[float]] = Field(
-        description="3 x 3, raw px: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+    camera_matrix: list[Row] = Field(
+        min_length=3, max_length=3, description="3 x 3, raw px: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
     )
     distortion: list[float] = Field(description="coefficients, 1: 4, 5, 8, 12 or 14 of them; fisheye: 4")
     fisheye: bool = Field(False, description="whether the coefficients are of the fisheye model")

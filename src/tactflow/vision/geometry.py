@@ -230,9 +230,8 @@ class Preprocessor:
         self.mapping: PixelMapping = PixelMapping((int(width), int(height)), size, matrix, lens)
         """Exact mapping between raw and processed pixels."""
         self._rotate = rotate
-        self._factor = downsample
         self._method = method
-        self._shrunk: NDArray[Any] | None = None
+        self._shrunk: list[NDArray[Any]] = []
         self._resampler: _Resampler | None = None
         if lens is not None or homography is not None:
             self._resampler = _Resampler(self.mapping if method == "area" else before_pyramid)
@@ -257,11 +256,11 @@ class Preprocessor:
         block: NDArray[Any] = image[self._block]
         if self._method == "pyramid" and self._levels:
             return self._pyramid(block if self._rotate == 0 else cv2.rotate(block, _ROTATIONS[self._rotate]))
-        if self._factor > 1:
+        if self._levels:
             block = self._shrink(block)
         if self._rotate:
             return cv2.rotate(block, _ROTATIONS[self._rotate])  # type: ignore[return-value]
-        if self._factor > 1:
+        if self._levels:
             return block
         if block.shape == image.shape:
             same = image.view()
@@ -270,14 +269,16 @@ class Preprocessor:
         return np.ascontiguousarray(block)
 
     def _shrink(self, block: NDArray[Any]) -> NDArray[Any]:
-        """Block averages; into a buffer of our own where rotation makes a fresh array out of it anyway."""
-        height, width = block.shape[:2]
-        size = (width // self._factor, height // self._factor)
-        if self._rotate == 0:
-            return cv2.resize(block, size, interpolation=cv2.INTER_AREA)
-        if self._shrunk is None:
-            self._shrunk = np.empty((size[1], size[0], 3), np.uint8)
-        return cv2.resize(block, size, dst=self._shrunk, interpolation=cv2.INTER_AREA)
+        """Block averages, by halving: three times as fast as one step of four, for 1/8 grey level of bias."""
+        for level in range(self._levels):
+            size = (block.shape[1] // 2, block.shape[0] // 2)
+            if level == self._levels - 1 and self._rotate == 0:
+                return cv2.resize(block, size, interpolation=cv2.INTER_AREA)
+            # What is halved or rotated afterwards can live in a buffer of our own.
+            if len(self._shrunk) <= level:
+                self._shrunk.append(np.empty((size[1], size[0], 3), np.uint8))
+            block = cv2.resize(block, size, dst=self._shrunk[level], interpolation=cv2.INTER_AREA)
+        return block
 
     def _pyramid(self, image: NDArray[Any]) -> NDArray[Any]:
         for _ in range(self._levels):

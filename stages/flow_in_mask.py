@@ -1,0 +1,39 @@
+"""Stage `flow_in_mask`: how the markers inside the contact move."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from tactflow.engine.stage import StageParams
+from tactflow.ports import ContactMask
+from tactflow.vision.flow import flow_in_mask
+from tactflow.vision.types import Flow, Markers
+
+
+class FlowInMask:
+    """Mean displacement, twist and press of the markers inside the contact (seed's `draw_flow_mask`)."""
+
+    memory = "pure"
+
+    class Params(StageParams):
+        """Which markers count as inside, and how they are averaged."""
+
+        dilate: float = Field(
+            8.0,
+            ge=0,
+            le=1000,
+            description="markers up to this far outside the contact count too, px; more markers make the "
+            "mean steadier and mix in gel that moves less",
+        )
+        method: Literal["mean", "seed"] = Field(
+            "mean", description="seed: the original's whole-pixel displacements and square dilation"
+        )
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+
+    def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
+        """The flow inside the contact; its mean is None where no marker is inside."""
+        return flow_in_mask(markers, contact_mask, dilate=self._params.dilate, method=self._params.method)
