@@ -61,6 +61,7 @@ class Jsonl:
         del sensor, directory
         self.params = params
         self._name = "standard output" if params.path == "-" else params.path
+        self.description = self._name
         self._file: BinaryIO | None = None
         self._pending: list[bytes] = []
         self._flushed = 0.0

@@ -71,6 +71,7 @@ class Zmq:
         del directory
         self.params = params
         self.endpoint = params.endpoint
+        self.description = params.endpoint
         self._topic = f"tactflow.{sensor} ".encode()
         # Sockets belong to one thread at a time: `wants` is called by another thread than `write`.
         self._lock = threading.Lock()
@@ -100,7 +101,8 @@ class Zmq:
             raise StageError(_bind_problem(self.params.endpoint, error)) from error
         self._context, self._socket = context, socket
         self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
-        log.info("publishing %s on %s", self._topic.decode().strip(), self.endpoint)
+        self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
+        log.info("publishing %s", self.description)
         self._wait_for_subscriber(self.params.wait_for_subscriber)
 
     def _wait_for_subscriber(self, seconds: float) -> None:

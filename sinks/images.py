@@ -1,0 +1,96 @@
+"""Images: every n-th annotated frame as a numbered file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+from pydantic import Field
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Tick
+from tactflow.engine.stage import StageParams
+from tactflow.ports import Picture
+
+
+class Images:
+    """Writes pictures to `folder/frame-000036.png`, numbered by the frame's `seq`.
+
+    The picture comes from the port `annotated`. `in: {annotated: inpaint.unmarked}` writes another port
+    instead, as long as it is a colour image.
+    """
+
+    threaded = True
+    when_live = "block"
+    observer = False
+
+    class Params(StageParams):
+        """Where to write, what kind of file, and how many."""
+
+        folder: str = Field(
+            "images", min_length=1, description="folder, relative to the current directory; created"
+        )
+        format: Literal["png", "jpg"] = Field("png", description="png keeps every bit, jpg is small and fast")
+        quality: int = Field(95, ge=1, le=100, description="of a jpg: 100 is best and largest")
+        every: int = Field(
+            1,
+            ge=1,
+            description="write the frames whose seq is a multiple of this (after a drop, the next one). The "
+            "others are drawn all the same; max_rate avoids that",
+        )
+        overwrite: bool = Field(
+            False, description="write into a folder that holds frame-*.png or .jpg already"
+        )
+
+    def __init__(self, params: Params) -> None:
+        """Prepare; nothing is written yet."""
+        self.params = params
+        self._folder = Path(params.folder).expanduser()
+        self.description = str(self._folder)
+        self._next = 0
+        self._files = 0
+        self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
+
+    def open(self) -> None:
+        """Create the folder.
+
+        Raises
+        ------
+        StageError
+            If it holds frames already and `overwrite` is not set, or cannot be created.
+        """
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            present = next(self._folder.glob("frame-*.[pj][np]g"), None)
+        except OSError as error:
+            raise StageError(f"{self._folder}: cannot be created: {error.strerror or error}") from error
+        if present is not None and not self.params.overwrite:
+            raise StageError(
+                f"{self._folder}: holds frames already ({present.name}, ...); set overwrite: true or give "
+                "another folder"
+            )
+
+    def counters(self) -> dict[str, int]:
+        """files : written so far."""
+        return {"files": self._files}
+
+    def write(self, tick: Tick, annotated: Picture) -> None:
+        """Write one file if it is this frame's turn.
+
+        Raises
+        ------
+        StageError
+            If it cannot be written.
+        """
+        seq, every = tick.frame.seq, self.params.every
+        if seq < self._next:
+            return
+        self._next = seq - seq % every + every
+        path = self._folder / f"frame-{seq:06d}.{self.params.format}"
+        _, data = cv2.imencode(path.suffix, annotated, self._options)
+        try:
+            path.write_bytes(data.tobytes())
+        except OSError as error:
+            raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        self._files += 1

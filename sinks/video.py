@@ -1,0 +1,228 @@
+"""Video: annotated frames as a file to watch."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import statistics
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Tick
+from tactflow.engine.stage import StageParams
+from tactflow.ports import Picture
+
+log = logging.getLogger("tactflow")
+
+CODECS = {".avi": "MJPG", ".mkv": "mp4v", ".mp4": "mp4v", ".m4v": "mp4v", ".mov": "mp4v"}
+LOSSLESS_CODECS = {".avi": ("HFYU", "FFV1"), ".mkv": ("HFYU", "FFV1")}
+# The rate of the frames is not known before some have come; so many are held back to measure it.
+FRAMES_TO_MEASURE_RATE = 12
+MIN_FREE_BYTES = 16 << 20
+FRAMES_BETWEEN_DISK_CHECKS = 50
+
+
+class Video:
+    """Writes annotated frames to a video file; its extension chooses the codec.
+
+    The file plays at the pace at which the frames were captured: without `fps`, the rate is the median of
+    the first frames' time differences. Players show frames at a constant rate, so frames that a live run
+    dropped shorten the film. Pictures with an odd side get one more row or column (a copy of the last),
+    unless the codec is lossless: others would cut it off.
+    """
+
+    threaded = True
+    when_live = "block"
+    observer = False
+
+    class Params(StageParams):
+        """Where to write, and how."""
+
+        path: str = Field(
+            "annotated.avi",
+            description="file: .avi (MJPG), .mkv, .mp4, .m4v, .mov (MPEG-4); relative to the current "
+            "directory. An .avi survives a killed process, an .mp4 does not",
+        )
+        lossless: bool = Field(
+            False, description="keep every bit (HFYU, else FFV1; .avi or .mkv): about a third of the raw size"
+        )
+        fps: float | None = Field(
+            None, gt=0, le=1000, description="rate of the file, frames per second; default: as captured"
+        )
+        overwrite: bool = Field(False, description="replace an existing file")
+
+        @model_validator(mode="after")
+        def _known_extension(self) -> Video.Params:
+            known = LOSSLESS_CODECS if self.lossless else CODECS
+            suffix = Path(self.path).suffix.lower()
+            if suffix not in known:
+                kind = "a lossless video" if self.lossless else "a video"
+                raise ValueError(
+                    f"required a path that ends in {', '.join(known)} for {kind}, got {self.path!r}"
+                )
+            return self
+
+    def __init__(self, params: Params) -> None:
+        """Prepare; nothing is opened yet."""
+        self.params = params
+        self._path = Path(params.path).expanduser()
+        self.description = str(self._path)
+        self._codec = ""
+        self._held: list[tuple[float, Picture]] = []
+        self._writer: cv2.VideoWriter | None = None
+        self._size: tuple[int, int] | None = None
+        self._frames = 0
+
+    def open(self) -> None:
+        """Choose the codec and create the folder; the file itself follows with the first frames.
+
+        Raises
+        ------
+        StageError
+            If the file exists, its folder cannot be written, or this OpenCV cannot encode it (a lossless codec
+            is tried on a small picture and must give back every bit).
+        """
+        if self._path.exists() and not self.params.overwrite:
+            raise StageError(f"{self._path}: this file exists; set overwrite: true or give another path")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=self._path.parent, prefix=".tactflow-") as folder:
+                self._codec = self._choose_codec(Path(folder) / f"probe{self._path.suffix.lower()}")
+        except OSError as error:
+            raise StageError(f"{self._path}: cannot be written: {error.strerror or error}") from error
+
+    def _choose_codec(self, probe: Path) -> str:
+        suffix = probe.suffix
+        for codec in LOSSLESS_CODECS[suffix] if self.params.lossless else (CODECS[suffix],):
+            if _codec_works(probe, codec, exact=self.params.lossless):
+                return codec
+        kind = "losslessly" if self.params.lossless else "at all"
+        raise StageError(f"{self._path}: this OpenCV cannot encode {suffix} {kind}; try .avi or .mkv")
+
+    def counters(self) -> dict[str, int]:
+        """frames : written so far."""
+        return {"frames": self._frames}
+
+    def write(self, tick: Tick, annotated: Picture) -> None:
+        """Add one frame.
+
+        Raises
+        ------
+        StageError
+            If the picture changes its size, or the disk is nearly full.
+        """
+        size = (annotated.shape[1], annotated.shape[0])
+        if self._size is not None and size != self._size:
+            raise StageError(
+                f"{self._path}: a video has one size, {self._size[0]} x {self._size[1]}, but this frame is "
+                f"{size[0]} x {size[1]}"
+            )
+        self._size = size
+        if self._writer is None:
+            self._held.append((tick.frame.t, annotated))
+            if self.params.fps is not None or len(self._held) >= FRAMES_TO_MEASURE_RATE:
+                self._start()
+        else:
+            self._add(annotated)
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises
+        ------
+        StageError
+            If fewer frames can be found in it than were written.
+        """
+        try:
+            if self._held:
+                self._start()
+        finally:
+            written = self._writer is not None
+            if self._writer is not None:
+                self._writer.release()
+                self._writer = None
+        if written and (found := count_frames(self._path)) < self._frames:
+            raise StageError(
+                f"{self._path}: only {found} of {self._frames} frames could be written; is the disk full?"
+            )
+
+    def _start(self) -> None:
+        assert self._size is not None
+        rate = self.params.fps or _rate([t for t, _ in self._held])
+        width, height = self._size if self.params.lossless else _even(self._size)
+        code = cv2.VideoWriter.fourcc(*self._codec)
+        self._writer = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, (width, height))
+        if not self._writer.isOpened():
+            raise StageError(f"{self._path}: cannot be written; may this folder be written to?")
+        log.info("%s: %d x %d, %g fps, %s", self._path, width, height, rate, self._codec)
+        held, self._held = self._held, []
+        for _, picture in held:
+            self._add(picture)
+
+    def _add(self, picture: Picture) -> None:
+        assert self._writer is not None
+        if self._frames % FRAMES_BETWEEN_DISK_CHECKS == 0:
+            self._check_disk()
+        if not self.params.lossless:
+            picture = _padded(picture)
+        self._writer.write(picture)
+        self._frames += 1
+
+    def _check_disk(self) -> None:
+        # The encoder does not tell anybody that a write failed.
+        if shutil.disk_usage(self._path.parent).free < MIN_FREE_BYTES:
+            raise StageError(f"{self._path}: the disk is full, after {self._frames} frames")
+
+
+def count_frames(path: Path) -> int:
+    """How many frames a video file says that it holds; 0 if it cannot be opened."""
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+    finally:
+        capture.release()
+
+
+def _rate(times: list[float]) -> float:
+    steps = [later - earlier for earlier, later in pairwise(times) if later > earlier]
+    return min(max(1.0 / statistics.median(steps), 0.01), 1000.0) if steps else 30.0
+
+
+def _even(size: tuple[int, int]) -> tuple[int, int]:
+    return size[0] + size[0] % 2, size[1] + size[1] % 2
+
+
+def _padded(picture: Picture) -> NDArray[np.uint8]:
+    height, width = picture.shape[:2]
+    if height % 2 == 0 and width % 2 == 0:
+        return picture
+    return np.asarray(
+        cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE), np.uint8
+    )
+
+
+def _codec_works(path: Path, codec: str, *, exact: bool) -> bool:
+    """Write two frames and read them again; with `exact` they must come back as they were."""
+    # Noise has detail in every channel: a codec that stores colour at half the resolution is found out.
+    frames = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), 30.0, (64, 48))
+    if not writer.isOpened():
+        return False
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        back = [capture.read() for _ in frames]
+    finally:
+        capture.release()
+    if not all(there for there, _ in back):
+        return False
+    return not exact or all(np.array_equal(a, b) for a, (_, b) in zip(frames, back, strict=True))

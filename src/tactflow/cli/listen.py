@@ -1,0 +1,164 @@
+"""`tactflow listen`: print what a running tactflow publishes."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections import deque
+from typing import Any
+
+from tactflow.client import DEFAULT_ENDPOINT, Subscriber
+from tactflow.engine.errors import ConfigError, SourceError
+
+HELP = "print what a running tactflow publishes"
+
+Message = dict[str, Any]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `listen`."""
+    parser.add_argument(
+        "endpoint",
+        nargs="?",
+        default=DEFAULT_ENDPOINT,
+        metavar="ENDPOINT",
+        help=f"default: {DEFAULT_ENDPOINT}",
+    )
+    parser.add_argument("--sensor", metavar="NAME", help="only this sensor; default: all")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="the messages as they are, one JSON object a line")
+    form.add_argument("--table", action="store_true", help="a live table of the latest values, on a terminal")
+    parser.add_argument("--latest", action="store_true", help="skip what is out of date; keep up at any rate")
+    parser.add_argument("--count", type=_count, metavar="N", help="end after N messages")
+    parser.add_argument(
+        "--timeout",
+        type=_seconds,
+        metavar="S",
+        help="end when no message has come for S seconds; an error (exit code 4) if none came at all",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print until `--count`, `--timeout` or Ctrl-C; returns the exit code."""
+    if args.table and not sys.stdout.isatty():
+        raise ConfigError("--table needs a terminal; for a pipe or a file, leave it out or use --json")
+    try:
+        subscriber = Subscriber(args.endpoint, args.sensor, latest=args.latest, timeout=args.timeout)
+    except ValueError as error:
+        raise ConfigError(f"listen: {error}") from None
+    if sys.stderr.isatty():
+        print(f"listening to {args.endpoint}; Ctrl-C ends", file=sys.stderr)
+    show = _table if args.table else _json_lines if args.json else _lines
+    with subscriber:
+        try:
+            show(subscriber, math.inf if args.count is None else args.count)
+        except TimeoutError as error:
+            if subscriber.received == 0:
+                raise SourceError(f"listen: {error}") from None
+        except KeyboardInterrupt:
+            pass
+    return 0
+
+
+def describe(message: Message) -> str:
+    """A result message in one line for people."""
+    contact, flow, markers = message["contact"], message["flow"], message["markers"]
+    parts = [f"{message['sensor']} {message['seq']}", f"t {message['t']:.3f} s"]
+    if contact is not None:
+        parts.append(f"contact {contact['area']:.0f} px^2 at {_pair(contact['center'], '.1f')}")
+        parts.append(f"angle {_angle(contact['angle'])}")
+    else:
+        parts.append(_missing("contact", message, "no contact"))
+    if flow is not None:
+        mean = "-" if flow["mean"] is None else f"{_pair(flow['mean'], '+.2f')} px"
+        parts.append(f"flow {mean} of {flow['count']}")
+    if markers is not None:
+        status = markers["status"]
+        parts.append(f"markers {status.count('tracked')}/{len(status)}")
+    return "  ".join(parts)
+
+
+def _missing(port: str, message: Message, usual: str) -> str:
+    reason = message["skipped"].get(port, "no_contact")
+    return usual if reason == "no_contact" else f"no {port} ({reason})"
+
+
+def _pair(pair: list[float], form: str) -> str:
+    return f"({pair[0]:{form}}, {pair[1]:{form}})"
+
+
+def _angle(angle: float | None) -> str:
+    return "-" if angle is None else f"{angle:.1f} deg"
+
+
+def _lines(subscriber: Subscriber, count: float) -> None:
+    lost = 0
+    while subscriber.received < count:
+        line = describe(subscriber.receive())
+        if subscriber.lost > lost:
+            line += f"  ({subscriber.lost - lost} lost)"
+            lost = subscriber.lost
+        print(line, flush=True)
+
+
+def _json_lines(subscriber: Subscriber, count: float) -> None:
+    out = sys.stdout.buffer
+    while subscriber.received < count:
+        out.write(subscriber.receive_json() + b"\n")
+        out.flush()
+
+
+def _table(subscriber: Subscriber, count: float) -> None:
+    from rich.live import Live
+    from rich.table import Table
+
+    rows: dict[str, tuple[Message, deque[float]]] = {}
+
+    def table() -> Table:
+        result = Table("sensor", "seq", "contact", "area, px^2", "angle, deg", "flow, px", "markers", "Hz")
+        for sensor, (message, arrivals) in sorted(rows.items()):
+            result.add_row(sensor, *_cells(message), _rate(arrivals))
+        result.caption = f"{subscriber.received} received, {subscriber.lost} lost"
+        return result
+
+    with Live(table(), get_renderable=table, refresh_per_second=10):
+        while subscriber.received < count:
+            message = subscriber.receive()
+            arrivals = rows.get(message["sensor"], (message, deque[float](maxlen=60)))[1]
+            arrivals.append(time.monotonic())
+            rows[message["sensor"]] = (message, arrivals)
+
+
+def _cells(message: Message) -> list[str]:
+    contact, flow, markers = message["contact"], message["flow"], message["markers"]
+    return [
+        str(message["seq"]),
+        "no" if contact is None else _pair(contact["center"], ".1f"),
+        "" if contact is None else f"{contact['area']:.0f}",
+        "" if contact is None else _angle(contact["angle"]).removesuffix(" deg"),
+        "" if flow is None or flow["mean"] is None else _pair(flow["mean"], "+.2f"),
+        "" if markers is None else f"{markers['status'].count('tracked')}/{len(markers['status'])}",
+    ]
+
+
+def _rate(arrivals: deque[float]) -> str:
+    span = arrivals[-1] - arrivals[0]
+    return f"{(len(arrivals) - 1) / span:.0f}" if span > 0 else ""
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"required a whole number from 1, got {text!r}")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (0 < value < math.inf):
+        raise argparse.ArgumentTypeError(f"required a number of seconds above 0, got {text!r}")
+    return value

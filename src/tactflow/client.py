@@ -1,0 +1,141 @@
+"""A subscriber for programs that use what a running tactflow publishes.
+
+>>> from tactflow.client import Subscriber
+>>> with Subscriber(latest=True, timeout=5) as messages:      # doctest: +SKIP
+...     for message in messages:
+...         print(message["seq"], message["contact"])
+
+Nothing here needs OpenCV, or tactflow itself: the same few lines work over plain ZeroMQ in any language.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any
+
+import orjson
+import zmq
+
+DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
+"""Where tactflow publishes unless its pipeline says otherwise."""
+
+
+class Subscriber:
+    """Receives result messages (`tactflow.frame/1`) as dicts; a context manager and an iterator.
+
+    Belongs to one thread at a time. Connecting does not wait: it does not matter whether tactflow is started
+    before or after; only messages published after the connection stands are received.
+
+    Parameters
+    ----------
+    endpoint : address that tactflow publishes on.
+    sensor : receive only this sensor; None for all.
+    latest : keep only the newest message: for control loops, which want the present and not what is waiting.
+        Otherwise every message waits until it is read.
+    timeout : s without any message after which waiting ends in a TimeoutError; None waits for ever.
+
+    Attributes
+    ----------
+    lost : frames missing between the messages received so far, told by gaps in `seq`: those that tactflow
+        dropped to stay live, those that did not fit a queue on the way, and with `latest` those skipped.
+    received : messages received so far.
+
+    Raises
+    ------
+    ValueError
+        If the endpoint is no address.
+    """
+
+    def __init__(
+        self,
+        endpoint: str = DEFAULT_ENDPOINT,
+        sensor: str | None = None,
+        latest: bool = False,
+        timeout: float | None = None,
+    ) -> None:
+        self.endpoint = endpoint
+        self.timeout = timeout
+        self.lost = 0
+        self.received = 0
+        self._sensor = sensor
+        self._last_seq: dict[str, int] = {}
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.linger = 0
+        # After a pause of the publisher, be back within a quarter of a second, and keep trying.
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 250)
+        if latest:
+            self._socket.setsockopt(zmq.CONFLATE, 1)
+        else:
+            self._socket.setsockopt(zmq.RCVHWM, 0)
+        # The space ends the topic: `main` is not to receive `main2`.
+        self._socket.subscribe(b"tactflow." if sensor is None else f"tactflow.{sensor} ".encode())
+        try:
+            self._socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            self.close()
+            raise ValueError(
+                f"required an address such as {DEFAULT_ENDPOINT}, got {endpoint!r}: {error.strerror}"
+            ) from None
+
+    def receive(self) -> dict[str, Any]:
+        """The next message; waits for it.
+
+        Raises
+        ------
+        TimeoutError
+            If nothing comes for `timeout` seconds.
+        """
+        message: dict[str, Any] = orjson.loads(self.receive_json())
+        self._count(message["sensor"], message["seq"])
+        return message
+
+    def receive_json(self) -> bytes:
+        """The next message as it was sent, JSON in UTF-8; not counted in `lost`. Raises as `receive`."""
+        deadline = None if self.timeout is None else time.monotonic() + self.timeout
+        while True:
+            left = None if deadline is None else max(int((deadline - time.monotonic()) * 1000), 0)
+            if not self._socket.poll(left):
+                raise TimeoutError(self._silence())
+            # Someone else's message that shares the beginning of our topic has no JSON in it.
+            _, _, body = self._socket.recv().partition(b" ")
+            if body.startswith(b"{"):
+                self.received += 1
+                return body
+
+    def _silence(self) -> str:
+        what = f"no message from {self.endpoint} for {self.timeout:g} s"
+        if self.received:
+            return f"{what}; has the run ended?"
+        hint = "is tactflow running and publishing there"
+        return f"{what}; {hint}{f', and is its sensor called {self._sensor}' if self._sensor else ''}?"
+
+    def _count(self, sensor: str, seq: int) -> None:
+        last = self._last_seq.get(sensor)
+        # A smaller number than before means that tactflow was started again.
+        if last is not None and seq > last + 1:
+            self.lost += seq - last - 1
+        self._last_seq[sensor] = seq
+
+    def close(self) -> None:
+        """Disconnect. May be called twice."""
+        self._socket.close()
+        self._context.term()
+
+    def __enter__(self) -> Subscriber:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        while True:
+            yield self.receive()
