@@ -6,6 +6,7 @@ the same plane. Everything is closed-form or solved to machine precision, so tha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import cv2
@@ -64,20 +65,22 @@ class Camera:
             return np.array(raw, dtype=np.float64)
         offset = (np.asarray(raw, dtype=np.float64) - self._center) / self._half_diagonal
         grown = offset * (1.0 + self._k * np.sum(offset * offset, axis=-1, keepdims=True))
-        return project(self._inverse, grown * self._half_diagonal + self._center)
+        straight: Points = grown * self._half_diagonal + self._center
+        return project(self._inverse, straight)
 
     def to_raw(self, gel: Points) -> Points:
         """Raw pixel positions (N, 2) float64 of gel coordinates (N, 2)."""
         if self.identity:
             return np.array(gel, dtype=np.float64)
-        offset = project(self._homography, np.asarray(gel, dtype=np.float64)) - self._center
-        offset /= self._half_diagonal
+        straight = project(self._homography, np.asarray(gel, dtype=np.float64))
+        offset: Points = (straight - self._center) / self._half_diagonal
         if self._k:
             radius = np.sqrt(np.sum(offset * offset, axis=-1))
             solved = radius.copy()
             for _ in range(12):  # Newton; quadratic, so a dozen steps reach machine precision
                 solved -= (solved * (1.0 + self._k * solved**2) - radius) / (1.0 + 3.0 * self._k * solved**2)
-            offset *= np.where(radius > 0, solved / np.where(radius > 0, radius, 1.0), 1.0)[..., None]
+            shrink = np.divide(solved, radius, out=np.ones_like(radius), where=radius > 0)
+            offset = offset * shrink[..., None]
         return offset * self._half_diagonal + self._center
 
     def local_inverse(self, gel: Points) -> NDArray[np.float64]:
@@ -136,17 +139,17 @@ def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), dtype=np.uint8)
 
 
-def delivered_frames(count: int, dropped: float, repeated: float, seed: int) -> NDArray[np.int64]:
-    """(count,) int64: which moment of the scene the camera delivers as frame i.
+def delivered_frames(count: int, dropped: float, repeated: float, seed: int) -> Sequence[int]:
+    """(count,): which moment of the scene the camera delivers as frame i.
 
     dropped, repeated : fractions in [0, 0.9]. A dropped moment is never delivered (the next frame comes in
     its place); a repeated one is delivered twice, bit for bit.
     """
     if not dropped and not repeated:
-        return np.arange(count, dtype=np.int64)
+        return range(count)
     draw = np.random.default_rng([seed, 0x6472]).random((count, 2))
     steps = np.ones(count, dtype=np.int64)
     steps[draw[:, 0] < dropped] = 2
     steps[draw[:, 1] < repeated] = 0
     steps[0] = 0
-    return np.cumsum(steps)
+    return [int(moment) for moment in np.cumsum(steps)]

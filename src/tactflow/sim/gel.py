@@ -1,12 +1,13 @@
 """The gel: where an indenter touches it, what its surface looks like, and how its markers move.
 
-Contact. A soft surface gives way before it is touched: around a ball pressed by d it sinks, and at the rim of
-the contact it has sunk by d / 2 (Hertz; Johnson, Contact Mechanics, 1985, ch. 4), so that the contact radius is
-sqrt(R d) and not the sqrt(2 R d) of the geometric overlap. The same rule is used for every shape: the contact is
-where the indenter reaches deeper than half of its depth, and there the gel's surface is the indenter's surface.
-Around it the surface decays smoothly to rest, as the pyramid of Gaussians of Taxim (Si and Yuan, "Taxim: An
-Example-based Simulation Model for GelSight Tactile Sensors", RA-L 2022) makes it, but in closed form: with
-s = d / 2 it is s exp(reached / s - 1), which joins the contact with the same value and slope.
+Contact. A soft surface gives way before it is touched: around a ball pressed by d it sinks, and at the rim
+of the contact it has sunk by d / 2 (Hertz; Johnson, Contact Mechanics, 1985, ch. 4), so that the contact
+radius is sqrt(R d) and not the sqrt(2 R d) of the geometric overlap. The same rule is used for every shape:
+the contact is where the indenter reaches deeper than half of its depth, and there the gel's surface is the
+indenter's surface. Around it the surface decays smoothly to rest, as the pyramid of Gaussians of Taxim (Si
+and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L 2022) makes it, but in
+closed form: with s = d / 2 it is s exp(FALL (reached / s - 1)). For a ball this is within 0.05 d of Hertz's
+surface up to 1.5 contact radii, and falls faster beyond, as on a gel that is thin and backed by a plate.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from tactflow.sim.shapes import Array, Shape
 
 SINK_IN = 0.5
 """Share of the depth by which the gel has sunk at the rim of a contact."""
+FALL = 0.55
+"""Slope of the surface just outside a contact, relative to just inside: the crease at the rim."""
 TOUCH_DEPTH = 0.25
 """Depth below which an indenter does not count as touching, px."""
 SHEAR_SPREAD = 110.0
@@ -72,17 +75,17 @@ def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_
 def surface(press: Press, depth: Array) -> Array:
     """How far the gel's surface has sunk, px >= 0, from the depth that `reached` gives."""
     sink = np.float32(SINK_IN * press.depth)
-    outside = sink * np.exp(np.minimum(depth, sink) / sink - np.float32(1.0))
+    outside = sink * np.exp(np.float32(FALL) * (np.minimum(depth, sink) / sink - np.float32(1.0)))
     return np.maximum(depth, outside)
 
 
 def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 2) float64 displacement, px, of gel points whose rest positions (N, 2) are given.
 
-    Press pushes the gel apart, shear drags it along, twist turns it about the contact, each with a Gaussian decay
-    around the contact, after FOTS (Zhao et al., RA-L 2024). Shear and twist act in full within the push's spread
-    around the shape and fade with `SHEAR_SPREAD` beyond; all fade together with the depth when the contact
-    is released. Bounded slopes (shear below 1.5 times the spread) keep the map free of folds.
+    Press pushes the gel apart, shear drags it along, twist turns it about the contact, each with a Gaussian
+    decay around the contact, after FOTS (Zhao et al., RA-L 2024). Shear and twist act in full within the
+    push's spread around the shape and fade beyond; all fade with the depth when the contact is released.
+    The spread grows with the shear so that its slope stays below 1: the gel never folds over.
     """
     moved = np.zeros_like(rest)
     for press in presses:
@@ -90,7 +93,8 @@ def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray
             continue
         grip = min(1.0, press.depth / (0.3 * press.shape.depth))
         grip = grip * grip * (3.0 - 2.0 * grip)
-        center = np.array([press.x - press.shear[0] * grip, press.y - press.shear[1] * grip])
+        shear = np.asarray(press.shear) * grip
+        center = np.array([press.x, press.y]) - shear
         angle = press.angle - press.twist * grip
         cos, sin = np.cos(angle), np.sin(angle)
         own_axes = np.array([[cos, -sin], [sin, cos]])
@@ -103,8 +107,11 @@ def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray
             away = local[:, None, :] - press.shape.sources[None, :, :]
             distance = np.sqrt(np.min(np.sum(away * away, axis=-1), axis=1))
             beyond = np.maximum(distance - press.shape.spread, 0.0)
-            weight = np.exp(-(beyond**2) / (2.0 * SHEAR_SPREAD**2))[:, None] * grip
-            turn = press.twist
-            rotation = np.array([[np.cos(turn) - 1.0, -np.sin(turn)], [np.sin(turn), np.cos(turn) - 1.0]])
-            moved += weight * (np.asarray(press.shear) + offset @ rotation.T)
+            spread = max(SHEAR_SPREAD, 1.2 * float(np.hypot(*shear)))
+            weight = np.exp(-(beyond**2) / (2.0 * spread**2))
+            turn = weight * press.twist * grip
+            # A turn by an angle that varies with the distance keeps areas; a faded displacement would not.
+            moved[:, 0] += offset[:, 0] * (np.cos(turn) - 1.0) - offset[:, 1] * np.sin(turn)
+            moved[:, 1] += offset[:, 0] * np.sin(turn) + offset[:, 1] * (np.cos(turn) - 1.0)
+            moved += weight[:, None] * shear
     return moved

@@ -1,9 +1,11 @@
 """How the gel is lit: the untouched gel, and how its light changes where the surface tilts.
 
-Three coloured lights graze the gel from three sides, so that each colour channel answers to the slope of the
-surface in one direction: photometric stereo as in GelSight (Yuan, Dong and Adelson, "GelSight: High-Resolution
-Robot Tactile Sensors for Estimating Geometry and Force", Sensors 2017). With the elevation e of a light and its
-horizontal direction t, a Lambertian surface of slope g answers (1 - cot(e) g . t) / sqrt(1 + |g|^2), 1 at rest.
+Three coloured lights graze the gel from three sides, so that each colour channel answers to the slope of
+the surface in one direction: photometric stereo as in GelSight (Yuan, Dong and Adelson, "GelSight:
+High-Resolution Robot Tactile Sensors for Estimating Geometry and Force", Sensors 2017). With the elevation e
+of a light and the horizontal direction t towards it, a Lambertian surface of height z and slope g = grad z
+answers (1 - cot(e) g . t) / sqrt(1 + |g|^2), which is 1 at rest. Seen from inside, where the camera sits,
+a pressed place is a hill.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ class Light:
 LIGHTS = {
     "photometric": Light(
         "three coloured lights; a contact answers with colour",
-        (325.0, 80.0, 205.0), (122.0, 136.0, 118.0), 0.5, 1.45, 0.25, 0.0,
+        (325.0, 80.0, 205.0), (122.0, 136.0, 118.0), 0.4, 1.9, 0.25, 0.0,
     ),
     "bright": Light(
         "white light; a contact brightens in all channels",

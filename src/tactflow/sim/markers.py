@@ -1,8 +1,8 @@
 """Markers on the gel: where they are printed, and how they are drawn with exact sub-pixel centres.
 
 A marker is drawn by evaluating its shape, blurred by the lens, at each pixel's centre. The edge is a logistic
-ramp of `EDGE` px standard deviation, close to that of a Gaussian point spread: smooth enough that sampling it at
-whole pixels moves its centre of gravity by less than 1e-4 px, wherever it lies.
+ramp of `EDGE` px standard deviation, close to that of a Gaussian point spread: smooth enough that sampling it
+at whole pixels moves its centre of gravity by less than 1e-3 px, wherever it lies.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def coverage(
     if shape == "square":
         return _ramp(r - np.abs(x), edge) * _ramp(r - np.abs(y), edge)
     if shape == "doubled":
-        half = np.float32(0.95 * radius)
+        half = np.float32(0.72 * radius)
         small = np.float32(0.72 * radius)
         left = _ramp(small - np.hypot(x + half, y), edge)
         right = _ramp(small - np.hypot(x - half, y), edge)
@@ -94,7 +94,7 @@ def coverage(
 
 def half_patch(radius: float, shape: str, scale: float = 1.0) -> int:
     """Pixels around a marker's centre, to each side, outside which it leaves no trace."""
-    extent = {"round": 1.0, "square": 1.4143, "doubled": 1.68}[shape]
+    extent = {"round": 1.0, "square": 1.4143, "doubled": 1.45}[shape]
     return int(np.ceil(radius * extent * scale + 5.0 * EDGE)) + 1
 
 
@@ -119,8 +119,8 @@ def draw(
     """
     padded_height, padded_width = canvas.shape[:2]
     anchor = np.rint(centers).astype(np.int64)
-    # A marker whose centre is outside still shows if its rim reaches in. Where its patch leaves the padding, the
-    # indices are clamped to the outermost padding, which nobody sees.
+    # A marker whose centre is outside still shows if its rim reaches in. Where its patch leaves the padding,
+    # the indices are clamped to the outermost padding, which nobody sees.
     reachable = np.all(anchor > -half, axis=1)
     reachable &= (anchor[:, 0] < padded_width - half) & (anchor[:, 1] < padded_height - half)
     span = np.arange(-half, half + 1)

@@ -23,9 +23,9 @@ class Programme:
     period : from one contact to the next. rise : from touch to full depth, and back. hold : time at depth.
     depths : relative depth of successive contacts. place : their mean position as a fraction of the frame;
     wander : how far from it they may be, px. angles : range of the indenter's angle, degrees.
-    shear : pitches by which the gel is dragged at most. twist : degrees by which it is turned at most.
-    travel : px by which the indenter slides during a hold. jumps : if true, the shear jumps to a new place every
-    third frame. creep : px per frame by which the gel is dragged. dilation : pitches by which a press pushes apart.
+    travel : px by which the indenter slides during a hold. jumps : if true, the gel is dragged to a new place
+    every third frame. creep : px per frame by which the gel is dragged. dilation : pitches by which a press
+    pushes the gel apart. single : one contact that lasts as long as the recording.
     """
 
     build: Callable[[float], tuple[Shape, ...]]
@@ -37,8 +37,6 @@ class Programme:
     place: tuple[float, float] = (0.5, 0.5)
     wander: tuple[float, float] = (190.0, 120.0)
     angles: tuple[float, float] = (0.0, 0.0)
-    shear: float = 0.12
-    twist: float = 0.0
     travel: float = 0.0
     jumps: bool = False
     creep: float = 0.0
@@ -94,7 +92,8 @@ def presses(
 ) -> tuple[tuple[Press, ...], int]:
     """The indenters at one moment, and the number of the contact they belong to (-1 between contacts).
 
-    moment : frame of the scene. frames : its length. depth : scales all depths. shear : pitches, twist : degrees.
+    moment : frame of the scene. frames : its length. depth : scales all depths. shear : pitches by which the
+        gel is dragged at most. twist : degrees by which it is turned at most.
     """
     start = max(1, round(0.1 * frames)) if frames > 1 else 1
     usable = frames - start - max(1, frames // 30)

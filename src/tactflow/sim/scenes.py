@@ -59,12 +59,16 @@ _SCENES: dict[str, _Recipe] = {
     "bent_cable": _Recipe("a cable that bends by 70 degrees", _CABLE, {"bend": 70.0}),
     "slide": _Recipe(
         "a ball drags the gel along until it slips, and slides over it",
-        motion.Programme(_sphere, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)),
+        motion.Programme(
+            _sphere, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)
+        ),
         {"shear": 0.9},
     ),
     "roll": _Recipe(
         "a ball rolls over the gel without dragging it",
-        motion.Programme(_sphere, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7)),
+        motion.Programme(
+            _sphere, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7)
+        ),
         {"shear": 0.0},
     ),
     "idle": _Recipe("nothing touches the gel", None),
@@ -89,7 +93,8 @@ _SCENES: dict[str, _Recipe] = {
         motion.Programme(_one(shapes.ring), wander=(150.0, 90.0), dilation=0.15),
     ),
     "text": _Recipe(
-        "raised letters", motion.Programme(_one(shapes.text), wander=(60.0, 110.0), angles=(-20.0, 20.0), dilation=0.1)
+        "raised letters",
+        motion.Programme(_one(shapes.text), wander=(60.0, 110.0), angles=(-20.0, 20.0), dilation=0.1),
     ),
     "screw": _Recipe(
         "a threaded rod: a contact in many pieces",
@@ -104,7 +109,8 @@ _SCENES: dict[str, _Recipe] = {
         motion.Programme(_sphere, place=(0.965, 0.5), wander=(25.0, 180.0)),
     ),
     "tap": _Recipe(
-        "contacts of a single frame", motion.Programme(_sphere, period=30, rise=0, hold=1, depths=(1.0, 0.6), shear=0.0)
+        "contacts of a single frame",
+        motion.Programme(_sphere, period=30, rise=0, hold=1, depths=(1.0, 0.6)),
     ),
     "spike": _Recipe(
         "contacts that come and go within five frames", motion.Programme(_sphere, period=24, rise=1, hold=3)
@@ -117,11 +123,13 @@ _SCENES: dict[str, _Recipe] = {
     "flicker": _Recipe("presses under flickering light", _PRESS, {"flicker": 0.06, "gain": 0.03}),
     "jumps": _Recipe(
         "a contact that drags the markers by up to 0.9 pitch between two frames",
-        motion.Programme(_one(shapes.box), wander=(120.0, 80.0), jumps=True, hold=36, period=72, dilation=0.1),
+        motion.Programme(
+            _one(shapes.box), wander=(120.0, 80.0), jumps=True, hold=36, period=72, dilation=0.1
+        ),
     ),
     "worn": _Recipe(
         "faded, missing and vanishing markers, and dirt",
-        motion.Programme(_sphere, shear=0.4),
+        _PRESS,
         {"worn": 0.3, "missing": 0.08, "dirty": 0.3, "vanish": 0.15, "shear": 0.4},
     ),
     "dense": _Recipe("520 small markers", _PRESS, {"markers": (26, 20), "shear": 0.6}),
@@ -224,7 +232,7 @@ class Scene:
         return f"<Scene {self.name}, {len(self)} frames>"
 
     def moment(self, index: int) -> int:
-        """Which moment of the scene frame `index` shows: differs from it where frames are dropped or repeated."""
+        """Which moment of the scene frame `index` shows; another where frames are dropped or repeated."""
         return int(self._delivered[self._checked(index)])
 
     def presses(self, index: int) -> tuple[gel.Press, ...]:
@@ -265,8 +273,9 @@ class Scene:
     def truth(self, index: int, mapping: Any = None) -> Truth:
         """What frame `index` really shows.
 
-        mapping : a `PixelMapping` or a `Preprocessor` of `tactflow.vision.geometry`; the truth is then given in
-            the coordinates of the processed frame, with the contact evaluated at its pixels' centres. None: raw.
+        mapping : a `PixelMapping` or a `Preprocessor` of `tactflow.vision.geometry`; the truth is then given
+            in the coordinates of the processed frame, with the contact evaluated at its pixels' centres, and
+            a `Preprocessor` also makes `unmarked` exactly as it makes the frame. None: raw.
         """
         moment = self.moment(index)
         pressed, cycle = self._contact(moment)
@@ -326,7 +335,7 @@ class Scene:
         raw_x, raw_y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         center = ((width - 1) / 2.0, (height - 1) / 2.0)
         half_diagonal = float(np.hypot(width, height)) / 2.0
-        dim = 0.55 if settings.polarity == "bright" else 1.0
+        dim = 0.65 if settings.polarity == "bright" else 1.0
         image = light.untouched_gel(self._light, raw_x, raw_y, center, half_diagonal, dim)
         if settings.texture:
             image *= light.texture((height, width), settings.texture, settings.seed)

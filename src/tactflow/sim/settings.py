@@ -167,5 +167,6 @@ def _grid(value: str) -> tuple[int, int]:
         if all(1 <= side <= KEYS["markers"].high for side in grid):
             return grid
     raise ValueError(
-        f"simulated sensor: required markers as columns x rows, like 10x8 (1 to 60 each), or none, got {value!r}"
+        "simulated sensor: required markers as columns x rows, like 10x8 (1 to 60 each), or none, "
+        f"got {value!r}"
     )

@@ -62,14 +62,13 @@ def _segment(half_length: float, count: int) -> NDArray[np.float64]:
 
 
 def sphere(radius: float = 130.0, depth: float = 20.0) -> Shape:
-    """A ball of `radius` px."""
+    """A ball of `radius` px, as the paraboloid that Hertz's theory puts in its place."""
 
     def gap(x: Array, y: Array) -> Array:
-        squared = np.minimum(x * x + y * y, np.float32(radius**2))
-        return np.asarray(np.float32(radius) - np.sqrt(np.float32(radius**2) - squared), dtype=np.float32)
+        return np.asarray((x * x + y * y) * np.float32(0.5 / radius), dtype=np.float32)
 
     contact = float(np.sqrt(radius * depth))
-    return Shape("sphere", gap, 3.2 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
+    return Shape("sphere", gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
 
 
 def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0, bend: float = 0.0) -> Shape:
@@ -89,8 +88,7 @@ def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0,
         else:
             along, across = x, y
         beyond = np.maximum(np.abs(along) - np.float32(half_length), 0)
-        squared = np.minimum(beyond * beyond + across * across, np.float32(radius**2))
-        return np.asarray(np.float32(radius) - np.sqrt(np.float32(radius**2) - squared), dtype=np.float32)
+        return np.asarray((beyond * beyond + across * across) * np.float32(0.5 / radius), dtype=np.float32)
 
     sources = _segment(half_length, 24)
     if abs(curvature) > 1e-9:
@@ -108,7 +106,7 @@ def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0) -
         away = np.sqrt(beyond * beyond + y * y + np.float32(9.0)) - np.float32(3.0)
         return np.asarray(away * np.float32(slope), dtype=np.float32)
 
-    return Shape("edge", gap, half_length + 90, depth, _segment(half_length, 12), 45.0)
+    return Shape("edge", gap, half_length + 150, depth, _segment(half_length, 12), 45.0)
 
 
 def _flank(outside: Array) -> Array:
@@ -136,10 +134,9 @@ def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape
 
     def gap(x: Array, y: Array) -> Array:
         across = np.hypot(x, y) - np.float32(radius)
-        squared = np.minimum(across * across, np.float32(tube**2))
-        return np.asarray(np.float32(tube) - np.sqrt(np.float32(tube**2) - squared), dtype=np.float32)
+        return np.asarray(across * across * np.float32(0.5 / tube), dtype=np.float32)
 
-    return Shape("ring", gap, radius + 3.2 * float(np.sqrt(tube * depth)), depth, np.zeros((1, 2)), radius)
+    return Shape("ring", gap, radius + 3.8 * float(np.sqrt(tube * depth)), depth, np.zeros((1, 2)), radius)
 
 
 def text(words: str = "TACT", depth: float = 11.0) -> Shape:

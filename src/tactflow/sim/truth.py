@@ -18,7 +18,7 @@ NO_DIRECTION = 0.02
 """Anisotropy (difference over sum of the principal second moments) below which a region has no direction."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Truth:
     """The truth about one frame. Coordinates as in `tactflow.vision.types`.
 
@@ -26,13 +26,15 @@ class Truth:
     contact_mask : (H, W) bool, true where the gel is in contact at the pixel's centre.
     center : (x, y) centroid of the contact region, px; None without a contact.
     angle : principal direction of the region, degrees in (-90, 90]; None for a disc and without a contact.
-    hull : (N, 2) float64, vertices of the convex hull of the region's pixel centres, in order; (0, 2) without.
+    hull : (N, 2) float64, vertices of the convex hull of the region's pixel centres, in order; (0, 2)
+        without a contact.
     area : of that hull, px^2.
+    depth : of the deepest indenter, raw px, 0 without a contact: how faint the contact is.
     origin : (N, 2) float64, markers on the untouched gel. position : (N, 2) float64, now. Markers that were
         never printed are not listed.
     visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, and not vanished.
-    mean_flow : (dx, dy), mean displacement of the visible markers whose position lies in the contact, px; None
-        where there are none.
+    mean_flow : (dx, dy), mean displacement of the visible markers whose position lies in the contact, px;
+        None where there are none.
     """
 
     touching: bool
@@ -45,7 +47,8 @@ class Truth:
     position: NDArray[np.float64]
     visible: NDArray[np.bool_]
     mean_flow: tuple[float, float] | None
-    _render: Callable[[], NDArray[np.uint8]] = field(repr=False, compare=False)
+    depth: float
+    _render: Callable[[], NDArray[np.uint8]] = field(repr=False)
 
     @cached_property
     def unmarked(self) -> NDArray[np.uint8]:
@@ -134,10 +137,13 @@ def measure(
         if mapping is None:
             return image
         if callable(mapping):
-            return np.asarray(getattr(mapping(image), "image", mapping(image)), dtype=np.uint8)
+            return np.array(mapping(image), dtype=np.uint8)
         return _resampled(image, mapping)
 
-    return Truth(touching, mask, center, angle, hull, area, origin, position, visible, mean_flow, render)
+    depth = max((press.depth for press in pressed), default=0.0) if touching else 0.0
+    return Truth(
+        touching, mask, center, angle, hull, area, origin, position, visible, mean_flow, depth, render
+    )
 
 
 def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
