@@ -28,9 +28,12 @@ STAGES: dict[str, dict[str, Any]] = {
 MakeRunner = Callable[..., Runner]
 
 
-@pytest.fixture()
+@pytest.fixture
 def toy_runner(tmp_path: Path) -> MakeRunner:
-    """Make a runner for the toy graph: `stages` are merged into it (None removes one), `sinks` are its sinks."""
+    """Make a runner for the toy graph.
+
+    `stages` are merged into it (None removes one); `sinks` are its sinks, one that collects by default.
+    """
     shutil.copy(TOYS, tmp_path / "toys.py")
 
     def make(

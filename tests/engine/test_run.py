@@ -401,6 +401,33 @@ def test_stopping_drains_what_is_under_way(toy_runner: MakeRunner) -> None:
     assert got == list(range(done[0].stats["frames"])), "every captured frame was finished"
 
 
+def test_a_paused_recording_waits_and_steps_frame_by_frame(toy_runner: MakeRunner) -> None:
+    runner = toy_runner({"capture": {"frames": 12}})
+    runner.pause(True)
+    thread = threading.Thread(target=runner.run)
+    thread.start()
+    for count in (1, 2, 3):
+        runner.step()
+        while "out" not in runner.nodes or len(rows(runner)) < count:
+            time.sleep(0.001)
+        assert [row[0] for row in rows(runner)] == list(range(count))
+    assert runner.paused
+    runner.pause(False)
+    thread.join(10)
+    assert [row[0] for row in rows(runner)] == list(range(12)), "nothing is lost by pausing"
+    assert runner.snapshot()["frames"] == 12
+
+
+def test_a_paused_run_can_be_stopped(toy_runner: MakeRunner) -> None:
+    runner = toy_runner()
+    runner.pause(True)
+    thread = threading.Thread(target=runner.run)
+    thread.start()
+    runner.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+
+
 def test_a_stage_that_hangs_is_named(toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 0.2)
     runner = toy_runner({"join": {"seconds": 60}, "capture": {"frames": 3}})

@@ -77,6 +77,9 @@ class Runner:
         self._source_stats = NodeStats()
         self._stopping = threading.Event()
         self._interrupted = False
+        self._turn = threading.Condition()
+        self._paused = False
+        self._steps = 0
         self._source: Any = None
 
     # -- life cycle ---------------------------------------------------------------------------------------
@@ -120,6 +123,8 @@ class Runner:
         with self._lock:
             self._end = self._end or reason
         self._stopping.set()
+        with self._turn:
+            self._turn.notify_all()
         if self._source is not None and hasattr(self._source, "stop"):
             self._source.stop()
 
@@ -137,6 +142,27 @@ class Runner:
         """Take the next frames as a new reference. From any thread."""
         if self._source is not None and hasattr(self._source, "retake"):
             self._source.retake()
+
+    def pause(self, paused: bool) -> None:
+        """Hold capturing, or go on. A recording waits; a live source's frames are let go. From any thread."""
+        with self._turn:
+            self._paused = paused
+            self._turn.notify_all()
+
+    @property
+    def paused(self) -> bool:
+        """Whether capturing is held."""
+        return self._paused
+
+    def step(self) -> None:
+        """While paused, let one frame through. From any thread."""
+        with self._turn:
+            self._steps += 1
+            self._turn.notify_all()
+
+    def snapshot(self) -> dict[str, Any]:
+        """The statistics so far. From any thread."""
+        return self._stats(time.perf_counter() - self._began)
 
     @property
     def source(self) -> Any:
@@ -166,7 +192,7 @@ class Runner:
 
     def _build(self, node: Node, kind: type[TactflowError]) -> Any:
         """Construct a node's class with what its constructor asks for, and open it."""
-        offered = {"sensor": self.pipeline.sensor, "directory": self.pipeline.directory}
+        offered = {"sensor": self.pipeline.sensor, "directory": self.pipeline.directory, "control": self}
         try:
             wanted = inspect.signature(node.component.cls).parameters
             extra = {name: value for name, value in offered.items() if name in wanted}
@@ -256,6 +282,8 @@ class Runner:
                     segment.current = None
                 if frame is None:
                     break
+                if not self._may_go_on():
+                    continue
                 self._source_stats.runs += 1
                 self._source_stats.durations.add(time.perf_counter() - began)
                 if frame.seq >= 0:
@@ -279,6 +307,17 @@ class Runner:
             self._stopping.set()
             for link, _ in segment.outputs:
                 link.close()
+
+    def _may_go_on(self) -> bool:
+        """Whether the frame just captured is to be handled; while paused, waits or lets it go."""
+        if not self._paused:
+            return True
+        with self._turn:
+            if not getattr(self._source, "live", False):
+                self._turn.wait_for(lambda: not self._paused or self._steps or self._stopping.is_set())
+            go = not self._paused or self._steps > 0
+            self._steps = max(0, self._steps - 1)
+            return go and not self._stopping.is_set()
 
     def _demand(self, sinks: Sequence[RunningNode], frame: Frame) -> frozenset[str]:
         """The sinks that want this frame; none wants a reference image that is not part of the source."""

@@ -1,0 +1,36 @@
+"""What a stage or sink may ask of the run it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+
+class Control(Protocol):
+    """A handle on the run, given to a stage or sink whose constructor has a parameter `control`.
+
+    All methods may be called from any thread and return at once.
+    """
+
+    def stop(self, reason: str = "signal") -> None:
+        """End the run soon: no more frames are captured, those under way are finished."""
+
+    def pause(self, paused: bool) -> None:
+        """Hold capturing, or go on. A recording waits; a live source's frames are let go."""
+
+    @property
+    def paused(self) -> bool:
+        """Whether capturing is held."""
+
+    def step(self) -> None:
+        """While paused, let one frame through."""
+
+    def retake_reference(self) -> None:
+        """Take the next frames as a new reference."""
+
+    def snapshot(self) -> Mapping[str, Any]:
+        """The run's statistics so far, as in the statistics file."""
+
+    @property
+    def source(self) -> Any:
+        """The source stage's instance."""
