@@ -64,8 +64,8 @@ class Camera:
         if self.identity:
             return np.array(raw, dtype=np.float64)
         offset = (np.asarray(raw, dtype=np.float64) - self._center) / self._half_diagonal
-        grown = offset * (1.0 + self._k * np.sum(offset * offset, axis=-1, keepdims=True))
-        straight: Points = grown * self._half_diagonal + self._center
+        grown = offset * (1.0 + self._k * np.square(offset).sum(axis=-1, keepdims=True))
+        straight = np.asarray(grown * self._half_diagonal + self._center, dtype=np.float64)
         return project(self._inverse, straight)
 
     def to_raw(self, gel: Points) -> Points:
@@ -81,7 +81,7 @@ class Camera:
                 solved -= (solved * (1.0 + self._k * solved**2) - radius) / (1.0 + 3.0 * self._k * solved**2)
             shrink = np.divide(solved, radius, out=np.ones_like(radius), where=radius > 0)
             offset = offset * shrink[..., None]
-        return offset * self._half_diagonal + self._center
+        return np.asarray(offset * self._half_diagonal + self._center, dtype=np.float64)
 
     def local_inverse(self, gel: Points) -> NDArray[np.float64]:
         """(N, 2, 2) derivative d gel / d raw at gel points (N, 2): how a small dot is deformed."""

@@ -1,13 +1,13 @@
 """The gel: where an indenter touches it, what its surface looks like, and how its markers move.
 
-Contact. A soft surface gives way before it is touched: around a ball pressed by d it sinks, and at the rim
-of the contact it has sunk by d / 2 (Hertz; Johnson, Contact Mechanics, 1985, ch. 4), so that the contact
-radius is sqrt(R d) and not the sqrt(2 R d) of the geometric overlap. The same rule is used for every shape:
-the contact is where the indenter reaches deeper than half of its depth, and there the gel's surface is the
-indenter's surface. Around it the surface decays smoothly to rest, as the pyramid of Gaussians of Taxim (Si
-and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L 2022) makes it, but in
-closed form: with s = d / 2 it is s exp(FALL (reached / s - 1)). For a ball this is within 0.05 d of Hertz's
-surface up to 1.5 contact radii, and falls faster beyond, as on a gel that is thin and backed by a plate.
+Contact. A soft surface gives way before it is touched. Around a ball of radius R pressed by d into a deep gel
+it has sunk by d / 2 at the rim of the contact, whose radius is sqrt(R d) (Hertz); a thin layer on a plate
+sinks only where it is touched, and the radius is the sqrt(2 R d) of the geometric overlap (Johnson, Contact
+Mechanics, 1985, ch. 4 and 5.8). The gel of a sensor is a layer of moderate depth: here it has sunk by
+`SINK_IN` d at the rim, and for every shape the contact is where the indenter reaches deeper than that. There
+the gel's surface is the indenter's surface. Around it the surface decays smoothly to rest, as the pyramid of
+Gaussians of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors",
+RA-L 2022) makes it, but in closed form: with s = SINK_IN d it is s exp(FALL (reached / s - 1)).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from tactflow.sim.shapes import Array, Shape
 
-SINK_IN = 0.5
+SINK_IN = 0.3
 """Share of the depth by which the gel has sunk at the rim of a contact."""
-FALL = 0.55
+FALL = 0.6
 """Slope of the surface just outside a contact, relative to just inside: the crease at the rim."""
 TOUCH_DEPTH = 0.25
 """Depth below which an indenter does not count as touching, px."""

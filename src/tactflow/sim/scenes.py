@@ -48,7 +48,7 @@ def _made(make: Any, sizes: tuple[tuple[str, Any], ...], _bend: float) -> tuple[
 
 
 def _pair(_bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.sphere(radius=95.0, depth=16.0), shapes.box(half_width=48.0, half_height=36.0, depth=11.0))
+    return (shapes.sphere(radius=70.0, depth=22.0), shapes.box(half_width=48.0, half_height=36.0, depth=11.0))
 
 
 _PRESS = motion.Programme(_sphere)

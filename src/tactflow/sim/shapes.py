@@ -61,7 +61,7 @@ def _segment(half_length: float, count: int) -> NDArray[np.float64]:
     return np.stack([np.linspace(-half_length, half_length, count), np.zeros(count)], axis=1)
 
 
-def sphere(radius: float = 130.0, depth: float = 20.0) -> Shape:
+def sphere(radius: float = 95.0, depth: float = 26.0) -> Shape:
     """A ball of `radius` px, as the paraboloid that Hertz's theory puts in its place."""
 
     def gap(x: Array, y: Array) -> Array:
