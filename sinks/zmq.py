@@ -40,7 +40,7 @@ class Zmq:
             description="address to bind: tcp://127.0.0.1:PORT for this machine only (* picks a free port), "
             "tcp://*:PORT for the network, ipc:///path",
         )
-        queue: int = Field(
+        backlog: int = Field(
             8,
             ge=1,
             description="messages that may wait for each subscriber; more bridges its pauses, fewer keep it "
@@ -91,7 +91,7 @@ class Zmq:
         """
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket = context.socket(zmq.XPUB)
-        socket.sndhwm = self.params.queue
+        socket.sndhwm = self.params.backlog
         socket.setsockopt(zmq.SNDBUF, self.params.send_buffer)
         try:
             socket.bind(self.params.endpoint)
