@@ -134,7 +134,8 @@ def _run_line(statistics: Mapping[str, Any]) -> str:
     latency = statistics["latency_ms"]
     return (
         f"the run: {statistics['frames']} frames in {statistics['wall_s']:.1f} s, "
-        f"{statistics['dropped']} dropped, latency p50 {_ms(latency['p50'])}, p99 {_ms(latency['p99'])}, end: {statistics['end']}"
+        f"{statistics['dropped']} dropped, latency p50 {_ms(latency['p50'])}, p99 {_ms(latency['p99'])}, "
+        f"end: {statistics['end']}"
     )
 
 
