@@ -155,8 +155,7 @@ def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
     )
     for shift in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         raw = np.asarray(mapping.to_raw(grid + shift), dtype=np.float32).reshape(height, width, 2)
-        sampled = cv2.remap(
-            image, raw, np.empty(0, np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        x, y = np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])
+        sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         total += sampled
     return np.rint(total / 4.0).astype(np.uint8)
