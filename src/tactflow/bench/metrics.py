@@ -189,6 +189,24 @@ def polygon_area(polygon: FloatArray) -> float:
     return float(abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2)
 
 
+def lattice_area(hull: FloatArray) -> float:
+    """Number of pixels whose centres lie in or on a polygon (N, 2) with corners on pixel centres, px^2.
+
+    This is the area of the convex region that those pixels make up; the polygon through their centres misses
+    half a pixel along the rim.
+
+    References
+    ----------
+    G. Pick, "Geometrisches zur Zahlenlehre", Lotos 19 (1899) 311-319.
+    """
+    if len(hull) == 0:
+        return 0.0
+    corners = np.rint(np.asarray(hull)).astype(np.int64)
+    edge = np.roll(corners, -1, axis=0) - corners
+    on_rim = int(np.gcd(np.abs(edge[:, 0]), np.abs(edge[:, 1])).sum())
+    return polygon_area(corners.astype(np.float64)) + on_rim / 2 + 1
+
+
 def _counter_clockwise(polygon: FloatArray) -> NDArray[np.float64]:
     points = np.asarray(polygon, dtype=np.float64)
     x, y = (points - points[0]).T

@@ -56,6 +56,7 @@ _ALL = [
     Quantity("angle_mean", "direction error, mean", "deg", slack=0.05),
     Quantity("angle_max", "direction error, maximum", "deg", slack=0.3),
     Quantity("angle_missing", "frames with a direction where none was given", "%", slack=1.0),
+    Quantity("angle_invented", "round contacts that were given a direction", "%", slack=2.0),
     Quantity("flow_error", "mean-flow error inside the contact, mean", "px", slack=0.02),
     Quantity("false_contacts", "idle frames called contact", "%", slack=0.0),
     Quantity("missed_contacts", "frames with contact missed", "%", slack=1.0),

@@ -532,7 +532,8 @@ def html(result: Result) -> str:
         "<p>Down and left is better. A dot is a method at its median over the scenes, its whisker reaches "
         'from the best scene to the worst; the <span class="on">blue line</span> is the Pareto front, the '
         '<span style="color:var(--limit)">dashed lines</span> are limits: the Cramér-Rao bound on a '
-        "position, and the time to read and write every byte of a raw frame once. Point at a dot for its numbers.</p>",
+        "position, and the time to read and write every byte of a raw frame once. Point at a dot for its "
+        "numbers.</p>",
         _plots(result),
         "<h2>Everything that was measured</h2>",
         _everything(result),

@@ -1,0 +1,226 @@
+"""Whole pipelines, taking turns frame by frame.
+
+Each pipeline runs in the real engine with all its nodes in one segment, so in one thread that reads a frame,
+computes, writes its JSON line, and comes back for the next frame. Here that thread is held at the source
+until it is its turn. So pipelines can be compared frame by frame (A B A B ...) in one process, and the
+measured time is everything a frame costs, reading and writing included, and nothing else.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import TactflowError
+from tactflow.engine.frame import Frame
+from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue, Ref
+from tactflow.engine.registry import resolve
+from tactflow.engine.run import Runner, RunResult
+from tactflow.engine.stage import Port, Ports, StageParams
+from tactflow.vision.geometry import PixelMapping
+from tactflow.vision.types import Contact, Flow, Markers
+
+_PATIENCE = 120.0
+"""How long one frame of one pipeline may take, s; a hanging plug-in must not hang the bench for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a pipeline said about one frame, and what that cost.
+
+    cpu, wall : s; reading the frame, computing, writing the line. The others as in the result message.
+    """
+
+    frame: Frame
+    contact: Contact | None
+    flow: Flow | None
+    markers: Markers | None
+    contact_mask: NDArray[np.uint8] | None
+    mapping: PixelMapping | None
+    cpu: float
+    wall: float
+
+
+class Collect:
+    """A sink that keeps the last values for the bench."""
+
+    def __init__(self, params: StageParams) -> None:
+        self.params = params
+        self.last: dict[str, Any] = {}
+
+    def write(self, **values: Any) -> None:
+        """Remember this frame's values."""
+        self.last = values
+
+
+class _Turns:
+    """Hands one turn at a time to the pipeline's thread, and takes it back with the time it took."""
+
+    def __init__(self) -> None:
+        self._go = threading.Semaphore(0)
+        self._done = threading.Semaphore(0)
+        self._ended = False
+        self.cpu = 0.0
+        self.wall = 0.0
+        self._start: tuple[float, float] | None = None
+
+    def take(self) -> bool:
+        """For the bench: let one frame through; False if there is none."""
+        self._go.release()
+        if not self._done.acquire(timeout=_PATIENCE):
+            raise TactflowError(f"one frame took more than {_PATIENCE:g} s")
+        return not self._ended
+
+    def wait(self) -> bool:
+        """For the pipeline's thread, in front of a frame: report the last one and wait. False to stop."""
+        if self._start is not None:
+            self.cpu = time.thread_time() - self._start[0]
+            self.wall = time.perf_counter() - self._start[1]
+            self._start = None
+            self._done.release()
+        self._go.acquire()
+        if self._ended:
+            return False
+        self._start = (time.thread_time(), time.perf_counter())
+        return True
+
+    def end(self) -> None:
+        """No more frames; from either side."""
+        self._ended = True
+        self._go.release()
+        self._done.release()
+
+
+class LockstepPipeline:
+    """One pipeline, run frame by frame.
+
+    Parameters
+    ----------
+    pipeline : as loaded; its source must be the recording to run on. Its sinks are replaced by `jsonl`.
+    jsonl : where the JSON lines go, or None for no JSON lines.
+    """
+
+    def __init__(self, pipeline: Pipeline, jsonl: Path | None) -> None:
+        self._turns = _Turns()
+        self._runner = Runner(_rewired(pipeline, jsonl, self._turns))
+        self._result: RunResult | None = None
+        self._thread = threading.Thread(target=self._run, name="tactflow-bench", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._result = self._runner.run()
+        finally:
+            self._turns.end()
+
+    def step(self) -> Outcome | None:
+        """Run the next frame; None at the end of the recording.
+
+        Raises
+        ------
+        TactflowError
+            If the pipeline failed.
+        """
+        if not self._turns.take():
+            self._thread.join(_PATIENCE)
+            if self._result is not None and self._result.error is not None:
+                raise TactflowError(self._result.error)
+            return None
+        last = self._runner.nodes[_COLLECT].instance.last
+        return Outcome(
+            frame=self._runner.source.last_frame,
+            contact=last.get("contact"),
+            flow=last.get("flow"),
+            markers=last.get("markers"),
+            contact_mask=last.get("contact_mask"),
+            mapping=last.get("mapping"),
+            cpu=self._turns.cpu,
+            wall=self._turns.wall,
+        )
+
+    def close(self) -> None:
+        """Stop, and wait for the pipeline's thread."""
+        self._runner.stop("max_frames")
+        self._turns.end()
+        self._thread.join(_PATIENCE)
+
+
+_COLLECT = "bench"
+
+
+def _lockstep_source(cls: type, turns: _Turns) -> type:
+    """The source class, held before every frame until it is its turn."""
+
+    class Lockstep(cls):  # type: ignore[misc]
+        last_frame: Frame | None = None
+
+        def frames(self) -> Iterator[Frame]:
+            frames = super().frames()
+            while turns.wait():
+                frame = next(frames, None)
+                if frame is None:
+                    return
+                self.last_frame = frame
+                yield frame
+
+    return Lockstep
+
+
+def _last_output(pipeline: Pipeline, name: str) -> Ref | None:
+    """The port of that name which comes last in the file, as a sink at its end would see it."""
+    found = None
+    for node in pipeline.nodes.values():
+        for port in node.component.ports.outputs:
+            if port.name == name:
+                found = Ref(node.id, name)
+    return found
+
+
+def _rewired(pipeline: Pipeline, jsonl: Path | None, turns: _Turns) -> Pipeline:
+    """The same graph in one segment, with the bench's source in front and its sinks behind."""
+    source = pipeline.source
+    segment = source.segment or "capture"
+    nodes: dict[str, Node] = {}
+    for node in pipeline.nodes.values():
+        if node.component.kind == "sink":
+            continue
+        node = replace(node, segment=segment, queue=Queue())
+        if node.id == source.id:
+            node = replace(
+                node, component=replace(node.component, cls=_lockstep_source(node.component.cls, turns))
+            )
+        nodes[node.id] = node
+    mark = Mark("bench", 0, 0)
+    if jsonl is not None:
+        component = resolve("jsonl", "sinks", pipeline.directory)
+        params = component.params.model_validate({"path": str(jsonl), "overwrite": True})
+        inputs = {port.name: _last_output(pipeline, port.name) for port in component.ports.inputs}
+        nodes["jsonl"] = Node("jsonl", component, params, inputs, mark, segment=segment)
+    wanted: Mapping[str, Any] = {
+        "contact": Contact,
+        "flow": Flow,
+        "markers": Markers,
+        "contact_mask": NDArray[np.uint8],
+        "mapping": PixelMapping,
+    }
+    collect = Component(
+        name=_COLLECT,
+        kind="sink",
+        cls=Collect,
+        params=StageParams,
+        ports=Ports([Port(name, annotation, optional=True) for name, annotation in wanted.items()], []),
+        memory="pure",
+        origin="bench",
+    )
+    inputs = {name: _last_output(pipeline, name) for name in wanted}
+    nodes[_COLLECT] = Node(
+        _COLLECT, collect, StageParams(), inputs, mark, segment=segment, on_error=OnError()
+    )
+    return replace(pipeline, nodes=nodes, opencv_threads=1)

@@ -1,0 +1,293 @@
+"""Each stage's methods alone, on the same inputs.
+
+The alternatives are whatever the stage's `method` parameter allows, so a new method is measured without
+anything being added here. A method that a shipped pipeline uses is given that pipeline's parameters. The
+inputs come from the default pipeline's stages, the same for every alternative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args, get_origin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.bench import metrics
+from tactflow.bench.results import Measurement
+from tactflow.bench.scenes import Rendered
+from tactflow.bench.score import ContactScore, DetectionScore, FlowScore, MarkerScore, RemovalScore
+from tactflow.bench.timing import CopyUnit, Samples, interleaved
+from tactflow.engine.frame import Absent, Frame
+from tactflow.engine.graph import Pipeline
+from tactflow.engine.stage import StageParams
+from tactflow.sim import Truth
+
+SEED = "seed"
+"""The name of the pipeline that is the yardstick."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """One way to do a stage's work. yardstick : whether the seed pipeline does it so."""
+
+    name: str
+    cls: type
+    params: StageParams
+    yardstick: bool = False
+
+    def build(self) -> Any:
+        """A fresh instance."""
+        return self.cls(self.params)
+
+
+def methods_of(params: type[StageParams]) -> list[str]:
+    """What the `method` parameter of a stage allows; empty where it has none."""
+    method = params.model_fields.get("method")
+    if method is None or get_origin(method.annotation) is not Literal:
+        return []
+    return [str(choice) for choice in get_args(method.annotation)]
+
+
+def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Alternative]:
+    """Every method of a stage, the default pipeline's own first.
+
+    Parameters
+    ----------
+    pipelines : name -> pipeline, the default one first, the yardstick under `SEED`.
+    stage : name of the stage (`use`).
+    """
+    found: dict[str, Alternative] = {}
+    for name, pipeline in pipelines.items():
+        for node in pipeline.nodes.values():
+            if node.component.name != stage:
+                continue
+            known = methods_of(node.component.params)
+            method = str(getattr(node.params, "method", stage))
+            if method not in found:
+                found[method] = Alternative(method, node.component.cls, node.params, name == SEED)
+            elif name == SEED:
+                found[method] = Alternative(method, node.component.cls, node.params, True)
+            for other in known:
+                if other not in found:
+                    params = node.params.model_copy(update={"method": other})
+                    found[other] = Alternative(other, node.component.cls, params)
+    return found
+
+
+@dataclass(slots=True)
+class _Inputs:
+    """What the stages of the default pipeline hand to each other for one frame."""
+
+    frame: Frame
+    truth: Truth
+    deep: bool
+    image: NDArray[np.uint8]
+    marker_mask: NDArray[np.uint8]
+    unmarked: NDArray[np.uint8]
+    contact_mask: NDArray[np.uint8]
+    markers: Any
+
+    @property
+    def kind(self) -> str:
+        if self.frame.reference:
+            return "reference"
+        return "contact" if self.truth.touching else "idle"
+
+
+def frames_of(rendered: Rendered, references: int = 1) -> Iterator[Frame]:
+    """The frames as the capture stage would hand them over."""
+    for index in range(len(rendered)):
+        image = np.array(rendered.frames[index])
+        image.flags.writeable = False
+        yield Frame("bench", index, index / rendered.scene.fps, image, reference=index < references)
+
+
+def _chain(pipeline: Pipeline, rendered: Rendered) -> list[_Inputs]:
+    """Run the default pipeline's stages by hand and keep everything in between."""
+    stage = {
+        node.component.name: node.component.cls(node.params)
+        for node in pipeline.nodes.values()
+        if node.component.kind == "stage"
+    }
+    collected = []
+    truths: list[Truth] | None = None
+    for index, frame in enumerate(frames_of(rendered)):
+        processed = stage["preprocess"].process(frame=frame)
+        if truths is None:
+            truths = rendered.truths(processed.mapping)
+        mask = stage["marker_mask"].process(image=processed.image)
+        unmarked = stage["inpaint"].process(image=processed.image, marker_mask=mask)
+        contact = stage["difference"].process(unmarked=unmarked, frame=frame)
+        markers = stage["tracker"].process(image=processed.image, frame=frame)
+        collected.append(
+            _Inputs(
+                frame,
+                truths[index],
+                rendered.deep(index),
+                processed.image,
+                mask,
+                unmarked,
+                contact.contact_mask,
+                markers,
+            )
+        )
+    return collected
+
+
+@dataclass(slots=True)
+class _Group:
+    """How one stage is fed and judged. `see` gets (score, inputs, result)."""
+
+    stage: str
+    feed: Callable[[_Inputs], dict[str, Any] | None]
+    score: Callable[[], Any]
+    see: Callable[[Any, _Inputs, Any], None]
+    group: str = field(default="")
+
+    def __post_init__(self) -> None:
+        self.group = self.group or self.stage
+
+
+def _see_contact(score: ContactScore, inputs: _Inputs, result: Any) -> None:
+    touching = bool(result.touching)
+    if score.detected(touching, inputs.truth, inputs.deep):
+        score.mask(result.contact_mask, inputs.truth)
+        score.centroid(result.contact_mask, inputs.truth)
+
+
+def _see_hull(score: ContactScore, inputs: _Inputs, result: Any) -> None:
+    found = not isinstance(result, Absent) and result is not None
+    if score.detected(found, inputs.truth, inputs.deep):
+        score.geometry(result, inputs.truth)
+
+
+def _see_mask(score: DetectionScore, inputs: _Inputs, result: NDArray[np.uint8]) -> None:
+    score.add(metrics.mask_centroids(result), inputs.truth)
+
+
+def _see_removal(score: RemovalScore, inputs: _Inputs, result: NDArray[np.uint8]) -> None:
+    score.add(result, inputs.truth.unmarked, inputs.marker_mask)
+
+
+def _see_markers(score: MarkerScore, inputs: _Inputs, result: Any) -> None:
+    if not isinstance(result, Absent):
+        score.add(result, inputs.truth)
+
+
+def _see_flow(score: FlowScore, inputs: _Inputs, result: Any) -> None:
+    score.add(None if isinstance(result, Absent) else result, inputs.truth)
+
+
+def _in_contact(inputs: _Inputs) -> bool:
+    return inputs.truth.touching and bool(inputs.contact_mask.any())
+
+
+_GROUPS = (
+    _Group("preprocess", lambda i: {"frame": i.frame}, DetectionScore, lambda *_: None),
+    _Group("marker_mask", lambda i: {"image": i.image}, DetectionScore, _see_mask),
+    _Group("inpaint", lambda i: {"image": i.image, "marker_mask": i.marker_mask}, RemovalScore, _see_removal),
+    _Group("difference", lambda i: {"unmarked": i.unmarked, "frame": i.frame}, ContactScore, _see_contact),
+    _Group(
+        "hull",
+        lambda i: {"contact_mask": i.contact_mask} if _in_contact(i) else None,
+        ContactScore,
+        _see_hull,
+    ),
+    _Group("tracker", lambda i: {"image": i.image, "frame": i.frame}, MarkerScore, _see_markers),
+    _Group(
+        "flow_in_mask",
+        lambda i: {"markers": i.markers, "contact_mask": i.contact_mask} if _in_contact(i) else None,
+        FlowScore,
+        _see_flow,
+    ),
+)
+
+
+def measure_methods(
+    pipelines: Mapping[str, Pipeline], rendered: Rendered, unit: CopyUnit, step: Callable[[], None]
+) -> list[Measurement]:
+    """Every method of every stage on one scene.
+
+    Parameters
+    ----------
+    pipelines : name -> pipeline; the first is the default one and provides the inputs.
+    rendered : the scene. unit : measured along the way. step : called once per stage.
+    """
+    default = next(iter(pipelines.values()))
+    inputs = _chain(default, rendered)
+    measurements: list[Measurement] = []
+    for group in _GROUPS:
+        ways = alternatives(pipelines, group.stage)
+        if len(ways) > 1 or (ways and group.stage in ("hull", "tracker")):
+            measurements += _measure_group(group, ways, inputs, rendered, unit)
+        step()
+    return measurements
+
+
+def _measure_group(
+    group: _Group,
+    ways: Mapping[str, Alternative],
+    inputs: Sequence[_Inputs],
+    rendered: Rendered,
+    unit: CopyUnit,
+) -> list[Measurement]:
+    instances = {name: way.build() for name, way in ways.items()}
+    scores = {name: group.score() for name in ways}
+    failures: dict[str, str] = {}
+
+    def call(name: str) -> Callable[[Any], Any]:
+        process = instances[name].process
+
+        def run(arguments: Any) -> Any:
+            if name in failures:
+                return None
+            try:
+                return process(**arguments[1])
+            except Exception as error:
+                failures[name] = f"{type(error).__name__}: {error}"
+                return None
+
+        return run
+
+    def see(name: str, _kind: Any, value: Any, result: Any) -> None:
+        if name not in failures:
+            group.see(scores[name], value[0], result)
+
+    def feed() -> Iterator[tuple[str, Any]]:
+        for item in inputs:
+            arguments = group.feed(item)
+            if arguments is not None:
+                unit.take()
+                yield item.kind, (item, arguments)
+
+    times = interleaved({name: call(name) for name in ways}, feed(), see=see)
+    yardstick = next((name for name, way in ways.items() if way.yardstick), None)
+    made = []
+    for name in ways:
+        measurement = Measurement(group.group, name, rendered.case.name, frames=len(inputs))
+        measurement.failure = failures.get(name)
+        if measurement.failure is None:
+            measurement.errors = scores[name].errors()
+            fill_times(measurement, times[name], unit, times[yardstick] if yardstick else None)
+        made.append(measurement)
+    return made
+
+
+def fill_times(
+    measurement: Measurement,
+    times: Mapping[Any, Samples],
+    unit: CopyUnit,
+    yardstick: Mapping[Any, Samples] | None,
+) -> None:
+    """Write times, copies and the ratio to the yardstick into a measurement, frames of reference left out."""
+    for kind in ("contact", "idle"):
+        summary = times[kind].summary() if kind in times else {}
+        if not summary:
+            continue
+        measurement.time[kind] = summary
+        measurement.copies[kind] = summary["cpu_ms_p50"] / unit.copy_ms
+        other = yardstick[kind].summary() if yardstick and kind in yardstick else {}
+        if other and summary["cpu_ms_p50"] > 0:
+            measurement.faster[kind] = other["cpu_ms_p50"] / summary["cpu_ms_p50"]

@@ -1,0 +1,210 @@
+"""Whole pipelines end to end: from the file on disk to the JSON line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tactflow.bench.lockstep import LockstepPipeline, Outcome
+from tactflow.bench.methods import SEED, fill_times
+from tactflow.bench.results import Measurement
+from tactflow.bench.scenes import Rendered
+from tactflow.bench.score import ContactScore, FlowScore, MarkerScore
+from tactflow.bench.timing import CopyUnit, Samples, quiet
+from tactflow.engine.errors import TactflowError
+from tactflow.engine.graph import Pipeline
+from tactflow.vision.geometry import PixelMapping
+
+
+def on_recording(pipeline: Pipeline, path: Path, **params: Any) -> Pipeline:
+    """The same pipeline reading another recording.
+
+    Parameters
+    ----------
+    path : the recording. params : further parameters of the capture stage.
+    """
+    source = pipeline.source
+    changed = source.component.params.model_validate(
+        {**source.params.model_dump(exclude_unset=True), "source": str(path), **params}
+    )
+    return replace(pipeline, nodes={**pipeline.nodes, source.id: replace(source, params=changed)})
+
+
+@dataclass(slots=True)
+class _Score:
+    contact: ContactScore = field(default_factory=ContactScore)
+    markers: MarkerScore = field(default_factory=MarkerScore)
+    flow: FlowScore = field(default_factory=FlowScore)
+    limit: float | None = None
+
+    def add(self, outcome: Outcome, rendered: Rendered) -> str:
+        """Judge one frame; returns whether it shows a contact, as a kind of time."""
+        index = outcome.frame.seq
+        mapping = outcome.mapping
+        if mapping is None:
+            height, width = outcome.frame.image.shape[:2]
+            mapping = PixelMapping.identity((width, height))
+        truth = rendered.truths(mapping)[index]
+        if self.contact.detected(outcome.contact is not None, truth, rendered.deep(index)):
+            assert outcome.contact is not None
+            self.contact.geometry(outcome.contact, truth)
+            if outcome.contact_mask is not None:
+                self.contact.mask(outcome.contact_mask, truth)
+        if outcome.markers is not None:
+            self.markers.add(outcome.markers, truth)
+            self.limit = self.limit or rendered.displacement_limit(mapping)
+        self.flow.add(outcome.flow, truth)
+        return "contact" if truth.touching else "idle"
+
+    def errors(self) -> dict[str, float]:
+        return {**self.contact.errors(), **self.markers.errors(), **self.flow.errors()}
+
+
+def take_turns(
+    pipelines: Mapping[str, Pipeline],
+    folder: Path,
+    unit: CopyUnit,
+    see: Callable[[str, Outcome], str],
+    step: Callable[[], None],
+) -> tuple[dict[str, dict[str, Samples]], dict[str, str]]:
+    """Run pipelines frame by frame, taking turns, until all recordings are over.
+
+    Parameters
+    ----------
+    pipelines : name -> pipeline, each with its recording.
+    folder : for the JSON lines.
+    see : called with (name, outcome) after each frame; returns the kind of frame its time belongs to.
+    step : called after each frame of all.
+
+    Returns
+    -------
+    times : name -> kind -> samples. failures : name -> why it stopped.
+    """
+    times: dict[str, dict[str, Samples]] = {name: {} for name in pipelines}
+    failures: dict[str, str] = {}
+    running: dict[str, LockstepPipeline] = {}
+    with quiet():
+        try:
+            for name, pipeline in pipelines.items():
+                try:
+                    running[name] = LockstepPipeline(pipeline, folder / f"{name}.jsonl")
+                except TactflowError as error:
+                    failures[name] = str(error)
+            active = list(running)
+            while active:
+                unit.take()
+                for name in list(active):
+                    try:
+                        outcome = running[name].step()
+                    except TactflowError as error:
+                        failures[name] = str(error)
+                        active.remove(name)
+                        continue
+                    if outcome is None:
+                        active.remove(name)
+                        continue
+                    kind = see(name, outcome)
+                    if outcome.frame.reference:
+                        kind = "reference"
+                    times[name].setdefault(kind, Samples()).add(outcome.cpu, outcome.wall)
+                step()
+        finally:
+            for pipeline_running in running.values():
+                pipeline_running.close()
+    return times, failures
+
+
+def measure_pipelines(
+    pipelines: Mapping[str, Pipeline],
+    rendered: Rendered,
+    folder: Path,
+    unit: CopyUnit,
+    step: Callable[[], None],
+) -> list[Measurement]:
+    """Every pipeline on one scene, frame by frame in turns.
+
+    Parameters
+    ----------
+    pipelines : name -> pipeline; `SEED` is the yardstick. rendered : the scene. folder : for scratch files.
+    step : called after each frame.
+    """
+    scores = {name: _Score() for name in pipelines}
+
+    def see(name: str, outcome: Outcome) -> str:
+        return scores[name].add(outcome, rendered)
+
+    ready = {name: on_recording(pipeline, rendered.path) for name, pipeline in pipelines.items()}
+    times, failures = take_turns(ready, folder, unit, see, step)
+    made = []
+    for name in pipelines:
+        measurement = Measurement("pipeline", name, rendered.case.name, frames=len(rendered))
+        measurement.failure = failures.get(name)
+        if measurement.failure is None:
+            measurement.errors = scores[name].errors()
+            limit = scores[name].limit
+            if limit is not None:
+                measurement.limits["displacement_rms"] = limit
+            fill_times(measurement, times[name], unit, times.get(SEED))
+        made.append(measurement)
+    return made
+
+
+def growth(pipeline: Pipeline, rendered: Rendered, folder: Path, unit: CopyUnit) -> float | None:
+    """How many times as long a frame with contact takes with 4 times the pixels and 4 times the markers.
+
+    The large recording shows every frame of the small one four times, mirrored at the seams, so that pixels,
+    markers and contact area all grow by four and the dots keep their size.
+    """
+    path = folder / "large.npy"
+    small = rendered.frames
+    shape = (len(small), 2 * small.shape[1], 2 * small.shape[2], 3)
+    large = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
+    for index, frame in enumerate(small):
+        upper = np.concatenate([frame, frame[:, ::-1]], axis=1)
+        large[index] = np.concatenate([upper, upper[::-1]], axis=0)
+    large.flush()
+    ready = {"small": on_recording(pipeline, rendered.path), "large": on_recording(pipeline, path)}
+    try:
+        times, failures = take_turns(
+            ready,
+            folder,
+            unit,
+            lambda _, outcome: "contact" if rendered.scene.presses(outcome.frame.seq) else "idle",
+            lambda: None,
+        )
+    finally:
+        path.unlink(missing_ok=True)
+    if failures:
+        return None
+    return (
+        times["large"]["contact"].summary()["cpu_ms_p50"] / times["small"]["contact"].summary()["cpu_ms_p50"]
+    )
+
+
+def peak_memory_mb(file: Path, recording: Path, sinks: Sequence[str]) -> float | None:
+    """Peak memory of `tactflow run` on a recording, MB, or None where it failed.
+
+    It includes what the system maps of the recording itself, so a short one is to be used.
+
+    Parameters
+    ----------
+    file : the pipeline's file. recording : what it reads. sinks : ids of its sinks, which are left out.
+    """
+    command = [sys.executable, "-m", "tactflow.cli.main", "run", str(file), "--source", str(recording)]
+    command += ["--quiet", "--jsonl", os.devnull]
+    for sink in sinks:
+        command += ["--set", f"sinks.{sink}=null"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        return None
+    # Linux counts in kB, macOS in bytes.
+    return usage.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)

@@ -1,0 +1,236 @@
+"""Collects, frame by frame, how far answers are from the truth, and sums them up as named quantities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.bench import metrics
+from tactflow.sim import Truth
+from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
+
+
+def _drop_unknown(values: dict[str, float | None]) -> dict[str, float]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(slots=True)
+class ContactScore:
+    """Where is the contact, and is there one?
+
+    Outline errors (mask, hull, area, centre, direction) are averaged over the frames in which the truth and
+    the method both see a contact; a contact that the method does not see counts as missed.
+    """
+
+    iou: list[float] = field(default_factory=list[float])
+    hull: list[float] = field(default_factory=list[float])
+    area: list[float] = field(default_factory=list[float])
+    center: list[float] = field(default_factory=list[float])
+    angle: list[float] = field(default_factory=list[float])
+    directed: int = 0
+    without_direction: int = 0
+    undirected: int = 0
+    invented_direction: int = 0
+    idle: int = 0
+    false: int = 0
+    touched: int = 0
+    missed: int = 0
+    deep: int = 0
+    missed_deep: int = 0
+
+    def detected(self, touching: bool, truth: Truth, deep: bool) -> bool:
+        """Count one frame's yes or no; True if both say yes."""
+        if not truth.touching:
+            self.idle += 1
+            self.false += touching
+            return False
+        self.touched += 1
+        self.missed += not touching
+        if deep:
+            self.deep += 1
+            self.missed_deep += not touching
+        return touching
+
+    def mask(self, mask: NDArray[np.uint8], truth: Truth) -> None:
+        """Compare the mask, and its centroid, of a frame with contact."""
+        self.iou.append(metrics.mask_iou(mask, truth.contact_mask))
+
+    def centroid(self, mask: NDArray[np.uint8], truth: Truth) -> None:
+        """Compare the centroid of a mask, where no geometry follows."""
+        moments = cv2.moments(mask, binaryImage=True)
+        if moments["m00"] > 0 and truth.center is not None:
+            x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
+            self.center.append(float(np.hypot(x - truth.center[0], y - truth.center[1])))
+
+    def geometry(self, contact: Contact, truth: Truth) -> None:
+        """Compare the geometry of a frame with contact."""
+        self.hull.append(metrics.convex_iou(contact.hull, truth.hull))
+        area = metrics.lattice_area(truth.hull)
+        if area > 0:
+            self.area.append(100 * abs(contact.area - area) / area)
+        if truth.center is not None:
+            self.center.append(
+                float(np.hypot(contact.center[0] - truth.center[0], contact.center[1] - truth.center[1]))
+            )
+        if truth.angle is None:
+            self.undirected += 1
+            self.invented_direction += contact.angle is not None
+        else:
+            self.directed += 1
+            if contact.angle is None:
+                self.without_direction += 1
+            else:
+                self.angle.append(metrics.angle_error(contact.angle, truth.angle))
+
+    def errors(self) -> dict[str, float]:
+        """Quantity -> value."""
+        return _drop_unknown(
+            {
+                "contact_iou": metrics.mean(self.iou),
+                "hull_iou": metrics.mean(self.hull),
+                "area_error": metrics.mean(self.area),
+                "center_error": metrics.mean(self.center),
+                "angle_mean": metrics.mean(self.angle),
+                "angle_max": max(self.angle, default=None),
+                "angle_missing": 100 * self.without_direction / self.directed if self.directed else None,
+                "angle_invented": 100 * self.invented_direction / self.undirected
+                if self.undirected
+                else None,
+                "false_contacts": 100 * self.false / self.idle if self.idle else None,
+                "missed_contacts": 100 * self.missed / self.touched if self.touched else None,
+                "missed_half_depth": 100 * self.missed_deep / self.deep if self.deep else None,
+            }
+        )
+
+
+@dataclass(slots=True)
+class MarkerScore:
+    """Where are the markers, and are they still themselves?
+
+    The first frame tells which of the method's markers is which true one. Displacement errors are lengths of
+    error vectors: their RMS over the markers that kept their identity, their 99th percentile over all whose
+    position the method claims to know. A visible marker that the method never found is lost.
+    """
+
+    index: NDArray[np.int64] | None = None
+    pitch: float = 0.0
+    right: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
+    claimed: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
+    visible: int = 0
+    wrong: int = 0
+    lost: int = 0
+
+    def add(self, markers: Markers, truth: Truth) -> None:
+        """Compare one frame."""
+        if len(truth.origin) == 0:
+            return
+        if self.index is None:
+            self.pitch = metrics.grid_pitch(truth.origin) if len(truth.origin) > 1 else 1e9
+            self.index = metrics.match(markers.origin, truth.origin, self.pitch / 2)
+        found = self.index >= 0
+        visible = np.asarray(truth.visible, dtype=np.bool_)
+        self.visible += int(np.count_nonzero(visible))
+        self.lost += int(np.count_nonzero(visible & ~found))
+        own = self.index[found]
+        lost = markers.status[own] == MarkerStatus.LOST
+        # Every true marker counts as a possible thief, also those that the method never found.
+        position = np.array(truth.position, dtype=np.float64)
+        position[found] = markers.position[own]
+        judged = visible & found
+        all_lost = np.zeros(len(found), dtype=np.bool_)
+        all_lost[found] = lost
+        identity = metrics.identity_errors(position, truth.position, judged, all_lost, self.pitch)
+        self.wrong += int(np.count_nonzero(identity.wrong))
+        self.lost += int(np.count_nonzero(identity.lost))
+        error = metrics.displacement_errors(
+            markers.position[own] - markers.origin[own], (truth.position - truth.origin)[found]
+        )
+        claimed = (judged & ~all_lost)[found]
+        self.claimed.append(error[claimed])
+        self.right.append(error[claimed & ~identity.wrong[found]])
+
+    def errors(self) -> dict[str, float]:
+        """Quantity -> value."""
+        if not self.visible:
+            return {}
+        right = np.concatenate(self.right) if self.right else np.zeros(0)
+        claimed = np.concatenate(self.claimed) if self.claimed else np.zeros(0)
+        return _drop_unknown(
+            {
+                "displacement_rms": metrics.rms(right),
+                "displacement_p99": metrics.percentile(claimed, 99),
+                "wrong_percent": 100 * self.wrong / self.visible,
+                "lost_percent": 100 * self.lost / self.visible,
+            }
+        )
+
+
+@dataclass(slots=True)
+class DetectionScore:
+    """Are the dots found, and nothing else?"""
+
+    recall: list[float] = field(default_factory=list[float])
+    precision: list[float] = field(default_factory=list[float])
+    distance: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
+
+    def add(self, points: NDArray[np.float64], truth: Truth) -> None:
+        """Compare one frame's detections, (N, 2) px, with the visible markers."""
+        visible = truth.position[np.asarray(truth.visible, dtype=np.bool_)]
+        if len(visible) < 2:
+            return
+        found = metrics.detection(points, visible, metrics.grid_pitch(visible) / 2)
+        self.recall.append(found.recall)
+        self.precision.append(found.precision)
+        self.distance.append(found.errors)
+
+    def errors(self) -> dict[str, float]:
+        """Quantity -> value."""
+        return _drop_unknown(
+            {
+                "marker_recall": metrics.mean(self.recall),
+                "marker_precision": metrics.mean(self.precision),
+                "localisation_rms": metrics.rms(np.concatenate(self.distance)) if self.distance else None,
+            }
+        )
+
+
+@dataclass(slots=True)
+class FlowScore:
+    """Is the mean flow inside the contact right?"""
+
+    error: list[float] = field(default_factory=list[float])
+
+    def add(self, flow: Flow | None, truth: Truth) -> None:
+        """Compare one frame, if both know a mean flow."""
+        if flow is None or flow.mean is None or truth.mean_flow is None:
+            return
+        self.error.append(
+            float(np.hypot(flow.mean[0] - truth.mean_flow[0], flow.mean[1] - truth.mean_flow[1]))
+        )
+
+    def errors(self) -> dict[str, float]:
+        """Quantity -> value."""
+        return _drop_unknown({"flow_error": metrics.mean(self.error)})
+
+
+@dataclass(slots=True)
+class RemovalScore:
+    """Does the picture without markers look as the gel would without them?"""
+
+    mae: list[float] = field(default_factory=list[float])
+    psnr: list[float] = field(default_factory=list[float])
+
+    def add(self, unmarked: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
+        """Compare one frame inside the marker mask."""
+        mae = metrics.masked_mae(unmarked, truth, mask)
+        psnr = metrics.masked_psnr(unmarked, truth, mask)
+        if mae is not None and psnr is not None:
+            self.mae.append(mae)
+            self.psnr.append(psnr)
+
+    def errors(self) -> dict[str, float]:
+        """Quantity -> value."""
+        return _drop_unknown({"inpaint_mae": metrics.mean(self.mae), "inpaint_psnr": metrics.mean(self.psnr)})
