@@ -1,0 +1,289 @@
+"""Pictures of the results, for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.flow import inside_mask
+from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
+
+View = Literal["frame", "contact"]
+Colour = tuple[int, int, int]
+
+YELLOW: Final[Colour] = (0, 255, 255)
+WHITE: Final[Colour] = (255, 255, 255)
+GRAY: Final[Colour] = (120, 120, 120)
+PALE: Final[Colour] = (200, 200, 200)
+GREEN: Final[Colour] = (90, 230, 60)
+ORANGE: Final[Colour] = (40, 150, 255)
+MAGENTA: Final[Colour] = (255, 120, 255)
+DARK: Final[Colour] = (25, 25, 25)
+
+# Drawing coordinates carry 4 binary digits after the point: 1/16 px.
+_SHIFT: Final = 4
+# Coordinates are cut here, in px, far outside any picture, to stay within 32 bits.
+_FAR: Final = 1e5
+_STATUS_COLOURS: Final = (
+    (MarkerStatus.LOST, GRAY),
+    (MarkerStatus.INFERRED, WHITE),
+    (MarkerStatus.TRACKED, YELLOW),
+)
+
+
+class Annotator:
+    """Draws contact, markers and flow on a copy of the processed frame (seed's `draw_flow`, `regress_line`).
+
+    arrow_scale : length of an arrow over the displacement it shows; 1 ends it where the marker is now.
+    view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest black
+        (seed's `draw_flow_mask`).
+    ellipse : whether the fitted ellipse is drawn.
+    text : whether numbers are written.
+    dilate : px, for the "contact" view: how far outside the contact the picture and its arrows reach.
+
+    Arrows are yellow for tracked markers, white for inferred ones, dim gray for lost ones. The hull is green,
+    the principal axis orange with a dot on the centroid and its angle beside it.
+
+    Raises ValueError for values out of range. Not to be shared between threads: it owns a font with a cache.
+    """
+
+    def __init__(
+        self,
+        *,
+        arrow_scale: float = 3.0,
+        view: View = "frame",
+        ellipse: bool = False,
+        text: bool = True,
+        dilate: float = 8.0,
+    ) -> None:
+        if not (arrow_scale >= 0 and math.isfinite(arrow_scale)):
+            raise ValueError(f"required arrow_scale >= 0, got {arrow_scale}")
+        if view not in ("frame", "contact"):
+            raise ValueError(f"required view to be 'frame' or 'contact', got {view!r}")
+        if not (dilate >= 0 and math.isfinite(dilate)):
+            raise ValueError(f"required dilate >= 0 px, got {dilate}")
+        self._arrow_scale = arrow_scale
+        self._view = view
+        self._ellipse = ellipse
+        self._text = text
+        self._dilate = dilate
+        self._font = cv2.FontFace("sans")
+
+    def __call__(
+        self,
+        image: NDArray[np.uint8],
+        *,
+        contact: Contact | None = None,
+        flow: Flow | None = None,
+        markers: Markers | None = None,
+        contact_mask: NDArray[np.uint8] | None = None,
+    ) -> NDArray[np.uint8]:
+        """A new picture of the size of `image`, with whatever is given drawn on it.
+
+        image : (H, W, 3) uint8 BGR. contact_mask : (H, W) uint8, needed by the "contact" view alone.
+        Returns (H, W, 3) uint8; the inputs stay as they are. Raises ValueError on another shape.
+        """
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise ValueError(f"required a (H, W, 3) uint8 image, got {image.shape} {image.dtype}")
+        if self._view == "contact":
+            picture = self._cut_out(image, contact_mask)
+            if markers is not None:
+                markers = self._inside(markers, contact_mask)
+        else:
+            picture = image.copy()
+        unit = max(1.0, min(image.shape[:2]) / 300)
+        if contact is not None and len(contact.hull):
+            if self._ellipse and contact.ellipse is not None:
+                draw_ellipse(picture, contact.ellipse, MAGENTA, unit)
+            draw_polygon(picture, contact.hull, GREEN, unit)
+        if markers is not None:
+            draw_arrows(picture, markers, self._arrow_scale, unit)
+        if contact is not None:
+            self._axis(picture, contact, unit)
+        if self._text:
+            self._write(picture, self._lines(contact, flow, markers), unit)
+        return picture
+
+    def _cut_out(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+        picture = np.zeros_like(image)
+        if mask is None:
+            return picture
+        if mask.shape != image.shape[:2] or mask.dtype != np.uint8:
+            raise ValueError(
+                f"required a contact_mask of shape {image.shape[:2]} uint8, got {mask.shape} {mask.dtype}"
+            )
+        side = 2 * round(self._dilate) + 1
+        grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
+        cv2.copyTo(image, grown, picture)
+        return picture
+
+    def _inside(self, markers: Markers, mask: NDArray[np.uint8] | None) -> Markers:
+        if mask is None:
+            keep = np.zeros(len(markers.status), np.bool_)
+        else:
+            keep = inside_mask(markers.position, mask, self._dilate)
+        return Markers(
+            markers.origin[keep], markers.position[keep], markers.status[keep], markers.stderr[keep]
+        )
+
+    def _axis(self, picture: NDArray[np.uint8], contact: Contact, unit: float) -> None:
+        center = np.array(contact.center)
+        if contact.angle is not None:
+            theta = math.radians(contact.angle)
+            along = np.array([math.cos(theta), -math.sin(theta)])
+            spread = (contact.hull - center) @ along
+            overhang = 14 * unit
+            ends = center + along * [[spread.min() - overhang], [spread.max() + overhang]]
+            _strokes(picture, [ends], DARK, 2.6 * unit)
+            _strokes(picture, [ends], ORANGE, 1.2 * unit)
+        _dots(picture, center[None], DARK, 4.0 * unit)
+        _dots(picture, center[None], ORANGE, 2.8 * unit)
+        if self._text and contact.angle is not None:
+            label = _signed(contact.angle, 1) + "°"
+            x, y = ends[1] + along * 3 * unit
+            self._halo_text(picture, label, (round(x), round(y + 4 * unit)), ORANGE, unit)
+
+    def _lines(
+        self, contact: Contact | None, flow: Flow | None, markers: Markers | None
+    ) -> list[tuple[str, Colour]]:
+        lines: list[tuple[str, Colour]] = []
+        if contact is None:
+            lines.append(("no contact", WHITE))
+        else:
+            x, y = contact.center
+            lines.append((f"contact {contact.area:.0f} px²  at {x:.1f}, {y:.1f}", GREEN))
+        if flow is not None and flow.mean is not None:
+            right, down = flow.mean
+            plural = "" if flow.count == 1 else "s"
+            lines.append(
+                (
+                    f"flow {_signed(right, 2)}, {_signed(down, 2)} px  ({flow.count} marker{plural})",
+                    YELLOW,
+                )
+            )
+            if flow.rotation is not None and flow.divergence is not None:
+                twist = f"twist {_signed(flow.rotation, 1)}°"
+                lines.append((f"{twist}  spread {_signed(100 * flow.divergence, 1)} %", YELLOW))
+        if markers is not None:
+            lost = int(np.count_nonzero(markers.status == MarkerStatus.LOST))
+            if lost:
+                lines.append((f"{lost} lost", PALE))
+        return lines
+
+    def _write(self, picture: NDArray[np.uint8], lines: Sequence[tuple[str, Colour]], unit: float) -> None:
+        size = round(11 * unit)
+        step = round(14 * unit)
+        height, width = picture.shape[:2]
+        longest = 0
+        for text, _ in lines:
+            box = cv2.getTextSize((width, height), text, (0, 0), self._font, size, 400)
+            longest = max(longest, box[2])
+        bar: NDArray[Any] = picture[: min(height, step * len(lines) + round(5 * unit)), : longest + step]
+        bar[...] = bar // 3
+        for index, (text, colour) in enumerate(lines):
+            place = (round(5 * unit), round(2 * unit) + step * (index + 1) - round(3 * unit))
+            cv2.putText(picture, text, place, colour, self._font, size, 400)
+
+    def _halo_text(
+        self, picture: NDArray[np.uint8], text: str, place: tuple[int, int], colour: Colour, unit: float
+    ) -> None:
+        """Text kept inside the picture, on a shade."""
+        size = round(11 * unit)
+        height, width = picture.shape[:2]
+        _, _, wide, tall = cv2.getTextSize((width, height), text, (0, 0), self._font, size, 400)
+        x = min(max(place[0], 2), max(2, width - wide - 3))
+        y = min(max(place[1], tall + 2), max(tall + 2, height - 3))
+        shade: NDArray[Any] = picture[max(0, y - tall - 1) : y + 3, max(0, x - 2) : x + wide + 3]
+        shade[...] = shade // 3
+        cv2.putText(picture, text, (x, y), colour, self._font, size, 400)
+
+
+def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0, unit: float = 1.0) -> None:
+    """Draw every marker's displacement into `picture`, from its origin, to 1/16 px (seed's `draw_flow`).
+
+    picture : (H, W, 3) uint8, changed. scale : arrow length over displacement. unit : line width, px.
+    Tracked markers are yellow, inferred white, lost dim gray; a displacement too short for a head is a dot.
+    """
+    for status, colour in _STATUS_COLOURS:
+        chosen = markers.status == status
+        if not chosen.any():
+            continue
+        tail = np.asarray(markers.origin[chosen], np.float64)
+        moved = (np.asarray(markers.position[chosen], np.float64) - tail) * scale
+        length = np.hypot(moved[:, 0], moved[:, 1])
+        long = length >= 2.0 * unit
+        along = moved[long] / length[long, None]
+        across = along[:, ::-1] * [-1.0, 1.0]
+        tip = tail[long] + moved[long]
+        back = np.minimum(0.45 * length[long], 5.0 * unit)[:, None]
+        neck = tip - along * back
+        left, right = neck + across * back * 0.5, neck - across * back * 0.5
+        shafts = np.stack([tail[long], neck], axis=1)
+        heads = np.stack([tip, left, right], axis=1)
+        for paint, extra in ((DARK, 1.4 * unit), (colour, 0.0)):
+            if status == MarkerStatus.LOST and extra:
+                continue
+            _strokes(picture, shafts, paint, 1.2 * unit + extra)
+            if extra:
+                _strokes(picture, heads, paint, extra, closed=True)
+            _fill(picture, heads, paint)
+            _dots(picture, tail[~long], paint, 1.2 * unit + extra / 2)
+
+
+def draw_polygon(
+    picture: NDArray[np.uint8], vertices: NDArray[np.float64], colour: Colour = GREEN, unit: float = 1.0
+) -> None:
+    """Draw a closed outline into `picture`; vertices (N, 2), px, to 1/16 px; unit is the line width, px."""
+    _strokes(picture, [vertices], DARK, 2.6 * unit, closed=True)
+    _strokes(picture, [vertices], colour, 1.2 * unit, closed=True)
+
+
+def draw_ellipse(
+    picture: NDArray[np.uint8], ellipse: Ellipse, colour: Colour = MAGENTA, unit: float = 1.0
+) -> None:
+    """Draw an ellipse into `picture`, to 1/16 px; unit is the line width, px."""
+    theta = math.radians(ellipse.angle or 0.0)
+    turn = np.array([[math.cos(theta), -math.sin(theta)], [math.sin(theta), math.cos(theta)]])
+    around = np.linspace(0, 2 * math.pi, 90, endpoint=False)
+    outline = np.column_stack([np.cos(around) * ellipse.axes[0] / 2, np.sin(around) * ellipse.axes[1] / 2])
+    _strokes(picture, [outline @ turn + ellipse.center], colour, 1.2 * unit, closed=True)
+
+
+def _fixed(points: NDArray[Any]) -> NDArray[np.int32]:
+    fixed: NDArray[np.int32] = np.rint(np.clip(points, -_FAR, _FAR) * 2**_SHIFT).astype(np.int32)
+    return fixed
+
+
+def _strokes(
+    picture: NDArray[np.uint8],
+    lines: Sequence[NDArray[Any]] | NDArray[Any],
+    colour: Colour,
+    width: float,
+    closed: bool = False,
+) -> None:
+    if len(lines):
+        points = [_fixed(line) for line in lines]
+        cv2.polylines(picture, points, closed, colour, max(1, round(width)), cv2.LINE_AA, _SHIFT)
+
+
+def _fill(picture: NDArray[np.uint8], polygons: NDArray[Any], colour: Colour) -> None:
+    for polygon in _fixed(polygons):
+        cv2.fillConvexPoly(picture, polygon, colour, cv2.LINE_AA, _SHIFT)
+
+
+def _dots(picture: NDArray[np.uint8], centers: NDArray[Any], colour: Colour, radius: float) -> None:
+    for x, y in _fixed(centers).tolist():
+        cv2.circle(picture, (x, y), round(radius * 2**_SHIFT), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+
+
+def _signed(value: float, digits: int) -> str:
+    """A number with a true minus sign; no sign for what rounds to zero."""
+    text = f"{abs(value):.{digits}f}"
+    if float(text) == 0:
+        return text
+    return ("−" if value < 0 else "+") + text
