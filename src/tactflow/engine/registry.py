@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import hashlib
 import importlib
 import inspect
@@ -104,9 +105,16 @@ def _builtins(section: Section) -> list[str]:
     return [module.name for module in pkgutil.iter_modules(package.__path__) if module.name[0] != "_"]
 
 
-def _entry_points(section: Section) -> list[metadata.EntryPoint]:
-    # A distribution found twice on sys.path (an editable install and its build folder) is one plug-in.
-    return list({(e.name, e.value): e for e in metadata.entry_points(group=f"tactflow.{section}")}.values())
+def _entry_points(section: Section) -> Sequence[metadata.EntryPoint]:
+    return _installed(section, tuple(sys.path))
+
+
+@functools.cache
+def _installed(section: Section, path: tuple[str, ...]) -> Sequence[metadata.EntryPoint]:
+    """Entry points of the distributions on a module path; reading them takes longer than all the rest."""
+    points = metadata.entry_points(group=f"tactflow.{section}") if path else ()
+    # A distribution found twice (an editable install and its build folder) is one plug-in.
+    return list({(point.name, point.value): point for point in points}.values())
 
 
 def _named(name: str, section: Section) -> Component:
