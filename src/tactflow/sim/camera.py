@@ -57,30 +57,34 @@ class Camera:
                 ]
             )
             self._homography = homography(gel, raw)
-        self._inverse = np.linalg.inv(self._homography)
+        self._inverse = np.linalg.inv(self._homography).astype(np.float64)
 
     def to_gel(self, raw: Points) -> Points:
         """Gel coordinates (N, 2) float64 of raw pixel positions (N, 2)."""
         if self.identity:
             return np.array(raw, dtype=np.float64)
-        offset = (np.asarray(raw, dtype=np.float64) - self._center) / self._half_diagonal
-        grown = offset * (1.0 + self._k * np.square(offset).sum(axis=-1, keepdims=True))
-        straight = np.asarray(grown * self._half_diagonal + self._center, dtype=np.float64)
-        return project(self._inverse, straight)
+        offset = self._relative(raw)
+        offset *= 1.0 + self._k * np.sum(offset * offset, axis=-1, keepdims=True)
+        return project(self._inverse, self._absolute(offset))
 
     def to_raw(self, gel: Points) -> Points:
         """Raw pixel positions (N, 2) float64 of gel coordinates (N, 2)."""
         if self.identity:
             return np.array(gel, dtype=np.float64)
-        straight = project(self._homography, np.asarray(gel, dtype=np.float64))
-        offset: Points = (straight - self._center) / self._half_diagonal
+        offset = self._relative(project(self._homography, np.asarray(gel, dtype=np.float64)))
         if self._k:
             radius = np.sqrt(np.sum(offset * offset, axis=-1))
             solved = radius.copy()
             for _ in range(12):  # Newton; quadratic, so a dozen steps reach machine precision
                 solved -= (solved * (1.0 + self._k * solved**2) - radius) / (1.0 + 3.0 * self._k * solved**2)
             shrink = np.divide(solved, radius, out=np.ones_like(radius), where=radius > 0)
-            offset = offset * shrink[..., None]
+            offset *= shrink[..., None]
+        return self._absolute(offset)
+
+    def _relative(self, pixels: Points) -> Points:
+        return np.asarray((pixels - self._center) / self._half_diagonal, dtype=np.float64)
+
+    def _absolute(self, offset: Points) -> Points:
         return np.asarray(offset * self._half_diagonal + self._center, dtype=np.float64)
 
     def local_inverse(self, gel: Points) -> NDArray[np.float64]:

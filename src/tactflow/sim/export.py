@@ -1,0 +1,208 @@
+"""Writing a scene to disk: the frames without loss, and the truth beside them.
+
+Frames are rendered and written one at a time. A file appears under its name only when it is complete; until
+then its name ends in `.partial`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.sim.scenes import Scene
+
+VIDEO_SUFFIXES = (".avi", ".mkv")
+TRUTH_SUFFIXES = (".jsonl", ".npz")
+Report = Callable[[int], None]
+
+
+class NotLosslessError(RuntimeError):
+    """The video that was written does not give the same frames back."""
+
+
+def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
+    """Write all frames of a scene.
+
+    path : `.npy` (uint8 N x H x W x 3 BGR), `.avi` or `.mkv` (HFYU, read back and compared frame by frame),
+        or, without a suffix, a folder of numbered PNG files. What is there is replaced.
+    report : called with the number of frames written so far.
+
+    Raises
+    ------
+    ValueError : a suffix that is not one of these. OSError : the place cannot be written.
+    NotLosslessError : the video codec of this machine is not lossless.
+    """
+    kind = frames_kind(path)
+    with _completed(path) as partial:
+        if kind == "npy":
+            _write_npy(scene, partial, report)
+        elif kind == "video":
+            _write_video(scene, partial, report)
+        else:
+            _write_folder(scene, partial, report)
+
+
+def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
+    """Write the truth about all frames, in raw pixel coordinates.
+
+    path : `.jsonl` is one JSON object a frame: frame, t (s), touching, center, angle, hull, area, depth,
+        origin, position, visible, mean_flow, with null for what there is not. `.npz` holds the same as
+        arrays, with contact_mask (N, H, W) bool besides: center, angle and mean_flow are 0 where `touching`,
+        `directed` and `has_flow` are false; the hull of frame i is hull[hull_start[i]:hull_start[i + 1]].
+    report : called with the number of frames written so far.
+
+    Raises ValueError for another suffix and OSError where the place cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in TRUTH_SUFFIXES:
+        raise ValueError(f"required the truth as {' or '.join(TRUTH_SUFFIXES)}, got {path.name!r}")
+    with _completed(path) as partial:
+        (_write_jsonl if suffix == ".jsonl" else _write_npz)(scene, partial, report)
+
+
+def frames_kind(path: Path) -> str:
+    """`npy`, `video` or `folder`; ValueError where the suffix is none of theirs."""
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return "npy"
+    if suffix in VIDEO_SUFFIXES:
+        return "video"
+    if not suffix or path.is_dir():
+        return "folder"
+    raise ValueError(f"required frames as .npy, {', '.join(VIDEO_SUFFIXES)} or a folder, got {path.name!r}")
+
+
+@contextmanager
+def _completed(path: Path) -> Iterator[Path]:
+    """A place to write to, moved to `path` if all went well and removed if not."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        if path.is_dir():
+            shutil.rmtree(path)
+        os.replace(partial, path)
+    finally:
+        if partial.is_dir():
+            shutil.rmtree(partial, ignore_errors=True)
+        else:
+            partial.unlink(missing_ok=True)
+
+
+def _write_npy(scene: Scene, path: Path, report: Report) -> None:
+    # Written, not mapped: a full disk then is an error of write(), not a SIGBUS.
+    width, height = scene.size
+    header = {"descr": "|u1", "fortran_order": False, "shape": (len(scene), height, width, 3)}
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for index in range(len(scene)):
+            file.write(np.ascontiguousarray(scene.frame(index)).data)
+            report(index + 1)
+
+
+def _write_video(scene: Scene, path: Path, report: Report) -> None:
+    fourcc = cv2.VideoWriter.fourcc(*"HFYU")
+    writer = cv2.VideoWriter(str(path), fourcc, scene.fps, scene.size)
+    if not writer.isOpened():
+        raise OSError(f"{path}: the video file cannot be opened for writing")
+    sums = []
+    try:
+        for index in range(len(scene)):
+            image = scene.frame(index)
+            sums.append(zlib.crc32(image.tobytes()))
+            writer.write(image)
+            report(index + 1)
+    finally:
+        writer.release()
+    reader = cv2.VideoCapture(str(path))
+    try:
+        for index, expected in enumerate(sums):
+            there, image_back = reader.read()
+            if not there:
+                raise OSError(
+                    f"{path}: only {index} of {len(sums)} frames can be read back; is the disk full?"
+                )
+            if zlib.crc32(image_back.tobytes()) != expected:
+                raise NotLosslessError(f"{path}: frame {index} reads back different; write .npy instead")
+    finally:
+        reader.release()
+
+
+def _write_folder(scene: Scene, path: Path, report: Report) -> None:
+    path.mkdir()
+    digits = max(6, len(str(len(scene) - 1)))
+    for index in range(len(scene)):
+        encoded = cv2.imencode(".png", scene.frame(index))[1]
+        (path / f"{index:0{digits}d}.png").write_bytes(encoded.tobytes())
+        report(index + 1)
+
+
+def _write_jsonl(scene: Scene, path: Path, report: Report) -> None:
+    with path.open("w", encoding="utf-8") as file:
+        for index in range(len(scene)):
+            truth = scene.truth(index)
+            line = {
+                "frame": index,
+                "t": index / scene.fps,
+                "touching": truth.touching,
+                "center": truth.center,
+                "angle": truth.angle,
+                "hull": truth.hull.tolist(),
+                "area": truth.area,
+                "depth": truth.depth,
+                "origin": truth.origin.tolist(),
+                "position": truth.position.tolist(),
+                "visible": truth.visible.tolist(),
+                "mean_flow": truth.mean_flow,
+            }
+            file.write(json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n")
+            report(index + 1)
+
+
+def _write_npz(scene: Scene, path: Path, report: Report) -> None:
+    rows: list[dict[str, Any]] = []
+    hulls: list[NDArray[np.float64]] = []
+    width, height = scene.size
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with archive.open("contact_mask.npy", "w", force_zip64=True) as member:
+            shape = (len(scene), height, width)
+            header = {"descr": "|b1", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(member, header)
+            for index in range(len(scene)):
+                truth = scene.truth(index)
+                member.write(truth.contact_mask.tobytes())
+                hulls.append(truth.hull)
+                rows.append(
+                    {
+                        "t": index / scene.fps,
+                        "touching": truth.touching,
+                        "center": truth.center or (0.0, 0.0),
+                        "angle": truth.angle or 0.0,
+                        "directed": truth.angle is not None,
+                        "area": truth.area,
+                        "depth": truth.depth,
+                        "position": truth.position,
+                        "visible": truth.visible,
+                        "mean_flow": truth.mean_flow or (0.0, 0.0),
+                        "has_flow": truth.mean_flow is not None,
+                    }
+                )
+                report(index + 1)
+        arrays = {key: np.asarray([row[key] for row in rows]) for key in rows[0]}
+        arrays["origin"] = scene.truth(0).origin
+        arrays["hull"] = np.concatenate(hulls)
+        arrays["hull_start"] = np.cumsum([0] + [len(hull) for hull in hulls])
+        for key, array in arrays.items():
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
