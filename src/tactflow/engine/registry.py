@@ -242,30 +242,23 @@ def _kinds(cls: type) -> list[Kind]:
 
 
 def _component(cls: type, name: str, origin: str) -> Component:
-    place = _class_place(cls)
     kinds = _kinds(cls)
     if len(kinds) != 1:
         methods = ", ".join(f"{method}() for a {kind}" for method, kind in _METHODS.items())
-        raise ConfigError(f"{place}: {cls.__name__} must have exactly one of {methods}")
+        raise _broken(cls, f" must have exactly one of {methods}")
     params = getattr(cls, "Params", StageParams)
     if not (inspect.isclass(params) and issubclass(params, StageParams)):
-        raise ConfigError(
-            f"{place}: {cls.__name__}.Params must be a subclass of tactflow.engine.stage.StageParams"
-        )
+        raise _broken(cls, ".Params must be a subclass of tactflow.engine.stage.StageParams")
     for key, field in params.model_fields.items():
         if (field.alias or key) in RESERVED:
-            raise ConfigError(
-                f"{place}: {cls.__name__}.Params.{key}: that name is a key of the pipeline file"
-            )
+            raise _broken(cls, f".Params.{key}: that name is a key of the pipeline file")
     try:
         signature = inspect.signature(cls)
         signature.bind(
             None, **{word: None for word in ("sensor", "directory") if word in signature.parameters}
         )
     except (TypeError, ValueError):
-        raise ConfigError(
-            f"{place}: {cls.__name__} must be built from its parameters: __init__(self, params)"
-        ) from None
+        raise _broken(cls, " must be built from its parameters: __init__(self, params)") from None
     method = next(method for method, kind in _METHODS.items() if kind == kinds[0])
     return Component(name, kinds[0], cls, params, read_ports(cls, method), _memory(cls, kinds[0]), origin)
 
@@ -279,14 +272,17 @@ def _memory(cls: type, kind: Kind) -> Memory:
         if memory == choice:
             return choice
     came = "nothing" if memory is None else repr(memory)
-    raise ConfigError(
-        f'{_class_place(cls)}: {cls.__name__} must declare memory = "pure" (its outputs depend on its inputs '
-        f'alone) or memory = "stateful", got {came}'
+    raise _broken(
+        cls,
+        ' must declare memory = "pure" (its outputs depend on its inputs alone) or memory = "stateful", '
+        f"got {came}",
     )
 
 
-def _class_place(cls: type) -> str:
+def _broken(cls: type, problem: str) -> ConfigError:
+    """The error for a class that breaks the contract, with the place of the class."""
     try:
-        return f"{inspect.getsourcefile(cls)}:{inspect.getsourcelines(cls)[1]}"
+        place = f"{inspect.getsourcefile(cls)}:{inspect.getsourcelines(cls)[1]}"
     except (OSError, TypeError):
-        return f"{cls.__module__}"
+        place = cls.__module__
+    return ConfigError(f"{place}: {cls.__name__}{problem}")
