@@ -1,0 +1,43 @@
+"""The wheel, installed where there is no checkout."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def command(*arguments: str | Path, cwd: Path) -> str:
+    """Run a command that must succeed; its output."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    done = subprocess.run(
+        [str(a) for a in arguments], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_wheel_runs_its_packaged_pipeline_in_a_fresh_environment(tmp_path: Path) -> None:
+    pip = ("-m", "pip", "--disable-pip-version-check", "--no-input", "--quiet")
+    command(sys.executable, *pip, "wheel", "--no-deps", "--wheel-dir", tmp_path, REPOSITORY, cwd=tmp_path)
+    (wheel,) = tmp_path.glob("tactflow-*.whl")
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    constraints = REPOSITORY / "constraints.txt"
+    command(python, *pip, "install", "--constraint", constraints, wheel, cwd=tmp_path)
+    program = tmp_path / "venv" / "bin" / "tactflow"
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    command(program, "run", "--max-frames", "30", "--set", "sinks.zmq.endpoint=tcp://127.0.0.1:*", cwd=empty)
+    assert len((empty / "out" / "results.jsonl").read_text().splitlines()) == 30
+    where = command(python, "-c", "import tactflow.stages.hull as m; print(m.__file__)", cwd=empty)
+    assert str(tmp_path / "venv") in where
+    assert "hull" in command(program, "stages", cwd=empty)

@@ -1,0 +1,296 @@
+"""The main job from outside: the program as its users run it, and a subscriber in another process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import orjson
+import pytest
+import yaml
+import zmq
+
+from tactflow.message import message_schema
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SHIPPED = yaml.safe_load((REPOSITORY / "pipeline.yaml").read_text())
+WITHOUT = {name: ("--set", f"sinks.{name}=null") for name in SHIPPED["sinks"]}
+NO_SINKS = tuple(word for words in WITHOUT.values() for word in words)
+ONLY_ZMQ = tuple(word for name, words in WITHOUT.items() if name != "zmq" for word in words)
+
+
+def tactflow(
+    *arguments: str, cwd: Path = REPOSITORY, timeout: float = 100
+) -> subprocess.CompletedProcess[str]:
+    """Run the program to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "tactflow", *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+
+
+def messages(text: str) -> list[dict[str, Any]]:
+    """Standard output as messages; anything else on it is an error here."""
+    return [orjson.loads(line) for line in text.splitlines()]
+
+
+@pytest.fixture
+def subscriber() -> Iterator[zmq.Socket[bytes]]:
+    """A subscriber that binds nothing and connects when the test says where."""
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.SUBSCRIBE, b"tactflow.")
+        socket.rcvtimeo = 20_000
+        socket.linger = 0
+        yield socket
+
+
+def free_endpoint() -> str:
+    """An address that nobody listens on."""
+    with zmq.Context() as context, context.socket(zmq.REP) as socket:
+        socket.linger = 0
+        port = socket.bind_to_random_port("tcp://127.0.0.1")
+    return f"tcp://127.0.0.1:{port}"
+
+
+def test_the_main_job_gives_one_valid_message_a_frame_and_nothing_else_on_standard_output() -> None:
+    done = tactflow("run", "pipeline.yaml", *NO_SINKS, "--source", "sim:press?frames=60", "--jsonl", "-")
+    assert done.returncode == 0, done.stderr
+    rows = messages(done.stdout)
+    validator = jsonschema.Draft202012Validator(message_schema())
+    for row in rows:
+        validator.validate(row)
+    assert [row["seq"] for row in rows] == list(range(60))
+    assert {tuple(row["size"]) for row in rows} == {(300, 400)}
+    assert any(row["contact"] for row in rows)
+    assert rows[0]["contact"] is None
+    assert len(rows[0]["markers"]["origin"]) == 80
+    for row in rows:
+        assert (row["contact"] is None) == (row["flow"] is None)
+        assert row["contact"] is not None or row["skipped"]["contact"] == "no_contact"
+
+
+def test_real_rolls_give_a_valid_message_a_frame_with_every_marker_found(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.jsonl"
+    done = tactflow(
+        *(
+            "run",
+            "pipelines/wedge.yaml",
+            "--set",
+            "sinks.zmq=null",
+            "--source",
+            str(shared_data / "wedge_roll"),
+        ),
+        *("--jsonl", str(out), "--quiet"),
+    )
+    assert done.returncode == 0, done.stderr
+    rows = messages(out.read_text())
+    validator = jsonschema.Draft202012Validator(message_schema())
+    for row in rows:
+        validator.validate(row)
+    assert len(rows) == 301
+    assert len(rows[0]["markers"]["origin"]) == 140
+    assert {len(row["markers"]["position"]) for row in rows} == {140}
+    assert sum(row["contact"] is not None for row in rows) > 250
+
+
+def test_a_subscriber_in_another_process_gets_every_message_of_a_run(
+    subscriber: zmq.Socket[bytes], tmp_path: Path
+) -> None:
+    endpoint = free_endpoint()
+    subscriber.connect(endpoint)
+    stats = tmp_path / "stats.json"
+    with subprocess.Popen(
+        [
+            *(sys.executable, "-m", "tactflow", "run", "pipeline.yaml", *ONLY_ZMQ, "--quiet"),
+            *("--set", f"sinks.zmq.endpoint={endpoint}", "--set", "sinks.zmq.wait_for_subscriber=20"),
+            *("--source", "sim:press?frames=50", "--stats", str(stats)),
+        ],
+        cwd=REPOSITORY,
+    ) as process:
+        got = []
+        while len(got) < 50:
+            topic, _, body = subscriber.recv().partition(b" ")
+            assert topic == b"tactflow.main"
+            got.append(json.loads(body))
+        assert process.wait(20) == 0
+    assert [message["seq"] for message in got] == list(range(50))
+    jsonschema.validate(got[-1], message_schema())
+    assert json.loads(stats.read_text())["sinks"]["zmq"]["counters"]["serialised"] == 50
+
+
+def test_a_subscriber_that_never_reads_loses_messages_and_costs_no_frame(
+    subscriber: zmq.Socket[bytes], tmp_path: Path
+) -> None:
+    endpoint = free_endpoint()
+    subscriber.rcvhwm = 1
+    subscriber.connect(endpoint)
+    out, stats = tmp_path / "out.jsonl", tmp_path / "stats.json"
+    done = tactflow(
+        *("run", *ONLY_ZMQ, "--set", f"sinks.zmq.endpoint={endpoint}", "--quiet", "--jsonl", str(out)),
+        *("--set", "sinks.zmq.wait_for_subscriber=20", "--source", "sim:press?frames=150"),
+        *("--stats", str(stats)),
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(messages(out.read_text())) == 150
+    assert json.loads(stats.read_text())["sinks"]["zmq"]["runs"] == 150
+
+
+def test_nothing_is_serialised_while_nobody_subscribes(tmp_path: Path) -> None:
+    stats = tmp_path / "stats.json"
+    done = tactflow(
+        *("run", *ONLY_ZMQ, "--set", f"sinks.zmq.endpoint={free_endpoint()}", "--quiet"),
+        *("--source", "sim:press?frames=20", "--stats", str(stats)),
+    )
+    assert done.returncode == 0, done.stderr
+    read = json.loads(stats.read_text())
+    assert read["sinks"]["zmq"]["counters"]["serialised"] == 0
+    assert read["stages"]["hull"]["runs"] == 0, "nobody asked for the contact"
+    assert read["stages"]["tracker"]["runs"] == 20, "a stateful stage sees every frame"
+
+
+# -- exit codes -------------------------------------------------------------------------------------------
+
+
+def started(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
+    """Start an endless run that has delivered its first messages."""
+    process = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "tactflow", "run", str(REPOSITORY / "pipeline.yaml"), *NO_SINKS),
+            *("--source", "sim:press?frames=100000", "--jsonl", "out.jsonl", *arguments),
+        ],
+        cwd=cwd,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    out = cwd / "out.jsonl"
+    deadline = time.monotonic() + 60
+    while not (out.exists() and out.stat().st_size) and time.monotonic() < deadline:
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.02)
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_signal_drains_and_finalises(number: int, tmp_path: Path) -> None:
+    process = started("--stats", "stats.json", cwd=tmp_path)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 0, errors
+    stats = json.loads((tmp_path / "stats.json").read_text())
+    assert stats["end"] == "signal"
+    rows = messages((tmp_path / "out.jsonl").read_text())
+    assert [row["seq"] for row in rows] == list(range(stats["frames"]))
+
+
+SLOW = """
+import time
+from tactflow.ports import Image
+
+class Slow:
+    memory = "pure"
+    class Params(__import__("tactflow.engine.stage", fromlist=["StageParams"]).StageParams):
+        pass
+    def __init__(self, params): pass
+    def process(self, image: Image) -> Image:
+        time.sleep(60)
+        return image
+"""
+
+
+def test_a_second_signal_ends_at_once_with_130(tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text(SLOW)
+    (tmp_path / "pipeline.yaml").write_text(
+        "stages:\n  capture: {source: 'sim:idle?frames=50'}\n  preprocess: {}\n"
+        "  slow: {use: './slow.py:Slow'}\nsinks:\n  jsonl: {path: out.jsonl}\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactflow", "run"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    )
+    while not (tmp_path / "out.jsonl").exists():
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.02)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert process.poll() is None, "one signal waits for the frame under way"
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=10)
+    assert process.returncode == 130
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["run", "missing.yaml"], 2, "missing.yaml"),
+        (["run", "--set", "stages.hull.min_aera=3"], 2, "did you mean min_area?"),
+        (["run", "--max-frames", "none"], 2, "required a whole number"),
+        (["run", "--source", "sim:pres"], 4, "press"),
+        (["run", "--source", "missing.mp4"], 4, "missing.mp4"),
+        (["run", "--source", "/dev/video97"], 4, "/dev/video97"),
+        (["run", "--jsonl", "/proc/nowhere/out.jsonl"], 3, "/proc/nowhere"),
+        (["run", "--jsonl", "/dev/full", "--source", "sim:idle?frames=30"], 3, "/dev/full"),
+        (["run", "--stats", "/proc/nowhere.json"], 2, "--stats"),
+        (["rum"], 2, "run"),
+    ],
+)
+def test_a_user_mistake_ends_with_its_code_and_advice(
+    arguments: list[str], code: int, words: str, tmp_path: Path
+) -> None:
+    extra = [*NO_SINKS] if arguments[0] == "run" and "missing.yaml" not in arguments else []
+    done = tactflow(*arguments, *extra, cwd=tmp_path)
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+
+
+def test_an_existing_result_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "out.jsonl").write_text("precious\n")
+    done = tactflow("run", *NO_SINKS, "--jsonl", "out.jsonl", "--max-frames", "3", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "overwrite" in done.stderr
+    assert (tmp_path / "out.jsonl").read_text() == "precious\n"
+
+
+def test_realtime_plays_a_recording_at_its_own_pace(tmp_path: Path) -> None:
+    done = tactflow(
+        *(
+            "run",
+            *NO_SINKS,
+            "--source",
+            "sim:idle?frames=30",
+            "--realtime",
+            "--stats",
+            "s.json",
+            "--jsonl",
+            "o.jsonl",
+        ),
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    stats = json.loads((tmp_path / "s.json").read_text())
+    assert stats["frames"] + stats["dropped"] == 30
+    assert stats["wall_s"] >= 29 / 60, "30 frames at 60 Hz last 29 intervals"
+    assert stats["links"]["capture->compute"]["policy"] == "latest"
+
+
+def test_importing_tactflow_does_not_import_opencv() -> None:
+    code = "import sys, tactflow, tactflow.client; print('cv2' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
+    )
+    assert done.stdout.strip() == "False"
