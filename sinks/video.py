@@ -86,8 +86,8 @@ class Video:
         Raises
         ------
         StageError
-            If the file exists, its folder cannot be written, or this OpenCV cannot encode it (a lossless codec
-            is tried on a small picture and must give back every bit).
+            If the file exists, its folder cannot be written, or this OpenCV cannot encode it: a lossless
+            codec is tried on a small picture and must give back every bit.
         """
         if self._path.exists() and not self.params.overwrite:
             raise StageError(f"{self._path}: this file exists; set overwrite: true or give another path")

@@ -1,0 +1,250 @@
+"""Capture: numbering, references, pace, stopping."""
+
+from __future__ import annotations
+
+import threading
+import time
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from tactflow.stages import capture as capture_module
+from tactflow.stages.capture import Capture
+
+from tactflow.engine.errors import SourceError
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> str:
+    """Six frames whose pixels tell their index."""
+    path = tmp_path / "recording.npy"
+    np.save(path, np.stack([np.full((4, 6, 3), index, np.uint8) for index in range(6)]))
+    return str(path)
+
+
+def capture(source: str, directory: Path | None = None, **params: Any) -> Capture:
+    stage = Capture(Capture.Params(source=source, **params), sensor="thumb", directory=directory)
+    stage.open()
+    return stage
+
+
+def test_frames_are_numbered_timed_and_read_only(recording: str) -> None:
+    stage = capture(recording, fps=10.0)
+    frames = list(stage.frames())
+    stage.close()
+    assert [frame.seq for frame in frames] == [0, 1, 2, 3, 4, 5]
+    assert [frame.t for frame in frames] == [index / 10.0 for index in range(6)]
+    assert {frame.sensor for frame in frames} == {"thumb"}
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [0, 1, 2, 3, 4, 5]
+    assert not any(frame.image.flags.writeable for frame in frames)
+    captured = [frame.captured for frame in frames]
+    assert captured == sorted(captured)
+    assert captured[-1] <= time.perf_counter()
+
+
+@pytest.mark.parametrize("kind", ["folder", "video", "array", "sim"])
+def test_frames_of_every_kind_are_read_only(kind: str, tmp_path: Path, recording: str) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((48, 64, 3), np.uint8))
+    video = str(tmp_path / "v.avi")
+    writer = cv2.VideoWriter(video, cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    spec = {"folder": str(tmp_path), "video": video, "array": recording, "sim": "sim:idle?frames=1"}[kind]
+    for frame in capture(spec).frames():
+        with pytest.raises(ValueError, match="read-only"):
+            frame.image[0, 0, 0] = 1
+
+
+def test_frames_of_an_array_are_not_copied(recording: str) -> None:
+    frames = list(capture(recording).frames())
+    addresses = [frame.image.ctypes.data for frame in frames]
+    # Consecutive frames of 4 x 6 x 3 bytes lie side by side, as in the file.
+    assert np.diff(addresses).tolist() == [72] * 5
+
+
+@pytest.mark.parametrize("count", [1, 3, 6, 9])
+def test_the_first_frames_are_the_reference(count: int, recording: str) -> None:
+    frames = list(capture(recording, reference=count).frames())
+    assert [frame.reference for frame in frames] == [index < count for index in range(6)]
+
+
+def test_a_reference_image_comes_before_the_first_frame(recording: str, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "gel.png"), np.full((4, 6), 99, np.uint8))
+    frames = list(capture(recording, directory=tmp_path, reference="gel.png").frames())
+    assert [frame.seq for frame in frames] == [-1, 0, 1, 2, 3, 4, 5]
+    assert [frame.reference for frame in frames] == [True] + [False] * 6
+    np.testing.assert_array_equal(frames[0].image, np.full((4, 6, 3), 99, np.uint8))
+    assert not frames[0].image.flags.writeable
+    assert frames[0].t == frames[1].t
+
+
+def test_a_reference_image_of_another_size_is_an_error_that_names_both(
+    recording: str, tmp_path: Path
+) -> None:
+    cv2.imwrite(str(tmp_path / "gel.png"), np.full((5, 6), 99, np.uint8))
+    stage = capture(recording, reference=str(tmp_path / "gel.png"))
+    with pytest.raises(SourceError, match=r"gel\.png.* 6 x 5 pixels.*recording\.npy are 6 x 4"):
+        next(stage.frames())
+
+
+def test_a_missing_reference_image_is_a_source_error(recording: str) -> None:
+    with pytest.raises(SourceError, match="no such file"):
+        capture(recording, reference="missing.png")
+
+
+@pytest.mark.parametrize("reference", [1, 2])
+def test_retaking_the_reference_starts_a_new_epoch_with_as_many_frames(
+    reference: int, recording: str
+) -> None:
+    stage = capture(recording, reference=reference)
+    frames = []
+    for frame in stage.frames():
+        frames.append(frame)
+        if frame.seq == 2:
+            stage.retake()
+    assert [frame.epoch for frame in frames] == [0, 0, 0, 1, 1, 1]
+    assert [frame.reference for frame in frames[3:]] == [index < reference for index in range(3)]
+
+
+def test_retaking_after_a_reference_image_takes_one_frame(recording: str, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "gel.png"), np.full((4, 6), 99, np.uint8))
+    stage = capture(recording, reference=str(tmp_path / "gel.png"))
+    stage.retake()
+    frames = list(stage.frames())
+    assert [(frame.epoch, frame.reference) for frame in frames[:3]] == [(0, True), (1, True), (1, False)]
+
+
+def test_skipped_frames_leave_their_numbers_unused(recording: str) -> None:
+    stage = capture(recording, skip=4)
+    assert stage.total == 2
+    frames = list(stage.frames())
+    assert [(frame.seq, frame.reference) for frame in frames] == [(4, True), (5, False)]
+
+
+def test_a_recording_is_live_only_when_played_at_its_own_pace(recording: str) -> None:
+    assert not capture(recording).live
+    assert capture(recording, realtime=True).live
+
+
+class _Clock:
+    """A clock that advances only when somebody waits, and while a frame is being read."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.waits: list[float] = []
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def wait(self, seconds: float) -> bool:
+        self.waits.append(seconds)
+        self.now += seconds
+        return False
+
+
+@pytest.mark.parametrize("reading", [0.0, 0.007, 0.099])
+def test_delays_do_not_add_up_at_the_recordings_own_pace(
+    reading: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = _Clock()
+    monkeypatch.setattr(capture_module.time, "perf_counter", clock.perf_counter)
+    stop = threading.Event()
+    monkeypatch.setattr(stop, "wait", clock.wait)
+    pace = capture_module._Pace(stop)
+    shown = []
+    for index in range(1000):
+        clock.now += reading
+        assert pace.wait_for(index / 10.0)
+        shown.append(clock.now)
+    # 1e-9 s: rounding of the clock's doubles only; any drift would be at least 1000 x 0.007 s.
+    np.testing.assert_allclose(np.array(shown) - shown[0], np.arange(1000) / 10.0, atol=1e-9)
+
+
+def test_after_a_long_interruption_the_recording_continues_instead_of_rushing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = _Clock()
+    monkeypatch.setattr(capture_module.time, "perf_counter", clock.perf_counter)
+    stop = threading.Event()
+    monkeypatch.setattr(stop, "wait", clock.wait)
+    pace = capture_module._Pace(stop)
+    pace.wait_for(0.0)
+    clock.now += 3600.0
+    pace.wait_for(0.1)
+    resumed = clock.now
+    pace.wait_for(0.2)
+    # 1e-9 s: rounding.
+    assert clock.now - resumed == pytest.approx(0.1, abs=1e-9)
+
+
+def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(recording: str) -> None:
+    # At this rate the second frame is due after 1000 s; the test's own time limit is far shorter.
+    stage = capture(recording, realtime=True, fps=0.001)
+    frames = []
+    first = threading.Event()
+
+    def run() -> None:
+        for frame in stage.frames():
+            frames.append(frame)
+            first.set()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert first.wait(10)
+    stage.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert len(frames) == 1
+
+
+def test_stopping_ends_a_capture_before_the_next_frame(recording: str) -> None:
+    stage = capture(recording)
+    frames = stage.frames()
+    assert len(list(islice(frames, 2))) == 2
+    stage.stop()
+    assert list(frames) == []
+
+
+def test_simulated_frames_are_described_and_counted() -> None:
+    stage = capture("sim:idle?frames=2")
+    assert stage.total == 2
+    assert stage.description == "sim:idle?frames=2, 2 frames at 60 fps"
+    assert len(list(stage.frames())) == 2
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        {"reference": 0},
+        {"reference": -3},
+        {"reference": True},
+        {"reference": ""},
+        {"reference": 1.5},
+        {"reference": None},
+        {"source": None},
+        {"source": True},
+        {"skip": -1},
+        {"width": 0},
+        {"fps": 0.0},
+        {"fps": float("inf")},
+        {"format": "MJPEG"},
+        {"sauce": "sim:press"},
+    ],
+    ids=str,
+)
+def test_wrong_parameters_are_refused(params: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        Capture.Params(**params)
+
+
+def test_a_camera_index_may_be_a_number() -> None:
+    assert Capture.Params.model_validate({"source": 0}).source == "0"
+
+
+def test_every_parameter_is_described() -> None:
+    for name, field in Capture.Params.model_fields.items():
+        assert field.description, name

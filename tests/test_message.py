@@ -1,0 +1,244 @@
+"""The result message and its schema."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactflow.engine.frame import Frame, Tick
+from tactflow.message import STATUS_NAMES, build_message, encode_message, message_schema
+from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
+
+VALIDATOR = jsonschema.Draft202012Validator(message_schema())
+
+RAW = np.zeros((600, 800, 3), np.uint8)
+PROCESSED = np.zeros((400, 300, 3), np.uint8)
+TICK = Tick(Frame("main", 36, 1.2, RAW))
+CONTACT = Contact(
+    area=5123.5,
+    center=(150.2, 201.7),
+    angle=-12.31,
+    slope=0.218,
+    hull=np.array([[1.0, 2.0], [3.0, 4.5], [0.1, 9.0]]),
+    ellipse=Ellipse((150.0, 200.0), (90.5, 60.25), -12.9),
+    confidence=0.75,
+)
+FLOW = Flow((1.21, -0.33), 9, stderr=(0.1, 0.2), rotation=3.5, divergence=0.01, residual=0.05)
+MARKERS = Markers(
+    origin=np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]]),
+    position=np.array([[10.5, 20.5], [30.25, 40.0], [50.0, 61.0]]),
+    status=np.array([0, 1, 2], np.uint8),
+    stderr=np.array([0.02, np.nan, np.nan]),
+)
+
+
+def test_the_message_has_exactly_the_fields_of_the_contract() -> None:
+    message = build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS)
+    assert message == {
+        "schema": "tactflow.frame/1",
+        "sensor": "main",
+        "seq": 36,
+        "t": 1.2,
+        "size": [300, 400],
+        "contact": {
+            "area": 5123.5,
+            "center": [150.2, 201.7],
+            "angle": -12.31,
+            "slope": 0.218,
+            "hull": [[1.0, 2.0], [3.0, 4.5], [0.1, 9.0]],
+            "ellipse": {"center": [150.0, 200.0], "axes": [90.5, 60.25], "angle": -12.9},
+        },
+        "flow": {"mean": [1.21, -0.33], "count": 9},
+        "markers": {
+            "origin": [[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]],
+            "position": [[10.5, 20.5], [30.25, 40.0], [50.0, 61.0]],
+            "status": ["tracked", "inferred", "lost"],
+        },
+        "skipped": {},
+    }
+    VALIDATOR.validate(message)
+
+
+def test_detail_adds_what_is_documented_and_nothing_else() -> None:
+    plain = build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS)
+    detailed = build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS, detail=True)
+    VALIDATOR.validate(detailed)
+    assert detailed["contact"].pop("confidence") == 0.75
+    assert detailed["flow"].pop("stderr") == [0.1, 0.2]
+    assert detailed["flow"].pop("rotation") == 3.5
+    assert detailed["flow"].pop("divergence") == 0.01
+    assert detailed["flow"].pop("residual") == 0.05
+    assert detailed["markers"].pop("stderr") == [0.02, None, None]
+    assert detailed == plain
+
+
+@pytest.mark.parametrize("detail", [False, True])
+@pytest.mark.parametrize(
+    ("contact", "flow", "markers"),
+    [
+        (None, None, None),
+        (None, None, MARKERS),
+        (CONTACT, None, None),
+        (replace(CONTACT, angle=None, slope=None, ellipse=None, area=0.0, hull=np.zeros((1, 2))), None, None),
+        (replace(CONTACT, angle=90.0, slope=None, ellipse=Ellipse((1, 2), (5, 5), None)), None, None),
+        (CONTACT, Flow(None, 0), MARKERS),
+        (CONTACT, Flow((0.0, 0.0), 1), None),
+        (None, None, Markers(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.uint8), np.zeros(0))),
+    ],
+)
+def test_whatever_is_unknown_is_null_and_the_message_stays_valid(
+    contact: Contact | None, flow: Flow | None, markers: Markers | None, detail: bool
+) -> None:
+    message = build_message(TICK, PROCESSED, contact, flow, markers, detail=detail)
+    VALIDATOR.validate(message)
+    assert (message["contact"] is None) == (contact is None)
+    assert (message["flow"] is None) == (flow is None)
+    assert (message["markers"] is None) == (markers is None)
+
+
+def test_without_a_processed_image_the_size_is_that_of_the_raw_one() -> None:
+    assert build_message(TICK, None, None, None, None)["size"] == [800, 600]
+
+
+def test_reasons_for_skipping_are_passed_on() -> None:
+    tick = Tick(TICK.frame, {"contact": "no_contact", "flow": "no_contact"})
+    message = build_message(tick, None, None, None, None)
+    assert message["skipped"] == {"contact": "no_contact", "flow": "no_contact"}
+    VALIDATOR.validate(message)
+
+
+def test_the_message_is_one_line() -> None:
+    assert b"\n" not in encode_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS, detail=True)
+
+
+def test_views_that_are_not_contiguous_and_other_number_types_are_written_correctly() -> None:
+    wide = np.arange(12, dtype=np.float64).reshape(3, 4)
+    markers = Markers(wide[:, ::2], wide[:, 1::2], np.array([0, 9, 0, 9, 0], np.uint8)[::2], wide[:, 0])
+    contact = replace(CONTACT, area=np.float64(2.5), center=(np.float32(1.5), 2))
+    message = build_message(TICK, None, contact, Flow((0.5, 0.5), np.int64(3)), markers, detail=True)
+    assert message["markers"]["origin"] == [[0.0, 2.0], [4.0, 6.0], [8.0, 10.0]]
+    assert message["markers"]["position"] == [[1.0, 3.0], [5.0, 7.0], [9.0, 11.0]]
+    assert message["contact"]["center"] == [1.5, 2.0]
+    VALIDATOR.validate(message)
+
+
+@given(
+    st.lists(
+        st.tuples(*[st.floats(-1e6, 1e6, allow_nan=False)] * 4, st.sampled_from(list(MarkerStatus))),
+        max_size=20,
+    )
+)
+def test_numbers_arrive_as_they_were(rows: list[tuple[float, float, float, float, MarkerStatus]]) -> None:
+    table = np.array([row[:4] for row in rows], np.float64).reshape(-1, 4)
+    status = np.array([row[4] for row in rows], np.uint8)
+    markers = Markers(table[:, :2], table[:, 2:], status, np.zeros(len(rows)))
+    body = encode_message(TICK, None, None, None, markers)
+    # Read with the standard library: another parser than the encoder's own.
+    message = json.loads(body)
+    assert message["markers"]["origin"] == table[:, :2].tolist()
+    assert message["markers"]["position"] == table[:, 2:].tolist()
+    assert message["markers"]["status"] == [MarkerStatus(s).name.lower() for s in status.tolist()]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    "field",
+    ["t", "contact.area", "contact.center", "contact.angle", "contact.slope", "contact.hull",
+     "contact.ellipse.axes", "contact.confidence", "flow.mean", "flow.rotation", "markers.origin",
+     "markers.position"],
+)  # fmt: skip
+def test_a_number_that_is_not_finite_is_refused_by_name(field: str, bad: float) -> None:
+    tick, contact, flow, markers = TICK, CONTACT, FLOW, MARKERS
+    first, _, rest = field.partition(".")
+    points = np.array([[1.0, bad]])
+    if first == "t":
+        tick = Tick(replace(TICK.frame, t=bad))
+    elif field == "contact.ellipse.axes":
+        contact = replace(CONTACT, ellipse=Ellipse((0, 0), (bad, 1), None))
+    elif first == "contact":
+        value: Any = {"center": (1.0, bad), "hull": points}.get(rest, bad)
+        contact = replace(CONTACT, **{rest: value})
+    elif first == "flow":
+        flow = replace(FLOW, **{rest: (bad, 1.0) if rest == "mean" else bad})
+    else:
+        markers = replace(MARKERS, **{rest: points})
+    with pytest.raises(ValueError, match=field):
+        encode_message(tick, None, contact, flow, markers, detail=True)
+
+
+def test_an_infinite_standard_error_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"markers\.stderr"):
+        encode_message(TICK, None, None, None, replace(MARKERS, stderr=np.array([np.inf, 0, 0])), detail=True)
+
+
+def test_status_names_follow_the_enum() -> None:
+    assert [STATUS_NAMES[status] for status in MarkerStatus] == ["tracked", "inferred", "lost"]
+
+
+def _changed(path: str, value: Any) -> dict[str, Any]:
+    message = build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS)
+    *parents, last = path.split(".")
+    target = message
+    for name in parents:
+        target = target[name]
+    if value is ...:
+        del target[last]
+    else:
+        target[last] = value
+    return message
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("schema", "tactflow.frame/2"),
+        ("schema", ...),
+        ("sensor", 1),
+        ("seq", -1),
+        ("seq", 1.5),
+        ("t", "now"),
+        ("t", None),
+        ("size", [300]),
+        ("size", [300, 400, 3]),
+        ("size", [0, 400]),
+        ("contact", ...),
+        ("contact", {}),
+        ("contact.area", -1.0),
+        ("contact.angle", -90.0),
+        ("contact.angle", 90.1),
+        ("contact.angle", ...),
+        ("contact.center", [1.0]),
+        ("contact.hull", [[1.0, 2.0, 3.0]]),
+        ("contact.ellipse", {"center": [1, 2]}),
+        ("contact.ellipse.axes", [1.0, 0.0]),
+        ("contact.extra", 1),
+        ("contact.confidence", None),
+        ("flow.count", -1),
+        ("flow.mean", [1.0, None]),
+        ("flow.extra", 1),
+        ("markers.status", ["seen"]),
+        ("markers.position", [[1.0, None]]),
+        ("markers.extra", []),
+        ("skipped", None),
+        ("skipped", {"flow": 1}),
+        ("extra", 1),
+    ],
+)
+def test_the_schema_refuses_what_the_contract_does_not_say(path: str, value: Any) -> None:
+    VALIDATOR.validate(build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS))
+    with pytest.raises(jsonschema.ValidationError):
+        VALIDATOR.validate(_changed(path, value))
+
+
+def test_the_schema_is_itself_a_valid_schema_without_defaults() -> None:
+    schema = message_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    assert '"default"' not in json.dumps(schema)
