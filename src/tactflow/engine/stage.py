@@ -228,7 +228,7 @@ def _output_ports(annotation: Any) -> tuple[Port, ...]:
     if isinstance(spec, ArrayPort | SignalPort):
         return (Port(spec.name, result, optional),)
     _check_array("the return annotation", result)
-    if not inspect.isclass(result) or result.__module__ == "builtins":
+    if result is Any or not inspect.isclass(result) or result.__module__ == "builtins":
         raise _PortError(
             f"the return annotation {_describe(result)} gives the output port no name; return a dataclass "
             "(Contact gives the port contact), a type of tactflow.ports, or a NamedTuple of ports"

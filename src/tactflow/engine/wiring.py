@@ -162,7 +162,9 @@ class _Wiring:
                 return ref
         giver = self._by_id.get(stage)
         if giver is None:
-            self._problems.add(item.mark, f"{path}: {self._unknown(text, user, by_port)}")
+            # A signal that nobody gives may be one of a stage that could not be found.
+            if self._complete or dot or not by_port:
+                self._problems.add(item.mark, f"{path}: {self._unknown(text, user, by_port)}")
         elif giver.section == "sinks":
             self._problems.add(item.mark, f"{path}: {stage} is a sink and gives nothing")
         elif giver.component is not None:

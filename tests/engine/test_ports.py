@@ -1,0 +1,263 @@
+"""Ports are read from annotations, and their types decide what fits together."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.frame import Absent, Frame, Tick
+from tactflow.engine.stage import ArrayPort, Port, SignalPort, describe_type, mismatch, port_type, read_ports
+from tactflow.ports import ContactMask, Image, Picture, Touching
+from tactflow.vision.types import Contact, Flow, Markers
+
+if TYPE_CHECKING:
+    from tactflow.vision.types import Ellipse
+
+Grey = Annotated[NDArray[np.uint8], ArrayPort("grey", ("H", "W"), "uint8", "grey levels")]
+AnyChannels = Annotated[NDArray[np.uint8], ArrayPort("any", ("H", "W", "C"), "uint8", "grey levels, BGR")]
+FloatMask = Annotated[NDArray[np.float32], ArrayPort("mask", ("H", "W"), "float32", "0 or 255")]
+Moving = Annotated[bool, SignalPort("moving", closed="still")]
+
+
+class Masks(NamedTuple):
+    contact_mask: ContactMask
+    contact: Contact | None
+    touching: Touching
+
+
+class NoFields(NamedTuple):
+    pass
+
+
+class RawField(NamedTuple):
+    picture: NDArray[np.uint8]
+
+
+class HiddenField(NamedTuple):
+    ellipse: Ellipse
+
+
+class HTTPStatusCode:
+    pass
+
+
+def outputs(annotation: Any) -> list[tuple[str, bool]]:
+    class Stage:
+        def process(self, image: Image) -> Any: ...
+
+    Stage.process.__annotations__["return"] = annotation
+    return [(port.name, port.optional) for port in read_ports(Stage, "process").outputs]
+
+
+def test_parameters_are_input_ports_and_none_makes_them_optional() -> None:
+    class Stage:
+        def process(self, image: Image, contact: Contact | None, flow: Flow | None = None) -> Contact: ...
+
+    ports = read_ports(Stage, "process")
+    assert [(port.name, port.optional) for port in ports.inputs] == [
+        ("image", False),
+        ("contact", True),
+        ("flow", True),
+    ]
+    assert port_type(ports.inputs[0].annotation).name == "image"
+    assert ports.inputs[1].annotation is Contact
+    assert not ports.takes_tick
+
+
+@pytest.mark.parametrize(
+    ("annotation", "expected"),
+    [
+        (Contact, [("contact", False)]),
+        (Contact | Absent, [("contact", True)]),
+        (Contact | None, [("contact", True)]),
+        (Picture, [("annotated", False)]),
+        (Picture | Absent, [("annotated", True)]),
+        (Touching, [("touching", False)]),
+        (HTTPStatusCode, [("http_status_code", False)]),
+        (Masks, [("contact_mask", False), ("contact", True), ("touching", False)]),
+        (Masks | Absent, [("contact_mask", False), ("contact", True), ("touching", False)]),
+    ],
+)
+def test_the_return_annotation_names_the_output_ports(
+    annotation: Any, expected: list[tuple[str, bool]]
+) -> None:
+    assert outputs(annotation) == expected
+
+
+@pytest.mark.parametrize(
+    ("annotation", "words"),
+    [
+        (np.ndarray, "a bare array does not say what it holds"),
+        (NDArray[np.uint8], "a bare array does not say what it holds"),
+        (RawField, "RawField.picture: a bare array"),
+        (NoFields, "NoFields has no annotated fields"),
+        (HiddenField, "the fields of HiddenField use Ellipse"),
+        (float, "gives the output port no name"),
+        (dict[str, int], "gives the output port no name"),
+        (Any, "gives the output port no name"),
+        (Contact | Flow, "names several types for one port"),
+        (None, "names no type for one port"),
+        (Absent, "names no type for one port"),
+    ],
+)
+def test_a_return_annotation_that_names_no_port_is_an_error(annotation: Any, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        outputs(annotation)
+
+
+def test_a_sink_may_take_the_tick() -> None:
+    class Sink:
+        def write(self, tick: Tick, contact: Contact | None) -> None: ...
+
+    ports = read_ports(Sink, "write")
+    assert ports.takes_tick
+    assert [port.name for port in ports.inputs] == ["contact"]
+    assert ports.outputs == ()
+
+
+@pytest.mark.parametrize("annotation", [Iterator[Frame], Generator[Frame, None, None]])
+def test_a_source_gives_the_port_frame(annotation: Any) -> None:
+    class Source:
+        def frames(self) -> Any: ...
+
+    Source.frames.__annotations__["return"] = annotation
+    ports = read_ports(Source, "frames")
+    assert ports.inputs == ()
+    assert ports.outputs == (Port("frame", Frame),)
+
+
+class SourceWithInput:
+    def frames(self, image: Image) -> Iterator[Frame]: ...
+
+
+class SourceOfNumbers:
+    def frames(self) -> Iterator[int]: ...
+
+
+class SourceWithoutAnnotation:
+    def frames(self): ...  # type: ignore[no-untyped-def]
+
+
+class StageWithTick:
+    def process(self, tick: Tick) -> Contact: ...
+
+
+class StageWithoutInputs:
+    def process(self) -> Contact: ...
+
+
+class StageWithoutReturn:
+    def process(self, image: Image): ...  # type: ignore[no-untyped-def]
+
+
+class StageWithDefault:
+    def process(self, image: Image, gain: float = 1.0) -> Contact: ...
+
+
+class StageWithHiddenNone:
+    def process(self, image: Image = None) -> Contact: ...  # type: ignore[assignment]
+
+
+class StageWithStars:
+    def process(self, *images: Image) -> Contact: ...
+
+
+class StageWithHiddenName:
+    def process(self, ellipse: Ellipse) -> Contact: ...
+
+
+class StageWithBareInput:
+    def process(self, image: NDArray[np.uint8]) -> Contact: ...
+
+
+class StageWithAbsentInput:
+    def process(self, contact: Contact | Absent) -> Flow: ...
+
+
+class SinkThatReturns:
+    def write(self, contact: Contact) -> int: ...
+
+
+class SinkWithOtherTick:
+    def write(self, now: Tick) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("cls", "method", "words"),
+    [
+        (SourceWithInput, "frames", "a source has no inputs, but image is one"),
+        (SourceOfNumbers, "frames", r"must be Iterator\[Frame\]"),
+        (SourceWithoutAnnotation, "frames", r"must be Iterator\[Frame\]"),
+        (StageWithTick, "process", "only a sink may take a Tick"),
+        (StageWithoutInputs, "process", "needs at least one input"),
+        (StageWithoutReturn, "process", "no return annotation"),
+        (StageWithDefault, "process", "gain has a default"),
+        (StageWithHiddenNone, "process", r"annotate it as optional: X \| None"),
+        (StageWithStars, "process", r"images: a port cannot be"),
+        (
+            StageWithHiddenName,
+            "process",
+            "the annotations use Ellipse, which is not known when the program runs",
+        ),
+        (StageWithBareInput, "process", "image: a bare array"),
+        (StageWithAbsentInput, "process", r"annotated X \| None"),
+        (SinkThatReturns, "write", "a sink returns nothing"),
+        (SinkWithOtherTick, "write", "must be called tick, not now"),
+    ],
+)
+def test_annotations_that_break_the_contract_are_reported_with_their_line(
+    cls: type, method: str, words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        read_ports(cls, method)
+    line = getattr(cls, method).__code__.co_firstlineno
+    assert str(caught.value).startswith(f"{__file__}:{line}: {cls.__name__}.{method}: ")
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted", "reason"),
+    [
+        (Image, Image, None),
+        (Image, AnyChannels, None),
+        (AnyChannels, Image, "axis of size C where 3 is wanted"),
+        (Image, ContactMask, "3 axes where 2 are wanted"),
+        (Grey, ContactMask, "unit 'grey levels' where '0 or 255' is wanted"),
+        (FloatMask, ContactMask, "dtype float32 where uint8 is wanted"),
+        (Touching, Moving, None),
+        (Touching, bool, None),
+        (bool, Touching, "the types differ"),
+        (Contact, Contact, None),
+        (Contact, Flow, "the types differ"),
+        (bool, int, None),
+        (int, bool, "the types differ"),
+        (Contact, object, None),
+        (Image, Any, None),
+        (Image, Contact, "the types differ"),
+        (Contact, Image, "the types differ"),
+        (list[int], list[int], None),
+        (list[int], list[str], "the types differ"),
+        (Flow, Contact | Flow, None),
+        (Markers, Contact | Flow, "the types differ"),
+    ],
+)
+def test_an_output_fits_an_input_or_says_why_not(given: Any, wanted: Any, reason: str | None) -> None:
+    assert mismatch(Port("given", given), Port("wanted", wanted)) == reason
+
+
+@pytest.mark.parametrize(
+    ("annotation", "words"),
+    [
+        (Image, "(H, W, 3) uint8, grey levels, BGR"),
+        (Touching, "signal"),
+        (Contact, "Contact"),
+        (Contact | Flow, "Contact or Flow"),
+        (list[int], "list[int]"),
+    ],
+)
+def test_a_type_is_described_in_words(annotation: Any, words: str) -> None:
+    assert describe_type(annotation) == words
