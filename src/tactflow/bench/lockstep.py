@@ -145,6 +145,15 @@ class LockstepPipeline:
             wall=self._turns.wall,
         )
 
+    def stages_ms(self) -> dict[str, float]:
+        """Stage or sink -> median time of a call so far, ms."""
+        medians = {
+            node.id: node.stats.durations.milliseconds(0.5)
+            for node in self._runner.nodes.values()
+            if node.id != _COLLECT
+        }
+        return {name: value for name, value in medians.items() if value is not None}
+
     def close(self) -> None:
         """Stop, and wait for the pipeline's thread."""
         self._runner.stop("max_frames")

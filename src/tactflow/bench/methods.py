@@ -266,7 +266,7 @@ def _measure_group(
     yardstick = next((name for name, way in ways.items() if way.yardstick), None)
     made = []
     for name in ways:
-        measurement = Measurement(group.group, name, rendered.case.name, frames=len(inputs))
+        measurement = Measurement(group.group, name, rendered.case.label, frames=len(inputs))
         measurement.failure = failures.get(name)
         if measurement.failure is None:
             measurement.errors = scores[name].errors()

@@ -67,13 +67,21 @@ class _Score:
         return {**self.contact.errors(), **self.markers.errors(), **self.flow.errors()}
 
 
+@dataclass(slots=True)
+class Times:
+    """samples : pipeline -> kind of frame -> samples. stages : pipeline -> stage -> median of a call, ms."""
+
+    samples: dict[str, dict[Any, Samples]]
+    stages: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
+
+
 def take_turns(
     pipelines: Mapping[str, Pipeline],
     folder: Path,
     unit: CopyUnit,
     see: Callable[[str, Outcome], str],
     step: Callable[[], None],
-) -> tuple[dict[str, dict[str, Samples]], dict[str, str]]:
+) -> tuple[Times, dict[str, str]]:
     """Run pipelines frame by frame, taking turns, until all recordings are over.
 
     Parameters
@@ -85,9 +93,9 @@ def take_turns(
 
     Returns
     -------
-    times : name -> kind -> samples. failures : name -> why it stopped.
+    times, and failures : name -> why it stopped.
     """
-    times: dict[str, dict[str, Samples]] = {name: {} for name in pipelines}
+    times = Times({name: {} for name in pipelines})
     failures: dict[str, str] = {}
     running: dict[str, LockstepPipeline] = {}
     with quiet():
@@ -113,11 +121,12 @@ def take_turns(
                     kind = see(name, outcome)
                     if outcome.frame.reference:
                         kind = "reference"
-                    times[name].setdefault(kind, Samples()).add(outcome.cpu, outcome.wall)
+                    times.samples[name].setdefault(kind, Samples()).add(outcome.cpu, outcome.wall)
                 step()
+            times.stages = {name: lockstep.stages_ms() for name, lockstep in running.items()}
         finally:
-            for pipeline_running in running.values():
-                pipeline_running.close()
+            for lockstep in running.values():
+                lockstep.close()
     return times, failures
 
 
@@ -144,14 +153,15 @@ def measure_pipelines(
     times, failures = take_turns(ready, folder, unit, see, step)
     made = []
     for name in pipelines:
-        measurement = Measurement("pipeline", name, rendered.case.name, frames=len(rendered))
+        measurement = Measurement("pipeline", name, rendered.case.label, frames=len(rendered))
         measurement.failure = failures.get(name)
         if measurement.failure is None:
             measurement.errors = scores[name].errors()
             limit = scores[name].limit
             if limit is not None:
                 measurement.limits["displacement_rms"] = limit
-            fill_times(measurement, times[name], unit, times.get(SEED))
+            fill_times(measurement, times.samples[name], unit, times.samples.get(SEED))
+            measurement.stages_ms = times.stages.get(name, {})
         made.append(measurement)
     return made
 
@@ -176,16 +186,15 @@ def growth(pipeline: Pipeline, rendered: Rendered, folder: Path, unit: CopyUnit)
             ready,
             folder,
             unit,
-            lambda _, outcome: "contact" if rendered.scene.presses(outcome.frame.seq) else "idle",
+            lambda _, outcome: "contact" if rendered.deep(outcome.frame.seq) else "idle",
             lambda: None,
         )
     finally:
         path.unlink(missing_ok=True)
     if failures:
         return None
-    return (
-        times["large"]["contact"].summary()["cpu_ms_p50"] / times["small"]["contact"].summary()["cpu_ms_p50"]
-    )
+    large_ms, small_ms = (times.samples[n]["contact"].summary()["cpu_ms_p50"] for n in ("large", "small"))
+    return large_ms / small_ms
 
 
 def peak_memory_mb(file: Path, recording: Path, sinks: Sequence[str]) -> float | None:

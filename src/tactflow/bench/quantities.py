@@ -70,6 +70,7 @@ _ALL = [
     Quantity("shared_dots", "markers that share a dot with another", "per frame", slack=0.0),
     Quantity("flow_jumps", "flow jumps over half a pitch against neighbours", "per frame", slack=0.0),
     Quantity("frames_with_jumps", "frames with at least one flow jump", "%", slack=0.0),
+    Quantity("lost_share", "markers declared lost on a real roll", "%", slack=0.2),
     Quantity("markers_short", "markers missing from the known grid", "", slack=0.0),
 ]
 

@@ -14,7 +14,7 @@ from html import escape
 from statistics import median
 
 from tactflow.bench.quantities import QUANTITIES, Quantity
-from tactflow.bench.results import RECORDING, Measurement, Result
+from tactflow.bench.results import Measurement, Result
 
 TITLES = {
     "pipeline": "Whole pipelines",
@@ -64,15 +64,11 @@ def cost_of(measurements: Iterable[Measurement]) -> float | None:
     return median(known) if known else None
 
 
-def points(result: Result, group: str, quantity: Quantity, recordings: bool = False) -> list[Point]:
+def points(result: Result, group: str, quantity: Quantity) -> list[Point]:
     """One point per method of a group that has both a time and this error."""
     found = []
     for method in result.methods(group):
-        rows = [
-            m
-            for m in result.of(group, method)
-            if quantity.key in m.errors and m.scene.startswith(RECORDING) == recordings
-        ]
+        rows = [m for m in result.of(group, method) if quantity.key in m.errors]
         cost = cost_of(rows)
         if not rows or cost is None:
             continue
@@ -382,9 +378,7 @@ def _heading(quantity: Quantity) -> str:
 
 
 def _value_with_worst(result: Result, group: str, method: str, quantity: Quantity) -> str:
-    rows = [
-        m for m in result.of(group, method) if quantity.key in m.errors and not m.scene.startswith(RECORDING)
-    ]
+    rows = [m for m in result.of(group, method) if quantity.key in m.errors]
     if not rows:
         return "-"
     values = [m.errors[quantity.key] for m in rows]

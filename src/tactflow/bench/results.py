@@ -28,6 +28,7 @@ class Measurement:
     faster : kind -> how many times faster than the seed method of the same group in the same run.
     errors : quantity -> value; only what the scene can tell.
     limits : quantity -> the smallest value that physics allows.
+    stages_ms : stage -> median time of a call, ms; whole pipelines only.
     peak_mb : peak memory of the process, MB; whole pipelines only.
     failure : why there is no result, or None.
     """
@@ -41,6 +42,7 @@ class Measurement:
     faster: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     limits: dict[str, float] = field(default_factory=dict)
+    stages_ms: dict[str, float] = field(default_factory=dict)
     peak_mb: float | None = None
     failure: str | None = None
 

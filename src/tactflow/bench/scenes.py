@@ -25,11 +25,18 @@ class Case:
     """A scene and how much of it is used.
 
     name : of the scene. frames : of its recording, all of which are used. query : further settings.
+    suffix : tells it from the same scene with other settings.
     """
 
     name: str
     frames: int
     query: str = ""
+    suffix: str = ""
+
+    @property
+    def label(self) -> str:
+        """What results call it."""
+        return self.name + self.suffix
 
     @property
     def spec(self) -> str:
@@ -58,6 +65,7 @@ FULL = (
     Case("strong_shear", 140),
     Case("jumps", 160),
     Case("worn", 150),
+    Case("jumps", 160, "worn=0.05&missing=0.05&vanish=0.05", "_worn"),
     Case("dense", 100),
     Case("sparse", 80),
     Case("bright_dots", 80),
@@ -71,6 +79,7 @@ FULL = (
     Case("flicker", 150),
     Case("idle", 100),
     Case("tap", 100),
+    Case("unmarked", 100),
 )
 """Every kind of contact, light, marker and camera trouble."""
 
@@ -108,7 +117,7 @@ class Rendered:
     def __init__(self, case: Case, folder: Path) -> None:
         self.case = case
         self.scene: Scene = open_scene(case.spec)
-        self.path = folder / f"{case.name}-{case.frames}.npy"
+        self.path = folder / f"{case.label}-{case.frames}.npy"
         size = (case.frames, self.scene.size[1], self.scene.size[0], 3)
         frames = np.lib.format.open_memmap(self.path, mode="w+", dtype=np.uint8, shape=size)
         for index in range(case.frames):

@@ -19,6 +19,7 @@ COMMANDS = {
     "graph": "print a pipeline as a Mermaid flowchart",
     "stages": "list the stages and sinks that can be used, their ports and parameters",
     "listen": "print what a running tactflow publishes",
+    "bench": "measure run time against error, per method and for whole pipelines",
     "sim": "write a simulated recording and its ground truth",
     "schema": "print the JSON Schema of the result message or of a pipeline file",
 }

@@ -1,0 +1,154 @@
+"""What was promised of the default pipeline, and what a run of the bench says about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from statistics import median
+
+from tactflow.bench.quantities import QUANTITIES
+from tactflow.bench.results import RECORDING, Measurement, Result, Target
+from tactflow.bench.scenes import NOMINAL
+
+DIRECTED = frozenset({"cable", "bright_cable", "edge"})
+"""Scenes whose contacts are at least twice as long as wide."""
+
+HARD_MARKERS = frozenset({"jumps", "jumps_worn"})
+
+ALWAYS = frozenset({"idle", "drift", "flicker", "noisy"})
+"""Scenes that tempt a method to see contacts."""
+
+
+def judge(result: Result, default: str, markerless: str | None, growth: float | None) -> list[Target]:
+    """Every promise with its result; those that were not measured say so.
+
+    Parameters
+    ----------
+    result : of a run. default : name of the pipeline that made the promises. markerless : name of the one for
+        sensors without markers. growth : from `pipelines.growth`.
+    """
+    simulated = [m for m in result.of("pipeline", default) if not m.scene.startswith(RECORDING)]
+    nominal = [m for m in simulated if m.scene in NOMINAL]
+    copies = f"copies of a raw frame ({result.copy_ms:.3f} ms here)"
+    return [
+        _time("frame with contact", nominal, "contact", 13, 60, copies),
+        _time("frame without contact", nominal, "idle", 5, 150, copies),
+        _worst("marker displacement", nominal, [("displacement_rms", 0.03), ("displacement_p99", 0.1)]),
+        _wrong("identities", nominal, 0.1),
+        _wrong("identities: jumps of 0.9 pitch; 5 % worn, missing", _of(simulated, HARD_MARKERS), 0.5),
+        _worst(
+            "contact", nominal, [("hull_iou", 0.88), ("center_error", 1.0), ("area_error", 8.0)], skip={"two"}
+        ),
+        _worst("direction", _of(simulated, DIRECTED), [("angle_mean", 0.7), ("angle_max", 2.5)]),
+        _worst("mean flow in contact", nominal, [("flow_error", 0.15)]),
+        _worst(
+            "idle frames called contact; half-depth contacts missed",
+            _of(simulated, NOMINAL | ALWAYS),
+            [("false_contacts", 0.0), ("missed_half_depth", 0.0)],
+        ),
+        Target(
+            "4 times the pixels and markers",
+            "<= 4.4 times the time",
+            "-" if growth is None else f"{growth:.2f} times",
+            None if growth is None else growth <= 4.4,
+            "press, mirrored to twice its width and height",
+        ),
+        _recording(
+            result,
+            default,
+            "wedge_ball",
+            [("found_percent", 100.0), ("label_center_p50", 2.0), ("label_center_p95", 4.8)],
+        ),
+        _recording(
+            result,
+            default,
+            "wedge_roll",
+            [("markers_short", 0.0), ("shared_dots", 0.0), ("flow_jumps", 0.0)],
+        ),
+        _tracker_time(result, default),
+        _recording(result, markerless or default, "wedge_grasp", [("force_right", 98.0)]),
+    ]
+
+
+def _of(measurements: Collection[Measurement], scenes: Collection[str]) -> list[Measurement]:
+    return [m for m in measurements if m.scene in scenes]
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _time(
+    name: str, measurements: Collection[Measurement], kind: str, most: float, faster: float, unit: str
+) -> Target:
+    copies = [m.copies[kind] for m in measurements if kind in m.copies]
+    ratios = [m.faster[kind] for m in measurements if kind in m.faster]
+    target = f"<= {most:g} {unit}; >= {faster:g} times as fast as the seed"
+    if not copies or not ratios:
+        return Target(name, target, "-", None)
+    result = f"{median(copies):.1f} copies; {median(ratios):.0f} times"
+    met = median(copies) <= most and median(ratios) >= faster
+    return Target(name, target, result, met, f"median of {len(copies)} scenes")
+
+
+def _worst(
+    name: str,
+    measurements: Collection[Measurement],
+    limits: Collection[tuple[str, float]],
+    skip: Collection[str] = (),
+) -> Target:
+    """Judged by the worst scene for each quantity."""
+    wanted, got, where = [], [], []
+    met: bool | None = None
+    for key, bound in limits:
+        quantity = QUANTITIES[key]
+        higher = quantity.better == "higher"
+        unit = f" {quantity.unit}" if quantity.unit else ""
+        wanted.append(f"{'>=' if higher else '<='} {bound:g}{unit}")
+        known = [m for m in measurements if key in m.errors and m.scene not in skip]
+        if not known:
+            got.append("-")
+            continue
+        pick: Callable[..., Measurement] = min if higher else max
+        worst = pick(known, key=lambda m: m.errors[key])
+        value = worst.errors[key]
+        got.append(_number(value))
+        where.append(worst.scene)
+        right = value >= bound if higher else value <= bound
+        met = right if met is None else met and right
+    scenes = len({m.scene for m in measurements} - set(skip))
+    on = f"worst of {scenes} scenes: {', '.join(dict.fromkeys(where))}" if where else ""
+    return Target(name, "; ".join(wanted), "; ".join(got), met, on)
+
+
+def _wrong(name: str, measurements: Collection[Measurement], most: float) -> Target:
+    """Wrong and lost markers together, judged by the worst scene."""
+    sums = {
+        m.scene: m.errors["wrong_percent"] + m.errors["lost_percent"]
+        for m in measurements
+        if "wrong_percent" in m.errors
+    }
+    target = f"<= {most:g} % wrong or lost"
+    if not sums:
+        return Target(name, target, "-", None)
+    worst = max(sums, key=lambda scene: sums[scene])
+    on = f"worst of {len(sums)} scenes: {worst}"
+    return Target(name, target, f"{_number(sums[worst])} %", sums[worst] <= most, on)
+
+
+def _recording(result: Result, method: str, scene: str, limits: Collection[tuple[str, float]]) -> Target:
+    rows = [m for m in result.of("pipeline", method) if m.scene == RECORDING + scene]
+    target = _worst(scene, rows, limits)
+    titles = "; ".join(QUANTITIES[key].title for key, _ in limits)
+    failure = next((m.failure for m in rows if m.failure), None)
+    if failure is not None:
+        return Target(scene, target.target, "failed", False, failure)
+    on = titles if rows else "give the recordings with --data"
+    return Target(scene, target.target, target.result, target.met, on)
+
+
+def _tracker_time(result: Result, default: str) -> Target:
+    rows = [m for m in result.of("pipeline", default) if m.scene == RECORDING + "wedge_roll"]
+    times = [m.stages_ms["tracker"] for m in rows if "tracker" in m.stages_ms]
+    if not times:
+        return Target("wedge_roll, tracker", "<= 1 ms a frame", "-", None)
+    return Target("wedge_roll, tracker", "<= 1 ms a frame", f"{times[0]:.2f} ms", times[0] <= 1.0, "median")

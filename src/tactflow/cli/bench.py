@@ -1,0 +1,166 @@
+"""`tactflow bench`: run time against error, per method and for whole pipelines."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from tactflow.bench.compare import Regression, against
+from tactflow.bench.methods import SEED
+from tactflow.bench.report import html
+from tactflow.bench.results import Result, load_errors
+from tactflow.bench.run import DEFAULT, Plan, run_bench
+from tactflow.bench.table import print_result
+from tactflow.cli.pipelines import find_pipeline, packaged_pipelines
+from tactflow.engine.errors import ConfigError
+
+WORSE = 3
+"""Exit code when `--against` finds something worse."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `bench`."""
+    parser.add_argument(
+        "pipelines",
+        nargs="*",
+        metavar="PIPELINE",
+        help="measure these as well, beside the packaged ones; ./pipeline.yaml is measured if it is there",
+    )
+    parser.add_argument("--quick", action="store_true", help="three short scenes, below a minute")
+    parser.add_argument(
+        "--scene",
+        action="append",
+        metavar="NAME",
+        help="only this scene of the simulated sensor; repeatable",
+    )
+    parser.add_argument(
+        "--data",
+        type=Path,
+        metavar="DIR",
+        help="also measure on the real recordings in DIR (wedge_ball, wedge_roll, wedge_grasp)",
+    )
+    parser.add_argument("--json", type=Path, metavar="PATH", help="write every number here, as JSON")
+    parser.add_argument("--html", type=Path, metavar="PATH", help="write the report here, as one HTML file")
+    parser.add_argument(
+        "--against",
+        type=Path,
+        metavar="FILE",
+        help="compare the errors with a stored result; exit code 3 if one got worse than its tolerance",
+    )
+    parser.add_argument(
+        "--errors", type=Path, metavar="PATH", help="write the errors alone, to be used with --against"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the table, write what was asked for; returns the exit code."""
+    if args.against is not None:
+        load_errors(args.against)
+    for path in (args.json, args.html, args.errors):
+        _refuse_unwritable(path)
+    plan = Plan(
+        files=_files(args.pipelines),
+        quick=args.quick,
+        data=args.data,
+        scenes=frozenset(args.scene) if args.scene else None,
+    )
+    with _quiet_log(), _progress_bar() as progress:
+        result = run_bench(plan, progress)
+    print_result(result, Console(file=sys.stdout, highlight=False))
+    _write(args, result)
+    worse = against(result, args.against) if args.against is not None else []
+    _report(worse, args.against)
+    return WORSE if worse else 0
+
+
+def _files(given: list[str]) -> dict[str, Path]:
+    """Name -> pipeline file: the default first, then the other packaged ones, then those that were given."""
+    others = [name for name in packaged_pipelines() if name not in (DEFAULT, SEED)]
+    files = {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, SEED, *others)}
+    local = Path("pipeline.yaml")
+    if local.exists() and local.read_bytes() != files[DEFAULT].read_bytes():
+        files["./pipeline"] = local
+    for word in given:
+        path = find_pipeline(word)
+        if not path.exists():
+            raise ConfigError(f"{word}: there is no such pipeline file")
+        if path not in files.values():
+            files[path.stem if path.stem not in files else str(path)] = path
+    return files
+
+
+def _refuse_unwritable(path: Path | None) -> None:
+    """Find out before the run, not after a quarter of an hour, that a result cannot be written."""
+    if path is not None and not path.parent.is_dir():
+        raise ConfigError(f"{path}: there is no folder {path.parent}")
+    if path is not None and path.is_dir():
+        raise ConfigError(f"{path}: is a folder; required the name of a file")
+
+
+def _write(args: argparse.Namespace, result: Result) -> None:
+    writers: list[tuple[Path | None, Callable[[Path], object]]] = [
+        (args.json, result.save),
+        (args.errors, result.save_errors),
+        (args.html, lambda path: path.write_text(html(result), encoding="utf-8")),
+    ]
+    for path, write in writers:
+        if path is None:
+            continue
+        try:
+            write(path)
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+        print(f"tactflow: wrote {path}", file=sys.stderr)
+
+
+def _report(worse: list[Regression], path: Path | None) -> None:
+    if path is None:
+        return
+    if not worse:
+        print(f"tactflow: nothing got worse than in {path}", file=sys.stderr)
+        return
+    print(f"tactflow: {len(worse)} results got worse than in {path}:", file=sys.stderr)
+    for regression in worse:
+        print(f"  {regression}", file=sys.stderr)
+
+
+@contextmanager
+def _quiet_log() -> Iterator[None]:
+    """Keep notes of the pipelines off the screen: each would appear once per scene."""
+    logger = logging.getLogger("tactflow")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on standard error, on a terminal only."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda _what, _done, _total: None
+        return
+    columns = (
+        TextColumn("{task.description:<28}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as display:
+        task = display.add_task("rendering", total=None)
+
+        def update(what: str, done: int, total: int) -> None:
+            display.update(task, description=what, completed=done, total=total)
+
+        yield update
