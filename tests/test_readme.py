@@ -1,0 +1,84 @@
+"""What the README shows works as shown."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import orjson
+import pytest
+import yaml
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+README = (REPOSITORY / "README.md").read_text()
+
+
+def block(first_line: str) -> str:
+    """The README's code block that starts with this line."""
+    (found,) = [text for text in re.findall(r"```\w+\n(.*?)```", README, re.S) if text.startswith(first_line)]
+    return found
+
+
+def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, timeout=100, check=False
+    )
+
+
+@pytest.mark.parametrize("by", ["file", "option"])
+def test_a_stage_in_a_loose_file_replaces_a_built_in_one(by: str, tmp_path: Path) -> None:
+    (tmp_path / "bright.py").write_text(block("# bright.py"))
+    pipeline = yaml.safe_load((REPOSITORY / "pipeline.yaml").read_text())
+    change = yaml.safe_load(block("  difference: {use:"))
+    options = ["--source", "sim:press?frames=60&light=bright", "--quiet", "--jsonl", "-"]
+    if by == "file":
+        pipeline["stages"].update(change)
+    else:
+        options += ["--set", 'stages.difference={use: "./bright.py:Bright"}']
+    pipeline["sinks"] = {}
+    (tmp_path / "pipeline.yaml").write_text(yaml.safe_dump(pipeline, sort_keys=False))
+    done = run("-m", "tactflow", "run", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = [orjson.loads(line) for line in done.stdout.splitlines()]
+    assert len(rows) == 60
+    assert any(row["contact"] for row in rows)
+
+
+def test_the_notebook_example_finds_the_dots(tmp_path: Path) -> None:
+    (tmp_path / "notebook.py").write_text(block("# notebook.py"))
+    done = run("notebook.py", cwd=tmp_path)
+    assert done.stdout.startswith("80 dots of radius"), done.stderr
+
+
+def test_every_command_and_file_that_the_readme_names_is_there() -> None:
+    for command in set(re.findall(r"`tactflow (\w+)", README)):
+        assert run("-m", "tactflow", command, "--help", cwd=REPOSITORY).returncode == 0, command
+    for link in re.findall(r"\]\(([^)#:]+)\)", README):
+        assert (REPOSITORY / link).exists(), link
+    stages = set(re.findall(r"^\| `(\w+)` \|.*\|.*\|$", README, re.M))
+    listed = run("-m", "tactflow", "stages", cwd=REPOSITORY).stdout
+    assert {"capture", "hull", "smooth"} <= stages
+    for stage in stages:
+        assert stage in listed
+
+
+def test_the_subscriber_example_prints_results(tmp_path: Path) -> None:
+    code = block("# subscriber.py").replace("5556", "5593")
+    (tmp_path / "subscriber.py").write_text(code)
+    with subprocess.Popen(
+        [sys.executable, "-u", "subscriber.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True
+    ) as listener:
+        try:
+            done = run(
+                *("-m", "tactflow", "run", "--set", "sinks.jsonl=null", "--source", "sim:press?frames=60"),
+                *("--set", "sinks.zmq.endpoint=tcp://127.0.0.1:5593", "--quiet"),
+                *("--set", "sinks.zmq.wait_for_subscriber=20"),
+                cwd=tmp_path,
+            )
+            assert done.returncode == 0, done.stderr
+            assert listener.stdout is not None
+            assert re.match(r"\d+ (None|\[)", listener.stdout.readline())
+        finally:
+            listener.terminate()
