@@ -21,6 +21,11 @@ BoolArray = NDArray[np.bool_]
 _PHASES: Final = 4
 # Costs of the joint choice, in units where a stretch of one half between neighbours costs 0.5: of not seeing a
 # mark, and of each of its links then.
+# A step is repeated, so many times at most, while it was longer than this, px: from there the linear model
+# leaves less than 0.005 px.
+_CONVERGED: Final = 0.25
+_ROUNDS: Final = 4
+_PRIOR: Final = 0.25
 _MISSING: Final = 1.0
 _MISSING_EDGE: Final = 0.25
 # A mark is lost when the weights of the found marks around it (one at a pitch's distance has 0.66) sum to less.
@@ -93,35 +98,51 @@ class _Appearance:
         ).ravel()
 
     def measure(
-        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray | None, rounds: int
+        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None
     ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Positions (n, 2), gain (n,), explained share of the contrast (n,), standard error (n,)."""
+        """Measure marks from starting points (n, 2), right to about a radius.
+
+        marks : (n,) which marks these are; None for all.
+        Returns positions (n, 2), gain (n,), explained share of the contrast (n,), standard error (n,).
+        """
         marks = self._rows if marks is None else marks
-        position = start
-        for _ in range(rounds):
-            base = np.rint(np.minimum(np.maximum(position, 0.0), self._limits))
-            # Phase cell of the sub-pixel remainder: 0 .. _PHASES - 1.
-            cell = np.floor((position - base + 0.5) * _PHASES).astype(np.int64)
-            np.clip(cell, 0, _PHASES - 1, out=cell)
-            corner = base.astype(np.int64) + self.pad
-            index = (corner[:, 1] * self._width + corner[:, 0])[:, None] + self._offsets
-            patch = flat.take(index).astype(np.float32)
-            patch -= np.float32(128)
-            which = (cell[:, 1] * _PHASES + cell[:, 0]) * self._count + marks
-            theta = np.matmul(self._pinv[which], patch[:, :, None])[:, :, 0]
-            gain = theta[:, 0]
-            safe = np.maximum(gain, np.float32(0.15))
-            step = theta[:, 1:] / safe[:, None]
-            np.clip(step, -self.radius, self.radius, out=step)
-            position = base + ((cell + 0.5) / _PHASES - 0.5) + step
-        seen = np.einsum("ni,nij,nj->n", theta, self._gram[which], theta)
-        flatness = patch @ self._plane
-        total = np.einsum("nk,nk->n", patch, patch) - np.einsum("nk,nk->n", flatness, flatness)
-        rest = np.maximum(total - seen, np.float32(1e-3))
-        share = seen / (seen + rest)
-        variance = rest / max(self.pixels - 6, 1)
-        stderr = np.sqrt(variance * self._spread[which]) / safe
+        position, gain, share, stderr = self._step(flat, start, marks)
+        active = np.flatnonzero(_longer(position - start, _CONVERGED))
+        for _ in range(_ROUNDS):
+            if len(active) == 0:
+                break
+            before = position[active]
+            position[active], gain[active], share[active], stderr[active] = self._step(
+                flat, before, marks[active]
+            )
+            active = active[_longer(position[active] - before, _CONVERGED)]
         return position, gain, share, stderr
+
+    def _step(
+        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray
+    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
+        """One least-squares step from the phase nearest to the starting points."""
+        base = np.rint(np.minimum(np.maximum(start, 0.0), self._limits))
+        cell = ((start - base + 0.5) * _PHASES).astype(np.int64)
+        np.minimum(np.maximum(cell, 0, out=cell), _PHASES - 1, out=cell)
+        corner = base.astype(np.int64) + self.pad
+        index = (corner[:, 1] * self._width + corner[:, 0])[:, None] + self._offsets
+        patch = flat.take(index).astype(np.float32)
+        # Far from zero, sums of squares would lose digits.
+        patch -= np.float32(128)
+        which = (cell[:, 1] * _PHASES + cell[:, 0]) * self._count + marks
+        theta = np.matmul(self._pinv[which], patch[:, :, None])[:, :, 0]
+        gain = theta[:, 0]
+        safe = np.maximum(gain, np.float32(0.15))
+        step = theta[:, 1:] / safe[:, None]
+        np.minimum(np.maximum(step, -self.radius, out=step), self.radius, out=step)
+        position = base + ((cell + 0.5) / _PHASES - 0.5) + step
+        seen = (np.matmul(self._gram[which], theta[:, :, None])[:, :, 0] * theta).sum(axis=1)
+        level = patch @ self._plane
+        total = np.einsum("nk,nk->n", patch, patch) - np.einsum("nk,nk->n", level, level)
+        rest = np.maximum(total - seen, np.float32(1e-3))
+        stderr = np.sqrt(rest * (self._spread[which] / max(self.pixels - 6, 1))) / safe
+        return position, gain, seen / (seen + rest), stderr
 
 
 class _Spots:
@@ -268,7 +289,7 @@ class MarkerTracker:
             raise ValueError(f"required a frame of (height, width) {self._shape}, got {gray.shape}")
         flat = self._appearance.padded(gray)
         last = self._position
-        position, gain, share, stderr = self._appearance.measure(flat, last, None, 2)
+        position, gain, share, stderr = self._appearance.measure(flat, last)
         move = np.hypot(*(position - last).T)
         good = _trusted(gain, share) & (move < 0.8 * self._radius)
         displacement = position - self._origin
@@ -326,7 +347,7 @@ class MarkerTracker:
         taken = free[chosen >= 0]
         if len(taken):
             start = spots[chosen[chosen >= 0]]
-            measured, gain, share, error = self._appearance.measure(flat, start, taken, 3)
+            measured, gain, share, error = self._appearance.measure(flat, start, taken)
             near = np.hypot(*(measured - start).T) < 0.6 * self._radius + 0.5
             sharp = _trusted(gain, share) & near
             result[taken] = np.where(sharp[:, None], measured, start)
@@ -376,13 +397,14 @@ class MarkerTracker:
         before = self._position[free]
         base = np.median((position - origin)[settled], axis=0) if settled.any() else np.zeros(2)
         distance = np.minimum(_distances(before, spots), _distances(origin[free] + base, spots))
-        labels = min(10, len(spots))
+        labels = min(8, len(spots), max(1, int((distance <= self._farthest).sum(axis=1).max())))
         label = np.argsort(distance, axis=1, kind="stable")[:, :labels]
         reachable = np.take_along_axis(distance, label, axis=1) <= self._farthest
         moved = spots[label] - origin[free][:, None]
         forbidden = 1e3
         unary = np.empty((count, labels + 1))
         unary[:, :labels] = 0.4 * np.clip(1.0 - strength[label], 0, 1)
+        unary[:, :labels] += _PRIOR * (np.take_along_axis(distance, label, axis=1) / self._pitch) ** 2
         unary[:, :labels][~reachable] = forbidden
         unary[:, labels] = _MISSING
         slot = np.full(self._count, -1, np.int64)
@@ -441,6 +463,10 @@ class MarkerTracker:
         position[missing[placed]] = self._origin[missing[placed]] + fitted[placed]
         position[missing[~placed]] = self._position[missing[~placed]]
         status[missing[~placed]] = MarkerStatus.LOST
+
+
+def _longer(vectors: FloatArray, length: float) -> BoolArray:
+    return np.asarray(np.einsum("ni,ni->n", vectors, vectors) > length * length, np.bool_)
 
 
 def _trusted(gain: NDArray[Any], share: NDArray[Any]) -> BoolArray:
