@@ -80,7 +80,7 @@ def test_parameters_are_input_ports_and_none_makes_them_optional() -> None:
         (Touching, [("touching", False)]),
         (HTTPStatusCode, [("http_status_code", False)]),
         (Masks, [("contact_mask", False), ("contact", True), ("touching", False)]),
-        (Masks | Absent, [("contact_mask", False), ("contact", True), ("touching", False)]),
+        (Masks | Absent, [("contact_mask", True), ("contact", True), ("touching", True)]),
     ],
 )
 def test_the_return_annotation_names_the_output_ports(

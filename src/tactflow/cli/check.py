@@ -6,8 +6,6 @@ import argparse
 
 from tactflow.cli.options import add_pipeline, load_plan
 
-HELP = "validate a pipeline file without running it; prints every mistake at once"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `check`."""

@@ -13,8 +13,6 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
 
-HELP = "why each stage runs, is skipped or is left out, and what it cost"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `explain`."""
@@ -163,25 +161,25 @@ def _read_statistics(path: Path) -> Mapping[str, Any]:
         raise ConfigError(f"--stats {path}: not JSON: {error}") from None
     if not _are_statistics(data):
         raise ConfigError(f"--stats {path}: not a statistics file; tactflow run --stats writes one")
-    assert isinstance(data, dict)
-    return data
+    return data  # type: ignore[no-any-return]
 
 
 def _are_statistics(data: Any) -> bool:
     """True if the parts shown here are there and have the right types."""
-    if not isinstance(data, dict) or not isinstance(data.get("stages"), dict):
+    if not isinstance(data, dict):
         return False
-    numbers = all(isinstance(data.get(key), int | float) for key in ("frames", "dropped", "wall_s"))
-    nodes = [*data["stages"].values(), *dict(data.get("sinks") or {}).values()]
+    stages, sinks = data.get("stages"), data.get("sinks", {})
     return (
-        numbers
+        isinstance(stages, dict)
+        and isinstance(sinks, dict)
         and "end" in data
+        and all(isinstance(data.get(key), int | float) for key in ("frames", "dropped", "wall_s"))
         and _is_pair(data.get("latency_ms"), "p50", "p99")
         and all(
             _is_pair(node, "p50_ms", "p99_ms")
             and isinstance(node.get("runs"), int)
             and isinstance(node.get("skips"), dict)
-            for node in nodes
+            for node in (*stages.values(), *sinks.values())
         )
     )
 

@@ -9,8 +9,6 @@ from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.plan import Plan
 
-HELP = "print a pipeline as a Mermaid flowchart"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `graph`."""

@@ -23,7 +23,11 @@ COMMANDS = {
     "sim": "write a simulated recording and its ground truth",
     "schema": "print the JSON Schema of the result message or of a pipeline file",
 }
-"""Subcommand -> what it does. Its module in `tactflow.cli` is imported only when it is used."""
+"""Subcommand -> what it does.
+
+The module of that name in `tactflow.cli` has `add_arguments(parser)` and `run(args) -> int`; it is imported
+only when the command is used.
+"""
 
 
 def entry() -> None:

@@ -9,8 +9,6 @@ from typing import Any, get_args
 
 from tactflow.engine.graph import Component, ErrorAction, FullPolicy
 
-HELP = "print the JSON Schema of the result message or of a pipeline file"
-
 Schema = dict[str, Any]
 
 _WORD = "^[A-Za-z0-9_-]+$"
@@ -90,8 +88,8 @@ def _section(section: str, components: Sequence[Component], definitions: Schema)
         "type": "object",
         "required": ["use"],
         "properties": {
-            "use": {"anyOf": [{"enum": known}, {"type": "string", "pattern": _OWN_CLASS}]},
             **_envelope(section),
+            "use": {"anyOf": [{"enum": known}, {"type": "string", "pattern": _OWN_CLASS}]},
         },
         "allOf": named,
     }

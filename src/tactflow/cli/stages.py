@@ -21,8 +21,6 @@ from tactflow.engine.registry import Section, catalogue, did_you_mean, names, re
 from tactflow.engine.stage import Port, describe_type
 from tactflow.engine.yamlmap import shown
 
-HELP = "list the stages and sinks that can be used, their ports and parameters"
-
 _LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
@@ -81,7 +79,7 @@ def details(component: Component) -> Iterator[str]:
     rows = list(_parameters(component.params))
     yield "parameters:" if rows else "parameters: none"
     for name, kind, default, description in rows:
-        yield f"  {name}: {kind}{'' if default is None else f' = {default}'}"
+        yield f"  {name}: {kind}{' (required)' if default is None else f' = {default}'}"
         yield from textwrap.wrap(description, 96, initial_indent="      ", subsequent_indent="      ")
 
 

@@ -223,7 +223,7 @@ def _output_ports(annotation: Any) -> tuple[Port, ...]:
         )
     result, optional = _single_type(annotation, "the return annotation")
     if inspect.isclass(result) and issubclass(result, tuple) and hasattr(result, "_fields"):
-        return _field_ports(result)
+        return _field_ports(result, optional)
     spec = port_type(result)
     if isinstance(spec, ArrayPort | SignalPort):
         return (Port(spec.name, result, optional),)
@@ -236,7 +236,7 @@ def _output_ports(annotation: Any) -> tuple[Port, ...]:
     return (Port(_snake_case(result.__name__), result, optional),)
 
 
-def _field_ports(result: type) -> tuple[Port, ...]:
+def _field_ports(result: type, all_optional: bool) -> tuple[Port, ...]:
     try:
         hints = get_type_hints(result, include_extras=True)
     except NameError as error:
@@ -248,7 +248,7 @@ def _field_ports(result: type) -> tuple[Port, ...]:
     for name, annotation in hints.items():
         field, optional = _single_type(annotation, f"{result.__name__}.{name}")
         _check_array(f"{result.__name__}.{name}", field)
-        ports.append(Port(name, field, optional))
+        ports.append(Port(name, field, optional or all_optional))
     if not ports:
         raise _PortError(f"{result.__name__} has no annotated fields, so the stage has no output ports")
     return tuple(ports)

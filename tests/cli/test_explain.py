@@ -1,0 +1,167 @@
+"""`explain` and `graph` tell what a pipeline does and why."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tactflow.cli.main import main
+
+PARTS = Path(__file__).resolve().parents[1] / "engine" / "parts.py"
+TEXT = """\
+stages:
+  capture: {use: './parts.py:Source'}
+  prepare: {use: './parts.py:Prepare'}
+  unused: {use: './parts.py:Needy', path: a}
+  compare: {use: './parts.py:Compare', segment: heavy, queue: {capacity: 2, when_full: drop_oldest}}
+  outline: {use: './parts.py:Outline', when: {signal: touching, hold: 3, at_least_every: 60}}
+  refine: {use: './parts.py:Refine', in: {flow: null}}
+sinks:
+  out: {use: './parts.py:Publish', max_rate: 5}
+  view: {use: './parts.py:Viewer'}
+"""
+STATISTICS: dict[str, Any] = {
+    "frames": 100,
+    "dropped": 2,
+    "wall_s": 1.5,
+    "end": "eos",
+    "stages": {
+        "capture": {"runs": 102, "skips": {}, "p50_ms": 0.1, "p99_ms": 0.2},
+        "outline": {"runs": 40, "skips": {"no_contact": 60, "unused": 0}, "p50_ms": 0.25, "p99_ms": 0.5},
+        "compare": {"runs": 0, "skips": {}, "p50_ms": None, "p99_ms": None},
+    },
+    "links": {},
+    "latency_ms": {"p50": 2.0, "p99": 5.0},
+}
+
+
+@pytest.fixture
+def pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a pipeline whose parts are gated, pruned, stateful."""
+    shutil.copy(PARTS, tmp_path / "parts.py")
+    (tmp_path / "pipeline.yaml").write_text(TEXT)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def paragraphs(text: str) -> dict[str, dict[str, str]]:
+    """Node -> fact -> text."""
+    found = {}
+    for block in text.strip().split("\n\n")[1:]:
+        title, *lines = block.splitlines()
+        facts = (tuple(re.split(r" {2,}", line.strip(), maxsplit=1)) for line in lines)
+        found[title.split()[0]] = dict(facts)
+    return found
+
+
+@pytest.mark.usefixtures("pipeline")
+def test_each_stage_says_why_it_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain"]) == 0
+    facts = paragraphs(capsys.readouterr().out)
+    assert list(facts) == ["capture", "prepare", "unused", "compare", "outline", "refine", "out", "view"]
+    assert facts["capture"]["runs because"] == "it captures the frames"
+    assert facts["prepare"]["runs because"] == "out and view need it"
+    assert facts["compare"]["runs because"] == "out needs it"
+    assert facts["compare"]["memory"].startswith("stateful")
+    assert facts["compare"]["segment"] == "heavy"
+    assert facts["outline"]["memory"].startswith("none (pure)")
+    assert facts["out"]["runs because"] == "it is a sink, at most 5 times a second"
+    assert facts["unused"] == {
+        "pruned because": "no sink needs what it makes",
+        "memory": "none (pure): runs only when something wants its result",
+        "is": "./parts.py:Needy",
+    }
+
+
+@pytest.mark.usefixtures("pipeline")
+def test_each_stage_says_when_it_is_skipped(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["explain"])
+    facts = paragraphs(capsys.readouterr().out)
+    assert facts["outline"]["skipped when"] == (
+        "compare.touching is false for more than 3 frames (its outputs are absent: no_contact), "
+        "but it runs at least every 60 frames; compare gives no contact_mask"
+    )
+    assert facts["refine"]["skipped when"] == "outline gives no contact"
+    assert "skipped when" not in facts["prepare"]
+    assert "skipped when" not in facts["out"]
+
+
+@pytest.mark.usefixtures("pipeline")
+def test_without_skipping_no_gate_is_mentioned(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["explain", "--set", "skipping=false"])
+    out = capsys.readouterr().out
+    assert "skipping is off" in out
+    assert "touching" not in out
+
+
+def test_statistics_say_how_often_and_what_it_cost(
+    pipeline: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (pipeline / "run.json").write_text(json.dumps(STATISTICS))
+    assert main(["explain", "--stats", "run.json"]) == 0
+    out = capsys.readouterr().out
+    assert "the run: 100 frames in 1.5 s, 2 dropped, latency p50 2.00 ms, p99 5.00 ms, end: eos" in out
+    facts = paragraphs(out)
+    assert facts["outline"]["statistics"] == "ran 40 times, p50 0.25 ms, p99 0.50 ms; skipped: 60 no_contact"
+    assert facts["compare"]["statistics"] == "ran 0 times"
+    assert facts["prepare"]["statistics"] == "not part of that run"
+    assert "statistics" not in facts["unused"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{",
+        "[]",
+        "3",
+        "{}",
+        '{"stages": {}}',
+        json.dumps({**STATISTICS, "stages": {"capture": 3}}),
+        json.dumps({**STATISTICS, "latency_ms": None}),
+        json.dumps({**STATISTICS, "sinks": {"out": {}}}),
+        json.dumps({**STATISTICS, "sinks": 3}),
+        json.dumps({**STATISTICS, "wall_s": "long"}),
+    ],
+)
+def test_a_file_that_is_no_statistics_is_refused(
+    content: str, pipeline: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (pipeline / "run.json").write_text(content)
+    assert main(["explain", "--stats", "run.json"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("tactflow: --stats run.json: not ")
+
+
+@pytest.mark.usefixtures("pipeline")
+def test_the_graph_shows_segments_edges_gates_queues_and_pruned_stages(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["graph"]) == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert lines[0] == "flowchart LR"
+    assert 'subgraph s1["segment compute"]' in lines
+    assert any(re.fullmatch(r'subgraph s\d\["segment heavy"\]', line) for line in lines)
+    ids = {name: key for line in lines for key, name in re.findall(r'(n\d)[\[(/]+"(\w+)"', line)}
+    assert set(ids) == {"capture", "prepare", "unused", "compare", "outline", "refine", "out", "view"}
+    assert f'{ids["capture"]} -->|"frame"| {ids["prepare"]}' in lines
+    assert f'{ids["compare"]} -.->|"when touching"| {ids["outline"]}' in lines
+    assert f'{ids["unused"]}["unused"]:::pruned' in lines
+    assert any('"queue: drop_oldest, 2"' in line for line in lines)
+    assert lines.count("end") == sum(line.startswith("subgraph") for line in lines)
+
+
+@pytest.mark.usefixtures("pipeline")
+def test_check_counts_and_warns_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check"]) == 0
+    out, err = capsys.readouterr()
+    assert out == "pipeline.yaml: OK (6 stages, 2 sinks, 3 segments, 1 warning)\n"
+    assert (
+        err == "tactflow: warning: pipeline.yaml:4:3  unused: not run, because no sink needs what it makes\n"
+    )

@@ -1,0 +1,141 @@
+"""The program finds its commands, keeps output and messages apart, and never shows a traceback."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tactflow import __version__
+from tactflow.cli.main import COMMANDS, main
+from tactflow.engine.errors import SourceError, StageError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def program(*args: str, **options: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tactflow.cli.main", *args]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)  # type: ignore[call-overload, no-any-return]
+
+
+def test_help_lists_every_command_and_what_it_does(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    for name, summary in COMMANDS.items():
+        assert f" {name} {summary}" in words
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_listed_command_is_there(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([name, "--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert f"usage: tactflow {name}" in words
+    assert COMMANDS[name] in words
+
+
+def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"tactflow {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], "required: COMMAND"),
+        (["chek"], "there is no command chek; did you mean check?"),
+        (["teleport"], "there is no command teleport; there are run, check"),
+        (["check", "--sett", "a=b"], "unrecognized arguments: --sett"),
+        (["check", "a.yaml", "b.yaml"], "unrecognized arguments: b.yaml"),
+        (["check", "--set"], "expected one argument"),
+        (["schema", "sensor"], "invalid choice"),
+        (["stages", "hul"], "there is no stage or sink 'hul'; did you mean hull?"),
+        (["stages", "./nowhere.py:A"], "cannot read ./nowhere.py"),
+        (["explain", "--stats", "nowhere.json"], "nowhere.json: cannot be read"),
+    ],
+)
+def test_a_wrong_command_line_gives_a_message_and_exit_code_2(
+    argv: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert words in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(StageError("no"), 3), (SourceError("no"), 4), (KeyboardInterrupt(), 130)]
+)
+def test_an_error_becomes_its_exit_code(
+    error: BaseException, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr("tactflow.cli.check.run", fail)
+    assert main(["check"]) == code
+    assert capsys.readouterr().err == ("tactflow: no\n" if code != 130 else "")
+
+
+def test_help_imports_neither_opencv_nor_numpy() -> None:
+    code = (
+        "import sys; from tactflow.cli.main import main; main(['--help']); "
+        "print({'cv2', 'numpy', 'pydantic'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "set()"
+
+
+def test_a_reader_that_leaves_early_causes_no_complaint() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "wb") as out:
+        done = subprocess.run(
+            [sys.executable, "-m", "tactflow.cli.main", "schema", "pipeline"],
+            stdout=out,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_program_ends_with_the_exit_code() -> None:
+    done = program("check", "nowhere.yaml")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "tactflow: there is no file nowhere.yaml\n"
+
+
+def test_without_a_name_the_pipeline_in_the_current_directory_is_taken_else_the_packaged_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["check"]) == 0
+    assert "default.yaml: OK" in capsys.readouterr().out
+    (tmp_path / "pipeline.yaml").write_text("stages:\n  capture:\nsinks:\n  jsonl:\n")
+    assert main(["check"]) == 0
+    assert capsys.readouterr().out == "pipeline.yaml: OK (1 stage, 1 sink, 2 segments)\n"
+
+
+@pytest.mark.parametrize("name", ["seed", "seed.yaml", "pipelines/seed.yaml"])
+def test_a_packaged_pipeline_is_found_by_its_name(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", name]) == 0
+    assert "seed.yaml: OK" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "path", [*sorted(ROOT.glob("pipelines/*.yaml")), ROOT / "pipeline.yaml"], ids=lambda p: p.stem
+)
+def test_every_shipped_pipeline_is_right(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(path)]) == 0
+    assert ": OK (" in capsys.readouterr().out

@@ -1,0 +1,72 @@
+"""`stages` shows what can be used and how."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tactflow.cli.main import main
+from tactflow.cli.stages import details
+from tactflow.engine.registry import available, resolve
+
+PARTS = Path(__file__).resolve().parents[1] / "engine" / "parts.py"
+
+
+def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stages"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    heading, *rows = out.splitlines()
+    assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN"]
+    assert [row.split()[:2] for row in rows] == [[c.name, c.kind] for c in available()]
+    hull = next(row for row in rows if row.startswith("hull "))
+    assert hull.split() == ["hull", "stage", "contact_mask", "contact", "built-in"]
+
+
+def test_one_stage_is_explained_with_ports_and_parameters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(PARTS, tmp_path / "parts.py")
+    monkeypatch.chdir(tmp_path)
+    assert main(["stages", "./parts.py:Prepare"]) == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert lines[0] == "./parts.py:Prepare: stage, ./parts.py"
+    assert "memory: pure" in lines
+    assert "frame  Frame" in lines
+    assert "image  (H, W, 3) uint8, grey levels, BGR" in lines
+    assert lines[lines.index("rotate: 0 | 90 | 180 | 270 = 0") + 1] == "degrees"
+    assert "gamma: number, > 0, <= 5 = 1.0" in lines
+    assert "corners: list of [number, number] = []" in lines
+    assert "size: [whole number, whole number] or null = null" in lines
+    assert "lens.focal: number, > 0 (required)" in lines
+    assert "lens.fisheye: true | false = false" in lines
+
+
+def test_a_sink_is_explained_like_a_stage(tmp_path: Path) -> None:
+    shutil.copy(PARTS, tmp_path / "parts.py")
+    lines = [line.strip() for line in details(resolve("./parts.py:Publish", "sinks", tmp_path))]
+    assert lines[0] == "./parts.py:Publish: sink, ./parts.py"
+    assert "contact  Contact (may be absent)" in lines
+    assert "path: text = 'out'" in lines
+    assert "parameters: none" in details(resolve("./parts.py:Viewer", "sinks", tmp_path))
+
+
+@pytest.mark.parametrize("component", available(), ids=lambda component: component.name)
+def test_every_parameter_of_a_built_in_is_described(component: object) -> None:
+    from tactflow.engine.graph import Component
+
+    assert isinstance(component, Component)
+    assert component.cls.__doc__
+    for name, field in component.params.model_fields.items():
+        assert field.description, name
+
+
+def test_a_broken_class_in_an_own_file_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(PARTS, tmp_path / "parts.py")
+    monkeypatch.chdir(tmp_path)
+    assert main(["stages", "./parts.py:Forgetful"]) == 2
+    assert "must declare memory" in capsys.readouterr().err
