@@ -51,9 +51,11 @@ def test_percentiles_are_those_of_the_samples() -> None:
     assert timing.Samples().summary() == {}
 
 
-def test_the_unit_is_the_time_of_a_real_copy() -> None:
+def test_the_unit_is_the_time_of_a_real_copy_and_a_real_pass() -> None:
     unit = timing.CopyUnit()
-    unit.take(5)
+    before = [int(frame[0, 0, 0]) for frame in unit._pool]
+    unit.take()
+    assert np.all(unit._pool[20] == before[0])
+    assert np.all(unit._pool[30] == 255 - before[10])
     assert unit.copy_ms > 0
     assert unit.touch_ms > 0
-    assert np.array_equal(unit._out, 255 - unit._frames[4])

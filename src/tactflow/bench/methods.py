@@ -2,7 +2,8 @@
 
 The alternatives are whatever the stage's `method` parameter allows, so a new method is measured without
 anything being added here. A method that a shipped pipeline uses is given that pipeline's parameters. The
-inputs come from the default pipeline's stages, the same for every alternative.
+inputs come from the default pipeline's stages, the same for every alternative; geometry and flow are given
+the true contact mask.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from tactflow.bench.results import Measurement
 from tactflow.bench.scenes import Rendered
 from tactflow.bench.score import ContactScore, DetectionScore, FlowScore, MarkerScore, RemovalScore
 from tactflow.bench.timing import CopyUnit, Samples, interleaved
+from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.stage import StageParams
@@ -86,14 +88,22 @@ class _Inputs:
     image: NDArray[np.uint8]
     marker_mask: NDArray[np.uint8]
     unmarked: NDArray[np.uint8]
-    contact_mask: NDArray[np.uint8]
     markers: Any
+
+    @property
+    def touching(self) -> bool:
+        return self.truth.touching
+
+    @property
+    def true_mask(self) -> NDArray[np.uint8]:
+        """What geometry and flow are given, so that their errors are their own and not the mask's."""
+        return np.asarray(self.truth.contact_mask, dtype=np.uint8) * np.uint8(255)
 
     @property
     def kind(self) -> str:
         if self.frame.reference:
             return "reference"
-        return "contact" if self.truth.touching else "idle"
+        return "contact" if self.touching else "idle"
 
 
 def frames_of(rendered: Rendered, references: int = 1) -> Iterator[Frame]:
@@ -113,26 +123,22 @@ def _chain(pipeline: Pipeline, rendered: Rendered) -> list[_Inputs]:
     }
     collected = []
     truths: list[Truth] | None = None
+
+    def run(name: str, **inputs: Any) -> Any:
+        try:
+            return stage[name].process(**inputs)
+        except Exception as error:
+            raise StageError(f"{name}, on {rendered.case.label}: {type(error).__name__}: {error}") from error
+
     for index, frame in enumerate(frames_of(rendered)):
-        processed = stage["preprocess"].process(frame=frame)
+        image, mapping = run("preprocess", frame=frame)
         if truths is None:
-            truths = rendered.truths(processed.mapping)
-        mask = stage["marker_mask"].process(image=processed.image)
-        unmarked = stage["inpaint"].process(image=processed.image, marker_mask=mask)
-        contact = stage["difference"].process(unmarked=unmarked, frame=frame)
-        markers = stage["tracker"].process(image=processed.image, frame=frame)
-        collected.append(
-            _Inputs(
-                frame,
-                truths[index],
-                rendered.deep(index),
-                processed.image,
-                mask,
-                unmarked,
-                contact.contact_mask,
-                markers,
-            )
-        )
+            truths = rendered.truths(mapping)
+        mask = run("marker_mask", image=image)
+        unmarked = run("inpaint", image=image, marker_mask=mask)
+        markers = run("tracker", image=image, frame=frame)
+        deep = rendered.deep(index)
+        collected.append(_Inputs(frame, truths[index], deep, image, mask, unmarked, markers))
     return collected
 
 
@@ -180,25 +186,16 @@ def _see_flow(score: FlowScore, inputs: _Inputs, result: Any) -> None:
     score.add(None if isinstance(result, Absent) else result, inputs.truth)
 
 
-def _in_contact(inputs: _Inputs) -> bool:
-    return inputs.truth.touching and bool(inputs.contact_mask.any())
-
-
 _GROUPS = (
     _Group("preprocess", lambda i: {"frame": i.frame}, DetectionScore, lambda *_: None),
     _Group("marker_mask", lambda i: {"image": i.image}, DetectionScore, _see_mask),
     _Group("inpaint", lambda i: {"image": i.image, "marker_mask": i.marker_mask}, RemovalScore, _see_removal),
     _Group("difference", lambda i: {"unmarked": i.unmarked, "frame": i.frame}, ContactScore, _see_contact),
-    _Group(
-        "hull",
-        lambda i: {"contact_mask": i.contact_mask} if _in_contact(i) else None,
-        ContactScore,
-        _see_hull,
-    ),
+    _Group("hull", lambda i: {"contact_mask": i.true_mask} if i.touching else None, ContactScore, _see_hull),
     _Group("tracker", lambda i: {"image": i.image, "frame": i.frame}, MarkerScore, _see_markers),
     _Group(
         "flow_in_mask",
-        lambda i: {"markers": i.markers, "contact_mask": i.contact_mask} if _in_contact(i) else None,
+        lambda i: {"markers": i.markers, "contact_mask": i.true_mask} if i.touching else None,
         FlowScore,
         _see_flow,
     ),

@@ -20,22 +20,22 @@ TITLES = {
     "pipeline": "Whole pipelines",
     "preprocess": "Preprocessing",
     "marker_mask": "Marker mask",
-    "markers": "Marker detection",
     "inpaint": "Marker removal",
-    "contact": "Contact",
+    "difference": "Contact or not, and where",
     "hull": "Contact geometry",
     "tracker": "Marker tracking",
+    "flow_in_mask": "Flow inside the contact",
 }
 """Group -> heading."""
 
 PRIMARY = {
     "pipeline": ("displacement_rms", "center_error", "angle_mean", "hull_iou", "flow_error"),
     "marker_mask": ("marker_recall", "localisation_rms"),
-    "markers": ("localisation_rms", "marker_recall"),
     "inpaint": ("inpaint_mae",),
-    "contact": ("contact_iou", "center_error"),
+    "difference": ("contact_iou", "center_error", "false_contacts", "missed_contacts"),
     "hull": ("angle_mean", "center_error"),
     "tracker": ("displacement_rms", "displacement_p99", "wrong_percent"),
+    "flow_in_mask": ("flow_error",),
 }
 """Group -> quantities that are plotted; the first one decides the answer."""
 
@@ -46,6 +46,7 @@ class Point:
 
     cost : copies of a raw frame. error : median over scenes, as distance from the perfect value.
     low, high : the best and the worst scene. scenes : how many, worst : the name of the worst one.
+    missing : scenes in which others have this quantity and this method has nothing to show.
     """
 
     method: str
@@ -55,6 +56,7 @@ class Point:
     high: float
     scenes: int
     worst: str
+    missing: int = 0
 
 
 def cost_of(measurements: Iterable[Measurement]) -> float | None:
@@ -66,22 +68,33 @@ def cost_of(measurements: Iterable[Measurement]) -> float | None:
 
 def points(result: Result, group: str, quantity: Quantity) -> list[Point]:
     """One point per method of a group that has both a time and this error."""
+    known = {
+        method: [m for m in result.of(group, method) if quantity.key in m.errors]
+        for method in result.methods(group)
+    }
+    everywhere = {m.scene for rows in known.values() for m in rows}
     found = []
-    for method in result.methods(group):
-        rows = [m for m in result.of(group, method) if quantity.key in m.errors]
+    for method, rows in known.items():
         cost = cost_of(rows)
         if not rows or cost is None:
             continue
         errors = [quantity.distance(m.errors[quantity.key]) for m in rows]
         worst = max(zip(errors, (m.scene for m in rows), strict=True))
-        found.append(Point(method, cost, median(errors), min(errors), max(errors), len(rows), worst[1]))
+        missing = len(everywhere) - len(rows)
+        found.append(
+            Point(method, cost, median(errors), min(errors), max(errors), len(rows), worst[1], missing)
+        )
     return found
 
 
 def pareto(candidates: Sequence[Point]) -> list[Point]:
-    """The points that no other beats in both time and error, by rising cost."""
+    """The points that no other beats in both time and error, by rising cost.
+
+    A method that has nothing to show in some scenes is left out: its median is that of the easy ones.
+    """
     front: list[Point] = []
-    for point in sorted(candidates, key=lambda p: (p.cost, p.error)):
+    whole = [p for p in candidates if not p.missing]
+    for point in sorted(whole, key=lambda p: (p.cost, p.error)):
         if not front or point.error < front[-1].error:
             front.append(point)
     return front
@@ -219,14 +232,10 @@ def scatter(candidates: Sequence[Point], quantity: Quantity, limit: float | None
         )
         taken.append(_Box(x - 17, _TOP, x + 2, _TOP + 150))
 
-    steps = [f"M {x_axis.at(front[0].cost):.1f} {_TOP}"]
-    for before, point in zip([None, *front], front, strict=False):
-        x, y = x_axis.at(point.cost), y_of(point.error)
-        if before is not None:
-            steps.append(f"H {x:.1f}")
-        steps.append(f"V {y:.1f}")
-    steps.append(f"H {WIDTH - _RIGHT}")
-    add(f'<path class="front" d="{" ".join(steps)}"/>')
+    if front:
+        steps = [f"M {x_axis.at(front[0].cost):.1f} {_TOP}"]
+        steps += [f"H {x_axis.at(point.cost):.1f} V {y_of(point.error):.1f}" for point in front]
+        add(f'<path class="front" d="{" ".join(steps)} H {WIDTH - _RIGHT}"/>')
 
     places = {p.method: (x_axis.at(p.cost), y_of(p.error)) for p in candidates}
     taken += [_Box(x - 6, y - 6, x + 6, y + 6) for x, y in places.values()]
@@ -238,11 +247,13 @@ def scatter(candidates: Sequence[Point], quantity: Quantity, limit: float | None
             f"{point.method}: {format_number(point.cost)} copies, error {format_number(point.error)} "
             f"{quantity.unit} (median of {point.scenes} scenes; best {format_number(point.low)}, "
             f"worst {format_number(point.high)} on {point.worst})"
+            + (f"; nothing to show in {point.missing} scenes" if point.missing else "")
         )
         add(f"<g><title>{escape(tip)}</title>")
         if point.scenes > 1:
             y0, y1 = y_of(point.high), y_of(point.low)
             add(f'<line class="whisker {kind}" x1="{x:.1f}" y1="{y0:.1f}" x2="{x:.1f}" y2="{y1:.1f}"/>')
+        kind += " partial" if point.missing else ""
         add(f'<circle class="dot {kind}" cx="{x:.1f}" cy="{y:.1f}" r="5"/></g>')
     for point in sorted(candidates, key=lambda p: p.method not in on_front):
         x, y = places[point.method]
@@ -306,8 +317,11 @@ def _limit_of(result: Result, group: str, quantity: Quantity) -> float | None:
 def _verdict(point: Point, everyone: Sequence[Point], front: Sequence[Point]) -> str:
     if len(everyone) == 1:
         return "the only method"
-    most_accurate = min(everyone, key=lambda p: (p.error, p.cost))
-    fastest = min(everyone, key=lambda p: (p.cost, p.error))
+    if point.missing:
+        return f"fails: nothing to show in {point.missing} of {point.missing + point.scenes} scenes"
+    whole = [p for p in everyone if not p.missing]
+    most_accurate = min(whole, key=lambda p: (p.error, p.cost))
+    fastest = min(whole, key=lambda p: (p.cost, p.error))
     if point is most_accurate and point is fastest:
         return "use this: the fastest and the most accurate"
     if point is most_accurate:
@@ -494,6 +508,7 @@ svg .zero { fill:var(--good); opacity:.09 }
 svg .front { fill:none; stroke:var(--on); stroke-width:1.6; opacity:.75 }
 svg .dot.on { fill:var(--on) } svg .dot.off { fill:var(--off) }
 svg .dot { stroke:var(--panel); stroke-width:1.5 }
+svg .dot.partial { fill:var(--panel); stroke:var(--bad) }
 svg .whisker { stroke-width:1.5; opacity:.45 } svg .whisker.on { stroke:var(--on) }
 svg .whisker.off { stroke:var(--off) } svg .leader { stroke:var(--soft); stroke-width:.8 }
 svg .limit { stroke:var(--limit); stroke-width:1.4; stroke-dasharray:6 4 }
@@ -527,7 +542,7 @@ def html(result: Result) -> str:
         'from the best scene to the worst; the <span class="on">blue line</span> is the Pareto front, the '
         '<span style="color:var(--limit)">dashed lines</span> are limits: the Cramér-Rao bound on a '
         "position, and the time to read and write every byte of a raw frame once. Point at a dot for its "
-        "numbers.</p>",
+        "numbers. A hollow dot has nothing to show in some scenes.</p>",
         _plots(result),
         "<h2>Everything that was measured</h2>",
         _everything(result),

@@ -22,7 +22,8 @@ class ContactScore:
     """Where is the contact, and is there one?
 
     Outline errors (mask, hull, area, centre, direction) are averaged over the frames in which the truth and
-    the method both see a contact; a contact that the method does not see counts as missed.
+    the method both see a contact. A missed contact of at least half depth enters with an overlap of 0; what
+    was missed in all is counted beside.
     """
 
     iou: list[float] = field(default_factory=list[float])
@@ -52,6 +53,9 @@ class ContactScore:
         if deep:
             self.deep += 1
             self.missed_deep += not touching
+            if not touching:
+                self.iou.append(0.0)
+                self.hull.append(0.0)
         return touching
 
     def mask(self, mask: NDArray[np.uint8], truth: Truth) -> None:
