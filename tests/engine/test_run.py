@@ -166,6 +166,32 @@ def test_a_repeating_gate_gives_its_last_value_and_says_why(toy_runner: MakeRunn
     assert by_frame[6][4] == {}
 
 
+@pytest.mark.parametrize("cut", [{}, SEGMENTS["each"]], ids=["default", "each"])
+def test_a_pure_stage_is_not_run_again_on_inputs_it_has_seen(
+    toy_runner: MakeRunner, cut: dict[str, Any]
+) -> None:
+    """The level is repeated while the pulse is low, so what follows from it alone is reused, with its reason."""
+    stages = {**cut, "level": {**cut.get("level", {}), "when": {"signal": "pulse.active", "otherwise": "repeat"}}}
+    stages["gated"] = {**cut.get("gated", {}), "when": []}
+    runner = toy_runner(stages)
+    result = ran(runner)
+    ran_in = [i for i in range(20) if 3 <= i % 10 <= 6]
+    assert seen(runner, "heavy") == seen(runner, "gated") == ran_in
+    by_frame = {row[0]: row for row in rows(runner)}
+    assert by_frame[8][3] == by_frame[6][3] == 36.5
+    assert by_frame[8][4] == {"gated": "idle"}
+    assert by_frame[6][4] == {}
+    assert result.stats["stages"]["heavy"]["skips"] == {"idle": 3, "unchanged": 9}
+    assert len(seen(runner, "total")) == 17, "a stateful stage sees a repeated input again"
+
+
+def test_switching_skipping_off_runs_every_stage_in_every_frame(toy_runner: MakeRunner) -> None:
+    runner = toy_runner({"level": {"when": {"signal": "pulse.active", "otherwise": "repeat"}}}, skipping=False)
+    ran(runner)
+    for name in ("level", "heavy", "gated", "join"):
+        assert seen(runner, name) == list(range(20))
+
+
 def test_only_what_a_sink_wants_is_computed_but_memory_is_kept(toy_runner: MakeRunner) -> None:
     runner = toy_runner(sinks={"out": {"use": "Collect", "max_rate": 10}})
     result = ran(runner)
