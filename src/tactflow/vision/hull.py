@@ -309,7 +309,7 @@ def _seed_contact(
         angle=line.angle,
         slope=line.slope,
         hull=vertices,
-        ellipse=_seed_ellipse(outline),
+        ellipse=_seed_ellipse(outline) if cv2.contourArea(polygon) > 0 else None,
         confidence=1.0,
         region_area=float(region_area),
     )

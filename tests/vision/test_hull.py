@@ -1,0 +1,542 @@
+"""Geometry of the contact region."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.types import Contact
+
+Mask = NDArray[np.uint8]
+
+
+def blank(width: int = 120, height: int = 100) -> Mask:
+    return np.zeros((height, width), np.uint8)
+
+
+def ellipse_mask(
+    center: tuple[float, float], axes: tuple[float, float], angle: float, size: tuple[int, int] = (160, 140)
+) -> Mask:
+    """Pixels whose centre lies in the ellipse; axes are full lengths, angle in degrees as seen on screen."""
+    y, x = np.mgrid[: size[1], : size[0]].astype(np.float64)
+    theta = math.radians(-angle)
+    along = (x - center[0]) * math.cos(theta) + (y - center[1]) * math.sin(theta)
+    across = (y - center[1]) * math.cos(theta) - (x - center[0]) * math.sin(theta)
+    return (((along / axes[0]) ** 2 + (across / axes[1]) ** 2) <= 0.25).astype(np.uint8) * 255
+
+
+def described(mask: Mask, **kwargs: Any) -> Contact:
+    contact = contact_geometry(mask, **kwargs)
+    assert contact is not None
+    assert_sound(contact)
+    return contact
+
+
+def assert_sound(contact: Contact) -> None:
+    """What holds for every contact: finite numbers in their ranges, slope and angle of one direction."""
+    assert math.isfinite(contact.area)
+    assert contact.area >= 0
+    assert np.isfinite(contact.center).all()
+    assert contact.hull.dtype == np.float64
+    assert contact.hull.shape[1] == 2
+    assert len(contact.hull) >= 1
+    assert 0 <= contact.confidence <= 1
+    if contact.angle is None:
+        assert contact.slope is None
+    else:
+        assert -90 < contact.angle <= 90
+        if contact.slope is None:
+            assert abs(contact.angle) == pytest.approx(90, abs=1e-5)
+        else:
+            assert contact.slope == pytest.approx(-math.tan(math.radians(contact.angle)), rel=1e-6, abs=1e-12)
+    if contact.ellipse is not None:
+        major, minor = contact.ellipse.axes
+        assert np.isfinite([major, minor, *contact.ellipse.center]).all()
+        assert major >= minor > 0
+
+
+def turned(first: float, second: float) -> float:
+    """Degrees between two axes, in [0, 90]."""
+    return abs((first - second + 90) % 180 - 90)
+
+
+def test_nothing_is_no_contact() -> None:
+    assert contact_geometry(blank()) is None
+    assert contact_geometry(blank(), method="seed") is None
+    assert contact_geometry(np.zeros((0, 0), np.uint8)) is None
+    assert contact_geometry(np.zeros((1, 1), np.uint8)) is None
+
+
+@pytest.mark.parametrize("method", ["moments", "seed"])
+def test_one_pixel_is_a_point(method: Any) -> None:
+    mask = blank()
+    mask[7, 11] = 255
+    contact = described(mask, method=method)
+    assert contact.center == (11, 7)
+    assert contact.angle is None
+    assert contact.ellipse is None
+    assert contact.hull.tolist() == [[11, 7]]
+    assert contact.region_area == 1
+    assert contact.area == (1 if method == "moments" else 0)
+
+
+def test_a_frame_of_one_pixel_can_be_a_contact() -> None:
+    assert described(np.full((1, 1), 255, np.uint8)).center == (0, 0)
+
+
+@pytest.mark.parametrize("offset", [(0, 0), (13, 5), (119, 99)])
+@pytest.mark.parametrize(
+    ("step", "angle", "slope"),
+    [((1, 0), 0.0, 0.0), ((0, 1), 90.0, None), ((1, 1), -45.0, 1.0), ((1, -1), 45.0, -1.0)],
+    ids=["row", "column", "falling", "rising"],
+)
+def test_a_line_of_pixels_has_its_direction_exactly(
+    step: tuple[int, int], angle: float, slope: float | None, offset: tuple[int, int]
+) -> None:
+    mask = blank(400, 400)
+    for k in range(21):
+        mask[100 + offset[1] + k * step[1], 100 + offset[0] + k * step[0]] = 255
+    contact = described(mask)
+    assert contact.angle == pytest.approx(angle, abs=1e-12)
+    assert contact.slope == (None if slope is None else pytest.approx(slope, abs=1e-12))
+    assert contact.confidence == pytest.approx(1.0, abs=1e-12)
+    assert contact.ellipse is None
+    assert contact.area == contact.region_area == 21
+    assert contact.center == (100 + offset[0] + 10 * step[0], 100 + offset[1] + 10 * step[1])
+
+
+@pytest.mark.parametrize("shape", [(1, 300), (300, 1)], ids=["row", "column"])
+def test_a_frame_of_one_row_or_column_is_a_line(shape: tuple[int, int]) -> None:
+    contact = described(np.full(shape, 255, np.uint8))
+    assert contact.angle == (0 if shape[0] == 1 else 90)
+    assert contact.area == 300
+
+
+@pytest.mark.parametrize("width", [3, 10, 41])
+def test_a_vertical_bar_is_vertical_and_has_no_slope(width: int) -> None:
+    mask = blank(201, 181)
+    mask[11:170, 33 : 33 + width] = 255
+    contact = described(mask)
+    assert contact.angle == 90.0
+    assert contact.slope is None
+    assert contact.area == contact.region_area == width * 159
+
+
+def test_the_whole_frame_is_a_contact() -> None:
+    contact = described(np.full((300, 400), 255, np.uint8))
+    assert contact.center == (199.5, 149.5)
+    assert contact.angle == 0.0
+    assert contact.area == 120000
+
+
+def test_a_disc_has_no_direction_wherever_it_lies() -> None:
+    rng = np.random.default_rng(0)
+    found = 0
+    for radius in (3, 6, 12, 25, 45):
+        for _ in range(60):
+            x, y = rng.uniform(65, 75, 2)
+            contact = described(ellipse_mask((x, y), (2 * radius, 2 * radius), 0))
+            found += contact.angle is not None
+    # 300 discs at a false alarm rate of 0.001 each: more than 4 have a chance of 2e-5.
+    assert found <= 4
+
+
+@pytest.mark.parametrize(("noise", "length"), [(1.0, 3.0), (2.0, 5.0)])
+def test_a_rough_disc_has_no_direction_and_a_rough_ellipse_has(noise: float, length: float) -> None:
+    rng = np.random.default_rng(5)
+
+    def rough(stretch: float) -> Mask:
+        knots = int(2 * math.pi * 30 / length)
+        around = np.linspace(0, 2 * math.pi, 720, endpoint=False)
+        bumps = rng.normal(0, noise, knots)
+        at = np.linspace(0, 2 * math.pi, knots + 1)
+        radius = 30 + np.interp(around, at, np.append(bumps, bumps[0]))
+        outline = np.column_stack([radius * np.cos(around) * stretch, radius * np.sin(around) / stretch])
+        mask = blank(160, 160)
+        cv2.fillPoly(mask, [np.rint((outline + 80) * 256).astype(np.int32)], 255, shift=8)
+        return mask
+
+    found = sum(described(rough(1.0)).angle is not None for _ in range(200))
+    # At a rate of 0.001, more than 4 of 200 have a chance of 3e-6; measured on 2000: 0.004 and 0.0015.
+    assert found <= 4
+    # An axis ratio of 1.69 and 2.
+    for stretch in (1.3, math.sqrt(2)):
+        for _ in range(20):
+            contact = described(rough(stretch))
+            assert contact.angle is not None
+            assert turned(contact.angle, 0) < 8
+
+
+@pytest.mark.parametrize("polygon", [3, 4, 5, 6, 8])
+def test_a_regular_polygon_has_no_direction(polygon: int) -> None:
+    corners = np.exp(2j * np.pi * (np.arange(polygon) / polygon + 0.013))
+    points = np.column_stack([corners.real, corners.imag]) * 40 + [70.3, 60.8]
+    mask = blank(160, 140)
+    cv2.fillPoly(mask, [np.rint(points * 256).astype(np.int32)], 255, shift=8)
+    assert described(mask).angle is None
+
+
+@pytest.mark.parametrize("ratio", [1.2, 1.5, 3.0])
+def test_a_rectangle_has_its_direction(ratio: float) -> None:
+    for angle in (0, 20, 45, 77, 90, -60):
+        theta = math.radians(-angle)
+        y, x = np.mgrid[:180, :180] - 90.4
+        along = x * math.cos(theta) + y * math.sin(theta)
+        across = y * math.cos(theta) - x * math.sin(theta)
+        mask = ((np.abs(along) <= 20 * ratio) & (np.abs(across) <= 20)).astype(np.uint8) * 255
+        contact = described(mask)
+        assert contact.angle is not None
+        # Straight edges meet the grid coherently, so no law of random phases holds; measured: 0.5.
+        assert turned(contact.angle, angle) < 1.0
+
+
+@pytest.mark.parametrize("ratio", [1.3, 2.0, 4.0])
+@pytest.mark.parametrize("angle", range(-85, 95, 5))
+def test_an_ellipse_is_found_as_it_was_drawn(angle: int, ratio: float) -> None:
+    minor = 28.0
+    major = minor * ratio
+    rng = np.random.default_rng(angle + 100)
+    center = tuple(rng.uniform(68, 72, 2))
+    contact = described(ellipse_mask(center, (major, minor), angle))  # type: ignore[arg-type]
+    assert contact.angle is not None
+    # Derived (see _anisotropy_limit): the grid moves the anisotropy by sqrt(0.122 / R^3) RMS per component,
+    # and the angle by half of that over the anisotropy; five times the RMS never happens in 108 cases.
+    radius = math.sqrt(major * minor) / 2
+    scatter = math.degrees(0.5 * math.sqrt(0.122 / radius**3) / contact.confidence)
+    assert turned(contact.angle, angle) < 5 * scatter
+    # Area: Kendall's variance of the lattice points in an oval, 0.46 R times the oval's roundness; 6 sigma.
+    area = math.pi / 4 * major * minor
+    assert abs(contact.area - area) < 6 * math.sqrt(0.46 * major)
+    # Centre: first moments vary by 0.68 R^1.5 / (pi R^2) px, below 0.02 px here; six times that.
+    assert np.abs(np.subtract(contact.center, center)).max() < 6 * 0.68 / (math.pi * math.sqrt(minor / 2))
+    ellipse = contact.ellipse
+    assert ellipse is not None
+    assert ellipse.axes == pytest.approx((major, minor), rel=0.02)
+    assert ellipse.angle == contact.angle
+    assert contact.confidence == pytest.approx((ratio**2 - 1) / (ratio**2 + 1), abs=0.02)
+
+
+def blobs(seed: int, size: tuple[int, int] = (140, 120)) -> Mask:
+    """A few random ellipses that stay 20 px away from the border."""
+    rng = np.random.default_rng(seed)
+    mask = blank(*size)
+    for _ in range(3):
+        center = rng.uniform([45, 45], [size[0] - 45, size[1] - 45])
+        axes = tuple(rng.uniform(8, 48, 2))
+        mask |= ellipse_mask(tuple(center), axes, rng.uniform(-90, 90), size)  # type: ignore[arg-type]
+    return mask
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_shifting_the_mask_shifts_the_result_and_nothing_else(seed: int) -> None:
+    mask = blobs(seed)
+    first = described(mask)
+    second = described(np.roll(mask, (7, -11), axis=(0, 1)))
+    np.testing.assert_array_equal(second.hull, first.hull + np.array([-11, 7]))
+    # The same whole numbers, divided and shifted: equal to the last digit or two.
+    assert second.center == pytest.approx((first.center[0] - 11, first.center[1] + 7), abs=1e-12)
+    assert (second.area, second.angle, second.slope) == (first.area, first.angle, first.slope)
+    assert second.confidence == first.confidence
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_turning_the_mask_turns_the_result(seed: int, quarters: int) -> None:
+    mask = blobs(seed)
+    first = described(mask)
+    second = described(np.ascontiguousarray(np.rot90(mask, quarters)))
+    assert second.area == first.area
+    # The limit of the anisotropy follows a rotation only up to rounding.
+    assert second.confidence == pytest.approx(first.confidence, abs=1e-12)
+    assert (second.angle is None) == (first.angle is None)
+    if first.angle is not None and second.angle is not None:
+        assert turned(second.angle, first.angle + 90 * quarters) < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_mirroring_the_mask_mirrors_the_result(seed: int) -> None:
+    mask = blobs(seed)
+    first = described(mask)
+    second = described(np.ascontiguousarray(mask[:, ::-1]))
+    assert second.center == pytest.approx((mask.shape[1] - 1 - first.center[0], first.center[1]), abs=1e-12)
+    assert second.area == first.area
+    assert (second.angle is None) == (first.angle is None)
+    if first.angle is not None and second.angle is not None:
+        assert turned(second.angle, -first.angle) < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_doubling_the_scale_doubles_lengths_and_keeps_angles(seed: int) -> None:
+    mask = blobs(seed)
+    first = described(mask)
+    second = described(np.kron(mask, np.ones((2, 2), np.uint8)))
+    assert second.center == pytest.approx((2 * first.center[0] + 0.5, 2 * first.center[1] + 0.5), abs=1e-9)
+    assert second.region_area == 4 * first.region_area
+    assert (second.angle is None) == (first.angle is None)
+    if first.angle is not None and second.angle is not None:
+        # Each pixel becomes a square, whose own moments are the same in every direction.
+        assert turned(second.angle, first.angle) < 1e-9
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    mask=hnp.arrays(
+        np.uint8,
+        hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=14),
+        elements=st.sampled_from([0, 0, 1, 255]),
+    ),
+    min_area=st.sampled_from([0.0, 1.0, 3.0]),
+    max_gap=st.sampled_from([None, 0.0, 2.0, 5.0]),
+    method=st.sampled_from(["moments", "seed"]),
+)
+def test_any_mask_gives_sound_numbers_or_none(
+    mask: Mask, min_area: float, max_gap: float | None, method: Any
+) -> None:
+    kept = mask.copy()
+    contact = contact_geometry(mask, min_area=min_area, max_gap=max_gap, method=method)
+    np.testing.assert_array_equal(mask, kept)
+    if contact is not None:
+        assert_sound(contact)
+    if not mask.any():
+        assert contact is None
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    mask=hnp.arrays(
+        np.uint8,
+        hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12),
+        elements=st.sampled_from([0, 255]),
+    )
+)
+def test_centre_and_area_are_those_of_the_pixels(mask: Mask) -> None:
+    contact = contact_geometry(mask)
+    if contact is None:
+        assert not mask.any()
+        return
+    y, x = np.nonzero(mask)
+    assert contact.region_area == len(x)
+    assert contact.center == pytest.approx((x.mean(), y.mean()), abs=1e-9)
+    inside = 0
+    polygon = contact.hull.astype(np.int32)
+    for v, u in np.ndindex(mask.shape):
+        inside += cv2.pointPolygonTest(polygon, (float(u), float(v)), False) >= 0
+    assert contact.area == inside
+
+
+def test_specks_below_min_area_do_not_count() -> None:
+    mask = ellipse_mask((60, 50), (50, 20), 30)
+    alone = described(mask)
+    mask[120:123, 130:133] = 255
+    mask[5, 5] = 255
+    cleaned = described(mask, min_area=10)
+    assert cleaned.center == alone.center
+    assert cleaned.angle == alone.angle
+    assert cleaned.area == alone.area
+    assert contact_geometry(mask, min_area=5000) is None
+    assert described(mask, min_area=9).hull.max() == 132
+
+
+def test_a_hole_belongs_to_the_hull_and_to_the_blob_size_but_not_to_the_region() -> None:
+    mask = blank()
+    mask[20:40, 20:40] = 255
+    mask[25:35, 24:30] = 0
+    contact = described(mask, min_area=400)
+    assert contact.area == 400
+    assert contact.region_area == 340
+    assert contact.center[0] > 29.5
+
+
+def test_blobs_belong_together_up_to_max_gap() -> None:
+    mask = blank()
+    mask[40:60, 10:30] = 255
+    mask[40:60, 40:50] = 255
+    mask[40:60, 70:78] = 255
+    # Nearest pixels are 11 and 21 px apart; a gap is judged to within 1 px.
+    assert described(mask, max_gap=None).hull[:, 0].max() == 77
+    assert described(mask, max_gap=22).hull[:, 0].max() == 77
+    assert described(mask, max_gap=15).hull[:, 0].max() == 49
+    assert described(mask, max_gap=9).hull[:, 0].max() == 29
+    assert described(mask, max_gap=0).region_area == 400
+    assert described(mask, max_gap=1e9).region_area == 760
+
+
+def test_the_group_with_most_pixels_is_the_contact_even_of_many_small_blobs() -> None:
+    mask = blank()
+    mask[5:20, 5:20] = 255
+    for k in range(8):
+        mask[60:68, 20 + 11 * k : 28 + 11 * k] = 255
+    contact = described(mask, max_gap=6)
+    assert contact.region_area == 8 * 64
+    assert contact.angle == 0.0
+
+
+@pytest.mark.parametrize("value", [1, 128, 255])
+def test_any_non_zero_value_is_contact(value: int) -> None:
+    mask = ellipse_mask((60, 50), (50, 20), 30)
+    other = described((mask // 255 * value).astype(np.uint8))
+    assert other.center == described(mask).center
+
+
+def test_views_and_read_only_masks_are_as_good_as_any() -> None:
+    mask = ellipse_mask((60, 50), (50, 20), 30)
+    wide = np.zeros((140, 320), np.uint8)
+    wide[:, ::2] = mask
+    view = wide[:, ::2]
+    view.flags.writeable = False
+    assert described(view).center == described(mask).center
+    assert described(view, method="seed").center == described(mask, method="seed").center
+
+
+def test_a_large_frame_loses_no_precision() -> None:
+    mask = np.zeros((2160, 3840), np.uint8)
+    mask[500:1500, 1000:3000] = 255
+    contact = described(mask)
+    assert contact.center == (1999.5, 999.5)
+    assert contact.angle == 0.0
+    assert contact.area == 2_000_000
+    # A row of n pixels has the variance (n^2 - 1) / 12.
+    assert contact.ellipse is not None
+    expected = (4 * math.sqrt((2000**2 - 1) / 12), 4 * math.sqrt((1000**2 - 1) / 12))
+    assert contact.ellipse.axes == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("mask", "kwargs", "message"),
+    [
+        (np.zeros((3, 3), bool), {}, "uint8"),
+        (np.zeros((3, 3, 3), np.uint8), {}, r"\(H, W\)"),
+        (np.zeros((3, 3), np.uint8), {"min_area": -1}, "min_area"),
+        (np.zeros((3, 3), np.uint8), {"min_area": math.nan}, "min_area"),
+        (np.zeros((3, 3), np.uint8), {"max_gap": -1}, "max_gap"),
+        (np.zeros((3, 3), np.uint8), {"max_gap": math.nan}, "max_gap"),
+    ],
+)
+def test_bad_input_is_refused_with_a_reason(mask: Any, kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        contact_geometry(mask, **kwargs)
+
+
+def seed_line(points: NDArray[Any], width: int) -> tuple[float, float, tuple[float, float]]:
+    """The seed's `regress_line`, step by step: (-angle, slope, midpoint)."""
+    vx, vy, x, y = (float(v) for v in np.ravel(cv2.fitLine(points, cv2.DIST_L2, 0, 0.01, 0.01)))
+    slope = vy / vx
+    left = int(-x * vy / vx + y)
+    right = int((width - x) * vy / vx + y)
+    ends = (width - 1, right), (0, left)
+    middle = ((ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2)
+    return -math.degrees(math.atan(slope)), slope, middle
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_seed_method_is_the_original_line_through_the_hull(seed: int) -> None:
+    mask = blobs(seed)
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    hull = cv2.convexHull(np.vstack(contours))
+    contact = described(mask, method="seed")
+    angle, slope, middle = seed_line(hull, mask.shape[1])
+    assert contact.area == cv2.contourArea(hull)
+    np.testing.assert_array_equal(contact.hull, hull.reshape(-1, 2))
+    assert contact.angle == pytest.approx(angle, abs=1e-9)
+    assert contact.slope == pytest.approx(slope, abs=1e-9)
+    assert contact.center == middle
+
+
+def test_the_seed_method_survives_a_vertical_line() -> None:
+    mask = blank()
+    mask[10:90, 30] = 255
+    contact = described(mask, method="seed")
+    assert contact.angle == pytest.approx(90, abs=1e-4)
+    assert contact.slope is None
+    assert contact.center == pytest.approx((30, 49.5), abs=1e-4)
+    assert contact.ellipse is None
+
+
+def test_the_seed_ellipse_is_the_one_that_was_drawn() -> None:
+    contact = described(ellipse_mask((70.0, 60.0), (80, 40), 25), method="seed")
+    assert contact.ellipse is not None
+    assert contact.ellipse.angle is not None
+    assert turned(contact.ellipse.angle, 25) < 1
+    # Contours run through pixel centres: about a pixel shorter than the shape.
+    assert contact.ellipse.axes == pytest.approx((80, 40), abs=1.5)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
+@pytest.mark.parametrize("angle", [-89.9, -45, 0, 0.01, 30, 89.99])
+def test_a_line_far_from_the_origin_is_fitted_as_well(angle: float, offset: float) -> None:
+    t = np.linspace(-50, 50, 41)
+    theta = math.radians(-angle)
+    points = np.column_stack([t * math.cos(theta), t * math.sin(theta)]) + offset
+    line = regress_line(points)
+    assert line.angle is not None
+    # Derived: a coordinate near 1e6 is rounded to 1.2e-10 px, over a length of 100 px that is 1e-10 rad.
+    assert turned(line.angle, angle) < 1e-8
+    assert line.point == pytest.approx((offset, offset), abs=1e-9)
+
+
+def test_float32_points_cost_no_more_than_their_own_rounding() -> None:
+    t = np.linspace(-50, 50, 41)
+    points = np.column_stack([t * 0.8, t * 0.6]) + 300
+    line = regress_line(points.astype(np.float32))
+    assert line.angle is not None
+    # float32 rounds 300 to 1.5e-5 px: at most 1.5e-5 / 50 rad.
+    assert turned(line.angle, -math.degrees(math.atan2(0.6, 0.8))) < math.degrees(3e-7)
+
+
+def test_the_line_minimises_perpendicular_distances() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.normal(0, 1, (60, 2)) * [20, 4] @ np.array([[0.9, 0.436], [-0.436, 0.9]]) + 90
+
+    def cost(degrees: float) -> float:
+        theta = math.radians(-degrees)
+        away = (points - points.mean(axis=0)) @ [-math.sin(theta), math.cos(theta)]
+        return float(away @ away)
+
+    line = regress_line(points)
+    assert line.angle is not None
+    assert cost(line.angle) < min(cost(line.angle + 0.01), cost(line.angle - 0.01))
+
+
+def test_the_regression_line_agrees_with_opencv_and_the_seed() -> None:
+    rng = np.random.default_rng(4)
+    points = (rng.normal(0, 1, (50, 2)) * [30, 9] + [120, 80]).astype(np.float32)
+    angle, slope, middle = seed_line(points, 240)
+    line = regress_line(points, 240)
+    # OpenCV sums in float32.
+    assert line.angle == pytest.approx(angle, abs=1e-3)
+    assert line.slope == pytest.approx(slope, abs=1e-4)
+    assert line.midpoint == middle
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_points_without_direction_have_no_line(offset: float) -> None:
+    square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float64) + offset
+    for points in (square, square[:1], np.repeat(square[:1] + 0.1, 7, axis=0)):
+        line = regress_line(points, 100)
+        assert line.angle is None
+        assert line.slope is None
+        assert line.midpoint == line.point
+
+
+def test_a_vertical_line_has_no_slope() -> None:
+    line = regress_line([[5, 0], [5, 10], [5, 30]], 100)
+    assert line.angle == 90
+    assert line.slope is None
+    assert line.midpoint == line.point == pytest.approx((5, 40 / 3))
+
+
+@pytest.mark.parametrize(
+    "points", [np.empty((0, 2)), [[1, 2, 3]], [[np.nan, 1]], [[np.inf, 1], [0, 0]]], ids=str
+)
+def test_points_that_are_none_are_refused(points: Any) -> None:
+    with pytest.raises(ValueError, match="required finite points"):
+        regress_line(points)
