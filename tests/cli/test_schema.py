@@ -48,7 +48,7 @@ def test_every_shipped_pipeline_fits_the_schema(path: Path, validator: Draft2020
         "{stages: {hull: {use: capture, source: a}}, sinks: }",
         "stages: {hull: {when: [touching, {signal: a.b, hold: 3}], queue: {capacity: 2}}}",
         "stages: {hull: {on_error: disable, segment: heavy, in: {contact_mask: a.b}}}",
-        "{stages: {capture: }, sinks: {jsonl: {path: a, max_rate: 5, on_error: {action: skip_frame, budget: 3}}}}",
+        "{stages: {capture: }, sinks: {jsonl: {max_rate: 5, on_error: {action: skip_frame, budget: 3}}}}",
     ],
 )
 def test_right_pipelines_fit(text: str, validator: Draft202012Validator) -> None:

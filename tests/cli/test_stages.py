@@ -19,10 +19,10 @@ def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFix
     out, err = capsys.readouterr()
     assert err == ""
     heading, *rows = out.splitlines()
-    assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN"]
+    assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT", "IT", "DOES"]
     assert [row.split()[:2] for row in rows] == [[c.name, c.kind] for c in available()]
     hull = next(row for row in rows if row.startswith("hull "))
-    assert hull.split() == ["hull", "stage", "contact_mask", "contact", "built-in"]
+    assert hull.split()[:5] == ["hull", "stage", "contact_mask", "contact", "built-in"]
 
 
 def test_one_stage_is_explained_with_ports_and_parameters(
@@ -70,3 +70,5 @@ def test_a_broken_class_in_an_own_file_is_reported(
     monkeypatch.chdir(tmp_path)
     assert main(["stages", "./parts.py:Forgetful"]) == 2
     assert "must declare memory" in capsys.readouterr().err
+    assert main(["stages", "./parts.py"]) == 2
+    assert "has several classes" in capsys.readouterr().err

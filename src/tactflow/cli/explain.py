@@ -141,7 +141,7 @@ def _cost(node: Node, statistics: Mapping[str, Any]) -> str:
     entry = {**statistics.get("sinks", {}), **statistics["stages"]}.get(node.id)
     if entry is None:
         return "not part of that run"
-    text = f"ran {entry['runs']} times"
+    text = "ran once" if entry["runs"] == 1 else f"ran {entry['runs']} times"
     if entry["runs"]:
         text += f", p50 {_ms(entry['p50_ms'])}, p99 {_ms(entry['p99_ms'])}"
     skips = ", ".join(f"{count} {reason}" for reason, count in entry["skips"].items() if count)

@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from tactflow.engine.envelope import is_word
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 from tactflow.engine.registry import Section, catalogue, did_you_mean, names, resolve
@@ -51,11 +52,9 @@ def run(args: argparse.Namespace) -> int:
 
 def plain_table(components: Sequence[Component]) -> Iterator[str]:
     """Lines of a table with aligned columns."""
-    rows = [
-        ("NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN"),
-        *(_row(component)[:5] for component in components),
-    ]
-    widths = [max(len(row[column]) for row in rows) for column in range(5)]
+    heading = ("NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT IT DOES")
+    rows = [heading, *(_row(component) for component in components)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
 
@@ -90,7 +89,7 @@ def _find(name: str) -> Component:
         try:
             return resolve(name, section, Path())
         except ConfigError as error:
-            if ":" in name or name in names(section):
+            if not is_word(name) or name in names(section):
                 errors.append(error)
     known = [*names("stages"), *names("sinks")]
     # A class in a file is looked for as a stage, then as a sink; the last word is the one that counts.
@@ -112,12 +111,13 @@ def _print_table(components: Sequence[Component]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(
-        "name", "kind", "inputs", "outputs", "origin", "what it does", box=None, header_style="bold"
-    )
+    table = Table("name", "inputs", "outputs", box=None, header_style="bold", pad_edge=False)
+    table.add_column("what it does", overflow="fold")
     for component in components:
-        table.add_row(*_row(component))
-    Console().print(table)
+        name, _, inputs, outputs, origin, summary = _row(component)
+        source = "" if origin == "built-in" else f" ({origin})"
+        table.add_row(name, inputs, outputs, summary + source)
+    Console(highlight=False).print(table)
 
 
 def _document(cls: type) -> str:

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from tactflow.engine import wiring
+from tactflow.engine import envelope, wiring
 from tactflow.engine.complaints import complain
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import ErrorAction, FullPolicy, Mark, Node, OnError, Pipeline, Queue
@@ -53,7 +53,7 @@ def load_pipeline(
     for text in overrides:
         root = _override(root, text, problems)
     root = _add_sinks(root, extra_sinks or {})
-    wiring.check_keys(root.entries, TOP_LEVEL, "", problems)
+    envelope.check_keys(root.entries, TOP_LEVEL, "", problems)
     drafts = [draft for section in _SECTIONS for draft in _drafts(root, section, problems)]
     _check_ids(drafts, problems)
     for draft in drafts:
@@ -73,10 +73,10 @@ def load_pipeline(
     pipeline = Pipeline(
         file=str(path),
         directory=path.parent,
-        sensor=wiring.word(root.entries, "sensor", "", problems) or "main",
+        sensor=envelope.word(root.entries, "sensor", "", problems) or "main",
         nodes=nodes,
         skipping=_flag(root.entries, "skipping", True, problems),
-        opencv_threads=wiring.whole(root.entries, "opencv_threads", 0, "", problems),
+        opencv_threads=envelope.whole(root.entries, "opencv_threads", 0, "", problems),
         warnings=_warnings(root, drafts),
     )
     problems.raise_if_any()
@@ -164,7 +164,7 @@ def _drafts(root: Item, section: Section, problems: Problems) -> list[Draft]:
         return []
     drafts = []
     for id_, given in entry.item.entries.items():
-        if not wiring.is_word(id_):
+        if not envelope.is_word(id_):
             problems.add(given.mark, f"{section}.{id_}: an id is a word of letters, digits, _ and -")
         elif not given.item.is_mapping:
             what = f"expected a mapping of settings, as in {{use: {id_}}}, got {given.item.words()}"
@@ -261,7 +261,7 @@ def _node(draft: Draft, params: StageParams | None, problems: Problems) -> Node 
     entries, path = draft.item.entries, draft.path
     queue = _queue(entries, path, problems)
     on_error = _on_error(draft, problems)
-    segment = wiring.word(entries, "segment", path, problems)
+    segment = envelope.word(entries, "segment", path, problems)
     max_rate = _max_rate(entries, path, problems) if draft.section == "sinks" else None
     if draft.component is None or params is None:
         return None
@@ -289,11 +289,11 @@ def _queue(entries: Mapping[str, Entry], path: str, problems: Problems) -> Queue
         problems.add(entry.item.mark, f"{path}: {what}")
         return Queue()
     settings = entry.item.entries
-    wiring.check_keys(settings, ["capacity", "when_full"], path, problems)
+    envelope.check_keys(settings, ["capacity", "when_full"], path, problems)
     policies: tuple[FullPolicy, ...] = get_args(FullPolicy)
-    name = wiring.choice(settings, "when_full", policies, path, problems)
+    name = envelope.choice(settings, "when_full", policies, path, problems)
     policy = next((known for known in policies if known == name), None)
-    return Queue(wiring.whole(settings, "capacity", 1, path, problems), policy)
+    return Queue(envelope.whole(settings, "capacity", 1, path, problems), policy)
 
 
 def _on_error(draft: Draft, problems: Problems) -> OnError:
@@ -306,11 +306,11 @@ def _on_error(draft: Draft, problems: Problems) -> OnError:
     path = f"{draft.path}.on_error"
     if isinstance(entry.item.content, dict):
         settings = entry.item.content
-        wiring.check_keys(settings, ["action", "budget"], path, problems)
-        name = wiring.choice(settings, "action", actions, path, problems)
-        budget = wiring.whole(settings, "budget", 0, path, problems)
+        envelope.check_keys(settings, ["action", "budget"], path, problems)
+        name = envelope.choice(settings, "action", actions, path, problems)
+        budget = envelope.whole(settings, "budget", 0, path, problems)
     else:
-        name = wiring.choice({"on_error": entry}, "on_error", actions, draft.path, problems)
+        name = envelope.choice({"on_error": entry}, "on_error", actions, draft.path, problems)
         budget = None
     action: ErrorAction = next((known for known in actions if known == name), "stop")
     return OnError(action) if budget is None else OnError(action, budget)

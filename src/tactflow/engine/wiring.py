@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from tactflow.engine import envelope
 from tactflow.engine.graph import Component, Gate, Mark, Ref
 from tactflow.engine.registry import Section, catalogue, did_you_mean
 from tactflow.engine.stage import Port, SignalPort, describe_type, mismatch, port_type
@@ -233,7 +234,7 @@ class _Wiring:
         settings = item.entries
         if isinstance(item.content, dict):
             known = ["signal", "otherwise", "hold", "at_least_every", "reason"]
-            check_keys(settings, known, path, self._problems)
+            envelope.check_keys(settings, known, path, self._problems)
             if "signal" not in settings:
                 self._problems.add(
                     item.mark, f"{path}: signal is missing; it names the port that opens the gate"
@@ -244,12 +245,12 @@ class _Wiring:
             signal_path = path
         otherwise: Literal["absent", "repeat"] = (
             "repeat"
-            if choice(settings, "otherwise", ["absent", "repeat"], path, self._problems) == "repeat"
+            if envelope.choice(settings, "otherwise", ["absent", "repeat"], path, self._problems) == "repeat"
             else "absent"
         )
-        hold = whole(settings, "hold", 0, path, self._problems)
-        at_least_every = whole(settings, "at_least_every", 1, path, self._problems)
-        reason = word(settings, "reason", path, self._problems)
+        hold = envelope.whole(settings, "hold", 0, path, self._problems)
+        at_least_every = envelope.whole(settings, "at_least_every", 1, path, self._problems)
+        reason = envelope.word(settings, "reason", path, self._problems)
         ref = self._reference(item, signal_path, draft, by_port=True)
         if ref is None:
             return
@@ -265,60 +266,3 @@ class _Wiring:
             return
         draft.gates.append(Gate(ref, reason or signal.closed, otherwise, hold or 0, at_least_every))
         draft.edges.append((ref, item.mark))
-
-
-def check_keys(entries: Mapping[str, Entry], known: Sequence[str], path: str, problems: Problems) -> None:
-    """Report every key that is not known."""
-    for key, entry in entries.items():
-        if key not in known:
-            problems.add(
-                entry.mark, f"{path + '.' if path else ''}{key}: unknown key{did_you_mean(key, known)}"
-            )
-
-
-def choice(
-    entries: Mapping[str, Entry], key: str, choices: Sequence[str], path: str, problems: Problems
-) -> str | None:
-    """The value of `key` if it is one of `choices`; None if it is not given or wrong."""
-    entry = entries.get(key)
-    if entry is None:
-        return None
-    value = entry.item.content
-    if isinstance(value, str) and value in choices:
-        return value
-    hint = did_you_mean(value, choices) if isinstance(value, str) else ""
-    hint = hint if "did you mean" in hint else ""
-    expected = f"expected {' or '.join([', '.join(choices[:-1]), choices[-1]])}"
-    problems.add(entry.item.mark, f"{path}.{key}: {expected}, got {entry.item.words()}{hint}")
-    return None
-
-
-def whole(entries: Mapping[str, Entry], key: str, least: int, path: str, problems: Problems) -> int | None:
-    """The value of `key` if it is a whole number >= `least`; None if it is null, not given or wrong."""
-    entry = entries.get(key)
-    if entry is None or entry.item.content is None:
-        return None
-    value = entry.item.content
-    if isinstance(value, int) and not isinstance(value, bool) and value >= least:
-        return value
-    expected = f"expected a whole number >= {least}"
-    problems.add(entry.item.mark, f"{path + '.' if path else ''}{key}: {expected}, got {entry.item.words()}")
-    return None
-
-
-def word(entries: Mapping[str, Entry], key: str, path: str, problems: Problems) -> str | None:
-    """The value of `key` if it is a word (see `is_word`); None if it is null, not given or wrong."""
-    entry = entries.get(key)
-    if entry is None or entry.item.content is None:
-        return None
-    value = entry.item.content
-    if isinstance(value, str) and is_word(value):
-        return value
-    expected = "expected a word of letters, digits, _ and -"
-    problems.add(entry.item.mark, f"{path + '.' if path else ''}{key}: {expected}, got {entry.item.words()}")
-    return None
-
-
-def is_word(text: str) -> bool:
-    """True for a word of ASCII letters, digits, `_` and `-`."""
-    return text.isascii() and text.replace("_", "a").replace("-", "a").isalnum()
