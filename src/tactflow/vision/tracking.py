@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.marker_appearance import MarkerAppearance
+from tactflow.vision.marker_matching import choose_spots
 from tactflow.vision.markers import Detection, to_gray
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -16,133 +18,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-# Sub-pixel phases per axis at which the reference appearance is kept: an eighth of a pixel is the farthest an
-# estimate lies from one of them, where the linear model errs by far less than the noise.
-_PHASES: Final = 4
-# Costs of the joint choice, in units where a stretch of one half between neighbours costs 0.5: of not seeing a
-# mark, and of each of its links then.
-# A step is repeated, so many times at most, while it was longer than this, px: from there the linear model
-# leaves less than 0.005 px.
-_CONVERGED: Final = 0.25
-_ROUNDS: Final = 4
-_PRIOR: Final = 0.25
-_MISSING: Final = 1.0
-_MISSING_EDGE: Final = 0.25
-# A mark is lost when the weights of the found marks around it (one at a pitch's distance has 0.66) sum to less.
+# A mark is lost when the weights of the found marks around it (one a pitch away has 0.66) sum to less.
 _LEAST_SUPPORT: Final = 0.6
-
-
-class _Appearance:
-    """Measures marks against their own look in the reference, by least squares in the image as it is.
-
-    A patch of the frame is modelled as gain * reference mark, shifted, + a plane (Lucas and Kanade 1981 with
-    the illumination model of Hager and Belhumeur 1998, in the inverse form of Baker and Matthews 2004: all
-    that is costly is done once for the reference). The frame is only ever read at whole pixels; it is the
-    noise-free side, the reference, that is interpolated.
-    """
-
-    def __init__(self, reference: NDArray[np.float32], origin: FloatArray, radius: float) -> None:
-        self.radius = radius
-        reach = int(np.ceil(1.55 * radius + 1.2))
-        self.pad = reach + 1
-        self.shape = reference.shape
-        axis = np.arange(-reach, reach + 1)
-        grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
-        disc = np.hypot(grid_x, grid_y) <= 1.55 * radius + 1.2
-        self._width = reference.shape[1] + 2 * self.pad
-        self._offsets = (grid_y[disc] * self._width + grid_x[disc]).astype(np.int64)
-        self.pixels = int(disc.sum())
-        x, y = grid_x[disc].astype(np.float64), grid_y[disc].astype(np.float64)
-        plane, _ = np.linalg.qr(np.column_stack([np.ones_like(x), x, y]))
-        self._plane = plane.astype(np.float32)
-
-        count = len(origin)
-        self._rows = np.arange(count)
-        steps = (np.arange(_PHASES) + 0.5) / _PHASES - 0.5
-        pinv = np.empty((_PHASES, _PHASES, count, 3, self.pixels), np.float32)
-        gram = np.empty((_PHASES, _PHASES, count, 3, 3), np.float32)
-        spread = np.empty((_PHASES, _PHASES, count), np.float32)
-        half = 0.25
-        for row, phase_y in enumerate(steps):
-            for column, phase_x in enumerate(steps):
-                phase = np.array([phase_x, phase_y])
-
-                def look(shift_x: float, shift_y: float, phase: FloatArray = phase) -> FloatArray:
-                    points = origin - phase - (shift_x, shift_y)
-                    return _resample(reference, points, reach)[:, disc]
-
-                mark = look(0, 0)
-                slope_x = (look(half, 0) - look(-half, 0)) / (2 * half)
-                slope_y = (look(0, half) - look(0, -half)) / (2 * half)
-                basis = np.stack([mark, slope_x, slope_y], axis=1)
-                basis -= (basis @ plane) @ plane.T
-                products = basis @ basis.transpose(0, 2, 1)
-                # A trace of ridge keeps marks without contrast solvable; they are never trusted anyway.
-                ridge = 1e-6 * np.trace(products, axis1=1, axis2=2) + 1e-6
-                inverse = np.linalg.inv(products + ridge[:, None, None] * np.eye(3))
-                pinv[row, column] = inverse @ basis
-                gram[row, column] = products
-                spread[row, column] = 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
-        self._pinv = pinv.reshape(_PHASES * _PHASES * count, 3, self.pixels)
-        self._gram = gram.reshape(_PHASES * _PHASES * count, 3, 3)
-        self._spread = spread.reshape(_PHASES * _PHASES * count)
-        self._count = count
-        limits = np.array([reference.shape[1] - 1, reference.shape[0] - 1], np.float64)
-        self._limits = limits
-
-    def padded(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The frame with a rim, flat, so that patches may reach over its border."""
-        pad = self.pad
-        return np.asarray(
-            cv2.copyMakeBorder(gray, pad, pad, pad, pad, cv2.BORDER_REPLICATE), np.uint8
-        ).ravel()
-
-    def measure(
-        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None
-    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Measure marks from starting points (n, 2), right to about a radius.
-
-        marks : (n,) which marks these are; None for all.
-        Returns positions (n, 2), gain (n,), explained share of the contrast (n,), standard error (n,).
-        """
-        marks = self._rows if marks is None else marks
-        position, gain, share, stderr = self._step(flat, start, marks)
-        active = np.flatnonzero(_longer(position - start, _CONVERGED))
-        for _ in range(_ROUNDS):
-            if len(active) == 0:
-                break
-            before = position[active]
-            position[active], gain[active], share[active], stderr[active] = self._step(
-                flat, before, marks[active]
-            )
-            active = active[_longer(position[active] - before, _CONVERGED)]
-        return position, gain, share, stderr
-
-    def _step(
-        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray
-    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """One least-squares step from the phase nearest to the starting points."""
-        base = np.rint(np.minimum(np.maximum(start, 0.0), self._limits))
-        cell = ((start - base + 0.5) * _PHASES).astype(np.int64)
-        np.minimum(np.maximum(cell, 0, out=cell), _PHASES - 1, out=cell)
-        corner = base.astype(np.int64) + self.pad
-        index = (corner[:, 1] * self._width + corner[:, 0])[:, None] + self._offsets
-        patch = flat.take(index).astype(np.float32)
-        # Far from zero, sums of squares would lose digits.
-        patch -= np.float32(128)
-        which = (cell[:, 1] * _PHASES + cell[:, 0]) * self._count + marks
-        theta = np.matmul(self._pinv[which], patch[:, :, None])[:, :, 0]
-        gain = theta[:, 0]
-        safe = np.maximum(gain, np.float32(0.15))
-        step = theta[:, 1:] / safe[:, None]
-        np.minimum(np.maximum(step, -self.radius, out=step), self.radius, out=step)
-        position = base + ((cell + 0.5) / _PHASES - 0.5) + step
-        seen = (np.matmul(self._gram[which], theta[:, :, None])[:, :, 0] * theta).sum(axis=1)
-        level = patch @ self._plane
-        total = np.einsum("nk,nk->n", patch, patch) - np.einsum("nk,nk->n", level, level)
-        rest = np.maximum(total - seen, np.float32(1e-3))
-        stderr = np.sqrt(rest * (self._spread[which] / max(self.pixels - 6, 1))) / safe
-        return position, gain, seen / (seen + rest), stderr
 
 
 class _Spots:
@@ -150,7 +27,7 @@ class _Spots:
 
     def __init__(self, reference: NDArray[np.uint8], detection: Detection) -> None:
         self._factor = 1
-        while detection.dot_radius / self._factor >= 3.4:
+        while detection.dot_radius / self._factor >= 2.3:
             self._factor *= 2
         radius = detection.dot_radius / self._factor
         self._narrow = max(radius / 1.83, 0.8)
@@ -259,7 +136,7 @@ class MarkerTracker:
         self._pitch = detection.pitch
         self._radius = detection.dot_radius
         self._farthest = max_displacement or 1.3 * detection.pitch
-        self._appearance = _Appearance(mean, self._origin, detection.dot_radius)
+        self._appearance = MarkerAppearance(mean, self._origin, detection.dot_radius)
         self._spots = _Spots(np.rint(mean).astype(np.uint8), detection)
         self._edges = detection.edges
         self._edge_length = np.linalg.norm(
@@ -269,13 +146,17 @@ class MarkerTracker:
         for number, (first, second) in enumerate(self._edges.tolist()):
             self._neighbours[first].append((second, number))
             self._neighbours[second].append((first, number))
+        degree = [len(links) for links in self._neighbours]
+        usual = sorted(degree)[len(degree) // 2]
+        self._rim_weight = [3 if links < usual else 1 for links in degree]
         self._around, self._around_weight = _surroundings(self._origin, self._pitch)
         self.reset()
 
     def reset(self) -> None:
         """Forget what was tracked; the reference stays."""
         self._position = self._origin.copy()
-        self._status = np.full(self._count, MarkerStatus.TRACKED, np.uint8)
+        self._seen = np.ones(self._count, bool)
+        self._accepted = np.zeros(len(self._edges))
         self._age = 0
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
@@ -288,167 +169,134 @@ class MarkerTracker:
         if gray.shape != self._shape:
             raise ValueError(f"required a frame of (height, width) {self._shape}, got {gray.shape}")
         flat = self._appearance.padded(gray)
-        last = self._position
-        position, gain, share, stderr = self._appearance.measure(flat, last)
-        move = np.hypot(*(position - last).T)
-        good = _trusted(gain, share) & (move < 0.8 * self._radius)
-        displacement = position - self._origin
-        change = displacement[self._edges[:, 0]] - displacement[self._edges[:, 1]]
-        strain = np.hypot(change[:, 0], change[:, 1]) / self._edge_length
-        seen_before = self._status == MarkerStatus.TRACKED
-        missing = ~good
-        smooth = bool((strain < 0.4)[good[self._edges].all(axis=1)].all())
-        lost_one = bool((missing & seen_before).any())
-        self._age += 1
-        stale = bool(missing.any()) and (
-            self._age >= 10 or float(move[good].max(initial=0.0)) > 0.1 * self._pitch
-        )
-        if lost_one or stale or not smooth:
+        position, gain, share, stderr = self._appearance.measure(flat, self._position)
+        move = _lengths(position - self._position)
+        seen = _trusted(gain, share) & (move < 0.8 * self._radius)
+        stretch = self._stretch(position)
+        if self._doubtful(seen, move, stretch):
+            position, seen, stderr = self._search(gray, flat, position, seen, stderr, stretch)
+            self._accepted = self._stretch(position)
             self._age = 0
-            position, good, stderr = self._search(gray, flat, position, good, stderr, strain)
-        status = np.where(good, MarkerStatus.TRACKED, MarkerStatus.INFERRED).astype(np.uint8)
-        stderr = np.where(good, stderr, np.nan).astype(np.float64)
-        if not good.all():
-            self._infer(position, good, status)
-        self._position = position
-        self._status = status
-        return Markers(self._origin.copy(), position.copy(), status.copy(), stderr)
+        status = np.full(self._count, MarkerStatus.TRACKED, np.uint8)
+        stderr = stderr.astype(np.float64)
+        if not seen.all():
+            stderr[~seen] = np.nan
+            self._infer(position, seen, status)
+        self._position, self._seen = position, seen
+        return Markers(self._origin.copy(), position.copy(), status, stderr)
+
+    def _stretch(self, position: FloatArray) -> FloatArray:
+        """By how much the displacements of neighbours differ, as a fraction of their distance: (E,)."""
+        moved = position - self._origin
+        return _lengths(moved[self._edges[:, 0]] - moved[self._edges[:, 1]]) / self._edge_length
+
+    def _doubtful(self, seen: BoolArray, move: FloatArray, stretch: FloatArray) -> bool:
+        """Whether measuring where the marks were last may have missed or mistaken one."""
+        self._age += 1
+        if bool((self._seen & ~seen).any()):
+            return True
+        rough = stretch > np.maximum(0.4, self._accepted + 0.15)
+        rough |= stretch > 0.7
+        if bool((rough & seen[self._edges[:, 0]] & seen[self._edges[:, 1]]).any()):
+            return True
+        if bool(seen.all()) and float(stretch.max(initial=0.0)) < 0.4:
+            return False
+        # Something is missing or strongly stretched: look again when the rest has moved, and now and then.
+        return self._age >= 10 or float(move[seen].max(initial=0.0)) > 0.1 * self._pitch
 
     def _search(
         self,
         gray: NDArray[np.uint8],
         flat: NDArray[np.uint8],
         position: FloatArray,
-        good: BoolArray,
+        seen: BoolArray,
         stderr: NDArray[Any],
-        strain: FloatArray,
-    ) -> tuple[FloatArray, BoolArray, FloatArray]:
+        stretch: FloatArray,
+    ) -> tuple[FloatArray, BoolArray, NDArray[Any]]:
         """Joint choice among the spots of the whole frame, for marks outside the largest smooth part."""
-        origin, pitch = self._origin, self._pitch
         spots, strength = self._spots.find(gray, 0.25)
-        settled = self._largest_part(good, strain)
+        settled = self._largest_part(seen, stretch)
         free = np.flatnonzero(~settled)
-        result = position.copy()
-        stderr = np.array(stderr, np.float64)
-        extra = free[good[free]]
-        if len(extra):
-            apart = np.ones(len(extra), bool)
-            if len(spots):
-                apart = _distances(position[extra], spots).min(axis=1) > 0.35 * pitch
-            spots = np.concatenate([spots, position[extra[apart]]])
-            strength = np.concatenate([strength, np.full(int(apart.sum()), 0.5)])
-        fixed = np.flatnonzero(settled)
-        if len(spots) and len(fixed):
-            unclaimed = _distances(spots, position[fixed]).min(axis=1) > 0.3 * pitch
-            spots, strength = spots[unclaimed], strength[unclaimed]
-        found = good.copy()
-        found[free] = False
-        chosen = self._choose(free, settled, position, spots, strength)
+        # What was measured without belonging to that part is a spot like any other, unless it was found anyway.
+        own = position[free[seen[free]]]
+        own = own[~self._near(own, spots, 0.35)]
+        unclaimed = ~self._near(spots, position[settled], 0.3)
+        spots = np.concatenate([spots[unclaimed], own])
+        strength = np.concatenate([strength[unclaimed], np.full(len(own), 0.5)])
+        moved = position - self._origin
+        common = np.median(moved[settled], axis=0) if settled.any() else np.zeros(2)
+        chosen = choose_spots(
+            self._origin,
+            self._edges,
+            free,
+            settled,
+            moved,
+            np.stack([self._position[free], self._origin[free] + common]),
+            spots,
+            strength,
+            pitch=self._pitch,
+            farthest=self._farthest,
+        )
+        result, stderr, found = position.copy(), stderr.copy(), settled.copy()
         taken = free[chosen >= 0]
         if len(taken):
             start = spots[chosen[chosen >= 0]]
             measured, gain, share, error = self._appearance.measure(flat, start, taken)
-            near = np.hypot(*(measured - start).T) < 0.6 * self._radius + 0.5
-            sharp = _trusted(gain, share) & near
+            sharp = _trusted(gain, share) & (_lengths(measured - start) < 0.6 * self._radius + 0.5)
             result[taken] = np.where(sharp[:, None], measured, start)
             # A spot that does not look like the mark any more is still its place, to a part of its radius.
             stderr[taken] = np.where(sharp, error, 0.15 * self._radius)
             found[taken] = True
-        missing = np.flatnonzero(~found)
-        if len(missing):
-            status = np.where(found, MarkerStatus.TRACKED, MarkerStatus.INFERRED).astype(np.uint8)
-            self._infer(result, found, status)
         return result, found, stderr
 
-    def _largest_part(self, good: BoolArray, strain: FloatArray) -> BoolArray:
-        """The largest set of found marks that are linked by edges along which the displacement is smooth."""
-        linked = (strain < 0.3).tolist()
-        open_ = good.tolist()
+    def _near(self, points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
+        """Which points have one of the others within so many pitches, to a tenth of a pitch: a raster, so
+        that the cost does not grow with the product of their numbers."""
+        if len(points) == 0 or len(others) == 0:
+            return np.zeros(len(points), bool)
+        cell = 0.1 * self._pitch
+        height, width = (int(side / cell) + 2 for side in self._shape)
+        raster = np.zeros((height, width), np.uint8)
+        limits = np.array([width - 1, height - 1])
+        column, row = np.clip((others / cell + 0.5).astype(np.int64), 0, limits).T
+        raster[row, column] = 1
+        size = 2 * round(10 * distance) + 1
+        raster = np.asarray(
+            cv2.dilate(raster, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))), np.uint8
+        )
+        column, row = np.clip((points / cell + 0.5).astype(np.int64), 0, limits).T
+        return np.asarray(raster[row, column] > 0, np.bool_)
+
+    def _largest_part(self, seen: BoolArray, stretch: FloatArray) -> BoolArray:
+        """The largest set of seen marks that are linked by edges along which the displacement is smooth.
+
+        Marks at the rim count three times: they hardly move, so the part that holds them is the right one.
+        """
+        linked = (stretch < 0.3).tolist()
+        waiting = seen.tolist()
         best: list[int] = []
+        most = 0
         for seed in range(self._count):
-            if not open_[seed]:
+            if not waiting[seed]:
                 continue
-            open_[seed] = False
-            part = [seed]
+            waiting[seed] = False
+            part, weight = [seed], 0
             for mark in part:
+                weight += self._rim_weight[mark]
                 for other, edge in self._neighbours[mark]:
-                    if open_[other] and linked[edge]:
-                        open_[other] = False
+                    if waiting[other] and linked[edge]:
+                        waiting[other] = False
                         part.append(other)
-            if len(part) > len(best):
-                best = part
+            if weight > most:
+                best, most = part, weight
         settled = np.zeros(self._count, bool)
         settled[best] = True
         return settled
 
-    def _choose(
-        self,
-        free: IntArray,
-        settled: BoolArray,
-        position: FloatArray,
-        spots: FloatArray,
-        strength: FloatArray,
-    ) -> IntArray:
-        """For each free mark the number of its spot, or -1."""
-        count = len(free)
-        if count == 0 or len(spots) == 0:
-            return np.full(count, -1, np.int64)
-        origin = self._origin
-        before = self._position[free]
-        base = np.median((position - origin)[settled], axis=0) if settled.any() else np.zeros(2)
-        distance = np.minimum(_distances(before, spots), _distances(origin[free] + base, spots))
-        labels = min(8, len(spots), max(1, int((distance <= self._farthest).sum(axis=1).max())))
-        label = np.argsort(distance, axis=1, kind="stable")[:, :labels]
-        reachable = np.take_along_axis(distance, label, axis=1) <= self._farthest
-        moved = spots[label] - origin[free][:, None]
-        forbidden = 1e3
-        unary = np.empty((count, labels + 1))
-        unary[:, :labels] = 0.4 * np.clip(1.0 - strength[label], 0, 1)
-        unary[:, :labels] += _PRIOR * (np.take_along_axis(distance, label, axis=1) / self._pitch) ** 2
-        unary[:, :labels][~reachable] = forbidden
-        unary[:, labels] = _MISSING
-        slot = np.full(self._count, -1, np.int64)
-        slot[free] = np.arange(count)
-        ends = slot[self._edges]
-        # Neighbours that are settled pull each on its own.
-        for one, other in ((0, 1), (1, 0)):
-            pulled = (ends[:, one] >= 0) & settled[self._edges[:, other]]
-            if pulled.any():
-                mark, anchor = ends[pulled, one], self._edges[pulled, other]
-                span = origin[anchor] - origin[free[mark]]
-                shift = (position - origin)[anchor]
-                cost = np.full((len(mark), labels + 1), _MISSING_EDGE)
-                cost[:, :labels] = _disagreement(moved[mark], shift[:, None], span[:, None])
-                np.add.at(unary, mark, cost)
-        inner = (ends >= 0).all(axis=1)
-        if inner.any():
-            first, second = ends[inner].T
-            span = origin[free[second]] - origin[free[first]]
-            pair = np.full((len(first), labels + 1, labels + 1), _MISSING_EDGE)
-            pair[:, :labels, :labels] = _disagreement(
-                moved[first][:, :, None], moved[second][:, None], span[:, None, None]
-            )
-            same = label[first][:, :, None] == label[second][:, None]
-            pair[:, :labels, :labels][same] = 4.0
-            belief = _propagate(unary, first, second, pair)
-        else:
-            belief = unary
-        choice = np.argmin(belief, axis=1)
-        margin = np.take_along_axis(belief, choice[:, None], axis=1)[:, 0] - belief[:, labels]
-        chosen = np.where(choice < labels, label[np.arange(count), np.minimum(choice, labels - 1)], -1)
-        # Two marks cannot share a spot: the surer one keeps it.
-        used: set[int] = set()
-        for mark in np.argsort(margin, kind="stable").tolist():
-            spot = int(chosen[mark])
-            if spot in used:
-                chosen[mark] = -1
-            elif spot >= 0:
-                used.add(spot)
-        return np.asarray(chosen, np.int64)
-
     def _infer(self, position: FloatArray, found: BoolArray, status: NDArray[np.uint8]) -> None:
         """Place the marks that were not found by an affine fit to the displacements around them, in place."""
         missing = np.flatnonzero(~found)
+        status[missing] = MarkerStatus.INFERRED
         around = self._around[missing]
         weight = self._around_weight[missing] * found[around]
         offset = (self._origin[around] - self._origin[missing][:, None]) / self._pitch
@@ -465,17 +313,12 @@ class MarkerTracker:
         status[missing[~placed]] = MarkerStatus.LOST
 
 
-def _longer(vectors: FloatArray, length: float) -> BoolArray:
-    return np.asarray(np.einsum("ni,ni->n", vectors, vectors) > length * length, np.bool_)
+def _lengths(vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)), np.float64)
 
 
 def _trusted(gain: NDArray[Any], share: NDArray[Any]) -> BoolArray:
     return np.asarray((gain > 0.3) & (gain < 3.0) & (share > 0.6), np.bool_)
-
-
-def _distances(first: FloatArray, second: FloatArray) -> FloatArray:
-    offset = first[:, None] - second[None]
-    return np.asarray(np.hypot(offset[..., 0], offset[..., 1]), np.float64)
 
 
 def _surroundings(origin: FloatArray, pitch: float) -> tuple[IntArray, FloatArray]:
@@ -494,62 +337,3 @@ def _surroundings(origin: FloatArray, pitch: float) -> tuple[IntArray, FloatArra
         weight[mark] = np.exp(-squared[order] / (2 * (1.1 * pitch) ** 2))
     weight[weight < 0.02] = 0.0
     return near, weight
-
-
-def _disagreement(first: FloatArray, second: FloatArray, span: FloatArray) -> FloatArray:
-    """Cost of two displacements of neighbours `span` apart: relative stretch, squared and bounded."""
-    change = second - first
-    squared = (span**2).sum(axis=-1)
-    cost = np.minimum(2.0 * (change**2).sum(axis=-1) / squared, 1.2)
-    folded = ((span + change) * span).sum(axis=-1) < 0.25 * squared
-    return np.asarray(cost + 1.0 * folded, np.float64)
-
-
-def _propagate(unary: FloatArray, first: IntArray, second: IntArray, pair: FloatArray) -> FloatArray:
-    """Min-sum belief propagation: (n, L) costs, edges with (L, L) costs each -> (n, L) beliefs (costs)."""
-    source = np.concatenate([first, second])
-    target = np.concatenate([second, first])
-    cost = np.concatenate([pair, pair.transpose(0, 2, 1)])
-    reverse = np.concatenate([np.arange(len(first)) + len(first), np.arange(len(first))])
-    gather = np.zeros((len(unary), len(source)))
-    gather[target, np.arange(len(source))] = 1.0
-    message = np.zeros((len(source), unary.shape[1]))
-    belief = unary
-    for _ in range(12):
-        outgoing = belief[source] - message[reverse]
-        fresh = (outgoing[:, :, None] + cost).min(axis=1)
-        fresh -= fresh.min(axis=1, keepdims=True)
-        message = 0.7 * fresh + 0.3 * message
-        belief = unary + gather @ message
-    return belief
-
-
-def _resample(image: NDArray[np.float32], points: FloatArray, reach: int) -> FloatArray:
-    """Patches (N, 2 reach + 1, 2 reach + 1) centred on sub-pixel points, by cubic convolution (Keys 1981)."""
-    pad = reach + 4
-    padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
-    base = np.floor(points).astype(np.int64)
-    fraction = points - base
-    span = np.arange(-reach - 1, reach + 3)
-    height, width = padded.shape
-    rows = np.clip(base[:, 1, None] + pad + span, 0, height - 1)
-    columns = np.clip(base[:, 0, None] + pad + span, 0, width - 1)
-    patches = padded[rows[:, :, None], columns[:, None, :]].astype(np.float64)
-    weights_x, weights_y = _cubic(fraction[:, 0]), _cubic(fraction[:, 1])
-    size = 2 * reach + 1
-    across = sum(patches[:, :, tap : tap + size] * weights_x[tap][:, None, None] for tap in range(4))
-    return np.asarray(
-        sum(across[:, tap : tap + size] * weights_y[tap][:, None, None] for tap in range(4)), np.float64
-    )
-
-
-def _cubic(fraction: FloatArray) -> FloatArray:
-    t = fraction
-    return np.stack(
-        [
-            ((-0.5 * t + 1.0) * t - 0.5) * t,
-            (1.5 * t - 2.5) * t * t + 1.0,
-            ((-1.5 * t + 2.0) * t + 0.5) * t,
-            (0.5 * t - 0.5) * t * t,
-        ]
-    )

@@ -1,0 +1,169 @@
+"""Measure marks against their own look in the reference frame."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+# Sub-pixel phases per axis at which the reference look is kept: an eighth of a pixel is the farthest an
+# estimate lies from one of them, where the linear model errs by far less than the noise.
+_PHASES: Final = 4
+# A step is repeated, so many times at most, while it was longer than this, px: from there the linear model
+# leaves less than 0.005 px.
+_CONVERGED: Final = 0.25
+_ROUNDS: Final = 4
+
+
+class MarkerAppearance:
+    """Measures marks against their own look in the reference, by least squares in the image as it is.
+
+    A patch of the frame is modelled as gain * reference mark, shifted, + a plane (Lucas and Kanade 1981 with
+    the illumination model of Hager and Belhumeur 1998, in the inverse form of Baker and Matthews 2004: all
+    that is costly is done once for the reference). The frame is only ever read at whole pixels; it is the
+    noise-free side, the reference, that is interpolated.
+    """
+
+    def __init__(self, reference: NDArray[np.float32], origin: FloatArray, radius: float) -> None:
+        self.radius = radius
+        reach = int(np.ceil(1.55 * radius + 1.2))
+        self.pad = reach + 1
+        self.shape = reference.shape
+        axis = np.arange(-reach, reach + 1)
+        grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
+        disc = np.hypot(grid_x, grid_y) <= 1.55 * radius + 1.2
+        self._width = reference.shape[1] + 2 * self.pad
+        self._offsets = (grid_y[disc] * self._width + grid_x[disc]).astype(np.int64)
+        self.pixels = int(disc.sum())
+        x, y = grid_x[disc].astype(np.float64), grid_y[disc].astype(np.float64)
+        plane, _ = np.linalg.qr(np.column_stack([np.ones_like(x), x, y]))
+        self._plane = plane.astype(np.float32)
+
+        count = len(origin)
+        self._rows = np.arange(count)
+        steps = (np.arange(_PHASES) + 0.5) / _PHASES - 0.5
+        pinv = np.empty((_PHASES, _PHASES, count, 3, self.pixels), np.float32)
+        gram = np.empty((_PHASES, _PHASES, count, 3, 3), np.float32)
+        spread = np.empty((_PHASES, _PHASES, count), np.float32)
+        half = 0.25
+        for row, phase_y in enumerate(steps):
+            for column, phase_x in enumerate(steps):
+                phase = np.array([phase_x, phase_y])
+
+                def look(shift_x: float, shift_y: float, phase: FloatArray = phase) -> FloatArray:
+                    points = origin - phase - (shift_x, shift_y)
+                    return _resample(reference, points, reach)[:, disc]
+
+                mark = look(0, 0)
+                slope_x = (look(half, 0) - look(-half, 0)) / (2 * half)
+                slope_y = (look(0, half) - look(0, -half)) / (2 * half)
+                basis = np.stack([mark, slope_x, slope_y], axis=1)
+                basis -= (basis @ plane) @ plane.T
+                products = basis @ basis.transpose(0, 2, 1)
+                # A trace of ridge keeps marks without contrast solvable; they are never trusted anyway.
+                ridge = 1e-6 * np.trace(products, axis1=1, axis2=2) + 1e-6
+                inverse = np.linalg.inv(products + ridge[:, None, None] * np.eye(3))
+                pinv[row, column] = inverse @ basis
+                gram[row, column] = products
+                spread[row, column] = 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
+        self._pinv = pinv.reshape(_PHASES * _PHASES * count, 3, self.pixels)
+        self._gram = gram.reshape(_PHASES * _PHASES * count, 3, 3)
+        self._spread = spread.reshape(_PHASES * _PHASES * count)
+        self._count = count
+        limits = np.array([reference.shape[1] - 1, reference.shape[0] - 1], np.float64)
+        self._limits = limits
+
+    def padded(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The frame with a rim, flat, so that patches may reach over its border."""
+        pad = self.pad
+        return np.asarray(
+            cv2.copyMakeBorder(gray, pad, pad, pad, pad, cv2.BORDER_REPLICATE), np.uint8
+        ).ravel()
+
+    def measure(
+        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None
+    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
+        """Measure marks from starting points (n, 2), right to about a radius.
+
+        marks : (n,) which marks these are; None for all.
+        Returns positions (n, 2), gain (n,), explained share of the contrast (n,), standard error (n,).
+        """
+        marks = self._rows if marks is None else marks
+        position, gain, share, stderr = self._step(flat, start, marks)
+        active = np.flatnonzero(_longer(position - start, _CONVERGED))
+        for _ in range(_ROUNDS):
+            if len(active) == 0:
+                break
+            before = position[active]
+            position[active], gain[active], share[active], stderr[active] = self._step(
+                flat, before, marks[active]
+            )
+            active = active[_longer(position[active] - before, _CONVERGED)]
+        return position, gain, share, stderr
+
+    def _step(
+        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray
+    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
+        """One least-squares step from the phase nearest to the starting points."""
+        base = np.rint(np.minimum(np.maximum(start, 0.0), self._limits))
+        cell = ((start - base + 0.5) * _PHASES).astype(np.int64)
+        np.minimum(np.maximum(cell, 0, out=cell), _PHASES - 1, out=cell)
+        corner = base.astype(np.int64) + self.pad
+        index = (corner[:, 1] * self._width + corner[:, 0])[:, None] + self._offsets
+        patch = flat.take(index).astype(np.float32)
+        # Far from zero, sums of squares would lose digits.
+        patch -= np.float32(128)
+        which = (cell[:, 1] * _PHASES + cell[:, 0]) * self._count + marks
+        theta = np.matmul(self._pinv[which], patch[:, :, None])[:, :, 0]
+        gain = theta[:, 0]
+        safe = np.maximum(gain, np.float32(0.15))
+        step = theta[:, 1:] / safe[:, None]
+        np.minimum(np.maximum(step, -self.radius, out=step), self.radius, out=step)
+        position = base + ((cell + 0.5) / _PHASES - 0.5) + step
+        seen = (np.matmul(self._gram[which], theta[:, :, None])[:, :, 0] * theta).sum(axis=1)
+        level = patch @ self._plane
+        total = np.einsum("nk,nk->n", patch, patch) - np.einsum("nk,nk->n", level, level)
+        rest = np.maximum(total - seen, np.float32(1e-3))
+        stderr = np.sqrt(rest * (self._spread[which] / max(self.pixels - 6, 1))) / safe
+        return position, gain, seen / (seen + rest), stderr
+
+
+def _longer(vectors: FloatArray, length: float) -> BoolArray:
+    return np.asarray(np.einsum("ni,ni->n", vectors, vectors) > length * length, np.bool_)
+
+
+def _resample(image: NDArray[np.float32], points: FloatArray, reach: int) -> FloatArray:
+    """Patches (N, 2 reach + 1, 2 reach + 1) centred on sub-pixel points, by cubic convolution (Keys 1981)."""
+    pad = reach + 4
+    padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
+    base = np.floor(points).astype(np.int64)
+    fraction = points - base
+    span = np.arange(-reach - 1, reach + 3)
+    height, width = padded.shape
+    rows = np.clip(base[:, 1, None] + pad + span, 0, height - 1)
+    columns = np.clip(base[:, 0, None] + pad + span, 0, width - 1)
+    patches = padded[rows[:, :, None], columns[:, None, :]].astype(np.float64)
+    weights_x, weights_y = _cubic(fraction[:, 0]), _cubic(fraction[:, 1])
+    size = 2 * reach + 1
+    across = sum(patches[:, :, tap : tap + size] * weights_x[tap][:, None, None] for tap in range(4))
+    return np.asarray(
+        sum(across[:, tap : tap + size] * weights_y[tap][:, None, None] for tap in range(4)), np.float64
+    )
+
+
+def _cubic(fraction: FloatArray) -> FloatArray:
+    t = fraction
+    return np.stack(
+        [
+            ((-0.5 * t + 1.0) * t - 0.5) * t,
+            (1.5 * t - 2.5) * t * t + 1.0,
+            ((-1.5 * t + 2.0) * t + 0.5) * t,
+            (0.5 * t - 0.5) * t * t,
+        ]
+    )
