@@ -4,33 +4,61 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image, MarkerMask
-from tactflow.vision.marker_mask import marker_mask
+from tactflow.vision.marker_mask import Dot, find_dot, marker_mask
 from tactflow.vision.seed_contact import seed_marker_mask
 
 
 class MarkerMaskStage:
-    """Mask of the marker dots (seed function `mask_marker`)."""
+    """Mask of the marker dots (seed function `mask_marker`); the first frame shows how they look."""
 
-    memory = "pure"
+    memory = "stateful"
 
     class Params(StageParams):
         """method : how markers are found. dot, polarity, contrast : what they look like (`dog` only)."""
 
-        method: Literal["dog", "seed"] = Field("dog", description="dog scales with the dot; seed is literal")
-        dot: float = Field(4.0, gt=0, le=100, description="radius of a dot, processed px")
-        polarity: Literal["dark", "bright"] = Field("dark", description="dots against the gel")
-        contrast: float = Field(6.0, gt=0, le=255, description="least difference to the gel, grey levels")
+        method: Literal["dog", "seed"] = Field(
+            "dog", description="dog scales with the dots; seed is the original rule, for dark dots"
+        )
+        dot: float | Literal["auto"] = Field(
+            "auto", description="radius of a dot, processed px, 1 to 100; auto finds it in the first frame"
+        )
+        polarity: Literal["auto", "dark", "bright"] = Field("auto", description="dots against the gel")
+        contrast: float | Literal["auto"] = Field(
+            "auto",
+            description="least difference to the gel, grey levels, 1 to 255; auto is a quarter of the dots' own",
+        )
 
     def __init__(self, params: Params) -> None:
+        for name, value, top in (("dot", params.dot, 100), ("contrast", params.contrast, 255)):
+            if value != "auto" and not 1 <= value <= top:
+                raise ValueError(f"{name}: required 1 to {top} or auto, got {value}")
         self._params = params
+        self._dot: Dot | None = None
+        self._looked = False
+
+    def reset(self) -> None:
+        """Look at the dots again; a new reference follows."""
+        self._dot, self._looked = None, False
 
     def process(self, image: Image) -> MarkerMask:
-        """255 where a marker covers the gel."""
-        params = self._params
-        if params.method == "seed":
+        """255 where a marker covers the gel; all 0 where the first frame showed no markers."""
+        if self._params.method == "seed":
             return seed_marker_mask(image)
-        return marker_mask(image, params.dot, polarity=params.polarity, contrast=params.contrast)
+        if not self._looked:
+            self._dot, self._looked = self._look(image), True
+        if self._dot is None:
+            return np.zeros(image.shape[:2], np.uint8)
+        return marker_mask(image, self._dot)
+
+    def _look(self, image: Image) -> Dot | None:
+        params = self._params
+        radius = None if params.dot == "auto" else params.dot
+        found = find_dot(image, radius=radius, polarity=params.polarity)
+        if found is None or params.contrast == "auto":
+            return found
+        return Dot(found.radius, found.polarity, params.contrast)

@@ -1,24 +1,18 @@
 """Where something touches the gel: comparison with frames of the untouched gel.
 
-The default method is a test against the sensor's own noise, at a stated rate of false alarms, followed by a
-region that does not depend on the noise:
+The default method first asks *whether*, by a test against the sensor's own noise at a stated rate of false
+alarms, and then *where*, by a rule that does not depend on the noise:
 
 1. Frames are compared as means over cells of 4 x 4 px, lightly smoothed.
-2. A change of the light that is smooth over the whole frame (gain, offset and plane per channel) is
-   estimated robustly, so that a contact is an outlier of the fit, and taken out.
-3. What is left, divided by the noise, is chi-square distributed with three degrees of freedom where nothing
-   touches: one threshold says whether anything does.
-4. Around every such place the region ends where the change has fallen to a fixed fraction of its local
-   maximum, and is filled. A gel lit from the side answers with the *slope* of its surface, so that the rim of
-   a contact changes most and its middle may not change at all.
+2. A change of the light that is smooth over the whole frame is fitted robustly and taken out.
+3. What is left, divided by its standard deviation, is chi-square distributed with three degrees of freedom
+   where nothing touches. One threshold, corrected for the number of cells, says whether anything does.
+4. Each connected change around such a place is looked at again at half resolution; `imprint` finds its rim.
 
 References
 ----------
-R. Otsu-free change detection: T. Aach, A. Kaup, R. Mester, "Statistical model-based change detection in
-moving video", Signal Processing 31 (1993).
-P. J. Huber, "Robust Statistics", 1981, chapter 7.8 (modified residuals).
-M. K. Johnson, E. H. Adelson, "Retrographic sensing for the measurement of surface texture and shape", CVPR
-2009 (why the answer of the gel goes with its slope).
+T. Aach, A. Kaup, R. Mester, "Statistical model-based change detection in moving video", Signal Processing 31
+(1993), for the test; `light` and `imprint` name the sources of theirs. Seed function `difference`.
 """
 
 from __future__ import annotations
@@ -31,215 +25,311 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.imprint import imprint
+from tactflow.vision.light import LightChange, light_change
 from tactflow.vision.seed_contact import seed_contact_mask
 
 ContactMethod = Literal["noise", "colour", "seed"]
 Float = NDArray[np.float32]
 
-CELL = 4
-BLOCK = 8
+_CELL = 4
+_PRIOR = 8
+_LEVELS = 6
+_QUANTISATION = 1 / 12
+_CORRELATED = 1.5
+_DARK = 0.1
+_SHARP = 0.05
+_WEAK = 0.25
+_LEAVE = 0.6
+_BLOBS = 12
 
 
 @dataclass(frozen=True, slots=True)
 class ContactResult:
-    """mask : (H, W) uint8, 255 in contact, else 0. touching : True if any pixel is in contact."""
+    """Where a frame shows contact.
+
+    mask : (H, W) uint8, 255 in contact, else 0. touching : whether any pixel is in contact.
+    strength : largest change anywhere, in standard deviations of the untouched gel (`noise` only; else 0).
+    """
 
     mask: NDArray[np.uint8]
     touching: bool
     strength: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class _Reference:
+    """The untouched gel: (h, w, 3) float32 at a quarter, (2h, 2w, 3) at half resolution."""
+
+    mean: Float
+    shade: Float
+    weight: Float
+    light: LightChange
+    half: Float
+    half_shade: Float
+    half_scale: Float
+
+
 def chi_square_threshold(probability: float) -> float:
-    """Value that a chi-square variable with three degrees of freedom exceeds with this probability."""
-
-    def tail(x: float) -> float:
-        return math.erfc(math.sqrt(x / 2)) + math.sqrt(2 * x / math.pi) * math.exp(-x / 2)
-
-    low, high = 0.0, 1000.0
+    """Value that a chi-square variable with three degrees of freedom exceeds with a probability in (0, 1)."""
+    if not 0 < probability < 1:
+        raise ValueError(f"required a probability in (0, 1), got {probability}")
+    low, high = 0.0, 1500.0
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if tail(middle) > probability else (low, middle)
+        tail = math.erfc(math.sqrt(middle / 2)) + math.sqrt(2 * middle / math.pi) * math.exp(-middle / 2)
+        low, high = (middle, high) if tail > probability else (low, middle)
     return high
 
 
-def reduce_to_cells(image: NDArray[np.uint8]) -> Float:
-    """Means over CELL x CELL px, smoothed by 3 x 3 cells: (rows, columns, 3) float32."""
-    height, width = image.shape[:2]
-    bottom, right = -height % CELL, -width % CELL
-    if bottom or right:
-        image = np.asarray(cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
-    height, width = image.shape[:2]
-    half = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    return np.asarray(
-        cv2.resize(half.astype(np.float32), (width // 4, height // 4), interpolation=cv2.INTER_AREA),
-        np.float32,
-    )
-
-
 class ContactDetector:
-    """Finds where a gel is touched, by comparison with frames of the untouched gel."""
+    """Finds where a gel is touched, by comparison with frames of the untouched gel.
+
+    Parameters
+    ----------
+    method : `noise` works for gels that answer with brightness or colour. `colour` is a plain distance of
+        colours with a fixed threshold. `seed` is the original rule: brighter in all channels.
+    false_alarms : expected number of frames of the untouched gel that are called contact, per frame, in
+        (0, 1). Lower misses lighter contacts.
+    repeatability : part of the brightness by which the light of the untouched gel may vary from place to
+        place, as well as noise, 0..1. Higher misses lighter contacts.
+    shift : distance by which the untouched gel may move against the camera, px. It makes sharp edges in the
+        picture count less.
+    distance : for `colour`: change of colour that is contact, grey levels.
+
+    Raises
+    ------
+    ValueError : a parameter out of its range.
+    """
 
     def __init__(
         self,
         method: ContactMethod = "noise",
         *,
         false_alarms: float = 1e-6,
-        edge: float = 0.4,
         repeatability: float = 0.015,
+        shift: float = 0.5,
         distance: float = 24.0,
     ) -> None:
-        self.method = method
-        self.false_alarms = false_alarms
-        self.edge = edge
-        self.repeatability = repeatability
-        self.distance = distance
+        if method not in ("noise", "colour", "seed"):
+            raise ValueError(f"method: required 'noise', 'colour' or 'seed', got {method!r}")
+        if not 0 < false_alarms < 1:
+            raise ValueError(f"false_alarms: required in (0, 1), got {false_alarms}")
+        if not 0 <= repeatability <= 1:
+            raise ValueError(f"repeatability: required in [0, 1], got {repeatability}")
+        if not shift >= 0:
+            raise ValueError(f"shift: required >= 0 px, got {shift}")
+        if not distance > 0:
+            raise ValueError(f"distance: required > 0 grey levels, got {distance}")
+        self._method = method
+        self._false_alarms = false_alarms
+        self._repeatability = repeatability
+        self._shift = shift
+        self._distance = distance
         self.reset()
 
     def reset(self) -> None:
         """Forget the reference."""
-        self._reference: NDArray[np.uint8] | None = None
+        self._last: NDArray[np.uint8] | None = None
         self._count = 0
+        self._mean: Float | None = None
+        self._half: Float | None = None
+        self._squares: Float | None = None
+        self._noise: Float | None = None
+        self._known: _Reference | None = None
+        self._touching = False
 
     @property
     def has_reference(self) -> bool:
         """Whether a frame of the untouched gel is known."""
-        return self._reference is not None
+        return self._last is not None
 
     def add_reference(self, image: NDArray[np.uint8]) -> None:
-        """Learn from a frame of the untouched gel."""
-        self._reference = image.copy()
-        if self.method != "noise":
+        """Learn from a frame of the untouched gel; the more, the better the noise is known.
+
+        image : (H, W, 3) uint8, BGR grey levels, without markers. Raises ValueError if it is not of that
+        kind, or not of the size of the frames before.
+        """
+        self._check(image)
+        if self._method != "noise":
+            self._last = image.copy()
             return
-        cells = reduce_to_cells(image)
-        smooth = cv2.blur(cells, (3, 3))
-        if self._count == 0:
-            self._mean = smooth
-            self._m2 = np.zeros_like(smooth)
-            self._count = 1
-            self._sigma0 = self._spatial(cells)
-            self._prepare()
+        half, cells = _cells(image)
+        smooth = np.asarray(cv2.blur(cells, (3, 3)), np.float32)
+        if self._mean is None or self._half is None or self._squares is None:
+            self._mean, self._half = smooth, half
+            self._squares = np.zeros_like(smooth)
+            self._noise = _spatial_noise(cells)
         else:
-            d, _ = self._change(smooth)
-            self._count += 1
-            self._mean = self._mean + d / self._count
-            self._m2 += d * d * ((self._count - 1) / self._count)
-            self._prepare()
-
-    def _spatial(self, cells: Float) -> Float:
-        """Noise of smoothed cells, from second differences of one frame, as a function of brightness."""
-        out = np.empty_like(cells)
-        for c in range(3):
-            x = cells[..., c]
-            if min(x.shape) < 3:
-                out[..., c] = 0.3
-                continue
-            lap = (x[1:-1, :-2] - 2 * x[1:-1, 1:-1] + x[1:-1, 2:]) / np.float32(6**0.5)
-            level = x[1:-1, 1:-1].ravel()
-            order = np.argsort(level)
-            parts = np.array_split(order, 6)
-            centre = [float(level[p].mean()) for p in parts if p.size]
-            spread = [1.4826 * float(np.median(np.abs(lap.ravel()[p]))) for p in parts if p.size]
-            out[..., c] = np.interp(x, centre, spread)
-        return out / 2
-
-    def _prepare(self) -> None:
-        mean = self._mean
-        h, w = mean.shape[:2]
-        n = self._count
-        prior = 8
-        var = (prior * self._sigma0**2 + self._m2) / (prior + n - 1)
-        var = var * (1 + 1 / n) + (self.repeatability * mean) ** 2 + 0.05
-        self._inv = (1 / var).astype(np.float32)
-        bw, bh = max(2, w // BLOCK), max(2, h // BLOCK)
-        self._bsize = (bw, bh)
-        y, x = np.mgrid[0:h, 0:w].astype(np.float32)
-        x = (x - x.mean()) / max(w, 1)
-        y = (y - y.mean()) / max(h, 1)
-        ref = mean.transpose(2, 0, 1)
-        basis = np.stack(
-            [np.broadcast_to(np.stack([np.ones_like(x), x, y]), (3, 3, h, w))[c] for c in range(3)]
-        )
-        refn = (ref - ref.mean((1, 2), keepdims=True)) / 100
-        self._basis = np.concatenate([basis, refn[:, None]], 1).reshape(3, 4, h * w).astype(np.float32)
-        small = []
-        for c in range(3):
-            small.append(
-                [
-                    cv2.resize(b.reshape(h, w), self._bsize, interpolation=cv2.INTER_AREA).ravel()
-                    for b in self._basis[c]
-                ]
-            )
-        B = np.array(small)  # 3,4,n
-        self._bb = B
-        ridge = np.eye(4) * 1e-3 * B.shape[2]
-        self._pinv = np.linalg.solve(B @ B.transpose(0, 2, 1) + ridge, B)  # 3,4,n
-        self._bref = cv2.resize(mean, self._bsize, interpolation=cv2.INTER_AREA).reshape(-1, 3).T
-        bvar = cv2.resize(var.astype(np.float32), self._bsize, interpolation=cv2.INTER_AREA).reshape(-1, 3).T
-        self._bs = np.sqrt(bvar)
-
-    def _light(self, smooth: Float) -> NDArray[np.float64]:
-        y = cv2.resize(smooth, self._bsize, interpolation=cv2.INTER_AREA).reshape(-1, 3).T - self._bref
-        beta = np.zeros((3, 4))
-        beta[:, 0] = np.median(y, 1)
-        k = 2.0 * self._bs
-        for _ in range(10):
-            r = y - np.einsum("ck,ckn->cn", beta, self._bb)
-            step = np.einsum("ckn,cn->ck", self._pinv, np.clip(r, -k, k))
-            beta += step
-            if np.abs(step).max() < 0.02:
-                break
-        return beta
-
-    def _change(self, smooth: Float) -> tuple[Float, NDArray[np.float64]]:
-        beta = self._light(smooth)
-        h, w = smooth.shape[:2]
-        light = np.matmul(beta[:, None, :].astype(np.float32), self._basis).reshape(3, h, w)
-        return smooth - self._mean - light.transpose(1, 2, 0), beta
+            known = self._reference()
+            change = self._change(smooth, known)[0]
+            self._squares = self._squares + change * change * np.float32(self._count / (self._count + 1))
+            self._mean = self._mean + change / np.float32(self._count + 1)
+            self._half = self._half + (half - self._half) / np.float32(self._count + 1)
+        self._count += 1
+        self._last = image
+        self._known = None
 
     def detect(self, image: NDArray[np.uint8]) -> ContactResult:
-        """Compare a frame with the untouched gel."""
-        if self._reference is None:
-            raise ValueError("required a reference frame first: call add_reference")
-        if self.method == "seed":
-            mask = seed_contact_mask(image, self._reference)
-            return ContactResult(mask, bool(mask.any()))
-        if self.method == "colour":
-            change = cv2.blur(cv2.absdiff(image, self._reference), (5, 5)).astype(np.float32)
-            squared = np.einsum("ijk,ijk->ij", change, change)
-            mask = np.where(squared > self.distance**2, 255, 0).astype(np.uint8)
-            mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8)), np.uint8)
-            return ContactResult(mask, bool(mask.any()))
-        smooth = cv2.blur(reduce_to_cells(image), (3, 3))
-        d, _ = self._change(smooth)
-        d2 = d * d
-        z = (d2 * self._inv).sum(2)
-        high = chi_square_threshold(self.false_alarms / z.size)
-        peak = float(z.max())
-        h, w = image.shape[:2]
-        if peak < high:
-            return ContactResult(np.zeros((h, w), np.uint8), False, peak**0.5)
-        s = np.sqrt(d2.sum(2))
-        mask = self._region(s, z, high)
-        mask = mask[:h, :w].copy()
-        return ContactResult(mask, bool(mask.any()), peak**0.5)
+        """Compare a frame with the untouched gel.
 
-    def _region(self, s: Float, z: Float, high: float) -> NDArray[np.uint8]:
-        low = high / 4
-        support = (z > low).astype(np.uint8)
-        n, labels, _, _ = cv2.connectedComponentsWithStats(support, connectivity=8)
-        u = np.zeros_like(s)
-        for i in range(1, n):
-            inside = labels == i
-            if z[inside].max() < high:
-                continue
-            v = np.sort(s[inside])
-            top = v[-max(1, min(15, v.size // 8))]
-            u = np.where(inside, s / (self.edge * top), u)
-        m = np.pad((u > 1).astype(np.uint8), 1)
-        flood = m.copy()
-        cv2.floodFill(flood, None, (0, 0), 2)
-        hole = (flood != 2)[1:-1, 1:-1] & (u <= 1)
-        u[hole] = 2
-        u = np.minimum(u, 2)
-        big = cv2.resize(u, (s.shape[1] * CELL, s.shape[0] * CELL), interpolation=cv2.INTER_LINEAR)
-        return (big > 1).astype(np.uint8) * np.uint8(255)
+        image : (H, W, 3) uint8, BGR grey levels, without markers, of the reference's size.
+        Raises ValueError if it is not, or without a reference.
+        """
+        self._check(image)
+        if self._last is None:
+            raise ValueError("required a reference frame first: call add_reference")
+        if self._method == "seed":
+            mask = seed_contact_mask(image, self._last)
+            return ContactResult(mask, bool(mask.any()))
+        if self._method == "colour":
+            return _colour_distance(image, self._last, self._distance)
+        return self._against_noise(image)
+
+    def _check(self, image: NDArray[np.uint8]) -> None:
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+            raise ValueError(
+                f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
+            )
+        if self._last is not None and image.shape != self._last.shape:
+            raise ValueError(f"required the reference's shape {self._last.shape}, got {image.shape}")
+
+    def _reference(self) -> _Reference:
+        if self._known is not None:
+            return self._known
+        assert self._mean is not None
+        assert self._half is not None
+        assert self._squares is not None
+        assert self._noise is not None
+        mean, count = self._mean, self._count
+        variance = (_PRIOR * self._noise**2 + self._squares) / (_PRIOR + count - 1)
+        variance = variance * (1 + 1 / count) + (self._repeatability * mean) ** 2
+        variance += (self._shift / _CELL * _steepness(mean)) ** 2
+        variance = np.asarray(variance, np.float32)
+        light = LightChange(mean, variance)
+        dark = _DARK * self._half.mean(axis=(0, 1)) + 1
+        edge = self._shift / 2 * _steepness(self._half) / (_SHARP * (self._half + dark))
+        self._known = _Reference(
+            mean=mean,
+            shade=light.shade(mean),
+            weight=np.asarray(1 / np.sqrt(variance), np.float32),
+            light=light,
+            half=self._half,
+            half_shade=light.shade(self._half),
+            half_scale=np.asarray(1 / ((self._half + dark) * np.sqrt(1 + edge**2)), np.float32),
+        )
+        return self._known
+
+    def _change(self, smooth: Float, known: _Reference) -> tuple[Float, Float]:
+        """Cells minus reference minus the light's change, and the latter's coefficients."""
+        found = known.light.fit(smooth)
+        expected = light_change(found, known.shade, slice(None), slice(None))
+        expected += known.mean
+        return np.asarray(smooth - expected, np.float32), found
+
+    def _against_noise(self, image: NDArray[np.uint8]) -> ContactResult:
+        known = self._reference()
+        half, cells = _cells(image)
+        change, found = self._change(np.asarray(cv2.blur(cells, (3, 3)), np.float32), known)
+        deviation = change * known.weight
+        square = np.einsum("ijk,ijk->ij", deviation, deviation)
+        largest = float(square.max())
+        limit = chi_square_threshold(self._false_alarms / square.size)
+        if largest < (limit * _LEAVE**2 if self._touching else limit):
+            self._touching = False
+            return ContactResult(np.zeros(image.shape[:2], np.uint8), False, math.sqrt(largest))
+        self._touching = True
+        mask = np.zeros((cells.shape[0] * _CELL, cells.shape[1] * _CELL), np.uint8)
+        for rows, columns, inside in _blobs(change, square, limit, min(limit, largest)):
+            light = light_change(found, known.half_shade, rows, columns)
+            answer = (half[rows, columns] - known.half[rows, columns] - light) * known.half_scale[
+                rows, columns
+            ]
+            answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8), np.float32)
+            level = imprint(answer, inside)
+            height, width = level.shape
+            large = cv2.resize(level, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR)
+            mask[2 * rows.start : 2 * rows.stop, 2 * columns.start : 2 * columns.stop][large > 0] = 255
+        mask = np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
+        return ContactResult(mask, bool(mask.any()), math.sqrt(largest))
+
+
+def _blobs(
+    change: Float, square: Float, limit: float, strong: float
+) -> list[tuple[slice, slice, NDArray[np.bool_]]]:
+    """Connected changes with a strong place: rows, columns at half resolution, and which pixels belong."""
+    support = (square > limit / 4).astype(np.uint8)
+    support = np.asarray(cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=8)
+    strength = np.einsum("ijk,ijk->ij", change, change)
+    height, width = square.shape
+    found = []
+    for index in range(1, count):
+        left, top, wide, high, _ = (int(value) for value in stats[index])
+        window = slice(top, top + high), slice(left, left + wide)
+        inside = labels[window] == index
+        if float(square[window][inside].max()) >= strong:
+            found.append((float(strength[window][inside].max()), index, left, top, wide, high))
+    found.sort(reverse=True)
+    blobs = []
+    for peak, index, left, top, wide, high in found[:_BLOBS]:
+        if peak < _WEAK**2 * found[0][0]:
+            break
+        rows = slice(max(top - 1, 0), min(top + high + 1, height))
+        columns = slice(max(left - 1, 0), min(left + wide + 1, width))
+        inside = (labels[rows, columns] == index).repeat(2, axis=0).repeat(2, axis=1)
+        blobs.append(
+            (slice(2 * rows.start, 2 * rows.stop), slice(2 * columns.start, 2 * columns.stop), inside)
+        )
+    return blobs
+
+
+def _cells(image: NDArray[np.uint8]) -> tuple[Float, Float]:
+    """Means over 2 x 2 and over 4 x 4 px, float32; the border is repeated to make whole cells."""
+    bottom, right = -image.shape[0] % _CELL, -image.shape[1] % _CELL
+    padded = np.ascontiguousarray(image)
+    if bottom or right:
+        padded = np.asarray(cv2.copyMakeBorder(padded, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
+    height, width = padded.shape[:2]
+    half = cv2.resize(padded, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+    cells = cv2.resize(half, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
+    return half, np.asarray(cells, np.float32)
+
+
+def _steepness(picture: Float) -> Float:
+    """Grey levels per cell by which the brightness changes."""
+    along = cv2.Scharr(picture, cv2.CV_32F, 1, 0, scale=1 / 32)
+    across = cv2.Scharr(picture, cv2.CV_32F, 0, 1, scale=1 / 32)
+    return np.asarray(cv2.magnitude(along, across), np.float32)
+
+
+def _spatial_noise(cells: Float) -> Float:
+    """Standard deviation of smoothed cells guessed from one frame, as a function of brightness.
+
+    Second differences of neighbouring cells see the noise and hardly the shading; their median is not moved
+    by markers. Grain of the gel counts as noise here, which errs on the side of silence.
+    """
+    noise = np.full_like(cells, math.sqrt(_QUANTISATION))
+    if cells.shape[1] < 3:
+        return noise
+    second = np.abs(cells[:, :-2] - 2 * cells[:, 1:-1] + cells[:, 2:]) * np.float32(1.4826 / math.sqrt(6))
+    for channel in range(3):
+        level = cells[:, 1:-1, channel].ravel()
+        order = np.argsort(level)
+        parts = [part for part in np.array_split(order, _LEVELS) if part.size]
+        center = [float(level[part].mean()) for part in parts]
+        spread = [float(np.median(second[..., channel].ravel()[part])) for part in parts]
+        noise[..., channel] = np.interp(cells[..., channel], center, spread)
+    # Smoothing 3 x 3 would divide by three were the cells independent; demosaicing and compression see to
+    # it that they are not quite.
+    return np.asarray(np.hypot(noise / 3 * _CORRELATED, math.sqrt(_QUANTISATION) / 4), np.float32)
+
+
+def _colour_distance(
+    image: NDArray[np.uint8], reference: NDArray[np.uint8], distance: float
+) -> ContactResult:
+    change = cv2.blur(cv2.absdiff(image, reference), (5, 5)).astype(np.float32)
+    squared = np.einsum("ijk,ijk->ij", change, change)
+    mask = np.where(squared > distance**2, 255, 0).astype(np.uint8)
+    mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8)), np.uint8)
+    return ContactResult(mask, bool(mask.any()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import cv2
@@ -12,6 +13,10 @@ InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 
 SEED_RADIUS = 7
 """Inpainting radius of the original script, px."""
+
+_CELL = 4
+_FAR = 0.01
+_TRACE = 1e-6
 
 
 def remove_markers(
@@ -73,17 +78,32 @@ def remove_markers(
 
 
 def _normalized(image: NDArray[np.uint8], mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
-    """Normalized convolution on a half-size copy: sum of valid pixels over their number."""
-    unmarked = image.copy()
+    """Normalized convolution on means over 4 x 4 px: sum of the valid over their weight."""
     height, width = mask.shape
-    half = ((width + 1) // 2, (height + 1) // 2)
-    valid = cv2.bitwise_not(mask)
-    kept = cv2.resize(cv2.bitwise_and(image, image, mask=valid), half, interpolation=cv2.INTER_AREA)
-    weight = cv2.resize(valid, half, interpolation=cv2.INTER_AREA)
-    size = 2 * max(1, round(radius)) + 1
-    total = cv2.blur(kept.astype(np.float32), (size, size))
-    share = cv2.blur(weight.astype(np.float32), (size, size))
-    filled = total * (np.float32(255) / np.maximum(share, np.float32(1e-3)))[..., None]
-    large = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
-    cv2.copyTo(np.clip(large + np.float32(0.5), 0, 255).astype(np.uint8), mask, unmarked)
+    unmarked = image.copy()
+    bottom, right = -height % _CELL, -width % _CELL
+    whole, hidden = unmarked, np.ascontiguousarray(mask)
+    if bottom or right:
+        frame = (0, bottom, 0, right, cv2.BORDER_REPLICATE)
+        whole = np.asarray(cv2.copyMakeBorder(unmarked, *frame), np.uint8)
+        hidden = np.asarray(cv2.copyMakeBorder(hidden, *frame), np.uint8)
+    half = ((width + right) // 2, (height + bottom) // 2)
+    quarter = (half[0] // 2, half[1] // 2)
+    # Only whole 2 x 2 blocks count: the soft rim of a marker is left out with it.
+    valid = cv2.inRange(cv2.resize(hidden, half, interpolation=cv2.INTER_AREA), (0.0,), (0.0,))
+    kept = cv2.copyTo(cv2.resize(whole, half, interpolation=cv2.INTER_AREA), valid)
+    total = cv2.resize(kept.astype(np.float32), quarter, interpolation=cv2.INTER_AREA)
+    weight = cv2.resize(valid.astype(np.float32), quarter, interpolation=cv2.INTER_AREA) / np.float32(255)
+    if not weight.any():
+        return unmarked
+    # Near neighbours decide wherever there are any; the wide window and the mean of all fill the rest.
+    size = 2 * math.ceil(radius / _CELL + 1) + 1
+    near, far = cv2.GaussianBlur(total, (3, 3), 0), cv2.blur(total, (size, size))
+    near_weight, far_weight = cv2.GaussianBlur(weight, (3, 3), 0), cv2.blur(weight, (size, size))
+    everywhere = np.asarray(cv2.mean(total)[:3], np.float32) * np.float32(_TRACE)
+    share = near_weight + np.float32(_FAR) * far_weight + np.float32(_TRACE * float(weight.mean()))
+    near += np.float32(_FAR) * far + everywhere
+    filled = np.rint(near / share[..., None]).astype(np.uint8)
+    large = cv2.resize(filled, (width + right, height + bottom), interpolation=cv2.INTER_LINEAR)
+    cv2.copyTo(large[:height, :width], mask, unmarked)
     return unmarked

@@ -1,0 +1,132 @@
+"""The outline of a contact in the picture of how a gel has changed.
+
+What a gel shows depends on how it is lit. Lit by white light through a coating, a touched area brightens as
+a whole: the contact ends where half of the brightening is gone. Lit by coloured light from the side, the
+gel answers with the slope of its surface: a ball's middle looks unchanged, and the slope is largest exactly at
+the rim of the contact, because outside the free surface flattens again (Hertz; K. L. Johnson, "Contact
+Mechanics", 1985, ch. 4). So the outline follows the ridge of the change. The ridge itself is a poor thing to
+trace (it is faint where the light comes along the rim, and has gaps); its distance from the outer edge of
+the change is not: averaged along the whole outline, the profile of the change across it has a clear peak.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+Mask = NDArray[np.uint8]
+
+OUTER = 0.4
+"""Fraction of its peak at which a change of slope is cut. Lower takes in more of the surroundings of a
+contact and of gel that wrinkles; higher opens the ring where the light is faint."""
+
+RIDGE = 0.9
+"""The rim is where the mean profile reaches this fraction of its peak: the peak itself is flat on a knife
+edge, whose flanks have the same slope all the way in."""
+
+HALF = 0.5
+"""Fraction of the plateau at which a brightened contact ends."""
+
+_PROFILE_STEP = 0.5
+_FEW = 8
+
+
+def imprint(change: Float, inside: NDArray[np.bool_]) -> Float:
+    """Level set of one contact's outline.
+
+    Parameters
+    ----------
+    change : (h, w, 3) float32, relative change of each channel, the light's own change taken out.
+    inside : (h, w) bool, where the change belongs to this contact.
+
+    Returns
+    -------
+    level : (h, w) float32, positive inside the contact, negative outside; to be interpolated.
+    """
+    mean = np.where(inside, change.mean(axis=2), np.float32(0))
+    strength = np.where(inside, np.sqrt(np.einsum("ijk,ijk->ij", change, change)), np.float32(0))
+    count = int(inside.sum())
+    top = max(1, min(40, count // 50 + 5))
+    colour = np.sqrt(np.maximum(strength * strength - 3 * mean * mean, 0))
+    darkens = -float(mean.min()) > float(mean.max())
+    if darkens:
+        mean = -mean
+    if _peak(mean, top) * 3**0.5 > _peak(colour, top):
+        return _brightened(mean, _peak(mean, top))
+    return _tilted(strength, _peak(strength, top))
+
+
+def _peak(values: Float, top: int) -> float:
+    """The `top`-th largest value: a maximum that a few pixels cannot set."""
+    flat = values.ravel()
+    return float(np.partition(flat, flat.size - min(top, flat.size))[flat.size - min(top, flat.size)])
+
+
+def _brightened(mean: Float, peak: float) -> Float:
+    level = mean / np.float32(peak) - np.float32(HALF)
+    filled = fill((level > 0).astype(np.uint8))
+    level[(filled > 0) & (level <= 0)] = HALF
+    return np.asarray(np.minimum(level, np.float32(HALF)) * np.float32(8), np.float32)
+
+
+def _tilted(strength: Float, peak: float) -> Float:
+    changed = (strength > OUTER * peak).astype(np.uint8)
+    filled = fill(_without_gaps(changed))
+    if filled.all():
+        return np.ones_like(strength)
+    depth = cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5)
+    bins = (depth * np.float32(1 / _PROFILE_STEP)).astype(np.intp).ravel()
+    count = np.bincount(bins)[1:]
+    total = np.bincount(bins, weights=strength.ravel())[1:]
+    known = np.flatnonzero(count >= _FEW)
+    if known.size < 2:
+        return np.asarray(depth - np.float32(0.5), np.float32)
+    profile = total[known] / count[known]
+    at = (known + 1.5) * _PROFILE_STEP
+    wanted = RIDGE * float(profile.max())
+    first = int(np.argmax(profile >= wanted))
+    rim = float(at[first])
+    if first > 0:
+        below, above = float(profile[first - 1]), float(profile[first])
+        rim = float(np.interp(wanted, [below, above], [at[first - 1], at[first]]))
+    return np.asarray(depth - np.float32(rim), np.float32)
+
+
+def _without_gaps(mask: Mask) -> Mask:
+    """Close gaps that are narrower than the ring itself is thick."""
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    hull = cv2.convexHull(np.vstack(outlines))
+    solid = sum(cv2.contourArea(outline) for outline in outlines)
+    if solid > 0.9 * cv2.contourArea(hull):
+        return mask
+    reach = float(cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1
+    margin = int(reach) + 2
+    padded = np.pad(mask, margin)
+    away = cv2.distanceTransform(1 - padded, cv2.DIST_L2, cv2.DIST_MASK_3)
+    grown = (away <= reach).astype(np.uint8)
+    closed = cv2.distanceTransform(grown, cv2.DIST_L2, cv2.DIST_MASK_3) > reach
+    return np.asarray(mask | closed[margin:-margin, margin:-margin], np.uint8)
+
+
+def fill(mask: Mask) -> Mask:
+    """Fill what a region encloses, alone or together with the border of the frame.
+
+    mask : (h, w) uint8, 0 or 1. Returns the same, fresh.
+    """
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    filled = np.zeros_like(mask)
+    if not outlines:
+        return filled
+    cv2.drawContours(filled, outlines, -1, (1.0,), cv2.FILLED)
+    outside, labels = cv2.connectedComponents(1 - filled, connectivity=4)
+    if outside > 2:
+        hull = np.zeros_like(mask)
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.vstack(outlines)), (1.0,))
+        size = np.bincount(labels.ravel(), minlength=outside)
+        covered = np.bincount(labels.ravel(), weights=hull.ravel(), minlength=outside)
+        enclosed = covered > 0.8 * size
+        enclosed[0] = False
+        filled[enclosed[labels]] = 1
+    return filled

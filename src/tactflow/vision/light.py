@@ -1,0 +1,89 @@
+"""Changes of the light that are smooth over the whole frame, found although something touches the gel."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+
+_BLOCK = 8
+_CLIP = 2.0
+_ROUNDS = 12
+_SETTLED = 0.05
+_RIDGE = 0.01
+
+
+class LightChange:
+    """Robust fit of gain, offset and plane per channel between a frame and the reference.
+
+    The four unknowns of a channel are fitted to means over blocks of 8 x 8 cells by Huber's modified
+    residuals: residuals are clipped to twice their standard deviation before each least-squares step, so
+    that a contact, however strong, pulls no harder than noise would; the matrix of the step is known
+    beforehand. The start is the median, so that a contact may cover nearly half of the frame.
+
+    References
+    ----------
+    P. J. Huber, "Robust Statistics", 1981, chapter 7.8.
+    """
+
+    def __init__(self, reference: Float, variance: Float) -> None:
+        """reference, variance : (h, w, 3) float32, mean and variance of the cells of the untouched gel."""
+        height, width = reference.shape[:2]
+        self._blocks = (max(1, width // _BLOCK), max(1, height // _BLOCK))
+        self._center: Float = np.asarray(reference.mean(axis=(0, 1)), np.float32)
+        x = np.broadcast_to(np.linspace(-0.5, 0.5, width, dtype=np.float32), (height, width))
+        y = np.broadcast_to(np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None], (height, width))
+        shade = self.shade(reference)
+        one = np.ones_like(x)
+        channels = range(3)
+        basis = np.stack([self._coarse(np.dstack([one, x, y, shade[..., c]])).T for c in channels])
+        normal = basis @ basis.transpose(0, 2, 1) + _RIDGE * basis.shape[2] * np.eye(4)
+        self._basis: Float = np.ascontiguousarray(basis, np.float32)
+        self._solve: Float = np.ascontiguousarray(
+            np.linalg.solve(normal, basis).transpose(0, 2, 1), np.float32
+        )
+        self._reference = self._coarse(reference)
+        self._limit: Float = np.float32(_CLIP) * np.sqrt(self._coarse(variance)).T[:, None, :]
+
+    def shade(self, reference: Float) -> Float:
+        """How the reference differs from its mean, relative: what a gain multiplies."""
+        return np.asarray((reference - self._center) / np.maximum(self._center, 1), np.float32)
+
+    def fit(self, cells: Float) -> Float:
+        """(3, 4) float32: offset, slope along x and y (per frame) and gain of each channel, grey levels.
+
+        cells : (h, w, 3) float32, the frame. The gain acts on `shade`.
+        """
+        excess = (self._coarse(cells) - self._reference).T[:, None, :]
+        found = np.zeros((3, 1, 4), np.float32)
+        found[..., 0] = np.median(excess, axis=2)
+        for _ in range(_ROUNDS):
+            residual = excess - found @ self._basis
+            step = np.clip(residual, -self._limit, self._limit) @ self._solve
+            found += step
+            if float(np.abs(step).max()) < _SETTLED:
+                break
+        return np.asarray(found[:, 0], np.float32)
+
+    def _coarse(self, cells: Float) -> Float:
+        small = cv2.resize(np.ascontiguousarray(cells), self._blocks, interpolation=cv2.INTER_AREA)
+        return np.asarray(small.reshape(-1, cells.shape[2]), np.float32)
+
+
+def light_change(found: Float, shade: Float, rows: slice, columns: slice) -> Float:
+    """(h, w, 3) float32: the change of the light over a window of the frame, grey levels.
+
+    found : (3, 4) from `LightChange.fit`. shade : (H, W, 3) of the whole frame, at any resolution.
+    rows, columns : the window.
+    """
+    height, width = shade.shape[:2]
+    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[columns]
+    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[rows]
+    along = (found[:, 0] + x[:, None] * found[:, 1]).ravel()
+    across = np.broadcast_to(found[:, 2], (x.size, 3)).ravel()
+    plane = np.column_stack([np.ones_like(y), y]) @ np.stack([along, across])
+    gain = np.broadcast_to(found[:, 3], (x.size, 3)).ravel()
+    window = np.ascontiguousarray(shade[rows, columns]).reshape(y.size, -1)
+    return np.asarray(plane + window * gain, np.float32).reshape(y.size, x.size, 3)
