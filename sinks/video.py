@@ -34,8 +34,8 @@ class Video:
 
     The file plays at the pace at which the frames were captured: without `fps`, the rate is the median of
     the first frames' time differences. Players show frames at a constant rate, so frames that a live run
-    dropped shorten the film. Pictures with an odd side get one more row or column (a copy of the last),
-    unless the codec is lossless: others would cut it off.
+    dropped shorten the film. Pictures with an odd side get one more row or column, a copy of the last:
+    otherwise the encoder would cut it off.
     """
 
     threaded = True
@@ -156,7 +156,7 @@ class Video:
     def _start(self) -> None:
         assert self._size is not None
         rate = self.params.fps or _rate([t for t, _ in self._held])
-        width, height = self._size if self.params.lossless else _even(self._size)
+        width, height = (side + side % 2 for side in self._size)
         code = cv2.VideoWriter.fourcc(*self._codec)
         self._writer = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, (width, height))
         if not self._writer.isOpened():
@@ -170,9 +170,7 @@ class Video:
         assert self._writer is not None
         if self._frames % FRAMES_BETWEEN_DISK_CHECKS == 0:
             self._check_disk()
-        if not self.params.lossless:
-            picture = _padded(picture)
-        self._writer.write(picture)
+        self._writer.write(_padded(picture))
         self._frames += 1
 
     def _check_disk(self) -> None:
@@ -193,10 +191,6 @@ def count_frames(path: Path) -> int:
 def _rate(times: list[float]) -> float:
     steps = [later - earlier for earlier, later in pairwise(times) if later > earlier]
     return min(max(1.0 / statistics.median(steps), 0.01), 1000.0) if steps else 30.0
-
-
-def _even(size: tuple[int, int]) -> tuple[int, int]:
-    return size[0] + size[0] % 2, size[1] + size[1] % 2
 
 
 def _padded(picture: Picture) -> NDArray[np.uint8]:

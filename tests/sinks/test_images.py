@@ -1,0 +1,88 @@
+"""The images sink: numbered files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from tactflow.sinks.images import Images
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame, Tick
+
+SEQS_WITH_DROPS = [0, 1, 2, 4, 5, 8, 9, 10, 11, 12]
+
+
+def picture(seq: int) -> np.ndarray:
+    return np.random.default_rng(seq).integers(0, 256, (24, 32, 3), np.uint8)
+
+
+def run(folder: Path, seqs: list[int], **params: Any) -> Images:
+    sink = Images(Images.Params(folder=str(folder), **params))
+    sink.open()
+    for seq in seqs:
+        sink.write(Tick(Frame("main", seq, 0.0, picture(seq))), picture(seq))
+    return sink
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_png_files_are_numbered_by_seq_and_keep_every_bit(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    sink = run(folder, [0, 36])
+    assert names(folder) == ["frame-000000.png", "frame-000036.png"]
+    np.testing.assert_array_equal(cv2.imread(str(folder / "frame-000036.png")), picture(36))
+    assert sink.counters() == {"files": 2}
+
+
+def test_jpg_files_are_smaller_with_less_quality(tmp_path: Path) -> None:
+    sizes = []
+    for quality in (95, 20):
+        folder = tmp_path / str(quality)
+        run(folder, [7], format="jpg", quality=quality)
+        sizes.append((folder / "frame-000007.jpg").stat().st_size)
+    assert sizes[1] < sizes[0]
+
+
+@pytest.mark.parametrize(
+    ("every", "expected"),
+    [(1, SEQS_WITH_DROPS), (3, [0, 4, 8, 9, 12]), (4, [0, 4, 8, 12]), (100, [0])],
+)
+def test_every_nth_frame_is_written_or_the_next_one_if_it_was_dropped(
+    every: int, expected: list[int], tmp_path: Path
+) -> None:
+    run(tmp_path, SEQS_WITH_DROPS, every=every)
+    assert names(tmp_path) == [f"frame-{seq:06d}.png" for seq in expected]
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_a_folder_that_holds_frames_is_refused_unless_asked(suffix: str, tmp_path: Path) -> None:
+    (tmp_path / f"frame-000000.{suffix}").write_bytes(b"precious")
+    with pytest.raises(StageError, match=rf"frame-000000\.{suffix}.*overwrite: true"):
+        run(tmp_path, [0])
+    assert (tmp_path / f"frame-000000.{suffix}").read_bytes() == b"precious"
+    run(tmp_path, [0], overwrite=True)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "frame-000000.png")), picture(0))
+
+
+def test_other_files_in_the_folder_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    run(tmp_path, [0])
+    assert names(tmp_path) == ["frame-000000.png", "notes.txt"]
+
+
+def test_a_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StageError, match="cannot be created"):
+        run(tmp_path / "file" / "images", [0])
+
+
+def test_a_file_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "frame-000003.png").mkdir()
+    with pytest.raises(StageError, match=r"frame-000003\.png: cannot be written"):
+        run(tmp_path, [3], overwrite=True)

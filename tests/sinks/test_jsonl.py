@@ -1,0 +1,243 @@
+"""The JSON Lines sink: complete lines, no lost data, clear errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from tactflow.sinks import jsonl as jsonl_module
+from tactflow.sinks.jsonl import Jsonl
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame, Tick
+
+IMAGE = np.zeros((3, 4, 3), np.uint8)
+
+
+def tick(seq: int) -> Tick:
+    return Tick(Frame("main", seq, seq / 10.0, IMAGE))
+
+
+def opened(path: Path | str, **params: Any) -> Jsonl:
+    sink = Jsonl(Jsonl.Params(path=str(path), **params))
+    sink.open()
+    return sink
+
+
+def write(sink: Jsonl, seqs: range) -> None:
+    for seq in seqs:
+        sink.write(tick(seq), None, None, None, None)
+
+
+def write_and_close(sink: Jsonl, seqs: range) -> None:
+    try:
+        write(sink, seqs)
+    finally:
+        sink.close()
+
+
+def seqs_in(path: Path) -> list[int]:
+    text = path.read_text()
+    assert text == "" or text.endswith("\n")
+    return [json.loads(line)["seq"] for line in text.splitlines()]
+
+
+@contextmanager
+def disk_full_after(size: int) -> Iterator[None]:
+    """Files cannot grow beyond `size` bytes: the kernel then refuses writes as it does on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_every_frame_is_one_line_and_folders_are_created(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "b" / "results.jsonl"
+    sink = opened(path)
+    write(sink, range(20))
+    sink.close()
+    assert seqs_in(path) == list(range(20))
+    assert sink.counters() == {"lines": 20}
+
+
+def test_lines_reach_the_file_at_the_interval_and_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 50.0
+    monkeypatch.setattr(jsonl_module.time, "monotonic", lambda: now)
+    path = tmp_path / "results.jsonl"
+    sink = opened(path, flush=0.5)
+    write(sink, range(3))
+    assert seqs_in(path) == []
+    now += 0.4
+    write(sink, range(3, 4))
+    assert seqs_in(path) == []
+    now += 0.2
+    write(sink, range(4, 5))
+    assert seqs_in(path) == [0, 1, 2, 3, 4]
+    write(sink, range(5, 6))
+    assert seqs_in(path) == [0, 1, 2, 3, 4]
+    sink.close()
+    assert seqs_in(path) == [0, 1, 2, 3, 4, 5]
+
+
+def test_an_interval_of_zero_writes_every_line_at_once(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "r.jsonl", flush=0.0)
+    for seq in range(3):
+        write(sink, range(seq, seq + 1))
+        assert seqs_in(tmp_path / "r.jsonl") == list(range(seq + 1))
+    sink.close()
+
+
+def test_an_existing_file_is_neither_replaced_nor_touched_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "r.jsonl"
+    path.write_text('{"seq":7}\n')
+    with pytest.raises(StageError, match=r"r\.jsonl: this file exists.*overwrite: true.*append: true"):
+        opened(path)
+    assert seqs_in(path) == [7]
+
+
+def test_an_empty_file_has_nothing_to_lose(tmp_path: Path) -> None:
+    path = tmp_path / "r.jsonl"
+    path.touch()
+    sink = opened(path)
+    write(sink, range(2))
+    sink.close()
+    assert seqs_in(path) == [0, 1]
+
+
+def test_overwrite_replaces_and_append_continues(tmp_path: Path) -> None:
+    path = tmp_path / "r.jsonl"
+    for params, expected in (
+        ({"append": True}, [0, 1]),
+        ({"append": True}, [0, 1, 0, 1]),
+        ({"overwrite": True}, [0, 1]),
+        ({"append": True}, [0, 1, 0, 1]),
+    ):
+        sink = opened(path, **params)
+        write(sink, range(2))
+        sink.close()
+        assert seqs_in(path) == expected
+
+
+@pytest.mark.parametrize(
+    ("before", "kept", "warns"),
+    [
+        ('{"seq":5}\n{"seq":6}', [5, 6], False),
+        ('{"seq":5}\n{"seq":6, "t"', [5], True),
+        ('{"seq":5, "contact": {"hu', [], True),
+        ('{"seq":5}\n' + '{"seq":6, "x": "' + "y" * 200_000, [5], True),
+        ('{"seq":5}\n' + '{"seq":6, "x": "' + "y" * 200_000 + '"}', [5, 6], False),
+    ],
+    ids=["no line end", "half a line", "only half a line", "long half line", "long line without end"],
+)
+def test_appending_to_a_file_that_ends_within_a_line_starts_a_clean_one(
+    before: str, kept: list[int], warns: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "r.jsonl"
+    path.write_text(before)
+    sink = opened(path, append=True)
+    write(sink, range(2))
+    sink.close()
+    assert seqs_in(path) == [*kept, 0, 1]
+    assert ("has been removed" in caplog.text) == warns
+
+
+def test_overwrite_and_append_exclude_each_other() -> None:
+    with pytest.raises(ValidationError, match="exclude each other"):
+        Jsonl.Params(overwrite=True, append=True)
+
+
+@pytest.mark.parametrize("flush", [0.0, 60.0])
+def test_a_full_device_is_a_clear_error(flush: float) -> None:
+    sink = opened("/dev/full", flush=flush)
+    with pytest.raises(StageError, match="/dev/full: cannot be written: No space left on device"):
+        write_and_close(sink, range(1))
+
+
+@pytest.mark.parametrize("flush", [0.0, 60.0])
+@pytest.mark.parametrize("append", [False, True])
+def test_a_disk_that_fills_up_leaves_complete_lines_only(append: bool, flush: float, tmp_path: Path) -> None:
+    path = tmp_path / "r.jsonl"
+    if append:
+        path.write_text('{"seq":100}\n')
+    sink = opened(path, append=append, flush=flush)
+    with disk_full_after(1000), pytest.raises(StageError, match="File too large") as raised:
+        write_and_close(sink, range(50))
+    seqs = [seq for seq in seqs_in(path) if seq != 100]
+    # A line has about 130 bytes: 7 fit into 1000 bytes, 6 or 7 beside the one that was there.
+    assert seqs == list(range(len(seqs)))
+    assert len(seqs) in (6, 7)
+    assert f"the {len(seqs)} lines written before are complete" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda folder: folder, "Is a directory"),
+        (lambda folder: folder / "file" / "r.jsonl", "Not a directory|File exists"),
+        (lambda _: Path("/proc/nowhere/r.jsonl"), "cannot be written"),
+    ],
+    ids=["a folder", "below a file", "where nothing can be created"],
+)
+def test_a_path_that_cannot_be_written_is_a_clear_error(make: Any, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StageError, match=expected):
+        opened(make(tmp_path))
+
+
+def test_closing_twice_or_without_opening_is_harmless(tmp_path: Path) -> None:
+    Jsonl(Jsonl.Params(path=str(tmp_path / "never.jsonl"))).close()
+    assert not (tmp_path / "never.jsonl").exists()
+    sink = opened(tmp_path / "r.jsonl")
+    sink.close()
+    sink.close()
+    assert not sink.wants()
+
+
+def test_standard_output_gets_every_line_at_once(capsysbinary: pytest.CaptureFixture[bytes]) -> None:
+    sink = opened("-", flush=60.0)
+    assert sink.wants()
+    write(sink, range(2))
+    assert [json.loads(line)["seq"] for line in capsysbinary.readouterr().out.splitlines()] == [0, 1]
+    sink.close()
+    sys.stdout.write("still open")
+    assert capsysbinary.readouterr().out == b"still open"
+
+
+def test_a_reader_that_leaves_ends_the_output_quietly() -> None:
+    program = """
+import numpy as np, sys
+from tactflow.engine.frame import Frame, Tick
+from tactflow.sinks.jsonl import Jsonl
+sink = Jsonl(Jsonl.Params(path="-"))
+sink.open()
+seq = 0
+while sink.wants():
+    sink.write(Tick(Frame("main", seq, 0.0, np.zeros((3, 4, 3), np.uint8))), None, None, None, None)
+    seq += 1
+sink.close()
+print("more text that nobody reads")
+"""
+    child = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=dict(os.environ)
+    )
+    assert child.stdout is not None
+    assert json.loads(child.stdout.readline())["seq"] == 0
+    child.stdout.close()
+    assert child.stderr is not None
+    assert child.stderr.read() == b""
+    child.stderr.close()
+    assert child.wait(30) == 0

@@ -1,0 +1,162 @@
+"""The video sink: what was drawn can be watched, or compared bit by bit."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from tactflow.sinks import video as video_module
+from tactflow.sinks.video import Video
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame, Tick
+
+Pixels = NDArray[np.uint8]
+
+
+def pictures(count: int, height: int = 48, width: int = 64) -> list[Pixels]:
+    """Noise: detail in every channel and pixel."""
+    return list(np.random.default_rng(1).integers(0, 256, (count, height, width, 3), np.uint8))
+
+
+def film(path: Path, shown: list[Pixels], step: float = 0.05, **params: Any) -> Video:
+    sink = Video(Video.Params(path=str(path), **params))
+    sink.open()
+    for index, picture in enumerate(shown):
+        sink.write(Tick(Frame("main", index, 1e9 + index * step, picture)), picture)
+    sink.close()
+    return sink
+
+
+def play(path: Path) -> tuple[list[Pixels], float]:
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    frames = []
+    while (item := capture.read())[0]:
+        frames.append(np.asarray(item[1], np.uint8))
+    fps = capture.get(cv2.CAP_PROP_FPS)
+    capture.release()
+    return frames, fps
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mkv", ".mp4", ".m4v", ".mov", ".AVI"])
+@pytest.mark.parametrize("count", [1, 5, 30])
+def test_every_frame_is_in_the_film(suffix: str, count: int, tmp_path: Path) -> None:
+    path = tmp_path / "new" / f"film{suffix}"
+    levels = np.linspace(20, 235, count).astype(np.uint8)
+    sink = film(path, [np.full((48, 64, 3), level, np.uint8) for level in levels])
+    frames, _ = play(path)
+    assert len(frames) == count
+    assert sink.counters() == {"frames": count}
+    # 6 grey levels: lossy codecs in 8-bit YUV of limited range; measured 3 for MPEG-4, 2 for MJPG.
+    np.testing.assert_allclose([frame.mean() for frame in frames], levels, atol=6)
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name], "nothing else may be left there"
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mkv"])
+@pytest.mark.parametrize("size", [(48, 64), (47, 63)])
+def test_a_lossless_film_gives_back_every_bit(suffix: str, size: tuple[int, int], tmp_path: Path) -> None:
+    shown = pictures(15, *size)
+    film(tmp_path / f"film{suffix}", shown, lossless=True)
+    back = [frame[: size[0], : size[1]] for frame in play(tmp_path / f"film{suffix}")[0]]
+    np.testing.assert_array_equal(back, shown)
+
+
+def test_a_codec_that_loses_bits_is_not_accepted_as_lossless(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(video_module.LOSSLESS_CODECS, ".avi", ("FFVH", "HFYU"))
+    shown = pictures(3)
+    film(tmp_path / "film.avi", shown, lossless=True)
+    np.testing.assert_array_equal(play(tmp_path / "film.avi")[0], shown)
+    monkeypatch.setitem(video_module.LOSSLESS_CODECS, ".avi", ("FFVH", "MJPG"))
+    with pytest.raises(StageError, match=r"cannot encode \.avi losslessly"):
+        film(tmp_path / "other.avi", shown, lossless=True)
+    assert not (tmp_path / "other.avi").exists()
+
+
+def test_odd_sizes_lose_no_row_and_no_column(tmp_path: Path) -> None:
+    picture = np.zeros((47, 63, 3), np.uint8)
+    picture[46] = picture[:, 62] = 200
+    film(tmp_path / "film.avi", [picture] * 3)
+    [frame, *_] = play(tmp_path / "film.avi")[0]
+    assert frame.shape == (48, 64, 3)
+    # Row 46 and column 62, the last ones, are bright: half of 200 tells them from dark ones after JPEG.
+    assert frame[46, :40].mean() > 100
+    assert frame[:40, 62].mean() > 100
+
+
+@pytest.mark.parametrize(("step", "fps"), [(0.05, 20.0), (1 / 60, 60.0), (0.5, 2.0)])
+def test_a_film_plays_at_the_pace_of_its_capture(step: float, fps: float, tmp_path: Path) -> None:
+    film(tmp_path / "film.avi", pictures(15), step=step)
+    # 0.01 %: times near 1e9 s have a resolution of 1e-7 s, and the file stores the rate as a fraction.
+    assert play(tmp_path / "film.avi")[1] == pytest.approx(fps, rel=1e-4)
+
+
+def test_the_pace_can_be_given(tmp_path: Path) -> None:
+    film(tmp_path / "film.avi", pictures(3), fps=7.5)
+    assert play(tmp_path / "film.avi")[1] == pytest.approx(7.5)
+
+
+def test_an_existing_file_is_replaced_only_when_asked(tmp_path: Path) -> None:
+    path = tmp_path / "film.avi"
+    path.write_text("precious")
+    with pytest.raises(StageError, match=r"film\.avi: this file exists; set overwrite: true"):
+        film(path, pictures(2))
+    assert path.read_text() == "precious"
+    film(path, pictures(2), overwrite=True)
+    assert len(play(path)[0]) == 2
+
+
+def test_without_any_frame_there_is_no_file(tmp_path: Path) -> None:
+    film(tmp_path / "film.avi", [])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_of_another_size_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(StageError, match="64 x 48, but this frame is 62 x 48"):
+        film(tmp_path / "film.avi", [*pictures(2), *pictures(1, 48, 62)])
+
+
+def test_a_folder_that_cannot_be_written_is_an_error() -> None:
+    with pytest.raises(StageError, match="cannot be written"):
+        film(Path("/proc/nowhere/film.avi"), pictures(1))
+
+
+def test_a_film_that_did_not_fit_on_the_disk_is_an_error(tmp_path: Path) -> None:
+    sink = Video(Video.Params(path=str(tmp_path / "film.avi"), lossless=True))
+    sink.open()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        for index, picture in enumerate(pictures(60)):
+            sink.write(Tick(Frame("main", index, index * 0.1, picture)), picture)
+        with pytest.raises(StageError, match="of 60 frames could be written; is the disk full"):
+            sink.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_disk_that_is_nearly_full_stops_the_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video_module, "MIN_FREE_BYTES", 1 << 62)
+    with pytest.raises(StageError, match="the disk is full"):
+        film(tmp_path / "film.avi", pictures(20))
+
+
+@pytest.mark.parametrize(
+    ("params", "expected"),
+    [
+        ({"path": "film"}, "required a path that ends in"),
+        ({"path": "film.gif"}, "required a path that ends in"),
+        ({"path": "film.mp4", "lossless": True}, "lossless"),
+        ({"fps": 0}, "greater than 0"),
+    ],
+)
+def test_wrong_parameters_are_refused(params: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ValidationError, match=expected):
+        Video.Params(**params)

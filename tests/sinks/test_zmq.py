@@ -1,0 +1,290 @@
+"""The ZeroMQ sink: who listens decides, and nobody slows it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+from tactflow.sinks.zmq import Zmq
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame, Tick
+from tactflow.vision.types import Markers
+
+IMAGE = np.zeros((300, 400, 3), np.uint8)
+MANY = Markers(np.zeros((140, 2)), np.full((140, 2), 1 / 3), np.zeros(140, np.uint8), np.zeros(140))
+WAIT = 10_000
+"""ms; only a broken test waits so long."""
+
+
+def tick(seq: int, sensor: str = "main") -> Tick:
+    return Tick(Frame(sensor, seq, seq / 10.0, IMAGE))
+
+
+def opened(**params: Any) -> Zmq:
+    sink = Zmq(Zmq.Params(endpoint="tcp://127.0.0.1:*", **params))
+    sink.open()
+    return sink
+
+
+def write(sink: Zmq, seqs: range) -> None:
+    for seq in seqs:
+        sink.write(tick(seq), IMAGE, None, None, MANY)
+
+
+def wait_until_wanted(sink: Zmq) -> None:
+    """Return when a subscription has arrived: an event on the publisher's socket, not a sleep."""
+    sink._wait_for_subscriber(WAIT / 1000)
+    assert sink.wants()
+
+
+class Subscribing:
+    """A plain ZeroMQ subscriber, as the README shows it."""
+
+    def __init__(self) -> None:
+        self.context = zmq.Context()
+        self.sockets: list[Any] = []
+
+    def __call__(self, endpoint: str, prefix: bytes = b"tactflow.main", **options: int) -> Any:
+        socket = self.context.socket(zmq.SUB)
+        socket.linger = 0
+        for name, value in options.items():
+            socket.setsockopt(getattr(zmq, name), value)
+        socket.subscribe(prefix)
+        socket.connect(endpoint)
+        self.sockets.append(socket)
+        return socket
+
+    def close(self) -> None:
+        for socket in self.sockets:
+            socket.close()
+        self.context.term()
+
+
+@pytest.fixture
+def subscribe() -> Iterator[Subscribing]:
+    subscribing = Subscribing()
+    yield subscribing
+    subscribing.close()
+
+
+def receive(socket: Any) -> tuple[bytes, dict[str, Any]]:
+    assert socket.poll(WAIT)
+    assert not socket.getsockopt(zmq.RCVMORE)
+    topic, _, body = socket.recv().partition(b" ")
+    return topic, json.loads(body)
+
+
+def test_a_subscriber_gets_topic_and_json_in_one_frame(subscribe: Subscribing) -> None:
+    sink = opened()
+    socket = subscribe(sink.endpoint)
+    wait_until_wanted(sink)
+    write(sink, range(3))
+    for seq in range(3):
+        topic, message = receive(socket)
+        assert not socket.getsockopt(zmq.RCVMORE)
+        assert topic == b"tactflow.main"
+        assert message["seq"] == seq
+        assert len(message["markers"]["status"]) == 140
+    sink.close()
+
+
+def test_nothing_is_wanted_or_encoded_while_nobody_listens() -> None:
+    sink = opened()
+    assert not sink.wants()
+    write(sink, range(100))
+    assert sink.counters() == {"serialised": 0, "subscriptions": 0}
+    sink.close()
+
+
+@pytest.mark.parametrize(
+    ("prefix", "wanted"),
+    [
+        (b"", True),
+        (b"tactflow.", True),
+        (b"tactflow.main", True),
+        (b"tactflow.main ", True),
+        (b'tactflow.main {"schema"', True),
+        (b"tactflow.mai", True),
+        (b"tactflow.main2", False),
+        (b"tactflow.thumb", False),
+        (b"something else", False),
+    ],
+)
+def test_only_a_subscription_to_this_sensor_counts(
+    prefix: bytes, wanted: bool, subscribe: Subscribing
+) -> None:
+    sink = opened()
+    subscribe(sink.endpoint, prefix)
+    assert sink._socket is not None
+    assert sink._socket.poll(WAIT), "the subscription did not arrive"
+    assert sink.wants() == wanted
+    write(sink, range(2))
+    assert sink.counters() == {"serialised": 2 if wanted else 0, "subscriptions": 1}
+    sink.close()
+
+
+def test_nothing_is_encoded_any_more_after_the_last_subscriber_has_left(subscribe: Subscribing) -> None:
+    sink = opened()
+    socket = subscribe(sink.endpoint)
+    wait_until_wanted(sink)
+    write(sink, range(1))
+    socket.close()
+    assert sink._socket is not None
+    assert sink._socket.poll(WAIT), "the end of the subscription did not arrive"
+    assert not sink.wants()
+    write(sink, range(1, 50))
+    assert sink.counters() == {"serialised": 1, "subscriptions": 0}
+    sink.close()
+
+
+def test_a_subscriber_that_never_reads_neither_blocks_the_run_nor_its_end(subscribe: Subscribing) -> None:
+    sink = opened(linger=0.1)
+    # It accepts little itself, so that everything piles up at the publisher.
+    subscribe(sink.endpoint, RCVHWM=1, RCVBUF=4096)
+    wait_until_wanted(sink)
+    done = threading.Event()
+
+    def run() -> None:
+        write(sink, range(2000))
+        sink.close()
+        done.set()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    assert done.wait(60)
+    assert sink.counters()["serialised"] == 2000
+
+
+def test_a_subscriber_that_reads_is_not_held_up_by_one_that_does_not(subscribe: Subscribing) -> None:
+    sink = opened(linger=0.1)
+    subscribe(sink.endpoint, RCVHWM=1, RCVBUF=4096)
+    wait_until_wanted(sink)
+    reader = subscribe(sink.endpoint, b"tactflow.")
+    assert sink._socket is not None
+    assert sink._socket.poll(WAIT)
+    assert sink.wants()
+    for seq in range(500):
+        write(sink, range(seq, seq + 1))
+        assert receive(reader)[1]["seq"] == seq
+    sink.close()
+
+
+def test_a_conflating_subscriber_that_pauses_gets_the_newest(subscribe: Subscribing) -> None:
+    sink = opened()
+    socket = subscribe(sink.endpoint, CONFLATE=1)
+    probe = subscribe(sink.endpoint, b"tactflow.")
+    assert sink._socket is not None
+    while sink.counters()["subscriptions"] < 2:
+        assert sink._socket.poll(WAIT)
+        sink.wants()
+    for seq in range(40):
+        write(sink, range(seq, seq + 1))
+        receive(probe)
+    # What is under way to `socket` arrives within moments; the newest one replaces all before it.
+    newest = -1
+    while newest < 39:
+        newest = receive(socket)[1]["seq"]
+    assert not socket.poll(50)
+    sink.close()
+
+
+def test_closing_delivers_the_last_messages(subscribe: Subscribing) -> None:
+    for _ in range(5):
+        sink = opened()
+        socket = subscribe(sink.endpoint)
+        wait_until_wanted(sink)
+        write(sink, range(5))
+        sink.close()
+        assert [receive(socket)[1]["seq"] for _ in range(5)] == [0, 1, 2, 3, 4]
+        socket.close()
+
+
+def test_an_address_in_use_is_an_error_that_says_what_to_try() -> None:
+    first = opened()
+    second = Zmq(Zmq.Params(endpoint=first.endpoint))
+    with pytest.raises(StageError, match="is in use") as raised:
+        second.open()
+    for words in (first.endpoint, "--set sinks.zmq.endpoint=", "--set sinks.zmq=null"):
+        assert words in str(raised.value)
+    second.close()
+    first.close()
+    again = Zmq(Zmq.Params(endpoint=first.endpoint))
+    again.open()
+    again.close()
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["", "5556", "tcp://127.0.0.1", "tcp://nobody.invalid:5556", "foo://bar"]
+)
+def test_an_address_that_makes_no_sense_is_an_error(endpoint: str) -> None:
+    sink = Zmq(Zmq.Params(endpoint=endpoint))
+    with pytest.raises(StageError, match=r"cannot be bound.*tcp://127"):
+        sink.open()
+    sink.close()
+
+
+def test_opening_can_wait_for_a_subscriber(subscribe: Subscribing) -> None:
+    reserved = opened()
+    endpoint = reserved.endpoint
+    reserved.close()
+    sink = Zmq(Zmq.Params(endpoint=endpoint, wait_for_subscriber=WAIT / 1000))
+    socket = subscribe(endpoint)
+    sink.open()
+    assert sink.wants()
+    write(sink, range(1))
+    assert receive(socket)[1]["seq"] == 0
+    sink.close()
+
+
+def test_waiting_for_a_subscriber_ends_without_one() -> None:
+    sink = opened(wait_for_subscriber=0.05)
+    assert not sink.wants()
+    sink.close()
+
+
+def test_asking_who_listens_is_safe_while_another_thread_sends(subscribe: Subscribing) -> None:
+    sink = opened()
+    socket = subscribe(sink.endpoint)
+    wait_until_wanted(sink)
+    stop = threading.Event()
+    answers: set[bool] = set()
+
+    def ask() -> None:
+        while not stop.is_set():
+            answers.add(sink.wants())
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    for seq in range(300):
+        write(sink, range(seq, seq + 1))
+        assert receive(socket)[1]["seq"] == seq
+    stop.set()
+    thread.join()
+    sink.close()
+    assert answers == {True}
+
+
+def test_the_sensor_names_the_topic(subscribe: Subscribing) -> None:
+    sink = Zmq(Zmq.Params(endpoint="tcp://127.0.0.1:*"), sensor="thumb")
+    sink.open()
+    socket = subscribe(sink.endpoint, b"tactflow.thumb")
+    wait_until_wanted(sink)
+    sink.write(tick(4, "thumb"), IMAGE, None, None, None)
+    topic, message = receive(socket)
+    assert topic == b"tactflow.thumb"
+    assert message["sensor"] == "thumb"
+    sink.close()
+
+
+def test_writing_and_asking_after_the_end_is_harmless() -> None:
+    sink = opened()
+    sink.close()
+    sink.close()
+    write(sink, range(1))
+    assert not sink.wants()

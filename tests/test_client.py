@@ -1,0 +1,284 @@
+"""The subscriber class and `tactflow listen`, against a real publisher."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import pytest
+from tactflow.sinks.zmq import Zmq
+
+from tactflow.cli import listen
+from tactflow.client import Subscriber
+from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.engine.frame import Frame, Tick
+from tactflow.vision.types import Contact, Flow, Markers
+
+IMAGE = np.zeros((300, 400, 3), np.uint8)
+CONTACT = Contact(5123.5, (150.2, 201.7), -12.31, 0.218, np.zeros((3, 2)), None)
+FLOW = Flow((1.214, -0.33), 9)
+MARKERS = Markers(np.zeros((3, 2)), np.zeros((3, 2)), np.array([0, 0, 2], np.uint8), np.zeros(3))
+LONG = 30.0
+"""s; only a broken test waits so long."""
+
+
+class Publisher:
+    """The real sink, with the sensor of each message chosen by the test."""
+
+    def __init__(self, sensor: str = "main") -> None:
+        self.sink = Zmq(Zmq.Params(endpoint="tcp://127.0.0.1:*", backlog=1000), sensor=sensor)
+        self.sink.open()
+        self.sensor = sensor
+        self.endpoint = self.sink.endpoint
+
+    def wait(self) -> None:
+        """Until somebody has subscribed."""
+        self.sink._wait_for_subscriber(LONG)
+        assert self.sink.wants()
+
+    def send(self, *seqs: int, contact: Contact | None = None) -> None:
+        for seq in seqs:
+            flow = None if contact is None else FLOW
+            self.sink.write(Tick(Frame(self.sensor, seq, seq / 10, IMAGE)), IMAGE, contact, flow, MARKERS)
+
+
+@pytest.fixture
+def publisher() -> Iterator[Publisher]:
+    publisher = Publisher()
+    yield publisher
+    publisher.sink.close()
+
+
+def test_every_message_arrives_as_a_dict(publisher: Publisher) -> None:
+    with Subscriber(publisher.endpoint, timeout=LONG) as messages:
+        publisher.wait()
+        publisher.send(0, 1, 2, contact=CONTACT)
+        received = list(islice(messages, 3))
+        assert [message["seq"] for message in received] == [0, 1, 2]
+        assert received[0]["contact"]["area"] == 5123.5
+        assert (messages.received, messages.lost) == (3, 0)
+
+
+@pytest.mark.parametrize(
+    ("seqs", "lost"),
+    [
+        ([0, 1, 2], 0),
+        ([5, 6], 0),
+        ([0, 2, 3, 7], 4),
+        ([10, 11, 0, 1], 0),
+        ([10, 0, 3], 2),
+    ],
+    ids=["none", "joined late", "gaps", "started again", "started again with a gap"],
+)
+def test_gaps_in_seq_are_counted_as_lost(seqs: list[int], lost: int, publisher: Publisher) -> None:
+    with Subscriber(publisher.endpoint, timeout=LONG) as messages:
+        publisher.wait()
+        publisher.send(*seqs)
+        assert [messages.receive()["seq"] for _ in seqs] == seqs
+        assert messages.lost == lost
+
+
+def test_latest_gives_the_newest_and_counts_what_it_skipped(publisher: Publisher) -> None:
+    # The probe receives everything, so the test knows that the messages have left the publisher.
+    with (
+        Subscriber(publisher.endpoint, latest=True, timeout=LONG) as messages,
+        Subscriber(publisher.endpoint, sensor="main", timeout=LONG) as probe,
+    ):
+        while publisher.sink.counters()["subscriptions"] < 2:
+            publisher.wait()
+        publisher.send(0)
+        assert messages.receive()["seq"] == 0
+        publisher.send(*range(1, 100))
+        for _ in range(100):
+            last = probe.receive()["seq"]
+        assert last == 99
+        seqs = [0]
+        while seqs[-1] < 99:
+            seqs.append(messages.receive()["seq"])
+        assert seqs == sorted(set(seqs))
+        assert messages.lost == 99 - (len(seqs) - 1)
+
+
+def test_a_sensor_can_be_chosen_and_its_name_is_matched_whole() -> None:
+    publisher = Publisher("main2")
+    with (
+        Subscriber(publisher.endpoint, sensor="main", timeout=0.05) as other,
+        Subscriber(publisher.endpoint, sensor="main2", timeout=LONG) as same,
+    ):
+        publisher.wait()
+        publisher.send(0)
+        assert same.receive()["sensor"] == "main2"
+        with pytest.raises(TimeoutError):
+            other.receive()
+    publisher.sink.close()
+
+
+def test_silence_is_a_timeout_that_says_what_to_check(publisher: Publisher) -> None:
+    with (
+        Subscriber(publisher.endpoint, sensor="thumb", timeout=0.05) as messages,
+        pytest.raises(TimeoutError, match=r"is tactflow running .* is its sensor called thumb"),
+    ):
+        messages.receive()
+    with Subscriber(publisher.endpoint, timeout=LONG) as messages:
+        publisher.wait()
+        publisher.send(0)
+        messages.receive()
+        messages.timeout = 0.05
+        with pytest.raises(TimeoutError, match="has the run ended"):
+            next(iter(messages))
+
+
+def test_a_subscriber_may_start_before_the_publisher_and_survives_its_restart() -> None:
+    first = Publisher()
+    endpoint = first.endpoint
+    first.sink.close()
+
+    def run(seqs: list[int]) -> None:
+        sink = Zmq(Zmq.Params(endpoint=endpoint, wait_for_subscriber=LONG))
+        sink.open()
+        for seq in seqs:
+            sink.write(Tick(Frame("main", seq, 0.0, IMAGE)), IMAGE, None, None, None)
+        sink.close()
+
+    with Subscriber(endpoint, timeout=LONG) as messages:
+        for seqs in ([3, 4], [0, 1]):
+            # In a thread: a subscriber subscribes again only while it waits for messages.
+            thread = threading.Thread(target=run, args=(seqs,))
+            thread.start()
+            assert [messages.receive()["seq"] for _ in seqs] == seqs
+            thread.join()
+        assert messages.lost == 0
+
+
+@pytest.mark.parametrize("endpoint", ["", "5556", "foo://bar", "tcp://127.0.0.1"])
+def test_an_address_that_makes_no_sense_is_refused(endpoint: str) -> None:
+    with pytest.raises(ValueError, match="required an address such as tcp://127"):
+        Subscriber(endpoint)
+
+
+def test_a_subscriber_needs_no_opencv() -> None:
+    program = "import sys, tactflow.client; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False, timeout=60).returncode == 0
+
+
+# -- tactflow listen --------------------------------------------------------------------------------------
+
+
+def parse(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    listen.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+def run_listen(publisher: Publisher, *words: str, send: Any) -> int:
+    """Run `listen` here, and `send` in a thread once it has subscribed."""
+
+    def publish() -> None:
+        publisher.wait()
+        send()
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        return listen.run(parse(publisher.endpoint, *words))
+    finally:
+        thread.join()
+
+
+def test_listen_prints_one_readable_line_a_message(
+    publisher: Publisher, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def send() -> None:
+        publisher.send(0)
+        publisher.send(1, 4, contact=CONTACT)
+
+    assert run_listen(publisher, "--count", "3", "--timeout", str(LONG), send=send) == 0
+    out, err = capsys.readouterr()
+    contact = "contact 5124 px^2 at (150.2, 201.7)  angle -12.3 deg  flow (+1.21, -0.33) px of 9  markers 2/3"
+    assert out.splitlines() == [
+        "main 0  t 0.000 s  no contact  markers 2/3",
+        f"main 1  t 0.100 s  {contact}",
+        f"main 4  t 0.400 s  {contact}  (2 lost)",
+    ]
+    assert err == ""
+
+
+def test_listen_prints_the_messages_as_they_are(
+    publisher: Publisher, capfdbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    code = run_listen(
+        publisher, "--json", "--count", "2", "--timeout", str(LONG), send=lambda: publisher.send(0, 1)
+    )
+    assert code == 0
+    lines = capfdbinary.readouterr().out.splitlines()
+    assert [json.loads(line)["seq"] for line in lines] == [0, 1]
+
+
+def test_listen_ends_well_when_messages_stop_coming(publisher: Publisher) -> None:
+    assert run_listen(publisher, "--timeout", "0.3", send=lambda: publisher.send(0)) == 0
+
+
+def test_listen_reports_that_nothing_came(publisher: Publisher) -> None:
+    with pytest.raises(SourceError, match="is tactflow running"):
+        listen.run(parse(publisher.endpoint, "--timeout", "0.05"))
+
+
+def test_listen_refuses_a_table_without_a_terminal() -> None:
+    with pytest.raises(ConfigError, match="--table needs a terminal"):
+        listen.run(parse("--table"))
+
+
+def test_listen_refuses_an_address_that_makes_no_sense() -> None:
+    with pytest.raises(ConfigError, match="required an address"):
+        listen.run(parse("nowhere"))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("--count", "0"), ("--count", "x"), ("--timeout", "0"), ("--timeout", "nan"), ("--json", "--table")],
+)
+def test_listen_refuses_wrong_options(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as raised:
+        parse(*words)
+    assert raised.value.code == 2
+    assert words[0] in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_listen_quietly(
+    publisher: Publisher, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(_: Subscriber) -> dict[str, Any]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Subscriber, "receive", interrupted)
+    assert listen.run(parse(publisher.endpoint)) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_table_shows_the_latest_values(
+    publisher: Publisher, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+
+    def send() -> None:
+        publisher.send(0, 3, contact=CONTACT)
+
+    assert run_listen(publisher, "--table", "--count", "2", "--timeout", str(LONG), send=send) == 0
+    out = capsys.readouterr().out
+    for words in ("main", "5124", "-12.3", "+1.21", "2/3", "2 received, 2 lost"):
+        assert words in out
+
+
+def test_a_contact_without_direction_is_described_without_one(publisher: Publisher) -> None:
+    round_contact = Contact(100.0, (1.0, 2.0), None, None, np.zeros((3, 2)), None)
+    with Subscriber(publisher.endpoint, timeout=LONG) as messages:
+        publisher.wait()
+        publisher.send(0, contact=round_contact)
+        assert "angle -  " in listen.describe(messages.receive())
