@@ -113,7 +113,8 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
     # Row by row of the disc, how many mask pixels lie in it, from sums over rectangles.
     ones: NDArray[Any] = cv2.threshold(roi, 0, 1, cv2.THRESH_BINARY)[1]
     sums = np.asarray(cv2.integral(ones))
-    down = np.arange(-reach, reach + 1)
+    # Only rows that the mask has, so that a huge reach costs no more than the mask's height.
+    down = np.arange(max(-reach, -int(y.max())), min(reach, height - 1 - int(y.min())) + 1)
     half = np.floor(np.sqrt(dilate**2 - down**2) + 1e-9).astype(np.intp)
     upper = y[:, None] + down
     begin, end = _clip(upper, height), _clip(upper + 1, height)
