@@ -454,6 +454,19 @@ def test_a_mistake_is_reported_at_its_place(
         assert word in found
 
 
+@pytest.mark.parametrize("command", ["run", "check", "explain", "graph"])
+def test_every_command_that_reads_a_pipeline_refuses_a_bad_one(
+    command: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "bad.yaml").write_text(HEAD + "  prepare: {}\n" + SINK)
+    assert main([command, "bad.yaml", "--set", "sinks.out.path=3"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "bad.yaml:3:3  stages.prepare: there is no stage called prepare" in err
+    assert "--set sinks.out.path=3: sinks.out.path: expected text, got 3" in err
+    assert "Traceback" not in err
+
+
 def test_the_table_is_long_enough() -> None:
     assert len(CASES) >= 40
 

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from tactflow.engine.config import load_pipeline
 from tactflow.engine.errors import ConfigError
@@ -81,8 +83,11 @@ def test_an_optional_input_nobody_gives_is_none(load: Load) -> None:
 
 def test_in_names_outputs_and_can_take_an_optional_one_away(load: Load) -> None:
     text = BODY.replace("sinks:", "  invert: {use: './parts.py:Invert'}\nsinks:")
-    for given, expected in (("prepare", Ref("prepare", "image")), ("prepare.image", Ref("prepare", "image"))):
-        assert load(text, f"sinks.out.in.image={given}").nodes["out"].inputs["image"] == expected
+    for reference, expected in (
+        ("prepare", Ref("prepare", "image")),
+        ("prepare.image", Ref("prepare", "image")),
+    ):
+        assert load(text, f"sinks.out.in.image={reference}").nodes["out"].inputs["image"] == expected
     assert load(text, "sinks.out.in.image=null").nodes["out"].inputs["image"] is None
 
 
@@ -245,6 +250,28 @@ class TestSet:
         message = str(caught.value)
         assert message.startswith(f"--set {override}: ")
         assert words in message
+
+    @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(
+        st.lists(
+            st.sampled_from(["stages", "sinks", "prepare", "out", "corners", "in", "when", "0", "x", ""]),
+            max_size=5,
+        ),
+        st.one_of(
+            st.text(max_size=12),
+            st.sampled_from(["null", "[[", "{a: 1}", "&a [*a]", "touching", "-1", "!!x"]),
+        ),
+    )
+    def test_whatever_it_says_the_pipeline_is_right_or_refused(
+        self, load: Load, keys: list[str], value: str
+    ) -> None:
+        try:
+            load(BODY, f"{'.'.join(keys)}={value}")
+        except ConfigError as error:
+            message = str(error)
+        else:
+            return
+        assert "--set" in message or "p.yaml:" in message
 
 
 class TestOptionsOfTheCommandLine:

@@ -40,11 +40,12 @@ def explanation(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | 
     if statistics is not None:
         yield _run_line(statistics)
     users = _sinks_behind(pipeline)
+    uncertain = _may_be_absent(pipeline)
     pruned = {node.id for node in plan.pruned}
     for node in pipeline.nodes.values():
         yield ""
         yield f"{node.id} ({node.mark})"
-        facts = _facts(node, pipeline, plan, users[node.id], node.id in pruned)
+        facts = _facts(node, pipeline, plan, users[node.id], uncertain, node.id in pruned)
         if statistics is not None and node.id not in pruned:
             facts["statistics"] = _cost(node, statistics)
         width = max(map(len, facts))
@@ -52,7 +53,9 @@ def explanation(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | 
             yield f"  {name.ljust(width)}  {text}"
 
 
-def _facts(node: Node, pipeline: Pipeline, plan: Plan, users: list[str], pruned: bool) -> dict[str, str]:
+def _facts(
+    node: Node, pipeline: Pipeline, plan: Plan, users: list[str], uncertain: set[str], pruned: bool
+) -> dict[str, str]:
     facts: dict[str, str] = {}
     if pruned:
         facts["pruned because"] = "no sink needs what it makes"
@@ -67,7 +70,7 @@ def _facts(node: Node, pipeline: Pipeline, plan: Plan, users: list[str], pruned:
         needed = [
             f"{ref.node} gives no {ref.port}"
             for port in node.component.ports.inputs
-            if not port.optional and (ref := node.inputs[port.name]) and _may_be_absent(ref.node, pipeline)
+            if not port.optional and (ref := node.inputs[port.name]) and ref.node in uncertain
         ]
         if skips or needed:
             facts["skipped when"] = "; ".join(skips + needed)
@@ -102,13 +105,19 @@ def _gate(gate: Gate) -> str:
     return text
 
 
-def _may_be_absent(id_: str, pipeline: Pipeline) -> bool:
-    """True if a stage's outputs may be missing: it is gated, says so itself, or needs what may be missing."""
-    node = pipeline.nodes[id_]
-    if (node.gates and pipeline.skipping) or any(port.optional for port in node.component.ports.outputs):
-        return True
-    inputs = [node.inputs[port.name] for port in node.component.ports.inputs if not port.optional]
-    return any(_may_be_absent(ref.node, pipeline) for ref in inputs if ref is not None)
+def _may_be_absent(pipeline: Pipeline) -> set[str]:
+    """Nodes whose outputs may be missing: gated, by their own word, or for want of an input."""
+    found: set[str] = set()
+    for node in pipeline.nodes.values():
+        ports = node.component.ports
+        needed = [node.inputs[port.name] for port in ports.inputs if not port.optional]
+        if (
+            (node.gates and pipeline.skipping)
+            or any(port.optional for port in ports.outputs)
+            or any(ref.node in found for ref in needed if ref is not None)
+        ):
+            found.add(node.id)
+    return found
 
 
 def _sinks_behind(pipeline: Pipeline) -> dict[str, list[str]]:

@@ -12,8 +12,6 @@ from typing import Any
 from tactflow.client import DEFAULT_ENDPOINT, Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 
-HELP = "print what a running tactflow publishes"
-
 Message = dict[str, Any]
 
 

@@ -23,8 +23,6 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.run import Progress as RunProgress
 from tactflow.engine.run import Runner, RunResult
 
-HELP = "run a pipeline"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `run`."""
