@@ -98,9 +98,9 @@ class Annotator:
             picture = image.copy()
         unit = max(1.0, min(image.shape[:2]) / 300)
         if contact is not None and len(contact.hull):
+            draw_polygon(picture, contact.hull, GREEN, unit)
             if self._ellipse and contact.ellipse is not None:
                 draw_ellipse(picture, contact.ellipse, MAGENTA, unit)
-            draw_polygon(picture, contact.hull, GREEN, unit)
         if markers is not None:
             draw_arrows(picture, markers, self._arrow_scale, unit)
         if contact is not None:
@@ -246,12 +246,16 @@ def draw_polygon(
 def draw_ellipse(
     picture: NDArray[np.uint8], ellipse: Ellipse, colour: Colour = MAGENTA, unit: float = 1.0
 ) -> None:
-    """Draw an ellipse into `picture`, to 1/16 px; unit is the line width, px."""
+    """Draw an ellipse into `picture`, dashed, to 1/16 px; unit is the line width, px."""
     theta = math.radians(ellipse.angle or 0.0)
     turn = np.array([[math.cos(theta), -math.sin(theta)], [math.sin(theta), math.cos(theta)]])
-    around = np.linspace(0, 2 * math.pi, 90, endpoint=False)
+    # Twelve dashes of half the outline; the ends of both axes lie in the middle of one.
+    step = np.arange(12)[:, None] * 8 + np.arange(-2, 3)
+    around = step.ravel() * (2 * math.pi / 96)
     outline = np.column_stack([np.cos(around) * ellipse.axes[0] / 2, np.sin(around) * ellipse.axes[1] / 2])
-    _strokes(picture, [outline @ turn + ellipse.center], colour, 1.2 * unit, closed=True)
+    dashes = (outline @ turn + ellipse.center).reshape(12, 5, 2)
+    _strokes(picture, dashes, DARK, 2.6 * unit)
+    _strokes(picture, dashes, colour, 1.2 * unit)
 
 
 def _fixed(points: NDArray[Any]) -> NDArray[np.int32]:

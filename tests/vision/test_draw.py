@@ -1,0 +1,222 @@
+"""Pictures of the results."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.vision.draw import Annotator, draw_arrows, draw_ellipse, draw_polygon
+from tactflow.vision.flow import flow_in_mask
+from tactflow.vision.hull import contact_geometry
+from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
+
+GRAY = np.full((240, 320, 3), 100, np.uint8)
+
+
+def slanted_mask() -> NDArray[np.uint8]:
+    y, x = np.mgrid[:240, :320].astype(np.float64)
+    along = (x - 150) * math.cos(0.5) + (y - 120) * math.sin(0.5)
+    across = (y - 120) * math.cos(0.5) - (x - 150) * math.sin(0.5)
+    return ((along / 60) ** 2 + (across / 18) ** 2 <= 1).astype(np.uint8) * 255
+
+
+MASK = slanted_mask()
+
+
+def contact() -> Contact:
+    found = contact_geometry(MASK)
+    assert found is not None
+    return found
+
+
+def markers(origin: Any, position: Any, status: Any) -> Markers:
+    return Markers(
+        np.array(origin, np.float64),
+        np.array(position, np.float64),
+        np.array(status, np.uint8),
+        np.full(len(origin), np.nan),
+    )
+
+
+def field() -> Markers:
+    origin = np.stack(np.meshgrid(np.arange(20, 310, 25.0), np.arange(60, 230, 25.0)), -1).reshape(-1, 2)
+    status = np.zeros(len(origin), np.uint8)
+    status[::7] = MarkerStatus.INFERRED
+    status[::11] = MarkerStatus.LOST
+    return Markers(origin, origin + np.array([2.3, -1.1]), status, np.full(len(origin), 0.02))
+
+
+def everything() -> dict[str, Any]:
+    given = field()
+    flow = flow_in_mask(given, MASK, dilate=8)
+    return {"contact": contact(), "flow": flow, "markers": given, "contact_mask": MASK}
+
+
+def test_a_picture_is_new_and_the_inputs_stay_as_they_are() -> None:
+    image = GRAY.copy()
+    image.flags.writeable = False
+    given = everything()
+    hull, position, mask = given["contact"].hull.copy(), given["markers"].position.copy(), MASK.copy()
+    picture = Annotator(ellipse=True)(image, **given)
+    assert picture.shape == image.shape
+    assert picture.dtype == np.uint8
+    assert not np.shares_memory(picture, image)
+    assert not np.array_equal(picture, image)
+    np.testing.assert_array_equal(image, GRAY)
+    np.testing.assert_array_equal(given["contact"].hull, hull)
+    np.testing.assert_array_equal(given["markers"].position, position)
+    np.testing.assert_array_equal(MASK, mask)
+
+
+def test_the_same_inputs_give_the_same_picture() -> None:
+    annotate = Annotator()
+    given = everything()
+    first = annotate(GRAY, **given)
+    kept = first.copy()
+    annotate(GRAY)
+    np.testing.assert_array_equal(annotate(GRAY, **given), kept)
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_nothing_given_and_no_text_is_the_frame_itself() -> None:
+    np.testing.assert_array_equal(Annotator(text=False)(GRAY), GRAY)
+
+
+@pytest.mark.parametrize(
+    ("status", "colour"),
+    [(MarkerStatus.TRACKED, (0, 255, 255)), (MarkerStatus.INFERRED, (255, 255, 255))],
+)
+def test_arrows_run_from_the_origin_and_show_the_status(status: MarkerStatus, colour: Any) -> None:
+    picture = GRAY.copy()
+    draw_arrows(picture, markers([[50, 60]], [[60, 60]], [status]), scale=3.0)
+    for x in (65, 78):
+        # An antialiased stroke of one pixel reaches 92 % of its colour; measured.
+        assert np.abs(picture[60, x].astype(int) - colour).max() <= 30
+    np.testing.assert_array_equal(picture[60, 90], GRAY[0, 0])
+    np.testing.assert_array_equal(picture[50, 65], GRAY[0, 0])
+
+
+def test_lost_markers_are_dim() -> None:
+    picture = np.zeros_like(GRAY)
+    draw_arrows(picture, markers([[50, 60]], [[80, 60]], [MarkerStatus.LOST]))
+    assert 0 < picture.max() <= 130
+
+
+def test_an_arrow_moves_with_its_marker_by_fractions_of_a_pixel() -> None:
+    black = np.zeros_like(GRAY)
+
+    def row_of(y: float) -> float:
+        picture = black.copy()
+        draw_arrows(picture, markers([[40, y]], [[140, y]], [MarkerStatus.TRACKED]))
+        weight = picture[:, 80, 1].astype(float)
+        return float((weight * np.arange(240)).sum() / weight.sum())
+
+    # Yellow on its dark rim; positions are kept to 1/16 px and grey levels to 1/255.
+    for y in (60.0, 60.25, 60.5, 60.75):
+        assert row_of(y) == pytest.approx(y, abs=0.15)
+
+
+def test_a_marker_that_stays_is_a_dot() -> None:
+    picture = GRAY.copy()
+    draw_arrows(picture, markers([[50, 60]], [[50, 60]], [MarkerStatus.TRACKED]))
+    assert picture[60, 50, 2] > 200
+    np.testing.assert_array_equal(picture[60, 56], GRAY[0, 0])
+
+
+def test_the_hull_is_green_and_the_axis_orange() -> None:
+    picture = Annotator(text=False)(GRAY, contact=contact())
+    x, y = (contact().hull[0] + contact().hull[1]) / 2
+    green = picture[round(y), round(x)].astype(int)
+    assert green[1] > green[0] + 60
+    assert green[1] > green[2] + 60
+    x, y = np.array(contact().center) + 30 * np.array([math.cos(0.5), math.sin(0.5)])
+    orange = picture[round(y), round(x)].astype(int)
+    assert orange[2] > orange[0] + 100
+
+
+def test_a_contact_without_direction_has_a_centre_and_no_axis() -> None:
+    disc = Contact(100.0, (100.0, 120.0), None, None, contact().hull, None)
+    picture = Annotator(text=False)(GRAY, contact=disc)
+    assert picture[120, 100, 2] > 200
+    np.testing.assert_array_equal(picture[120, 112], GRAY[0, 0])
+
+
+def test_an_ellipse_is_drawn_only_where_asked_for() -> None:
+    bare = Annotator(text=False)(GRAY, contact=contact())
+    with_ellipse = Annotator(text=False, ellipse=True)(GRAY, contact=contact())
+    assert not np.array_equal(bare, with_ellipse)
+
+
+def test_a_drawn_ellipse_goes_through_the_ends_of_its_axes() -> None:
+    picture = np.zeros_like(GRAY)
+    draw_ellipse(picture, Ellipse((150.0, 120.0), (120.0, 40.0), 30.0))
+    theta = math.radians(30)
+    for x, y in ((math.cos(theta) * 60, -math.sin(theta) * 60), (math.sin(theta) * 20, math.cos(theta) * 20)):
+        for sign in (1, -1):
+            assert picture[round(120 + sign * y), round(150 + sign * x)].max() > 60
+    assert picture[120, 150].max() == 0
+
+
+def test_the_contact_view_is_black_outside_the_contact() -> None:
+    picture = Annotator(view="contact", text=False, dilate=4)(GRAY, **everything())
+    assert not picture[:40].any()
+    assert not picture[:, 250:].any()
+    assert picture[120, 150].any()
+    empty = Annotator(view="contact", text=False)(GRAY, markers=field())
+    assert not empty.any()
+
+
+def test_text_appears_and_stays_inside_tiny_and_odd_pictures() -> None:
+    given = everything()
+    plain = Annotator(text=False)(GRAY, **given)
+    assert not np.array_equal(plain[:40, :100], Annotator()(GRAY, **given)[:40, :100])
+    for shape in ((1, 1, 3), (7, 3, 3), (33, 61, 3), (900, 1201, 3)):
+        assert Annotator()(np.zeros(shape, np.uint8), **{**given, "contact_mask": None}).shape == shape
+
+
+def test_extreme_values_are_drawn_without_complaint() -> None:
+    far = markers([[1e9, -1e9], [5, 5]], [[-1e12, 3], [5, 1e7]], [0, 1])
+    one = Contact(1.0, (3.0, 4.0), 90.0, None, np.array([[3.0, 4.0]]), None)
+    flow = Flow((1e9, -0.0), 1)
+    picture = Annotator()(GRAY, contact=one, markers=far, flow=flow)
+    assert picture.shape == GRAY.shape
+    none = Markers(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.uint8), np.empty(0))
+    np.testing.assert_array_equal(Annotator(text=False)(GRAY, markers=none), GRAY)
+
+
+def test_a_view_with_gaps_between_rows_is_drawn_like_its_copy() -> None:
+    wide = np.full((240, 640, 3), 100, np.uint8)
+    view = wide[:, 100:420]
+    np.testing.assert_array_equal(Annotator()(view, **everything()), Annotator()(GRAY, **everything()))
+
+
+def test_a_polygon_of_one_point_is_a_point() -> None:
+    picture = GRAY.copy()
+    draw_polygon(picture, np.array([[20.0, 30.0]]))
+    assert not np.array_equal(picture[28:33, 18:23], GRAY[28:33, 18:23])
+    np.testing.assert_array_equal(picture[60:], GRAY[60:])
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"arrow_scale": -1.0}, "arrow_scale"),
+        ({"arrow_scale": math.nan}, "arrow_scale"),
+        ({"view": "left"}, "'frame' or 'contact'"),
+        ({"dilate": -1.0}, "dilate"),
+    ],
+)
+def test_bad_options_are_refused_with_a_reason(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Annotator(**kwargs)
+
+
+def test_pictures_of_another_kind_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8"):
+        Annotator()(np.zeros((4, 4), np.uint8))
+    with pytest.raises(ValueError, match="contact_mask of shape"):
+        Annotator(view="contact")(GRAY, contact_mask=np.zeros((4, 4), np.uint8))
