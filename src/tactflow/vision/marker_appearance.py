@@ -18,7 +18,7 @@ _PHASES: Final = 4
 # A step is repeated, so many times at most, while it was longer than this, px: from there the linear model
 # leaves less than 0.005 px.
 _CONVERGED: Final = 0.25
-_ROUNDS: Final = 4
+_ROUNDS: Final = 3
 
 
 class MarkerAppearance:
@@ -38,8 +38,10 @@ class MarkerAppearance:
         axis = np.arange(-reach, reach + 1)
         grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
         disc = np.hypot(grid_x, grid_y) <= 1.55 * radius + 1.2
-        self._width = reference.shape[1] + 2 * self.pad
-        self._offsets = (grid_y[disc] * self._width + grid_x[disc]).astype(np.int64)
+        width = reference.shape[1] + 2 * self.pad
+        self._strides = np.array([1, width])
+        self._first = self.pad * (width + 1)
+        self._offsets = (grid_y[disc] * width + grid_x[disc]).astype(np.int64)
         self.pixels = int(disc.sum())
         x, y = grid_x[disc].astype(np.float64), grid_y[disc].astype(np.float64)
         plane, _ = np.linalg.qr(np.column_stack([np.ones_like(x), x, y]))
@@ -74,10 +76,9 @@ class MarkerAppearance:
                 spread[row, column] = 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
         self._pinv = pinv.reshape(_PHASES * _PHASES * count, 3, self.pixels)
         self._gram = gram.reshape(_PHASES * _PHASES * count, 3, 3)
-        self._spread = spread.reshape(_PHASES * _PHASES * count)
-        self._count = count
-        limits = np.array([reference.shape[1] - 1, reference.shape[0] - 1], np.float64)
-        self._limits = limits
+        self._spread = spread.reshape(_PHASES * _PHASES * count) / np.float32(max(self.pixels - 6, 1))
+        self._phase_strides = np.array([count, _PHASES * count])
+        self._limits = np.array([reference.shape[1] - 1, reference.shape[0] - 1], np.float64)
 
     def padded(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The frame with a rim, flat, so that patches may reach over its border."""
@@ -96,41 +97,41 @@ class MarkerAppearance:
         """
         marks = self._rows if marks is None else marks
         position, gain, share, stderr = self._step(flat, start, marks)
-        active = np.flatnonzero(_longer(position - start, _CONVERGED))
         for _ in range(_ROUNDS):
+            # Where nothing like the mark is in sight, more steps lead nowhere.
+            again = _longer(position - start, _CONVERGED) & (share > 0.3) & (gain > 0.2)
+            active = np.flatnonzero(again)
             if len(active) == 0:
                 break
-            before = position[active]
+            start = position.copy()
             position[active], gain[active], share[active], stderr[active] = self._step(
-                flat, before, marks[active]
+                flat, position[active], marks[active]
             )
-            active = active[_longer(position[active] - before, _CONVERGED)]
         return position, gain, share, stderr
 
     def _step(
         self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray
     ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
         """One least-squares step from the phase nearest to the starting points."""
-        base = np.rint(np.minimum(np.maximum(start, 0.0), self._limits))
-        cell = ((start - base + 0.5) * _PHASES).astype(np.int64)
-        np.minimum(np.maximum(cell, 0, out=cell), _PHASES - 1, out=cell)
-        corner = base.astype(np.int64) + self.pad
-        index = (corner[:, 1] * self._width + corner[:, 0])[:, None] + self._offsets
-        patch = flat.take(index).astype(np.float32)
+        # Quarters of a pixel: whole pixels above, the phase below.
+        inside = np.minimum(np.maximum(start, 0.0), self._limits)
+        quarter = (inside * _PHASES + _PHASES / 2).astype(np.int64)
+        index = quarter // _PHASES @ self._strides + self._first
+        which = quarter % _PHASES @ self._phase_strides + marks
+        patch = flat.take(index[:, None] + self._offsets).astype(np.float32)
         # Far from zero, sums of squares would lose digits.
         patch -= np.float32(128)
-        which = (cell[:, 1] * _PHASES + cell[:, 0]) * self._count + marks
-        theta = np.matmul(self._pinv[which], patch[:, :, None])[:, :, 0]
-        gain = theta[:, 0]
+        theta = np.matmul(self._pinv.take(which, axis=0), patch[:, :, None])
+        seen = np.vecdot(np.matmul(self._gram.take(which, axis=0), theta)[:, :, 0], theta[:, :, 0])
+        gain = theta[:, 0, 0]
         safe = np.maximum(gain, np.float32(0.15))
-        step = theta[:, 1:] / safe[:, None]
+        step = theta[:, 1:, 0] / safe[:, None]
         np.minimum(np.maximum(step, -self.radius, out=step), self.radius, out=step)
-        position = base + ((cell + 0.5) / _PHASES - 0.5) + step
-        seen = (np.matmul(self._gram[which], theta[:, :, None])[:, :, 0] * theta).sum(axis=1)
+        position = (quarter + 0.5) / _PHASES - 0.5 + step
         level = patch @ self._plane
-        total = np.einsum("nk,nk->n", patch, patch) - np.einsum("nk,nk->n", level, level)
-        rest = np.maximum(total - seen, np.float32(1e-3))
-        stderr = np.sqrt(rest * (self._spread[which] / max(self.pixels - 6, 1))) / safe
+        contrast = np.vecdot(patch, patch) - np.vecdot(level, level)
+        rest = np.maximum(contrast - seen, np.float32(1e-3))
+        stderr = np.sqrt(rest * self._spread.take(which)) / safe
         return position, gain, seen / (seen + rest), stderr
 
 

@@ -109,7 +109,7 @@ def choose_spots(
     if smooth:
         rows = np.arange(count)
         own_spot, own_move = label[rows, own], moved[rows, own]
-        smooth = len(np.unique(own_spot)) == count
+        smooth = len(set(own_spot.tolist())) == count
         smooth = smooth and bool((np.abs(own_move[second] - own_move[first]) < _SMOOTH * np.abs(span)).all())
         if smooth and len(mark):
             stretch = np.abs(own_move[mark] - shift[anchor])

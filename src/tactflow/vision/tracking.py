@@ -60,24 +60,23 @@ class _Spots:
         """Spots (M, 2), px, and their strength (M,) relative to the reference's marks."""
         response = self._response(gray)
         highest = cv2.dilate(response, self._neighbourhood)
-        threshold = least * self.typical
         peak = cv2.compare(response, highest, cv2.CMP_GE)
-        peak = cv2.bitwise_and(peak, cv2.compare(response, threshold, cv2.CMP_GT))
+        peak = cv2.bitwise_and(peak, cv2.compare(response, least * self.typical, cv2.CMP_GT))
         peak[0] = peak[-1] = 0
         peak[:, 0] = peak[:, -1] = 0
-        found = cv2.findNonZero(peak)
-        if found is None:
-            return np.zeros((0, 2)), np.zeros(0)
-        points = found.reshape(-1, 2)
-        columns, rows = points[:, 0], points[:, 1]
-        value = response[rows, columns]
-        result = np.empty((len(points), 2))
-        for axis, (step_y, step_x) in enumerate(((0, 1), (1, 0))):
-            before = response[rows - step_y, columns - step_x]
-            after = response[rows + step_y, columns + step_x]
-            bend = np.minimum(before + after - 2 * value, -1e-6)
-            result[:, axis] = points[:, axis] + np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
-        return result * self._factor + (self._factor - 1) / 2, (value / self.typical).astype(np.float64)
+        at = np.flatnonzero(peak)
+        width = response.shape[1]
+        rows, columns = np.divmod(at, width)
+        flat = response.ravel()
+        value = flat.take(at)
+        points = np.empty((len(at), 2))
+        for axis, (whole, step) in enumerate(((columns, 1), (rows, width))):
+            before, after = flat.take(at - step), flat.take(at + step)
+            bend = np.minimum(before + after - 2 * value, np.float32(-1e-6))
+            offset = 0.5 * (before - after) / bend
+            points[:, axis] = whole + np.minimum(np.maximum(offset, -0.5), 0.5)
+        strength = np.asarray(value / self.typical, np.float64)
+        return points * self._factor + (self._factor - 1) / 2, strength
 
 
 class MarkerTracker:
@@ -149,6 +148,8 @@ class MarkerTracker:
         degree = [len(links) for links in self._neighbours]
         usual = sorted(degree)[len(degree) // 2]
         self._rim_weight = [3 if links < usual else 1 for links in degree]
+        self._cell = 0.12 * self._pitch
+        self._raster_shape = tuple(int(side / self._cell) + 2 for side in self._shape)
         self._around, self._around_weight = _surroundings(self._origin, self._pitch)
         self.reset()
 
@@ -250,21 +251,19 @@ class MarkerTracker:
         return result, found, stderr
 
     def _near(self, points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
-        """Which points have one of the others within so many pitches, to a tenth of a pitch: a raster, so
+        """Which points have one of the others within so many pitches, to a tenth of a pitch; by a raster, so
         that the cost does not grow with the product of their numbers."""
         if len(points) == 0 or len(others) == 0:
             return np.zeros(len(points), bool)
-        cell = 0.1 * self._pitch
-        height, width = (int(side / cell) + 2 for side in self._shape)
+        height, width = self._raster_shape
         raster = np.zeros((height, width), np.uint8)
-        limits = np.array([width - 1, height - 1])
-        column, row = np.clip((others / cell + 0.5).astype(np.int64), 0, limits).T
+        scale, limits = 1 / self._cell, np.array([width - 1, height - 1])
+        column, row = np.minimum(np.maximum((others * scale + 0.5).astype(np.int64), 0), limits).T
         raster[row, column] = 1
-        size = 2 * round(10 * distance) + 1
-        raster = np.asarray(
-            cv2.dilate(raster, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))), np.uint8
-        )
-        column, row = np.clip((points / cell + 0.5).astype(np.int64), 0, limits).T
+        size = 2 * round(distance * self._pitch * scale) + 1
+        element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        raster = np.asarray(cv2.dilate(raster, element), np.uint8)
+        column, row = np.minimum(np.maximum((points * scale + 0.5).astype(np.int64), 0), limits).T
         return np.asarray(raster[row, column] > 0, np.bool_)
 
     def _largest_part(self, seen: BoolArray, stretch: FloatArray) -> BoolArray:
