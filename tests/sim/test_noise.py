@@ -1,0 +1,83 @@
+"""The noise is white, of the promised strength, and another one in every frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tactflow.sim import open_scene
+from tactflow.sim.camera import NOISE_UNIT, sensor_noise
+
+SHAPE = (600, 800, 3)
+COUNT = 600 * 800 * 3
+
+
+def frame_noise(seed: int, index: int) -> np.ndarray:
+    return sensor_noise(seed, index, SHAPE).astype(np.float64) / NOISE_UNIT
+
+
+def test_noise_has_mean_zero_and_deviation_one() -> None:
+    drawn = frame_noise(7, 3)
+    # Derived: standard errors 1 / sqrt(1.44e6) = 8e-4 and 6e-4; five of them.
+    assert abs(drawn.mean()) < 5 * COUNT**-0.5
+    assert abs(drawn.std() - 1) < 5 * (2 * COUNT) ** -0.5
+    # Excess kurtosis of a normal is 0, with standard error sqrt(24 / n) = 4e-3.
+    assert abs((drawn**4).mean() / drawn.var() ** 2 - 3) < 5 * (24 / COUNT) ** 0.5
+
+
+def test_neighbouring_pixels_and_channels_are_independent() -> None:
+    drawn = frame_noise(7, 3)
+    for first, second in (
+        (drawn[:, :-1], drawn[:, 1:]),
+        (drawn[:-1], drawn[1:]),
+        (drawn[..., 0], drawn[..., 1]),
+    ):
+        assert abs((first * second).mean()) < 5 * first.size**-0.5
+
+
+@pytest.mark.parametrize(("first", "second"), [(0, 1), (0, 2), (5, 6), (10, 299), (0, 1000), (3, 99_999)])
+def test_frames_are_independent_at_every_pixel_and_at_small_shifts(first: int, second: int) -> None:
+    one, other = frame_noise(7, first), frame_noise(7, second)
+    for dy, dx in ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0), (2, 2), (3, -3)):
+        shifted = np.roll(other, (dy, dx), axis=(0, 1))
+        # Derived: the standard error of a correlation is 1 / sqrt(n); five of them, over 42 tests.
+        assert abs((one * shifted).mean()) < 5 * COUNT**-0.5
+
+
+def test_no_two_of_many_frames_share_their_noise() -> None:
+    corners = {sensor_noise(1, index, SHAPE)[0, :4].tobytes() for index in range(20_000)}
+    assert len(corners) == 20_000
+
+
+def test_the_mean_of_many_frames_has_the_noise_that_independence_gives() -> None:
+    total = np.zeros(SHAPE)
+    for index in range(64):
+        total += frame_noise(2, index)
+    # Derived: 1 / sqrt(64); the standard error of that deviation is 8e-5 and five of them are 4e-4.
+    assert (total / 64).std() == pytest.approx(1 / 8, abs=5e-4)
+
+
+def test_the_difference_of_two_frames_at_rest_shows_the_noise_asked_for() -> None:
+    scene = open_scene("idle?noise=3&markers=none")
+    difference = scene.frame(1).astype(float) - scene.frame(2)
+    # Derived: sqrt(2) x 3, plus the rounding of two frames (1/12 each).
+    assert difference.std() == pytest.approx((2 * 9 + 2 / 12) ** 0.5, rel=0.005)
+    assert abs(difference.mean()) < 0.02
+
+
+def test_without_noise_frames_at_rest_are_equal() -> None:
+    scene = open_scene("idle?noise=0")
+    np.testing.assert_array_equal(scene.frame(0), scene.frame(200))
+
+
+def test_shot_noise_grows_with_the_square_root_of_the_light() -> None:
+    scene = open_scene("idle?noise=0&shot=4&markers=none&texture=0")
+    frames = np.stack([scene.frame(index) for index in range(24)]).astype(float)
+    level, spread = frames.mean(axis=0), frames.var(axis=0, ddof=1)
+    dark, bright = level < np.quantile(level, 0.1), level > np.quantile(level, 0.9)
+    for part in (dark, bright):
+        expected = 16 * level[part].mean() / 128 + 1 / 12
+        assert spread[part].mean() == pytest.approx(
+            expected, rel=0.02
+        )  # 144,000 values of 23 degrees of freedom
+    assert spread[bright].mean() > 1.3 * spread[dark].mean()
