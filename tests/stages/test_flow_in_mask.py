@@ -1,0 +1,47 @@
+"""Stage `flow_in_mask`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from tactflow.stages.flow_in_mask import FlowInMask
+
+from tactflow.engine.stage import read_ports
+from tactflow.vision.types import Flow, Markers
+
+ORIGIN = np.array([[20.0, 20], [40, 20], [20, 40], [40, 40], [80, 50]])
+MARKERS = Markers(ORIGIN, ORIGIN + np.array([1.5, -0.5]), np.zeros(5, np.uint8), np.full(5, 0.02))
+MASK = np.zeros((60, 90), np.uint8)
+MASK[15:45, 15:40] = 255
+
+
+def run(**params: Any) -> Flow:
+    return FlowInMask(FlowInMask.Params(**params)).process(MARKERS, MASK)
+
+
+def test_it_takes_markers_and_a_contact_mask_and_gives_a_flow() -> None:
+    ports = read_ports(FlowInMask, "process")
+    assert [port.name for port in ports.inputs] == ["markers", "contact_mask"]
+    assert [(port.name, port.optional) for port in ports.outputs] == [("flow", False)]
+
+
+def test_the_mean_is_over_the_markers_inside_the_dilated_contact() -> None:
+    flow = run(dilate=4)
+    assert flow.count == 4
+    assert flow.mean == pytest.approx((1.5, -0.5))
+    assert flow.rotation == pytest.approx(0, abs=1e-9)
+    assert run(dilate=0).count == 2
+    assert run(dilate=100).count == 5
+
+
+def test_the_seed_method_cuts_displacements_to_whole_pixels() -> None:
+    assert run(method="seed").mean == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("params", [{"dilate": -1}, {"method": "median"}, {"dilation": 3}], ids=str)
+def test_wrong_parameters_are_refused(params: Any) -> None:
+    with pytest.raises(ValidationError):
+        FlowInMask.Params(**params)

@@ -1,0 +1,71 @@
+"""Stage `hull`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from tactflow.stages.hull import Hull
+
+from tactflow.engine.frame import Absent
+from tactflow.engine.stage import read_ports
+from tactflow.vision.types import Contact
+
+
+def run(mask: NDArray[np.uint8], **params: Any) -> Contact | Absent:
+    mask.flags.writeable = False
+    return Hull(Hull.Params(**params)).process(mask)
+
+
+def bar(height: int = 10) -> NDArray[np.uint8]:
+    mask = np.zeros((60, 90), np.uint8)
+    mask[20 : 20 + height, 10:60] = 255
+    return mask
+
+
+def test_it_takes_a_contact_mask_and_may_give_a_contact() -> None:
+    ports = read_ports(Hull, "process")
+    assert [port.name for port in ports.inputs] == ["contact_mask"]
+    assert [(port.name, port.optional) for port in ports.outputs] == [("contact", True)]
+
+
+def test_an_empty_mask_is_no_contact() -> None:
+    assert run(np.zeros((60, 90), np.uint8)) == Absent("no_contact")
+
+
+def test_a_bar_is_described() -> None:
+    contact = run(bar())
+    assert isinstance(contact, Contact)
+    assert contact.angle == 0.0
+    assert contact.center == (34.5, 24.5)
+    assert contact.area == 500
+
+
+def test_what_is_smaller_than_min_area_is_no_contact() -> None:
+    assert run(bar(), min_area=501) == Absent("no_contact")
+    assert isinstance(run(bar(), min_area=500), Contact)
+
+
+def test_max_gap_and_method_reach_the_geometry() -> None:
+    mask = bar()
+    mask[20:30, 80:85] = 255
+    near, far = run(mask.copy(), max_gap=5), run(mask.copy())
+    assert isinstance(near, Contact)
+    assert isinstance(far, Contact)
+    assert near.hull[:, 0].max() == 59
+    assert far.hull[:, 0].max() == 84
+    seed = run(bar(), method="seed")
+    assert isinstance(seed, Contact)
+    # The hull of pixel centres, as the original measured it.
+    assert seed.area == 49 * 9
+
+
+@pytest.mark.parametrize(
+    "params", [{"min_area": -1}, {"max_gap": -1}, {"method": "x"}, {"min_aera": 3}], ids=str
+)
+def test_wrong_parameters_are_refused(params: Any) -> None:
+    with pytest.raises(ValidationError):
+        Hull.Params(**params)

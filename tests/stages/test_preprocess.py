@@ -1,0 +1,114 @@
+"""Stage `preprocess`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from tactflow.stages.preprocess import Preprocess
+
+from tactflow.engine.frame import Frame
+from tactflow.engine.stage import read_ports
+
+WEDGE = {
+    "from": [[33, 58], [208, 61], [56, 250], [185, 244]],
+    "to": [[0, 0], [240, 0], [0, 320], [240, 320]],
+    "size": [240, 320],
+}
+
+
+def stage(**params: Any) -> Preprocess:
+    return Preprocess(Preprocess.Params.model_validate(params))
+
+
+def frame(width: int = 80, height: int = 60, seed: int = 0) -> Frame:
+    image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    image.flags.writeable = False
+    return Frame("main", 0, 0.0, image)
+
+
+def test_it_takes_a_frame_and_gives_an_image_and_a_mapping() -> None:
+    ports = read_ports(Preprocess, "process")
+    assert [port.name for port in ports.inputs] == ["frame"]
+    assert [port.name for port in ports.outputs] == ["image", "mapping"]
+
+
+def test_without_parameters_the_frame_is_left_as_it_is() -> None:
+    given = frame()
+    result = stage().process(given)
+    np.testing.assert_array_equal(result.image, given.image)
+    assert result.mapping.to_raw([3.5, 4.25]).tolist() == [3.5, 4.25]
+
+
+def test_rotate_and_pyramid_are_the_original() -> None:
+    given = frame()
+    result = stage(rotate=90, downsample=2, method="pyramid").process(given)
+    original = cv2.pyrDown(cv2.rotate(given.image, cv2.ROTATE_90_CLOCKWISE))
+    np.testing.assert_array_equal(result.image, original)
+    assert result.mapping.size == (30, 40)
+
+
+def test_every_parameter_reaches_the_mapping() -> None:
+    result = stage(
+        rotate=270,
+        downsample=2,
+        crop=[10, 20, 200, 280],
+        homography=WEDGE,
+        undistort={"camera_matrix": [[300, 0, 120], [0, 300, 160], [0, 0, 1]], "distortion": [0.1, 0, 0, 0]},
+    ).process(frame(240, 320))
+    assert result.mapping.size == (140, 100)
+    assert result.image.shape == (100, 140, 3)
+    assert result.mapping.lens is not None
+
+
+def test_results_are_fresh() -> None:
+    preprocess = stage(rotate=90, downsample=2)
+    first = preprocess.process(frame(seed=1)).image
+    kept = first.copy()
+    preprocess.process(frame(seed=2))
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_a_frame_of_another_size_is_an_error_that_names_both() -> None:
+    preprocess = stage(rotate=90)
+    preprocess.process(frame())
+    with pytest.raises(ValueError, match=r"required a \(60, 80, 3\) uint8 frame, got \(50, 80, 3\)"):
+        preprocess.process(frame(80, 50))
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"rotate": 45}, "rotate"),
+        ({"downsample": 3}, "downsample"),
+        ({"method": "cubic"}, "method"),
+        ({"crop": [0, 0, 10]}, "crop"),
+        ({"crop": [-1, 0, 10, 10]}, "crop"),
+        ({"homography": {**WEDGE, "size": [0, 320]}}, "size"),
+        ({"homography": {**WEDGE, "from": WEDGE["from"][:3]}}, "homography.from"),
+        ({"homography": {**WEDGE, "from": [[0, 0], [1, 1], [2, 2], [0, 5]]}}, "no three lie on a line"),
+        ({"homography": {**WEDGE, "from": [[0, 0], [1, float("nan")], [2, 2], [0, 5]]}}, "finite"),
+        ({"undistort": {"camera_matrix": np.eye(3).tolist()}}, "distortion"),
+        ({"undistort": {"camera_matrix": [[1]], "distortion": [0, 0, 0, 0]}}, "camera_matrix"),
+        ({"undistort": {"camera_matrix": np.eye(3).tolist(), "distortion": [0, 0, 0]}}, "got 3"),
+        ({"rotation": 90}, "rotation"),
+    ],
+    ids=str,
+)
+def test_wrong_parameters_are_refused_before_anything_starts(params: Any, message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        Preprocess.Params.model_validate(params)
+
+
+def test_a_real_wedge_is_rectified_to_the_full_picture(shared_data: Path) -> None:
+    image = cv2.imread(str(shared_data / "wedge_ball" / "reference.jpg"))
+    assert image is not None
+    result = stage(homography=WEDGE).process(Frame("main", 0, 0.0, np.asarray(image, np.uint8)))
+    assert result.image.shape == (320, 240, 3)
+    np.testing.assert_allclose(result.mapping.to_processed(WEDGE["from"]), WEDGE["to"], atol=1e-9)
+    # The four points lie on the gel, so no part of the result is outside the raw frame, where it is black.
+    assert result.image.max(axis=2).min() > 0

@@ -1,0 +1,73 @@
+"""Stage `smooth`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from tactflow.stages.smooth import Smooth
+
+from tactflow.engine.frame import Absent, Frame
+from tactflow.engine.stage import read_ports
+from tactflow.vision.types import Contact
+
+IMAGE = np.zeros((4, 4, 3), np.uint8)
+
+
+def frame(t: float) -> Frame:
+    return Frame("main", round(60 * t), t, IMAGE)
+
+
+def contact(x: float) -> Contact:
+    return Contact(10.0, (x, 0.0), 30.0, -0.577, np.zeros((1, 2)), None)
+
+
+def centre(result: Contact | Absent) -> float:
+    assert isinstance(result, Contact)
+    return result.center[0]
+
+
+def test_it_replaces_the_contact_and_remembers() -> None:
+    ports = read_ports(Smooth, "process")
+    assert [(port.name, port.optional) for port in ports.inputs] == [("contact", True), ("frame", False)]
+    assert [(port.name, port.optional) for port in ports.outputs] == [("contact", True)]
+    assert Smooth.memory == "stateful"
+
+
+@pytest.mark.parametrize("method", ["one_euro", "alpha_beta"])
+def test_a_jump_is_followed_gradually(method: Any) -> None:
+    stage = Smooth(Smooth.Params(method=method))
+    assert centre(stage.process(contact(0), frame(0.0))) == 0
+    assert 0 < centre(stage.process(contact(10), frame(0.02))) < 10
+
+
+def test_no_contact_stays_none_and_the_next_contact_starts_afresh() -> None:
+    stage = Smooth(Smooth.Params())
+    stage.process(contact(0), frame(0.0))
+    assert stage.process(None, frame(0.02)) == Absent("no_contact")
+    assert centre(stage.process(contact(10), frame(0.04))) == 10
+
+
+def test_reset_forgets() -> None:
+    stage = Smooth(Smooth.Params())
+    stage.process(contact(0), frame(0.0))
+    stage.reset()
+    assert centre(stage.process(contact(10), frame(0.02))) == 10
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        {"method": "kalman"},
+        {"min_cutoff": 0},
+        {"alpha": 0},
+        {"method": "alpha_beta", "alpha": 1, "beta": 3},
+        {"cutoff": 1},
+    ],
+    ids=str,
+)
+def test_wrong_parameters_are_refused(params: Any) -> None:
+    with pytest.raises(ValidationError):
+        Smooth.Params(**params)
