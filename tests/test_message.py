@@ -179,6 +179,15 @@ def test_an_infinite_standard_error_is_refused() -> None:
         encode_message(TICK, None, None, None, replace(MARKERS, stderr=np.array([np.inf, 0, 0])), detail=True)
 
 
+def test_origins_that_change_in_place_or_are_copied_are_written_as_they_are() -> None:
+    origin = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    for value in (1.0, 7.0, 1.0):
+        origin[0, 0] = value
+        for array in (origin, origin.copy()):
+            message = build_message(TICK, None, None, None, replace(MARKERS, origin=array))
+            assert message["markers"]["origin"] == [[value, 2.0], [3.0, 4.0], [5.0, 6.0]]
+
+
 def test_status_names_follow_the_enum() -> None:
     assert [STATUS_NAMES[status] for status in MarkerStatus] == ["tracked", "inferred", "lost"]
 

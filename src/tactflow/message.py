@@ -25,6 +25,8 @@ STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
 
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 
+_last_origin: tuple[bytes, orjson.Fragment] = (b"", orjson.Fragment(b"[]"))
+
 
 def encode_message(
     tick: Tick,
@@ -118,7 +120,7 @@ def _flow(flow: Flow, detail: bool) -> dict[str, Any]:
 
 def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
     result: dict[str, Any] = {
-        "origin": _points(markers.origin, "markers.origin"),
+        "origin": _origin(markers.origin),
         "position": _points(markers.position, "markers.position"),
         "status": [STATUS_NAMES[value] for value in markers.status.tolist()],
     }
@@ -129,6 +131,18 @@ def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
         # The encoder writes NaN as null.
         result["stderr"] = stderr
     return result
+
+
+def _origin(origin: NDArray[np.float64]) -> orjson.Fragment:
+    """The origins as JSON. They stay the same for a whole epoch, so the last text is kept: half of the work."""
+    global _last_origin
+    key = np.asarray(origin, np.float64).tobytes()
+    known, text = _last_origin
+    if known != key:
+        text = orjson.Fragment(orjson.dumps(_points(origin, "markers.origin"), option=_OPTIONS))
+        # One assignment, so that sinks in several threads may use it.
+        _last_origin = (key, text)
+    return text
 
 
 def _number(value: float, name: str) -> float:
@@ -149,9 +163,9 @@ def _pair(pair: tuple[float, float], name: str) -> list[float]:
 def _points(points: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     # The encoder takes contiguous arrays only.
     points = np.ascontiguousarray(points, np.float64)
-    # A sum is finite only if every summand is: one pass, no temporary. (It could overflow for finite summands
-    # only beyond 1e300, which is no pixel.)
-    if not math.isfinite(points.sum()):
+    # A sum of squares is finite only if every number is: one pass, no temporary. (It overflows for numbers
+    # beyond 1e154, which are no pixels either.)
+    if not math.isfinite(np.vdot(points, points)):
         raise ValueError(f"{name}: required finite numbers, got NaN or infinity")
     return points
 
