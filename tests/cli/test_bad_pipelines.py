@@ -274,6 +274,18 @@ CASES: dict[str, tuple[str, list[str]]] = {
         "stages:\n  capture: {use: './parts.py:Source', source: §[0]}\n" + SINK,
         ["stages.capture.source: expected text or a whole number, got a list"],
     ),
+    "wrong value in one of several mappings": (
+        HEAD + "  p: {use: './parts.py:Prepare', shift: {angle: §steep}}\n" + SINK,
+        ["stages.p.shift.angle: expected a number, got 'steep'"],
+    ),
+    "misspelled key in one of several mappings": (
+        HEAD + "  p: {use: './parts.py:Prepare', shift: {angle: 3, §angel: 4}}\n" + SINK,
+        ["stages.p.shift.angel: unknown parameter; did you mean angle?"],
+    ),
+    "scalar for one of several mappings": (
+        HEAD + "  p: {use: './parts.py:Prepare', shift: §3}\n" + SINK,
+        ["stages.p.shift: expected a mapping, got 3"],
+    ),
     "long text": (
         COMPARE + "  o: {use: './parts.py:Outline', name: §abcdefghi}\n" + SINK,
         ["at most 8 characters"],

@@ -49,15 +49,23 @@ _EXPECTED = {
 }
 
 
+_MANY = 1000
+
+
 @dataclass(slots=True)
 class _Spot:
-    """Where an error belongs: the value (None if it is not in the file), its key's place, and its name."""
+    """Where an error belongs: the value (None if it is not in the file), its key's place, and its name.
+
+    union : where a union was tried on the way, and which member of it; None without a union.
+    inside : True if the error is about a part of that member, so that the member as such was meant.
+    """
 
     item: Item | None
     mark: Mark
     key_mark: Mark
     path: str
-    unmatched: bool
+    union: tuple[str, str] | None = None
+    inside: bool = False
 
 
 def complain(
@@ -73,10 +81,10 @@ def complain(
     model : the parameters that were validated. item : the mapping they were read from. path : its name.
     other_keys : keys that may stand beside the parameters, for suggestions.
     """
-    # A union reports one error per member; together they are one mistake.
+    found = [(detail, _spot(item, path, detail)) for detail in error.errors(include_url=False)]
+    # A union of scalars reports one error per member; together they are one mistake.
     groups: dict[tuple[Mark, str], list[tuple[ErrorDetails, _Spot]]] = {}
-    for detail in error.errors(include_url=False):
-        spot = _spot(item, path, detail)
+    for detail, spot in _meant(found):
         groups.setdefault((spot.mark, spot.path), []).append((detail, spot))
     for (mark, name), members in groups.items():
         detail, spot = members[0]
@@ -90,21 +98,43 @@ def complain(
         problems.add(mark, f"{name}: {_words(members)}")
 
 
+def _meant(found: list[tuple[ErrorDetails, _Spot]]) -> list[tuple[ErrorDetails, _Spot]]:
+    """Leave out the members of unions that fit worse: another kind of value, more missing or unknown keys."""
+    misfit: dict[tuple[str, str], int] = {}
+    for detail, spot in found:
+        if spot.union is not None:
+            keys = int(detail["type"] in ("missing", "extra_forbidden"))
+            misfit[spot.union] = misfit.get(spot.union, 0) + (keys if spot.inside else _MANY)
+    least = {place: min(n for (where, _), n in misfit.items() if where == place) for place, _ in misfit}
+    return [
+        (detail, spot)
+        for detail, spot in found
+        if spot.union is None or misfit[spot.union] == least[spot.union[0]]
+    ]
+
+
 def _spot(item: Item, path: str, detail: ErrorDetails) -> _Spot:
-    spot = _Spot(item, item.mark, item.mark, path, False)
-    for part in detail["loc"]:
+    spot = _Spot(item, item.mark, item.mark, path)
+    union: tuple[str, str] | None = None
+    inside = False
+    last = len(detail["loc"]) - 1
+    for index, part in enumerate(detail["loc"]):
         content = spot.item.content if spot.item is not None else None
         if isinstance(content, dict) and part in content:
             entry = content[part]
-            spot = _Spot(entry.item, entry.item.mark, entry.mark, f"{spot.path}.{part}", False)
+            spot = _Spot(entry.item, entry.item.mark, entry.mark, f"{spot.path}.{part}")
+            inside = union is not None
         elif isinstance(content, list) and isinstance(part, int) and part < len(content):
             inner = content[part]
-            spot = _Spot(inner, inner.mark, inner.mark, f"{spot.path}.{part}", False)
-        elif detail["type"] == "missing" or spot.item is item:
-            spot = _Spot(None, spot.mark, spot.key_mark, f"{spot.path}.{part}", False)
-        else:
-            # The name of a member of a union; it is not part of the file.
-            spot.unmatched = True
+            spot = _Spot(inner, inner.mark, inner.mark, f"{spot.path}.{part}")
+            inside = union is not None
+        elif index == 0 or (index == last and detail["type"] == "missing"):
+            spot = _Spot(None, spot.mark, spot.key_mark, f"{spot.path}.{part}")
+            inside = union is not None
+        elif union is None:
+            # Not part of the file: the name of the member of a union that was tried.
+            union = (spot.path, str(part))
+    spot.union, spot.inside = union, inside
     return spot
 
 
@@ -152,15 +182,20 @@ def _choices(detail: ErrorDetails) -> list[str]:
 
 def _field_names(model: type[BaseModel], loc: Iterable[int | str]) -> list[str]:
     """Names of the fields of the (nested) model at `loc`."""
+    choices: list[type[BaseModel]] = [model]
     for part in loc:
-        field = model.model_fields.get(part) if isinstance(part, str) else None
-        inner = _model_in(field.annotation) if field is not None else None
-        if inner is not None:
-            model = inner
-    return [field.alias or name for name, field in model.model_fields.items()]
+        named = [choice for choice in choices if choice.__name__ == part]
+        fields = {
+            field.alias or key: field for choice in choices for key, field in choice.model_fields.items()
+        }
+        if named:
+            choices = named
+        elif isinstance(part, str) and part in fields:
+            choices = _models_in(fields[part].annotation)
+    return [field.alias or key for choice in choices for key, field in choice.model_fields.items()]
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((found for part in get_args(annotation) if (found := _model_in(part)) is not None), None)
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
