@@ -64,7 +64,7 @@ def test_another_seed_gives_other_frames(name: str) -> None:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_the_gel_rests_at_the_start_and_at_the_end(name: str) -> None:
-    scene = open_scene(f"{name}?dropped=0")
+    scene = open_scene(f"{name}?dropped=0&repeated=0")
     touched = in_contact(scene)
     for index in (0, 5, 29, 299):
         truth = scene.truth(index)
@@ -85,7 +85,7 @@ def test_the_gel_rests_at_the_start_and_at_the_end(name: str) -> None:
 def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
     scene = open_scene(f"{name}?frames=150")
     touched = in_contact(scene)
-    for index in touched[:: max(1, len(touched) // 5)]:
+    for index in touched[:: max(1, len(touched) // 3)]:
         truth = scene.truth(index)
         assert truth.touching == truth.contact_mask.any()
         if not truth.touching:
@@ -122,39 +122,35 @@ def test_index_i_is_the_same_marker_in_every_frame() -> None:
         np.testing.assert_array_equal(scene.truth(index).origin, origin)
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in TOUCHED if name not in ("tap", "spike", "jumps", "stutter")]
-)
+FAST = ("tap", "spike", "jumps", "stutter", "unmarked")
+
+
+@pytest.mark.parametrize("name", [name for name in TOUCHED if name not in FAST])
 def test_markers_move_smoothly_in_time(name: str) -> None:
     scene = open_scene(name)
-    pitch = scene.layout.pitch
-    touched = in_contact(scene)
-    previous = scene.truth(touched[0] - 1).position
-    largest = 0.0
-    for index in touched:
-        current = scene.truth(index).position if index % 2 == 0 else scene.truth(index, None).position
-        if index - 1 in touched or index == touched[0]:
-            largest = max(largest, float(np.hypot(*(current - previous).T).max()))
-        previous = current
-    # Half a pitch is what nearest-neighbour matching can follow; only the named hard scenes are faster.
-    assert 0 < largest < 0.5 * pitch
+    steps = [largest_step(scene, index) for index in range(28, 110)]
+    # Half a pitch is what nearest-neighbour matching can follow; only the scenes named fast are faster.
+    assert 0 < max(steps) < 0.5 * scene.layout.pitch
+
+
+def largest_step(scene: Scene, index: int) -> float:
+    """How far the fastest marker moves from frame index - 1 to frame index, px."""
+    moved = scene.markers(index)[1] - scene.markers(index - 1)[1]
+    return float(np.hypot(*moved.T).max())
 
 
 def test_jumps_are_as_large_as_promised_and_no_larger() -> None:
     scene = open_scene("jumps")
-    pitch = scene.layout.pitch
-    steps = []
-    for index in range(1, 300):
-        moved = scene.truth(index).position - scene.truth(index - 1).position
-        steps.append(float(np.hypot(*moved.T).max()) / pitch)
-    assert 0.7 < max(steps) <= 0.9 + 0.1  # 0.1: the press itself pushes the gel apart meanwhile
+    largest = max(largest_step(scene, index) for index in range(1, 300)) / scene.layout.pitch
+    assert 0.7 < largest <= 0.9 + 0.1  # 0.1: the press itself pushes the gel apart meanwhile
 
 
 def test_creep_drags_the_gel_by_two_hundredths_of_a_pixel_a_frame() -> None:
-    scene = open_scene("creep?shear=0")
-    flows = [scene.truth(index).position - scene.truth(index - 1).position for index in range(100, 200)]
-    fastest = np.hypot(*np.stack(flows).reshape(-1, 2).T).reshape(100, -1).max(axis=1)
-    np.testing.assert_allclose(fastest, 0.02, rtol=0.05)  # markers beside the contact follow it a little less
+    scene = open_scene("creep")
+    steps = [largest_step(scene, index) for index in range(100, 200)]
+    # Some marker is always within the spread of the contact, where the gel follows in full; the push apart
+    # stays with the gel under the indenter and adds nothing.
+    np.testing.assert_allclose(steps, 0.02, rtol=0.01)
 
 
 def test_a_tap_lasts_one_frame() -> None:
@@ -165,18 +161,17 @@ def test_a_tap_lasts_one_frame() -> None:
 
 def test_strong_shear_reaches_one_and_a_half_pitches() -> None:
     scene = open_scene("strong_shear")
-    largest = max(
-        float(np.hypot(*(scene.truth(i).position - scene.truth(i).origin).T).max()) for i in range(40, 120, 4)
-    )
-    assert 1.35 * scene.layout.pitch < largest < 1.75 * scene.layout.pitch
+    moved = [np.subtract(*scene.markers(index)) for index in range(40, 120, 4)]
+    largest = max(float(np.hypot(*displacement.T).max()) for displacement in moved)
+    assert 1.3 * scene.layout.pitch < largest < 1.55 * scene.layout.pitch
 
 
-@pytest.mark.parametrize("name", TOUCHED)
-def test_the_gel_never_folds_over(name: str) -> None:
-    scene = open_scene(name)
-    grid = np.stack(np.meshgrid(np.arange(-50.0, 860, 14), np.arange(-50.0, 660, 14)), axis=-1).reshape(-1, 2)
+@pytest.mark.parametrize("spec", [*TOUCHED, "press?pitch=400", "box?twist=60", "slide?shear=1.5&markers=2x2"])
+def test_the_gel_never_folds_over(spec: str) -> None:
+    scene = open_scene(spec)
+    grid = np.stack(np.meshgrid(np.arange(-50.0, 860, 18), np.arange(-50.0, 660, 18)), axis=-1).reshape(-1, 2)
     step = 0.5
-    for index in in_contact(scene)[::7]:
+    for index in in_contact(scene)[::17]:
         presses = scene.presses(index)
         columns = []
         for axis in np.eye(2):

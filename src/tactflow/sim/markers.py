@@ -54,7 +54,7 @@ def layout(
     worn : fraction that has faded to between 35 and 80 % of its contrast.
     """
     width, height = size
-    pitch = pitch or min(width / (max(columns, 1) + 0.7), height / (max(rows, 1) + 0.7))
+    pitch = pitch or min(width / ((columns or 10) + 0.7), height / ((rows or 8) + 0.7))
     radius = radius or 0.135 * pitch
     rng = np.random.default_rng([seed, 0x6D61])
     across = (np.arange(columns) - (columns - 1) / 2.0) * pitch + (width - 1) / 2.0

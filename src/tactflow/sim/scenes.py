@@ -24,6 +24,10 @@ _STEP = 2
 """The gel's surface is computed at every second pixel of the raw frame; the light on it is smooth."""
 
 
+_LARGEST_STROKE = 110.0
+"""Contacts move the gel in proportion to the markers' pitch, up to this pitch, px."""
+
+
 @dataclass(frozen=True)
 class _Recipe:
     description: str
@@ -151,9 +155,11 @@ _SCENES: dict[str, _Recipe] = {
     ),
     "stutter": _Recipe("a camera that drops and repeats frames", _PRESS, {"dropped": 0.1, "repeated": 0.1}),
     "strong_shear": _Recipe(
-        "a ball that drags the gel by 1.5 pitches",
-        motion.Programme(_sphere, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8)),
-        {"shear": 1.5},
+        "a ball that moves markers by up to 1.5 pitches",
+        motion.Programme(
+            _sphere, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2
+        ),
+        {"shear": 1.3},
     ),
 }  # fmt: skip
 
@@ -277,23 +283,28 @@ class Scene:
             in the coordinates of the processed frame, with the contact evaluated at its pixels' centres, and
             a `Preprocessor` also makes `unmarked` exactly as it makes the frame. None: raw.
         """
-        moment = self.moment(index)
-        pressed, cycle = self._contact(moment)
-        rest = self.layout.rest
-        now = rest + gel.displacement(pressed, rest)
-        visible = np.ones(len(rest), dtype=np.bool_)
-        if cycle >= 0 and pressed:
-            visible &= self._vanishing >= self.settings.vanish
+        pressed, cycle = self._contact(self.moment(index))
+        origin, position = self.markers(index)
         return measure(
             pressed,
             self.camera,
-            self.camera.to_raw(rest),
-            self.camera.to_raw(now),
-            visible,
+            origin,
+            position,
+            ~self._hidden(cycle),
             SIZE,
             mapping,
             partial(self.clean, index),
         )
+
+    def markers(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Origin and position (N, 2) of the markers in frame `index`, raw pixels: a cheap part of `truth`."""
+        rest = self.layout.rest
+        now = rest + gel.displacement(self.presses(index), rest)
+        return self.camera.to_raw(rest), self.camera.to_raw(now)
+
+    def _hidden(self, cycle: int) -> NDArray[np.bool_]:
+        """(N,): markers that cannot be seen during contact number `cycle` (-1: no contact)."""
+        return (self._vanishing < self.settings.vanish) & (cycle >= 0)
 
     def _checked(self, index: int) -> int:
         if not 0 <= index < len(self):
@@ -311,7 +322,7 @@ class Scene:
             int(self._delivered[-1]) + 1,
             seed=settings.seed,
             size=SIZE,
-            pitch=self.layout.pitch,
+            pitch=min(self.layout.pitch, _LARGEST_STROKE),
             depth=settings.depth,
             shear=settings.shear,
             twist=settings.twist,
@@ -409,10 +420,8 @@ class Scene:
                 self._shade(padded, press)
             if marked:
                 rest = self.layout.rest
-                hidden = (self._vanishing < settings.vanish) if cycle >= 0 else np.zeros(len(rest), np.bool_)
-                self._paint(
-                    padded, rest + gel.displacement(pressed, rest), np.where(hidden, 0.0, 1.0), pressed
-                )
+                shown = np.where(self._hidden(cycle), 0.0, 1.0)
+                self._paint(padded, rest + gel.displacement(pressed, rest), shown, pressed)
         half = self._half
         canvas = padded[half:-half, half:-half]
         if settings.blur:

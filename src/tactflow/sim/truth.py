@@ -61,11 +61,11 @@ def pixel_mapping(mapping: Any) -> Any:
     return getattr(mapping, "mapping", mapping)
 
 
-def principal_angle(mask: NDArray[np.bool_]) -> float | None:
-    """Direction of the larger second moment of a region, degrees in (-90, 90]; None where it has none."""
-    rows, columns = np.nonzero(mask)
-    if len(rows) < 2:
-        return None
+def principal_angle(columns: NDArray[np.int64], rows: NDArray[np.int64]) -> float | None:
+    """Direction of the larger second moment of a region, degrees in (-90, 90]; None where it has none.
+
+    columns, rows : (n,) int, x and y of the region's pixels.
+    """
     x, y = columns - columns.mean(), rows - rows.mean()
     xx, yy, xy = float(np.mean(x * x)), float(np.mean(y * y)), float(np.mean(x * y))
     if np.hypot(xx - yy, 2 * xy) <= NO_DIRECTION * (xx + yy):
@@ -90,6 +90,23 @@ def _pixel_centres(
     return np.ascontiguousarray(mapped[..., 0]), np.ascontiguousarray(mapped[..., 1]), seen
 
 
+def _window(
+    pressed: Sequence[Press], gel_x: NDArray[np.float32], gel_y: NDArray[np.float32]
+) -> tuple[int, int, int, int]:
+    """Rows and columns that hold every pixel within the reach of an indenter; empty where there is none."""
+    near = np.zeros(gel_x.shape, dtype=np.bool_)
+    for press in pressed:
+        if press.touching:
+            reach = press.shape.reach
+            near |= (np.abs(gel_x - np.float32(press.x)) < reach) & (
+                np.abs(gel_y - np.float32(press.y)) < reach
+            )
+    rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+    if not len(rows):
+        return 0, 0, 0, 0
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+
 def measure(
     pressed: Sequence[Press],
     camera: Camera,
@@ -108,14 +125,19 @@ def measure(
     to = pixel_mapping(mapping)
     gel_x, gel_y, seen = _pixel_centres(camera, size, to)
     height, width = gel_x.shape
-    mask = in_contact(pressed, gel_x, gel_y) & seen
+    mask = np.zeros((height, width), dtype=np.bool_)
+    top, bottom, left, right = _window(pressed, gel_x, gel_y)
+    part = in_contact(pressed, gel_x[top:bottom, left:right], gel_y[top:bottom, left:right])
+    part &= seen[top:bottom, left:right]
+    mask[top:bottom, left:right] = part
     center = angle = None
     hull, area = np.empty((0, 2)), 0.0
-    touching = bool(mask.any())
+    touching = bool(part.any())
     if touching:
-        rows, columns = np.nonzero(mask)
+        rows, columns = np.nonzero(part)
+        rows, columns = rows + top, columns + left
         center = (float(columns.mean()), float(rows.mean()))
-        angle = principal_angle(mask)
+        angle = principal_angle(columns, rows)
         points = np.stack([columns, rows], axis=1).astype(np.int32)
         hull = cv2.convexHull(points).reshape(-1, 2).astype(np.float64)
         area = float(cv2.contourArea(hull.astype(np.float32)))
