@@ -134,7 +134,7 @@ def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
 
 
 def _origin(origin: NDArray[np.float64]) -> orjson.Fragment:
-    """The origins as JSON. They stay the same for a whole epoch, so the last text is kept: half of the work."""
+    """The origins as JSON. They stay the same for a whole epoch, so the last text is kept: half the work."""
     global _last_origin
     key = np.asarray(origin, np.float64).tobytes()
     known, text = _last_origin
