@@ -245,9 +245,9 @@ class MarkerTracker:
             measured, gain, share, error = self._appearance.measure(flat, start, taken)
             sharp = _trusted(gain, share) & (_lengths(measured - start) < 0.6 * self._radius + 0.5)
             result[taken] = np.where(sharp[:, None], measured, start)
-            # A spot that does not look like the mark any more is still its place, to a part of its radius.
+            # A spot that hardly looks like the mark any more is still its place, to a part of its radius.
             stderr[taken] = np.where(sharp, error, 0.15 * self._radius)
-            found[taken] = True
+            found[taken] = sharp | ((gain > 0.3) & (gain < 3.0) & (share > 0.33))
         return result, found, stderr
 
     def _near(self, points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
@@ -317,7 +317,7 @@ def _lengths(vectors: FloatArray) -> FloatArray:
 
 
 def _trusted(gain: NDArray[Any], share: NDArray[Any]) -> BoolArray:
-    return np.asarray((gain > 0.3) & (gain < 3.0) & (share > 0.6), np.bool_)
+    return np.asarray((gain > 0.2) & (gain < 3.0) & (share > 0.5), np.bool_)
 
 
 def _surroundings(origin: FloatArray, pitch: float) -> tuple[IntArray, FloatArray]:
