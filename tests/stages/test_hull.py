@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from tactflow.stages.hull import Hull
 
 from tactflow.engine.frame import Absent
 from tactflow.engine.stage import read_ports
+from tactflow.stages.hull import Hull
 from tactflow.vision.types import Contact
 
 
@@ -61,6 +61,15 @@ def test_max_gap_and_method_reach_the_geometry() -> None:
     assert isinstance(seed, Contact)
     # The hull of pixel centres, as the original measured it.
     assert seed.area == 49 * 9
+
+
+def test_a_stubby_contact_has_no_direction_unless_asked_for() -> None:
+    stubby = run(bar(height=39))
+    assert isinstance(stubby, Contact)
+    assert stubby.angle is None
+    asked = run(bar(height=39), min_confidence=0)
+    assert isinstance(asked, Contact)
+    assert asked.angle == 0.0
 
 
 @pytest.mark.parametrize(

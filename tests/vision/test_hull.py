@@ -346,6 +346,19 @@ def test_specks_below_min_area_do_not_count() -> None:
     assert described(mask, min_area=9).hull.max() == 132
 
 
+def test_stubby_regions_have_no_direction_where_confidence_is_asked_for() -> None:
+    mask = ellipse_mask((70, 60), (60, 40), 30)
+    assert described(mask).angle is not None
+    # An axis ratio of 1.5 has a confidence of 1.25 / 3.25 = 0.385.
+    assert described(mask, min_confidence=0.35).angle is not None
+    stubby = described(mask, min_confidence=0.42)
+    assert stubby.angle is None
+    assert stubby.slope is None
+    assert stubby.ellipse is not None
+    assert stubby.ellipse.angle is None
+    assert stubby.confidence == described(mask).confidence
+
+
 def test_a_hole_belongs_to_the_hull_and_to_the_blob_size_but_not_to_the_region() -> None:
     mask = blank()
     mask[20:40, 20:40] = 255
@@ -419,6 +432,8 @@ def test_a_large_frame_loses_no_precision() -> None:
         (np.zeros((3, 3), np.uint8), {"min_area": math.nan}, "min_area"),
         (np.zeros((3, 3), np.uint8), {"max_gap": -1}, "max_gap"),
         (np.zeros((3, 3), np.uint8), {"max_gap": math.nan}, "max_gap"),
+        (np.zeros((3, 3), np.uint8), {"min_confidence": 1.1}, "min_confidence"),
+        (np.zeros((3, 3), np.uint8), {"min_confidence": math.nan}, "min_confidence"),
     ],
 )
 def test_bad_input_is_refused_with_a_reason(mask: Any, kwargs: dict[str, Any], message: str) -> None:
