@@ -1,0 +1,185 @@
+"""View: the run, live, on a page in the browser."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import time
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from pydantic import Field, model_validator
+
+from tactflow.engine.control import Control
+from tactflow.engine.frame import Tick
+from tactflow.engine.stage import StageParams
+from tactflow.message import encode_message
+from tactflow.ports import Image
+from tactflow.view.address import address, bind, is_loopback
+from tactflow.vision.types import Contact, Flow, Markers
+
+if TYPE_CHECKING:
+    from tactflow.view.hub import Hub
+    from tactflow.view.server import Server
+
+log = logging.getLogger("tactflow")
+
+NEEDED = ("starlette", "uvicorn", "websockets")
+
+
+class View:
+    """Serves a page that draws the results over the processed frame, and can pause and end the run.
+
+    While no page is open, or none is ready for another frame, nothing is wanted and nothing is encoded. A
+    view that cannot be shown is reported once and never stops a run.
+    """
+
+    threaded = True
+    when_live = "latest"
+    observer = True
+
+    class Params(StageParams):
+        """Where the page is served, and how much it shows."""
+
+        host: str = Field(
+            "127.0.0.1",
+            min_length=1,
+            description="address of this machine to serve on; any but loopback needs a token, and sends it "
+            "unencrypted (from afar, ssh -L 8765:localhost:8765 is safer)",
+        )
+        port: int = Field(
+            8765, ge=0, le=65535, description="port; the next free one where it is taken; 0 picks any"
+        )
+        token: str | None = Field(
+            None,
+            min_length=16,
+            pattern=r"^[A-Za-z0-9_.~-]+$",
+            description="a secret that a page must show, as in http://HOST:PORT/?token=...",
+        )
+        max_fps: float = Field(
+            30.0, gt=0, le=240, description="frames shown a second; more is smoother and costs more"
+        )
+        quality: int = Field(
+            85, ge=1, le=100, description="of the JPEG pictures; higher is sharper and larger"
+        )
+        max_size: int = Field(
+            1280, ge=64, description="larger pictures are reduced to this length of their longer side, px"
+        )
+        open_browser: bool = Field(False, description="open the page in the desktop's browser")
+
+        @model_validator(mode="after")
+        def _guarded(self) -> View.Params:
+            if self.token is None and not is_loopback(self.host):
+                raise ValueError(
+                    f"host {self.host} can be reached from other machines, so a token is required: set token "
+                    "to 16 or more letters and digits that nobody guesses, or host to 127.0.0.1"
+                )
+            return self
+
+    def __init__(
+        self,
+        params: Params,
+        sensor: str = "main",
+        directory: Path | None = None,
+        control: Control | None = None,
+    ) -> None:
+        """Prepare; nothing is served yet.
+
+        Parameters
+        ----------
+        sensor : names the tab.
+        control : handle on the run, for the statistics and the buttons.
+        """
+        del directory
+        self.params = params
+        self.description: str | None = None
+        self._sensor = sensor
+        self._control = control
+        self._hub: Hub | None = None
+        self._server: Server | None = None
+        self._interval = 1.0 / params.max_fps
+        self._due = float("-inf")
+        self._encoded = 0
+
+    def open(self) -> None:
+        """Serve the page; afterwards `description` is its address, or None if it cannot be served."""
+        missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+        if missing:
+            log.warning(
+                "view: not shown, because %s is not installed: pip install 'tactflow[view]'; "
+                "--set sinks.view=null leaves the view out",
+                " and ".join(missing),
+            )
+            return
+        from tactflow.view.hub import Hub
+        from tactflow.view.server import Server
+
+        p = self.params
+        try:
+            listener = bind(p.host, p.port)
+        except OSError as error:
+            log.warning("view: not shown, because %s:%d cannot be served: %s", p.host, p.port, error)
+            return
+        port = listener.getsockname()[1]
+        if p.port not in (0, port):
+            log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
+        self._hub = Hub(self._control, self._sensor)
+        self._server = Server(self._hub, listener, p.host, p.token)
+        self._server.start()
+        self.description = address(p.host, port)
+        with_token = self.description + (f"?token={p.token}" if p.token else "")
+        log.info("view: %s", with_token)
+        if p.open_browser:
+            webbrowser.open(with_token)
+
+    def wants(self) -> bool:
+        """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""
+        hub = self._hub
+        return hub is not None and hub.wanted and time.perf_counter() >= self._due
+
+    def counters(self) -> dict[str, int]:
+        """encoded : pictures made; and those of `Hub.counters`."""
+        return {"encoded": self._encoded} | ({} if self._hub is None else self._hub.counters())
+
+    def write(
+        self,
+        tick: Tick,
+        image: Image | None,
+        contact: Contact | None,
+        flow: Flow | None,
+        markers: Markers | None,
+    ) -> None:
+        """Send the plain picture and the result message; the page draws one over the other."""
+        # What was wanted a moment ago may have become too much meanwhile.
+        if self._hub is None or not self.wants():
+            return
+        now = time.perf_counter()
+        # Counted from when it was due, so that an uneven source does not lower the rate.
+        self._due = max(self._due + self._interval, now - self._interval)
+        frame = tick.frame
+        message = encode_message(tick, image, contact, flow, markers, detail=True)
+        jpeg = self._encode(frame.image if image is None else image)
+        latency = (now - frame.captured) * 1000 if frame.captured else -1.0
+        header = b'{"latency_ms":%.3f,"epoch":%d,"message":%b' % (latency, frame.epoch, message)
+        self._hub.publish(header, jpeg, frame.captured)
+
+    def _encode(self, image: Image) -> bytes:
+        height, width = image.shape[:2]
+        factor = self.params.max_size / max(height, width)
+        if factor < 1:
+            size = (max(1, round(width * factor)), max(1, round(height * factor)))
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        done, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, self.params.quality))
+        if not done:
+            raise ValueError(f"required an image that JPEG can hold, got {image.shape} {image.dtype}")
+        self._encoded += 1
+        return jpeg.tobytes()
+
+    def close(self) -> None:
+        """Tell the pages that the run has ended, and serve no more."""
+        server, self._server = self._server, None
+        if server is not None:
+            server.close()

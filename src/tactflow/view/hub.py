@@ -1,0 +1,382 @@
+"""Who is watching a run, and what each page is sent when.
+
+Every page has credit for one frame: the next one leaves only after the page said that it drew the last. So a
+slow page gets fewer frames, never older ones, and slows nobody else. While no page has credit, the hub wants
+nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+import orjson
+
+from tactflow.engine.control import Control
+from tactflow.engine.stats import Durations
+
+log = logging.getLogger("tactflow")
+
+STATS_SECONDS = 0.5
+"""How often pages are told the statistics of the run."""
+
+STALE_SECONDS = 1.0
+"""A picture older than this is not shown to a page that has just opened, unless the run is paused."""
+
+MAX_PAGES = 16
+"""More pages than this at a time are turned away."""
+
+
+class Wire(Protocol):
+    """The connection to one page, as far as the hub uses it."""
+
+    async def send_text(self, data: str) -> None:
+        """Send a text message; waits while the connection is full."""
+
+    async def send_bytes(self, data: bytes) -> None:
+        """Send a binary message; waits while the connection is full."""
+
+    async def receive_text(self) -> str:
+        """The next text message of the page; raises when the connection has ended."""
+
+    async def close(self, code: int, reason: str) -> None:
+        """End the connection."""
+
+
+class Packet(NamedTuple):
+    """A frame as it is sent. number : counts from 1. captured : `time.perf_counter` at its capture, s."""
+
+    number: int
+    data: bytes
+    captured: float
+    published: float
+
+
+class BadCommandError(Exception):
+    """A page asked for something that does not exist, or that is not possible now; says why."""
+
+
+class Page:
+    """One open page."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.wire = wire
+        self.credit = True
+        self.sent = 0
+        self.captured = 0.0
+        self.sent_at = 0.0
+        self.screen_s: deque[float] = deque(maxlen=64)
+        # The newest message of each kind: a page that does not read makes nothing pile up.
+        self.texts: dict[str, str] = {}
+        self.wake = asyncio.Event()
+        self.ended = False
+
+    def post(self, kind: str, text: str) -> None:
+        """Have a text message sent, in place of an unsent one of the same kind."""
+        self.texts[kind] = text
+        self.wake.set()
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the last frame is overdue: the page is hidden, or its connection is slow."""
+        return not self.credit and time.perf_counter() - self.sent_at > 2 * STATS_SECONDS
+
+
+class Hub:
+    """The pages that are open now. All but `publish`, `wanted` and `counters` belong to the server's loop.
+
+    Parameters
+    ----------
+    control : handle on the run; None shows frames without any control over it.
+    sensor : name of the sensor this run serves.
+    """
+
+    def __init__(self, control: Control | None, sensor: str) -> None:
+        self.control = control
+        self.sensor = sensor
+        self.run_id = secrets.token_hex(8)
+        self.wanted = False
+        self.pages: set[Page] = set()
+        self._someone = asyncio.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._latest: Packet | None = None
+        self._number = 0
+        self._sent = 0
+        self._screen = Durations()
+        self._end: str | None = None
+        self._commands: Mapping[str, Callable[[Any], Any]] = {
+            "pause": self._pause,
+            "step": self._step,
+            "reference": self._reference,
+            "record": self._record,
+            "stop": self._stop,
+        }
+
+    # -- from other threads -------------------------------------------------------------------------------
+
+    def attach(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Tell which loop serves the pages."""
+        self._loop = loop
+
+    def publish(self, header: bytes, jpeg: bytes, captured: float) -> None:
+        """Offer a frame to every page. From one thread, any; never waits.
+
+        Parameters
+        ----------
+        header : JSON object that describes the frame, without its last brace.
+        jpeg : the picture.
+        captured : `time.perf_counter` at its capture, s.
+        """
+        self._number += 1
+        header = header + b',"number":%d}' % self._number
+        # A little-endian length, the JSON header, the picture.
+        data = struct.pack("<I", len(header)) + header + jpeg
+        packet = Packet(self._number, data, captured, time.perf_counter())
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._take, packet)
+
+    def counters(self) -> dict[str, int]:
+        """pages : open now. sent : frames, over all pages. screen_*_ms : from capture to the page's reply
+        that it is drawn, so an upper bound of what the eye waits for."""
+        result = {"pages": len(self.pages), "sent": self._sent}
+        for name, q in (("p50", 0.5), ("p99", 0.99)):
+            value = self._screen.quantile(q)
+            if value is not None:
+                result[f"screen_{name}_ms"] = round(value * 1000)
+        return result
+
+    # -- the life of a page -------------------------------------------------------------------------------
+
+    async def serve(self, wire: Wire) -> None:
+        """Look after a page until it goes away or the run ends."""
+        page = Page(wire)
+        page.post("hello", _text(type="hello", run=self.run_id, sensors=[self.sensor]))
+        page.post("state", self.state())
+        if self._latest is not None and not self._fresh(self._latest):
+            self._latest = None
+        self.pages.add(page)
+        self._someone.set()
+        self._recount()
+        page.wake.set()
+        sender = asyncio.create_task(self._send(page))
+        reader = asyncio.create_task(self._read(page))
+        try:
+            await asyncio.wait((sender, reader), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self.pages.discard(page)
+            self._recount()
+            if not self.pages:
+                self._someone.clear()
+            for task in (sender, reader):
+                task.cancel()
+            await asyncio.gather(sender, reader, return_exceptions=True)
+
+    async def report(self) -> None:
+        """Tell the pages the statistics of the run, again and again, while there are pages."""
+        while True:
+            await self._someone.wait()
+            self.tell_stats()
+            await asyncio.sleep(STATS_SECONDS)
+
+    def end(self) -> None:
+        """The run is over: tell every page how it ended and let it go."""
+        snapshot = self._snapshot()
+        self._end = str(snapshot.get("end", "eos"))
+        for page in self.pages:
+            page.post("stats", _text(type="stats", sensor=self.sensor, screen_ms=None, run=snapshot))
+            page.post("state", self.state())
+            page.ended = True
+
+    def tell_state(self) -> None:
+        """Tell every page what can be done now."""
+        text = self.state()
+        for page in self.pages:
+            page.post("state", text)
+
+    def tell_stats(self) -> None:
+        """Tell the pages that keep up the statistics so far, and what may have changed beside them."""
+        listeners = [page for page in self.pages if not page.stuck]
+        if not listeners:
+            return
+        snapshot = self._snapshot()
+        state = self.state()
+        for page in listeners:
+            delays = sorted(page.screen_s)
+            median = delays[len(delays) // 2] * 1000 if delays else None
+            page.screen_s.clear()
+            page.post("stats", _text(type="stats", sensor=self.sensor, screen_ms=median, run=snapshot))
+            page.post("state", state)
+
+    def state(self) -> str:
+        """The message that says what the run is doing, and which buttons work (null) or why not."""
+        control = self.control
+        source = getattr(control, "source", None)
+        recorder = find_recorder(control)
+        return _text(
+            type="state",
+            sensor=self.sensor,
+            paused=bool(control and control.paused),
+            recording=bool(recorder is not None and recorder.recording),
+            end=self._end,
+            source={
+                "description": _words(source, "description"),
+                "live": bool(getattr(source, "live", False)),
+                "total": getattr(source, "total", None),
+                "state": _words(source, "state"),
+            },
+            refused={name: self._refusal(name) for name in self._commands},
+        )
+
+    # -- inside the loop ----------------------------------------------------------------------------------
+
+    def _take(self, packet: Packet) -> None:
+        self._latest = packet
+        for page in self.pages:
+            if page.credit:
+                page.wake.set()
+
+    def _fresh(self, packet: Packet) -> bool:
+        paused = self.control is not None and self.control.paused
+        return paused or time.perf_counter() - packet.published < STALE_SECONDS
+
+    def _recount(self) -> None:
+        self.wanted = any(page.credit for page in self.pages)
+
+    async def _send(self, page: Page) -> None:
+        while True:
+            await page.wake.wait()
+            page.wake.clear()
+            while page.texts:
+                kind = next(iter(page.texts))
+                await page.wire.send_text(page.texts.pop(kind))
+            if page.ended:
+                await page.wire.close(1001, "the run has ended")
+                return
+            packet = self._latest
+            if page.credit and packet is not None and packet.number > page.sent:
+                page.credit = False
+                page.sent = packet.number
+                page.captured = packet.captured
+                page.sent_at = time.perf_counter()
+                self._sent += 1
+                self._recount()
+                await page.wire.send_bytes(packet.data)
+
+    async def _read(self, page: Page) -> None:
+        while True:
+            try:
+                message = orjson.loads(await page.wire.receive_text())
+            except orjson.JSONDecodeError:
+                message = None
+            if not isinstance(message, dict):
+                await page.wire.close(1008, "required a JSON object")
+                return
+            if "ack" in message:
+                self._acknowledged(page, message)
+            else:
+                await self._command(page, message)
+
+    def _acknowledged(self, page: Page, message: Mapping[str, Any]) -> None:
+        if message["ack"] != page.sent or page.credit:
+            return
+        # A hidden page draws nothing until it is looked at again: that is no delay.
+        if message.get("late") is not True and page.captured > 0:
+            delay = time.perf_counter() - page.captured
+            page.screen_s.append(delay)
+            self._screen.add(delay)
+        page.credit = True
+        self._recount()
+        page.wake.set()
+
+    async def _command(self, page: Page, message: Mapping[str, Any]) -> None:
+        name = message.get("do")
+        try:
+            if not isinstance(name, str) or name not in self._commands:
+                raise BadCommandError(f"there is no command {name!r}")
+            refusal = self._refusal(name)
+            if refusal is not None:
+                raise BadCommandError(refusal)
+            # Starting or ending a recording may touch the disk; the other commands return at once.
+            await asyncio.to_thread(self._commands[name], message.get("value"))
+        except Exception as error:
+            if not isinstance(error, BadCommandError):
+                log.warning("view: %s failed: %s: %s", name, type(error).__name__, error)
+            page.post("note", _text(type="note", text=str(error) or type(error).__name__))
+        self.tell_state()
+
+    def _refusal(self, name: str) -> str | None:
+        """Why a command is not possible now, or None."""
+        control = self.control
+        if control is None or self._end is not None:
+            return "the run cannot be controlled" if control is None else "the run has ended"
+        source = control.source
+        if name == "step":
+            if getattr(source, "live", False):
+                return "a live source cannot be stepped"
+            return None if control.paused else "pause first"
+        if name == "reference" and not hasattr(source, "retake"):
+            return "this source cannot take a new reference"
+        if name == "record" and find_recorder(control) is None:
+            return "no record sink in this pipeline"
+        return None
+
+    def _pause(self, value: Any) -> None:
+        assert self.control is not None
+        self.control.pause(value is True)
+
+    def _step(self, _: Any) -> None:
+        assert self.control is not None
+        self.control.step()
+
+    def _reference(self, _: Any) -> None:
+        assert self.control is not None
+        self.control.retake_reference()
+
+    def _record(self, value: Any) -> None:
+        recorder = find_recorder(self.control)
+        if recorder is not None:
+            if value is True:
+                recorder.start_recording()
+            else:
+                recorder.stop_recording()
+
+    def _stop(self, _: Any) -> None:
+        assert self.control is not None
+        self.control.stop()
+
+    def _snapshot(self) -> dict[str, Any]:
+        if self.control is None:
+            return {}
+        try:
+            return dict(self.control.snapshot())
+        except RuntimeError:
+            # The run is still opening its sinks: its tables grew while they were read. The next one is whole.
+            return {}
+
+
+def find_recorder(control: Control | None) -> Any:
+    """The sink of the run that can start and stop recording, or None.
+
+    It has the methods `start_recording` and `stop_recording` and the attribute `recording`.
+    """
+    wanted = ("start_recording", "stop_recording", "recording")
+    for node in list(getattr(control, "nodes", {}).values()):
+        instance = getattr(node, "instance", None)
+        if all(hasattr(instance, name) for name in wanted):
+            return instance
+    return None
+
+
+def _words(thing: Any, name: str) -> str | None:
+    value = getattr(thing, name, None)
+    return value if isinstance(value, str) else None
+
+
+def _text(**fields: Any) -> str:
+    return orjson.dumps(fields, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY).decode()

@@ -1,0 +1,85 @@
+// The WebSocket to the run: decodes what comes, answers for each frame, and finds the run again when it is lost.
+
+const DELAYS = [0.3, 0.7, 1.5, 3, 5];  // s between attempts; the last one repeats
+const WRONG_TOKEN = 4401;
+
+export class Connection {
+  // on: { hello, state, stats, note, frame(header, blob), open, lost(secondsToNextAttempt), refused(reason) }
+  constructor(on) {
+    this.on = on;
+    this.attempt = 0;
+    this.token = takeToken();
+    this.connect();
+    document.addEventListener("visibilitychange", () => document.hidden || this.retryNow());
+  }
+
+  connect() {
+    clearTimeout(this.timer);
+    const query = this.token ? `?token=${encodeURIComponent(this.token)}` : "";
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}/live${query}`);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = (event) => {
+      if (typeof event.data === "string") {
+        const message = JSON.parse(event.data);
+        if (message.type === "hello") {
+          this.attempt = 0;
+          this.on.open();
+        }
+        this.on[message.type]?.(message);
+      } else {
+        this.on.frame(...decode(event.data));
+      }
+    };
+    socket.onclose = (event) => {
+      if (this.socket !== socket) return;
+      this.socket = null;
+      if (event.code === WRONG_TOKEN) {
+        this.on.refused("token");
+      } else {
+        const delay = DELAYS[Math.min(this.attempt++, DELAYS.length - 1)];
+        this.timer = setTimeout(() => this.connect(), delay * 1000);
+        this.on.lost(delay, event.reason);
+      }
+    };
+    this.socket = socket;
+  }
+
+  // Skip the rest of the wait, if one is under way.
+  retryNow() {
+    if (this.socket === null) this.connect();
+  }
+
+  useToken(token) {
+    this.token = token;
+    sessionStorage.setItem("tactflow-token", token);
+    this.retryNow();
+  }
+
+  send(message) {
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  command(name, value = null) {
+    this.send({ do: name, value });
+  }
+}
+
+// A token in the address is kept for this tab only, and leaves the address bar.
+function takeToken() {
+  const url = new URL(location.href);
+  const token = url.searchParams.get("token");
+  if (token) {
+    sessionStorage.setItem("tactflow-token", token);
+    url.searchParams.delete("token");
+    history.replaceState(null, "", url);
+  }
+  return token ?? sessionStorage.getItem("tactflow-token");
+}
+
+// A little-endian length, a JSON header of that length, a JPEG picture.
+function decode(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  return [header, new Blob([new Uint8Array(buffer, 4 + length)], { type: "image/jpeg" })];
+}

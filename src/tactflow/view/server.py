@@ -1,0 +1,249 @@
+"""HTTP and WebSocket for the live view, on a thread of its own.
+
+Serves a handful of fixed files and one WebSocket. What it refuses: requests under a host name that is not
+ours (a foreign name that was made to point here), WebSockets opened by other pages, and, where a token is
+set, WebSockets without it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import logging
+import socket
+import threading
+from importlib import resources
+from urllib.parse import parse_qs, urlsplit
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from tactflow.view.address import LOOPBACK_NAMES, WILDCARDS, bracketed
+from tactflow.view.hub import MAX_PAGES, Hub
+
+log = logging.getLogger("tactflow")
+
+START_SECONDS = 10.0
+CLOSE_SECONDS = 3.0
+"""How long the server may take to start, and to end."""
+
+WRONG_TOKEN = 4401
+TOO_MANY = 4429
+"""WebSocket close codes of our own: the page must be told why, and a refused handshake tells it nothing."""
+
+TYPES = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+
+
+class Server:
+    """Serves the page and the hub's messages on a listening socket, which it owns from now on.
+
+    Parameters
+    ----------
+    host : the name or address that was configured; requests must be addressed to it or to loopback.
+    token : what a page must show to be let in; None lets in every page of our own.
+    """
+
+    def __init__(self, hub: Hub, listener: socket.socket, host: str, token: str | None) -> None:
+        self.hub = hub
+        self.token = token
+        self._listener = listener
+        self._files = _load_files()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ready = threading.Event()
+        app = Starlette(
+            routes=[WebSocketRoute("/live", self._live), Route("/{path:path}", self._file, methods=["GET"])]
+        )
+        config = uvicorn.Config(
+            _Guard(app, host),
+            loop="asyncio",
+            http="h11",
+            ws="websockets-sansio",
+            # Commands are short; pictures are compressed already.
+            ws_max_size=4096,
+            ws_per_message_deflate=False,
+            lifespan="off",
+            log_config=None,
+            log_level="critical",
+            access_log=False,
+            proxy_headers=False,
+            server_header=False,
+            timeout_graceful_shutdown=1,
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._run, name="tactflow-view-server", daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve; returns when requests are answered."""
+        self._thread.start()
+        self._ready.wait(START_SECONDS)
+
+    def close(self) -> None:
+        """Tell the pages that the run has ended, and stop serving; takes at most `CLOSE_SECONDS`."""
+        loop = self._loop
+        if loop is not None and self._thread.is_alive():
+            try:
+                asyncio.run_coroutine_threadsafe(self._end(), loop)
+            except RuntimeError:
+                # It ended by itself in this moment.
+                return
+            self._thread.join(CLOSE_SECONDS)
+            if self._thread.is_alive():
+                log.warning("view: the server did not end within %g s; it is left behind", CLOSE_SECONDS)
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except Exception as error:
+            log.warning("view: the server has failed: %s: %s", type(error).__name__, error)
+        finally:
+            self._listener.close()
+            self._ready.set()
+
+    async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self.hub.attach(self._loop)
+        self._ready.set()
+        reporter = asyncio.create_task(self._report())
+        try:
+            await self._server.serve(sockets=[self._listener])
+        finally:
+            reporter.cancel()
+
+    async def _report(self) -> None:
+        try:
+            await self.hub.report()
+        except Exception as error:
+            log.warning("view: no more statistics: %s: %s", type(error).__name__, error)
+
+    async def _end(self) -> None:
+        self.hub.end()
+        # A page that reads needs a moment for the last message; one that does not read is not waited for.
+        for _ in range(25):
+            if not self.hub.pages:
+                break
+            await asyncio.sleep(0.02)
+        self._server.should_exit = True
+
+    async def _file(self, request: Request) -> Response:
+        name = request.path_params["path"] or "index.html"
+        content = self._files.get(name)
+        if content is None:
+            return PlainTextResponse("there is no such page\n", 404)
+        return Response(content, media_type=TYPES[name.rpartition(".")[2]])
+
+    async def _live(self, websocket: WebSocket) -> None:
+        if not _same_origin(websocket.headers):
+            await websocket.close(1008)
+            return
+        await websocket.accept()
+        if not self._admits(websocket):
+            # Guessing is slow.
+            await asyncio.sleep(0.5)
+            await websocket.close(WRONG_TOKEN, "token required")
+        elif len(self.hub.pages) >= MAX_PAGES:
+            await websocket.close(TOO_MANY, f"more than {MAX_PAGES} pages are open")
+        else:
+            await self.hub.serve(_Wire(websocket))
+
+    def _admits(self, websocket: WebSocket) -> bool:
+        if self.token is None:
+            return True
+        shown = parse_qs(websocket.url.query).get("token", [""])[0]
+        return hmac.compare_digest(shown.encode(), self.token.encode())
+
+
+class _Wire:
+    """A WebSocket that ends quietly, whichever side ends it."""
+
+    def __init__(self, websocket: WebSocket) -> None:
+        self._websocket = websocket
+        self.receive_text = websocket.receive_text
+        self.send_text = websocket.send_text
+        self.send_bytes = websocket.send_bytes
+
+    async def close(self, code: int, reason: str) -> None:
+        if self._websocket.application_state is WebSocketState.CONNECTED:
+            with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+                await self._websocket.close(code, reason)
+
+
+class _Guard:
+    """Refuses requests under names that are not ours, and puts security headers on every answer."""
+
+    def __init__(self, app: ASGIApp, host: str) -> None:
+        self._app = app
+        wildcard = host in WILDCARDS
+        # On all interfaces our names cannot be known; there a token is required, and it protects.
+        self._names = None if wildcard else LOOPBACK_NAMES | {bracketed(host).lower()}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        host = Headers(scope=scope).get("host", "")
+        if self._names is not None and _name_of(host) not in self._names:
+            if scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": 1008})
+            else:
+                text = "this address is not known here; open the one that tactflow printed\n"
+                await PlainTextResponse(text, 421)(scope, receive, send)
+            return
+        policy = (
+            "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+            f"connect-src 'self' ws://{host} wss://{host}; base-uri 'none'; form-action 'none'; "
+            "frame-ancestors 'none'"
+        )
+        added = [
+            (b"content-security-policy", policy.encode("latin-1")),
+            (b"x-content-type-options", b"nosniff"),
+            (b"referrer-policy", b"no-referrer"),
+            (b"cross-origin-resource-policy", b"same-origin"),
+            (b"cross-origin-opener-policy", b"same-origin"),
+            (b"cache-control", b"no-store"),
+        ]
+
+        async def send_guarded(message: object) -> None:
+            assert isinstance(message, dict)
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message.get("headers", []), *added]
+            await send(message)
+
+        await self._app(scope, receive, send_guarded)
+
+
+def _load_files() -> dict[str, bytes]:
+    """Everything the page may ask for, read once: no request reaches the file system."""
+    folder = resources.files("tactflow.view") / "page"
+    return {
+        item.name: item.read_bytes()
+        for item in folder.iterdir()
+        if item.name.rpartition(".")[2] in TYPES and item.is_file()
+    }
+
+
+def _same_origin(headers: Headers) -> bool:
+    """Whether a WebSocket was opened by our own page; browsers always say by which."""
+    origin, host = headers.get("origin", ""), headers.get("host", "")
+    try:
+        parts = urlsplit(origin)
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower() != ""
+
+
+def _name_of(host: str) -> str:
+    """The name in a Host header, lower case, without the port."""
+    name, separator, port = host.rpartition(":")
+    return (name if separator and port.isdigit() else host).lower()
