@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from tactflow.bench.metrics import lattice_area
-from tactflow.bench.score import ContactScore, DetectionScore, FlowScore, MarkerScore, RemovalScore
+from tactflow.bench.score import (
+    ContactScore,
+    DetectionScore,
+    FlowScore,
+    MarkerScore,
+    RemovalScore,
+    aspect_ratio,
+)
 from tactflow.sim import Truth, open_scene
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
@@ -185,3 +192,21 @@ def test_removal_is_judged_inside_the_mask_only() -> None:
     score = RemovalScore()
     score.add(image, true, 255 - mask)
     assert score.errors()["inpaint_mae"] == 0
+
+
+def test_the_ratio_of_axes_is_that_of_a_rectangle() -> None:
+    mask = np.zeros((100, 100), bool)
+    mask[10:20, 10:50] = True
+    # The variance of a block of n pixels with their own extent is n^2 / 12: the ratio is exact.
+    assert aspect_ratio(mask) == pytest.approx(4)
+    assert aspect_ratio(np.zeros((5, 5))) == 1
+
+
+def test_the_direction_of_a_nearly_round_contact_is_not_judged(truth: Truth) -> None:
+    mask = np.zeros_like(truth.contact_mask)
+    mask[10:20, 10:25] = True
+    score = ContactScore()
+    score.geometry(replace(perfect(truth), angle=None), replace(truth, contact_mask=mask))
+    assert "angle_missing" not in score.errors()
+    score.geometry(replace(perfect(truth), angle=None), truth)
+    assert score.errors()["angle_missing"] == 100

@@ -25,6 +25,7 @@ from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.stage import StageParams
 from tactflow.sim import Truth
+from tactflow.vision.geometry import PixelMapping
 
 SEED = "seed"
 """The name of the pipeline that is the yardstick."""
@@ -114,7 +115,7 @@ def frames_of(rendered: Rendered, references: int = 1) -> Iterator[Frame]:
         yield Frame("bench", index, index / rendered.scene.fps, image, reference=index < references)
 
 
-def _chain(pipeline: Pipeline, rendered: Rendered) -> list[_Inputs]:
+def _chain(pipeline: Pipeline, rendered: Rendered) -> tuple[list[_Inputs], PixelMapping]:
     """Run the default pipeline's stages by hand and keep everything in between."""
     stage = {
         node.component.name: node.component.cls(node.params)
@@ -139,7 +140,7 @@ def _chain(pipeline: Pipeline, rendered: Rendered) -> list[_Inputs]:
         markers = run("tracker", image=image, frame=frame)
         deep = rendered.deep(index)
         collected.append(_Inputs(frame, truths[index], deep, image, mask, unmarked, markers))
-    return collected
+    return collected, mapping
 
 
 @dataclass(slots=True)
@@ -213,12 +214,17 @@ def measure_methods(
     rendered : the scene. unit : measured along the way. step : called once per stage.
     """
     default = next(iter(pipelines.values()))
-    inputs = _chain(default, rendered)
+    inputs, mapping = _chain(default, rendered)
+    limit = rendered.displacement_limit(mapping)
     measurements: list[Measurement] = []
     for group in _GROUPS:
         ways = alternatives(pipelines, group.stage)
         if len(ways) > 1 or (ways and group.stage in ("hull", "tracker")):
-            measurements += _measure_group(group, ways, inputs, rendered, unit)
+            made = _measure_group(group, ways, inputs, rendered, unit)
+            if group.stage == "tracker" and limit is not None:
+                for measurement in made:
+                    measurement.limits["displacement_rms"] = limit
+            measurements += made
         step()
     return measurements
 

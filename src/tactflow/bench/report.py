@@ -14,7 +14,7 @@ from html import escape
 from statistics import median
 
 from tactflow.bench.quantities import QUANTITIES, Quantity
-from tactflow.bench.results import Measurement, Result
+from tactflow.bench.results import RECORDING, Measurement, Result
 
 TITLES = {
     "pipeline": "Whole pipelines",
@@ -309,7 +309,8 @@ def _place_label(text: str, x: float, y: float, taken: Sequence[_Box]) -> tuple[
     return best[1], best[2], best[3]
 
 
-def _limit_of(result: Result, group: str, quantity: Quantity) -> float | None:
+def limit_of(result: Result, group: str, quantity: Quantity) -> float | None:
+    """Median over the scenes of the smallest error that physics allows, or None where it is not known."""
     limits = [m.limits[quantity.key] for m in result.of(group) if quantity.key in m.limits]
     return median(limits) if limits else None
 
@@ -379,16 +380,18 @@ def _answers(result: Result) -> str:
                 ]
                 row += [_value_with_worst(result, group, point.method, other) for other in others]
                 rows.append(row)
-            header = ["method", "", "copies", "ms", _heading(quantity), *map(_heading, others)]
+            header = ["method", "", "copies", "ms"]
+            header += [_heading(q, limit_of(result, group, q)) for q in (quantity, *others)]
             heading = escape(TITLES.get(group, group))
             parts.append(f"<h3>{heading}</h3>" + _table(header, rows, numeric_from=2))
             break
     return "".join(parts)
 
 
-def _heading(quantity: Quantity) -> str:
+def _heading(quantity: Quantity, limit: float | None = None) -> str:
     unit = f" ({quantity.unit})" if quantity.unit else ""
-    return escape(quantity.title + unit)
+    bound = f' <span class="limit">limit {format_number(limit)}</span>' if limit else ""
+    return escape(quantity.title + unit) + bound
 
 
 def _value_with_worst(result: Result, group: str, method: str, quantity: Quantity) -> str:
@@ -430,7 +433,7 @@ def _plots(result: Result) -> str:
                 name not in PRIMARY.get(group, ()) and not any(p.high for p in candidates)
             ):
                 continue
-            limit = _limit_of(result, group, quantity)
+            limit = limit_of(result, group, quantity)
             floor = result.touch_ms / result.copy_ms if group == "pipeline" else None
             figures.append(
                 f"<figure><figcaption>{escape(quantity.title)}</figcaption>"
@@ -476,6 +479,36 @@ def _everything(result: Result) -> str:
     return "".join(parts)
 
 
+def _where_time_goes(result: Result) -> str:
+    """Per pipeline, how much of a frame's time each stage takes."""
+    parts = []
+    for method in result.methods("pipeline"):
+        rows = [m for m in result.of("pipeline", method) if m.stages_ms and "contact" in m.time]
+        rows = [m for m in rows if not m.scene.startswith(RECORDING)]
+        if not rows:
+            continue
+        names = list(dict.fromkeys(name for m in rows for name in m.stages_ms))
+        times = {n: median(m.stages_ms[n] for m in rows if n in m.stages_ms) for n in names}
+        longest = max(times.values())
+        body = [
+            [
+                escape(name),
+                f'<span class="bar" style="width:{max(1.0, 220 * value / longest):.0f}px"></span>',
+                f"{value:.3f}",
+                format_number(value / result.copy_ms),
+            ]
+            for name, value in times.items()
+        ]
+        peak = next((m.peak_mb for m in rows if m.peak_mb), None)
+        memory = f", peak memory {peak:.0f} MB" if peak else ""
+        parts.append(
+            f"<div><h3>{escape(method)}<small>{memory}</small></h3>"
+            + _table(["stage", "", "ms", "copies"], body, numeric_from=2)
+            + "</div>"
+        )
+    return f'<div class="figures">{"".join(parts)}</div>' if parts else ""
+
+
 def _maybe(value: float | None, show: Callable[[float], str] = format_number) -> str:
     return "" if value is None else show(value)
 
@@ -511,6 +544,8 @@ svg .dot { stroke:var(--panel); stroke-width:1.5 }
 svg .dot.partial { fill:var(--panel); stroke:var(--bad) }
 svg .whisker { stroke-width:1.5; opacity:.45 } svg .whisker.on { stroke:var(--on) }
 svg .whisker.off { stroke:var(--off) } svg .leader { stroke:var(--soft); stroke-width:.8 }
+th .limit { display:block; color:var(--limit); font-weight:400 }
+.bar { display:inline-block; height:10px; border-radius:2px; background:var(--on) }
 svg .limit { stroke:var(--limit); stroke-width:1.4; stroke-dasharray:6 4 }
 svg .limit-label { fill:var(--limit) } svg .name { paint-order:stroke; stroke:var(--panel); stroke-width:3px }
 svg .name.on { font-weight:600 } svg .name.off { fill:var(--soft) }
@@ -534,6 +569,13 @@ def html(result: Result) -> str:
         "scene.</p>",
         _answers(result),
     ]
+    times = _where_time_goes(result)
+    if times:
+        sections += [
+            "<h2>Where the time of a frame goes</h2>",
+            "<p>Median wall time of one call, over the scenes. What is skipped costs nothing.</p>",
+            times,
+        ]
     if result.targets:
         sections += ["<h2>Promises and results</h2>", _targets(result)]
     sections += [

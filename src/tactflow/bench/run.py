@@ -120,9 +120,10 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
     whole, alone = plan.chosen()
     loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
     general = {name: p for name, p in loaded.items() if not _needs_rectifying(p) and name != MARKERLESS}
-    bare = {SEED: recordings.without_markers(loaded[SEED])}
+    # For gels without markers: the pipeline made for them, else the default one without its tracker.
+    bare = {name: recordings.without_markers(loaded[name]) for name in (DEFAULT, SEED)}
     if MARKERLESS in loaded:
-        bare = {MARKERLESS: loaded[MARKERLESS], **bare}
+        bare = {MARKERLESS: loaded[MARKERLESS], SEED: bare[SEED]}
     total = sum(case.frames for case in whole) + 7 * len(alone) + (1 if plan.quick else 60)
     if plan.memory:
         total += 20 * len(general)

@@ -83,7 +83,7 @@ FULL = (
 )
 """Every kind of contact, light, marker and camera trouble."""
 
-QUICK_STAGES = (Case("press", 24), Case("bright_cable", 24), Case("jumps", 24))
+QUICK_STAGES = (Case("press", 20), Case("bright_cable", 20), Case("jumps", 16))
 """For methods alone; short, because OpenCV's inpainting is slow."""
 
 FULL_STAGES = (

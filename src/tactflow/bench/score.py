@@ -12,9 +12,30 @@ from tactflow.bench import metrics
 from tactflow.sim import Truth
 from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
 
+DIRECTED = 2.0
+"""Ratio of a contact's axes from which on its direction is judged."""
+
+_ROUND = 100
+"""Pixels from which on a contact is large enough to be called round."""
+
 
 def _drop_unknown(values: dict[str, float | None]) -> dict[str, float]:
-    return {name: value for name, value in values.items() if value is not None}
+    # What is left of floating-point rounding in a perfect result is no error.
+    return {name: round(value, 9) for name, value in values.items() if value is not None}
+
+
+def aspect_ratio(mask: NDArray[np.generic]) -> float:
+    """Ratio of the principal axes of a region, >= 1; 1 where there is none, inf for a line.
+
+    A pixel has an extent of its own: 1/12 px^2 along each axis belongs to the variance.
+    """
+    moments = cv2.moments(np.asarray(mask, dtype=np.uint8), binaryImage=True)
+    count = moments["m00"]
+    if count == 0:
+        return 1.0
+    xx, yy, xy = (moments[name] / count for name in ("mu20", "mu02", "mu11"))
+    middle, half = (xx + yy) / 2 + 1 / 12, float(np.hypot(xx - yy, 2 * xy)) / 2
+    return float(np.sqrt((middle + half) / (middle - half)))
 
 
 @dataclass(slots=True)
@@ -23,7 +44,8 @@ class ContactScore:
 
     Outline errors (mask, hull, area, centre, direction) are averaged over the frames in which the truth and
     the method both see a contact. A missed contact of at least half depth enters with an overlap of 0; what
-    was missed in all is counted beside.
+    was missed in all is counted beside. Directions are judged where the truth is at least `DIRECTED` times as
+    long as wide.
     """
 
     iou: list[float] = field(default_factory=list[float])
@@ -80,9 +102,10 @@ class ContactScore:
                 float(np.hypot(contact.center[0] - truth.center[0], contact.center[1] - truth.center[1]))
             )
         if truth.angle is None:
-            self.undirected += 1
-            self.invented_direction += contact.angle is not None
-        else:
+            if np.count_nonzero(truth.contact_mask) >= _ROUND:
+                self.undirected += 1
+                self.invented_direction += contact.angle is not None
+        elif aspect_ratio(truth.contact_mask) >= DIRECTED:
             self.directed += 1
             if contact.angle is None:
                 self.without_direction += 1

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tactflow.bench.quantities import QUANTITIES
-from tactflow.bench.report import PRIMARY, TITLES, format_number, pareto, points
+from tactflow.bench.report import PRIMARY, TITLES, format_number, limit_of, pareto, points
 from tactflow.bench.results import RECORDING, Measurement, Result
 
 
@@ -36,7 +36,9 @@ def _methods(result: Result, group: str) -> Table:
     for heading in ("contact, copies", "idle, copies", "x seed"):
         table.add_column(heading, justify="right")
     for quantity in quantities:
-        table.add_column(quantity.title + (f", {quantity.unit}" if quantity.unit else ""), justify="right")
+        heading = quantity.title + (f", {quantity.unit}" if quantity.unit else "")
+        limit = limit_of(result, group, quantity)
+        table.add_column(heading + (f" (limit {format_number(limit)})" if limit else ""), justify="right")
     for method in result.methods(group):
         rows = [m for m in result.of(group, method) if not m.scene.startswith(RECORDING)]
         if not rows:
