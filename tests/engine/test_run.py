@@ -15,7 +15,7 @@ from tactflow.engine.run import Runner, RunResult
 
 MakeRunner = Callable[..., Runner]
 
-COLLECT = {"out": {"use": "Collect"}}
+REPEAT = {"signal": "pulse.active", "otherwise": "repeat"}
 
 
 def rows(runner: Runner, sink: str = "out") -> list[Any]:
@@ -170,8 +170,8 @@ def test_a_repeating_gate_gives_its_last_value_and_says_why(toy_runner: MakeRunn
 def test_a_pure_stage_is_not_run_again_on_inputs_it_has_seen(
     toy_runner: MakeRunner, cut: dict[str, Any]
 ) -> None:
-    """The level is repeated while the pulse is low, so what follows from it alone is reused, with its reason."""
-    stages = {**cut, "level": {**cut.get("level", {}), "when": {"signal": "pulse.active", "otherwise": "repeat"}}}
+    """The level is repeated while the pulse is low, so what follows from it alone is reused."""
+    stages = {**cut, "level": {**cut.get("level", {}), "when": REPEAT}}
     stages["gated"] = {**cut.get("gated", {}), "when": []}
     runner = toy_runner(stages)
     result = ran(runner)
@@ -186,7 +186,7 @@ def test_a_pure_stage_is_not_run_again_on_inputs_it_has_seen(
 
 
 def test_switching_skipping_off_runs_every_stage_in_every_frame(toy_runner: MakeRunner) -> None:
-    runner = toy_runner({"level": {"when": {"signal": "pulse.active", "otherwise": "repeat"}}}, skipping=False)
+    runner = toy_runner({"level": {"when": REPEAT}}, skipping=False)
     ran(runner)
     for name in ("level", "heavy", "gated", "join"):
         assert seen(runner, name) == list(range(20))

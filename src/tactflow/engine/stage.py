@@ -65,10 +65,15 @@ class ArrayPort:
 
 @dataclass(frozen=True, slots=True)
 class SignalPort:
-    """Type of a boolean port that can gate stages; `closed` is the reason given while it is False."""
+    """Type of a boolean port that can gate stages.
+
+    closed : the reason given while it is False. otherwise : what a gated stage's outputs are then, unless its
+    `when:` says something else: "absent", or "repeat" for the last ones again.
+    """
 
     name: str
     closed: str
+    otherwise: Literal["absent", "repeat"] = "absent"
 
 
 @dataclass(frozen=True, slots=True)

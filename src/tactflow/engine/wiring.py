@@ -243,11 +243,7 @@ class _Wiring:
             item, signal_path = settings["signal"].item, f"{path}.signal"
         else:
             signal_path = path
-        otherwise: Literal["absent", "repeat"] = (
-            "repeat"
-            if envelope.choice(settings, "otherwise", ["absent", "repeat"], path, self._problems) == "repeat"
-            else "absent"
-        )
+        chosen = envelope.choice(settings, "otherwise", ["absent", "repeat"], path, self._problems)
         hold = envelope.whole(settings, "hold", 0, path, self._problems)
         at_least_every = envelope.whole(settings, "at_least_every", 1, path, self._problems)
         reason = envelope.word(settings, "reason", path, self._problems)
@@ -264,5 +260,8 @@ class _Wiring:
                 f"({giver.mark}) gives {kind}",
             )
             return
+        otherwise: Literal["absent", "repeat"] = "repeat" if chosen == "repeat" else "absent"
+        if chosen is None:
+            otherwise = signal.otherwise
         draft.gates.append(Gate(ref, reason or signal.closed, otherwise, hold or 0, at_least_every))
         draft.edges.append((ref, item.mark))

@@ -1,0 +1,65 @@
+"""Probe: has anything changed since the last frame that was worked on?"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from pydantic import Field
+
+from tactflow.engine.frame import Frame
+from tactflow.engine.stage import StageParams
+from tactflow.ports import Changed
+from tactflow.vision.change import ChangeProbe
+
+
+class ProbePorts(NamedTuple):
+    """What the probe tells."""
+
+    changed: Changed
+
+
+class Probe:
+    """Looks at samples of the raw frame, so that stages with `when: changed` repeat their results."""
+
+    memory = "stateful"
+
+    class Params(StageParams):
+        """How careful to be."""
+
+        false_alarms: float = Field(
+            1e-3,
+            gt=0,
+            le=0.5,
+            description="share of still frames that are worked on all the same; a smaller share lets larger "
+            "changes pass unseen",
+        )
+        tile: int = Field(
+            40, ge=8, description="edge of the tiles that are tested on their own, px of the raw frame"
+        )
+        at_least_every: int = Field(
+            30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"
+        )
+
+    def __init__(self, params: Params) -> None:
+        """Prepare; the first frame says where to look."""
+        self.params = params
+        self._probe: ChangeProbe | None = None
+        self._since = 0
+
+    def reset(self) -> None:
+        """A new reference follows: choose the places to look at anew."""
+        self._probe = None
+
+    def process(self, frame: Frame) -> ProbePorts:
+        """Compare with the last frame that was called changed. A reference frame always is."""
+        if self._probe is None:
+            self._probe = ChangeProbe(
+                frame.image, false_alarms=self.params.false_alarms, tile=self.params.tile
+            )
+        changed = self._probe.look(frame.image)
+        self._since += 1
+        if changed or frame.reference or self._since >= self.params.at_least_every:
+            self._since = 0
+            self._probe.anchor_here()
+            return ProbePorts(True)
+        return ProbePorts(False)

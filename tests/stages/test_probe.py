@@ -1,0 +1,33 @@
+"""The probe stage: reference frames and the safety net."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactflow.engine.frame import Frame
+from tactflow.stages.probe import Probe
+
+IMAGE = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+
+
+def changes(probe: Probe, count: int, *, reference: bool = False) -> list[bool]:
+    return [probe.process(Frame("s", i, i / 60, IMAGE, reference=reference)).changed for i in range(count)]
+
+
+def test_a_still_scene_is_worked_on_at_least_every_so_many_frames() -> None:
+    probe = Probe(Probe.Params(at_least_every=5))
+    found = changes(probe, 40)
+    assert found[:6] == [True] * 6, "while the noise is not known"
+    assert [i for i, c in enumerate(found) if c][6:] == [10, 15, 20, 25, 30, 35]
+
+
+def test_a_reference_frame_is_always_worked_on() -> None:
+    probe = Probe(Probe.Params())
+    assert all(changes(probe, 20, reference=True))
+
+
+def test_a_reset_starts_anew() -> None:
+    probe = Probe(Probe.Params())
+    assert not changes(probe, 10)[-1]
+    probe.reset()
+    assert changes(probe, 6) == [True] * 6
