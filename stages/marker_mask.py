@@ -30,7 +30,7 @@ class MarkerMaskStage:
         polarity: Literal["auto", "dark", "bright"] = Field("auto", description="dots against the gel")
         contrast: float | Literal["auto"] = Field(
             "auto",
-            description="least difference to the gel, grey levels, 1 to 255; auto is a quarter of the dots' own",
+            description="least difference to the gel, grey levels, 1 to 255; auto: a quarter of the dots'",
         )
 
     def __init__(self, params: Params) -> None:

@@ -39,8 +39,8 @@ _QUANTISATION = 1 / 12
 _CORRELATED = 1.5
 _DARK = 0.1
 _SHARP = 0.05
-_WEAK = 0.25
-_LEAVE = 0.6
+_WEAK = 0.02
+_LEAVE = 0.7
 _BLOBS = 12
 
 
@@ -107,8 +107,8 @@ class ContactDetector:
         method: ContactMethod = "noise",
         *,
         false_alarms: float = 1e-6,
-        repeatability: float = 0.015,
-        shift: float = 0.5,
+        repeatability: float = 0.02,
+        shift: float = 1.0,
         distance: float = 24.0,
     ) -> None:
         if method not in ("noise", "colour", "seed"):
@@ -205,8 +205,7 @@ class ContactDetector:
         variance = (_PRIOR * self._noise**2 + self._squares) / (_PRIOR + count - 1)
         variance = variance * (1 + 1 / count) + (self._repeatability * mean) ** 2
         variance += (self._shift / _CELL * _steepness(mean)) ** 2
-        variance = np.asarray(variance, np.float32)
-        light = LightChange(mean, variance)
+        light = LightChange(mean, np.asarray(variance, np.float32))
         dark = _DARK * self._half.mean(axis=(0, 1)) + 1
         edge = self._shift / 2 * _steepness(self._half) / (_SHARP * (self._half + dark))
         self._known = _Reference(
@@ -261,7 +260,6 @@ def _blobs(
     support = (square > limit / 4).astype(np.uint8)
     support = np.asarray(cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=8)
-    strength = np.einsum("ijk,ijk->ij", change, change)
     height, width = square.shape
     found = []
     for index in range(1, count):
@@ -269,11 +267,11 @@ def _blobs(
         window = slice(top, top + high), slice(left, left + wide)
         inside = labels[window] == index
         if float(square[window][inside].max()) >= strong:
-            found.append((float(strength[window][inside].max()), index, left, top, wide, high))
+            found.append((float(square[window][inside].sum()), index, left, top, wide, high))
     found.sort(reverse=True)
     blobs = []
-    for peak, index, left, top, wide, high in found[:_BLOBS]:
-        if peak < _WEAK**2 * found[0][0]:
+    for energy, index, left, top, wide, high in found[:_BLOBS]:
+        if energy < _WEAK * found[0][0]:
             break
         rows = slice(max(top - 1, 0), min(top + high + 1, height))
         columns = slice(max(left - 1, 0), min(left + wide + 1, width))
@@ -297,10 +295,10 @@ def _cells(image: NDArray[np.uint8]) -> tuple[Float, Float]:
 
 
 def _steepness(picture: Float) -> Float:
-    """Grey levels per cell by which the brightness changes."""
-    along = cv2.Scharr(picture, cv2.CV_32F, 1, 0, scale=1 / 32)
-    across = cv2.Scharr(picture, cv2.CV_32F, 0, 1, scale=1 / 32)
-    return np.asarray(cv2.magnitude(along, across), np.float32)
+    """Grey levels per cell by which the brightness changes, here or in the cells around."""
+    along = cv2.Scharr(picture, cv2.CV_32F, 1, 0, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
+    across = cv2.Scharr(picture, cv2.CV_32F, 0, 1, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.dilate(cv2.magnitude(along, across), np.ones((3, 3), np.uint8)), np.float32)
 
 
 def _spatial_noise(cells: Float) -> Float:

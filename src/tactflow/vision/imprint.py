@@ -2,8 +2,8 @@
 
 What a gel shows depends on how it is lit. Lit by white light through a coating, a touched area brightens as
 a whole: the contact ends where half of the brightening is gone. Lit by coloured light from the side, the
-gel answers with the slope of its surface: a ball's middle looks unchanged, and the slope is largest exactly at
-the rim of the contact, because outside the free surface flattens again (Hertz; K. L. Johnson, "Contact
+gel answers with the slope of its surface: a ball's middle looks unchanged, and the slope is largest exactly
+at the rim of the contact, because outside the free surface flattens again (Hertz; K. L. Johnson, "Contact
 Mechanics", 1985, ch. 4). So the outline follows the ridge of the change. The ridge itself is a poor thing to
 trace (it is faint where the light comes along the rim, and has gaps); its distance from the outer edge of
 the change is not: averaged along the whole outline, the profile of the change across it has a clear peak.
@@ -33,13 +33,14 @@ _PROFILE_STEP = 0.5
 _FEW = 8
 
 
-def imprint(change: Float, inside: NDArray[np.bool_]) -> Float:
+def imprint(change: Float, inside: NDArray[np.bool_], bridge: float = 4.0) -> Float:
     """Level set of one contact's outline.
 
     Parameters
     ----------
     change : (h, w, 3) float32, relative change of each channel, the light's own change taken out.
     inside : (h, w) bool, where the change belongs to this contact.
+    bridge : half the width of gaps that are closed in any case, px: what a removed marker can leave.
 
     Returns
     -------
@@ -55,7 +56,7 @@ def imprint(change: Float, inside: NDArray[np.bool_]) -> Float:
         mean = -mean
     if _peak(mean, top) * 3**0.5 > _peak(colour, top):
         return _brightened(mean, _peak(mean, top))
-    return _tilted(strength, _peak(strength, top))
+    return _tilted(strength, _peak(strength, top), bridge)
 
 
 def _peak(values: Float, top: int) -> float:
@@ -71,9 +72,9 @@ def _brightened(mean: Float, peak: float) -> Float:
     return np.asarray(np.minimum(level, np.float32(HALF)) * np.float32(8), np.float32)
 
 
-def _tilted(strength: Float, peak: float) -> Float:
+def _tilted(strength: Float, peak: float, bridge: float) -> Float:
     changed = (strength > OUTER * peak).astype(np.uint8)
-    filled = fill(_without_gaps(changed))
+    filled = fill(_without_gaps(changed, bridge))
     if filled.all():
         return np.ones_like(strength)
     depth = cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5)
@@ -94,14 +95,14 @@ def _tilted(strength: Float, peak: float) -> Float:
     return np.asarray(depth - np.float32(rim), np.float32)
 
 
-def _without_gaps(mask: Mask) -> Mask:
-    """Close gaps that are narrower than the ring itself is thick."""
+def _without_gaps(mask: Mask, bridge: float) -> Mask:
+    """Close gaps that are narrower than the ring itself is thick, or than a marker."""
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     hull = cv2.convexHull(np.vstack(outlines))
     solid = sum(cv2.contourArea(outline) for outline in outlines)
-    if solid > 0.9 * cv2.contourArea(hull):
+    if solid > 0.98 * cv2.contourArea(hull):
         return mask
-    reach = float(cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1
+    reach = max(float(cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
     margin = int(reach) + 2
     padded = np.pad(mask, margin)
     away = cv2.distanceTransform(1 - padded, cv2.DIST_L2, cv2.DIST_MASK_3)

@@ -21,7 +21,9 @@ class LightChange:
     The four unknowns of a channel are fitted to means over blocks of 8 x 8 cells by Huber's modified
     residuals: residuals are clipped to twice their standard deviation before each least-squares step, so
     that a contact, however strong, pulls no harder than noise would; the matrix of the step is known
-    beforehand. The start is the median, so that a contact may cover nearly half of the frame.
+    beforehand. The start is the median, so that a contact may cover nearly half of the frame. Planes and
+    gains are drawn towards zero a little: on a gel lit from the side they are nearly the same thing, and
+    large ones of opposite sign would follow any band or spot.
 
     References
     ----------
@@ -39,11 +41,11 @@ class LightChange:
         one = np.ones_like(x)
         channels = range(3)
         basis = np.stack([self._coarse(np.dstack([one, x, y, shade[..., c]])).T for c in channels])
-        normal = basis @ basis.transpose(0, 2, 1) + _RIDGE * basis.shape[2] * np.eye(4)
+        penalty = _RIDGE * basis.shape[2] * np.diag([0.0, 1.0, 1.0, 1.0])
+        inverse = np.linalg.inv(basis @ basis.transpose(0, 2, 1) + penalty + 1e-6 * np.eye(4))
         self._basis: Float = np.ascontiguousarray(basis, np.float32)
-        self._solve: Float = np.ascontiguousarray(
-            np.linalg.solve(normal, basis).transpose(0, 2, 1), np.float32
-        )
+        self._solve: Float = np.ascontiguousarray((inverse @ basis).transpose(0, 2, 1), np.float32)
+        self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._coarse(reference)
         self._limit: Float = np.float32(_CLIP) * np.sqrt(self._coarse(variance)).T[:, None, :]
 
@@ -61,7 +63,7 @@ class LightChange:
         found[..., 0] = np.median(excess, axis=2)
         for _ in range(_ROUNDS):
             residual = excess - found @ self._basis
-            step = np.clip(residual, -self._limit, self._limit) @ self._solve
+            step = np.clip(residual, -self._limit, self._limit) @ self._solve - found @ self._shrink
             found += step
             if float(np.abs(step).max()) < _SETTLED:
                 break

@@ -15,7 +15,7 @@ from tactflow.vision.markers import NoMarkersError, detect_markers
 Polarity = Literal["dark", "bright"]
 
 _DIRECTIONS = 12
-_RIM = 1.0
+_RIM = 1.5
 _SHARE = 0.25
 _LEAST = 6.0
 
@@ -108,13 +108,19 @@ def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _response(half: NDArray[np.uint8], radius: float, polarity: Polarity) -> NDArray[np.uint8]:
     """Contrast of each pixel with the least different one on a circle around it; median of the channels."""
-    circle = _circle(radius + 0.5)
+    circle = _circle((radius + max(radius, 4.0) + 1) / 2)
     if polarity == "dark":
         contrast = cv2.subtract(cv2.erode(half, circle), half)
     else:
         contrast = cv2.subtract(half, cv2.dilate(half, circle))
     first, second, third = cv2.split(contrast)
-    return np.asarray(cv2.max(cv2.min(first, second), cv2.min(cv2.max(first, second), third)), np.uint8)
+    median = np.asarray(cv2.max(cv2.min(first, second), cv2.min(cv2.max(first, second), third)), np.uint8)
+    # In a corner of the frame three quarters of the circle are missing: any dark corner would be a spot.
+    reach = len(circle) // 2
+    for rows in (slice(0, reach), slice(-reach, None)):
+        median[rows, :reach] = 0
+        median[rows, -reach:] = 0
+    return median
 
 
 @lru_cache(maxsize=32)
