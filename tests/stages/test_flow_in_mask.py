@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tactflow.stages.flow_in_mask import FlowInMask
 
 from tactflow.engine.stage import read_ports
+from tactflow.stages.flow_in_mask import FlowInMask
 from tactflow.vision.types import Flow, Markers
 
 ORIGIN = np.array([[20.0, 20], [40, 20], [20, 40], [40, 40], [80, 50]])

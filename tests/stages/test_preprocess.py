@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tactflow.stages.preprocess import Preprocess
 
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import read_ports
+from tactflow.stages.preprocess import Preprocess
 
 WEDGE = {
     "from": [[33, 58], [208, 61], [56, 250], [185, 244]],

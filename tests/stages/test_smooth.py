@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tactflow.stages.smooth import Smooth
 
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.stage import read_ports
+from tactflow.stages.smooth import Smooth
 from tactflow.vision.types import Contact
 
 IMAGE = np.zeros((4, 4, 3), np.uint8)

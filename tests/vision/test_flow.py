@@ -256,3 +256,8 @@ def test_the_seed_method_without_contact_has_no_flow() -> None:
 def test_bad_input_is_refused_with_a_reason(mask: Any, dilate: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         flow_in_mask(moved(), mask, dilate=dilate)
+
+
+def test_an_unknown_method_is_refused() -> None:
+    with pytest.raises(ValueError, match="'mean' or 'seed', got 'median'"):
+        flow_in_mask(moved(), EVERYWHERE, method="median")  # type: ignore[arg-type]

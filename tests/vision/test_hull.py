@@ -434,6 +434,7 @@ def test_a_large_frame_loses_no_precision() -> None:
         (np.zeros((3, 3), np.uint8), {"max_gap": math.nan}, "max_gap"),
         (np.zeros((3, 3), np.uint8), {"min_confidence": 1.1}, "min_confidence"),
         (np.zeros((3, 3), np.uint8), {"min_confidence": math.nan}, "min_confidence"),
+        (np.zeros((3, 3), np.uint8), {"method": "ellipse"}, "'moments' or 'seed', got 'ellipse'"),
     ],
 )
 def test_bad_input_is_refused_with_a_reason(mask: Any, kwargs: dict[str, Any], message: str) -> None:

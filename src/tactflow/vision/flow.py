@@ -41,12 +41,15 @@ def flow_in_mask(
     the square root of the number of *tracked* markers, since an inferred one is no observation of its own;
     None with fewer than two of those.
 
-    Raises ValueError if mask is not (H, W) uint8, or if dilate is negative or not finite.
+    Raises ValueError if mask is not (H, W) uint8, if dilate is negative or not finite, or for an unknown
+    method.
     """
     if mask.ndim != 2 or mask.dtype != np.uint8:
         raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
     if not (dilate >= 0 and math.isfinite(dilate)):
         raise ValueError(f"required dilate >= 0 px, got {dilate}")
+    if method not in ("mean", "seed"):
+        raise ValueError(f"required method to be 'mean' or 'seed', got {method!r}")
     if method == "seed":
         return _seed_flow(markers, mask, round(dilate))
     chosen = np.flatnonzero(markers.status != _LOST)

@@ -90,6 +90,8 @@ def contact_geometry(
         raise ValueError(f"required max_gap >= 0 px or None, got {max_gap}")
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
+    if method not in ("moments", "seed"):
+        raise ValueError(f"required method to be 'moments' or 'seed', got {method!r}")
     if mask.size == 0:
         return None
     left, top, width, height = cv2.boundingRect(mask)
