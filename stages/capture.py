@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +14,9 @@ from pydantic import Field, field_validator
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
-
-# A recording played at its own pace that falls further behind than this (a laptop was asleep, the process
-# was halted) continues from there, instead of rushing through what it missed.
-MAX_BACKLOG = 0.5
+from tactflow.sources import CameraRequest, Source, open_source
+from tactflow.sources.files import load_image
+from tactflow.sources.pace import Pace
 
 
 class Capture:
@@ -90,7 +88,7 @@ class Capture:
         self.description = params.source
         self._sensor = sensor
         self._directory = directory
-        self._source: Any = None
+        self._source: Source | None = None
         self._reference_image: NDArray[np.uint8] | None = None
         self._stop = threading.Event()
         self._retake = threading.Event()
@@ -103,24 +101,14 @@ class Capture:
         SourceError
             If the source or the reference image cannot be opened.
         """
-        from tactflow.sources import CameraRequest, open_source
-
         p = self.params
         request = CameraRequest(p.width, p.height, p.fps, p.format)
-        self._reference_image = self._load_reference()
+        if isinstance(p.reference, str):
+            self._reference_image = load_image(p.reference, self._directory)
         self._source = open_source(p.source, directory=self._directory, fps=p.fps, camera=request)
         self.live = self._source.live or p.realtime
         self.total = None if self._source.total is None else max(self._source.total - p.skip, 0)
         self.description = self._source.description
-
-    def _load_reference(self) -> NDArray[np.uint8] | None:
-        if isinstance(self.params.reference, int):
-            return None
-        from tactflow.sources.base import Normaliser, find_path
-        from tactflow.sources.files import read_image
-
-        path = find_path(self.params.reference, self._directory)
-        return Normaliser(str(path))(read_image(path))
 
     def close(self) -> None:
         """Give the source back."""
@@ -144,15 +132,16 @@ class Capture:
         SourceError
             If a frame cannot be read, or the reference image is not as large as the frames.
         """
-        if self._source is None:
-            self.open()
+        source = self._source
+        if source is None:
+            raise SourceError(f"{self.description}: is not open")
         count = self.params.reference if isinstance(self.params.reference, int) else 1
         references_left = count if self._reference_image is None else 0
-        pace = _Pace(self._stop) if self.params.realtime and not self._source.live else None
+        pace = Pace(self._stop) if self.params.realtime and not source.live else None
         epoch = 0
         seq = -1
         while not self._stop.is_set():
-            item = self._source.read()
+            item = source.read()
             if item is None:
                 return
             image, t = item
@@ -182,24 +171,6 @@ class Capture:
                 "they must be equally large"
             )
         return Frame(self._sensor, -1, t, _read_only(image), time.perf_counter(), reference=True)
-
-
-class _Pace:
-    """Waits until a recording's frames are due, counted from the first one, so that delays do not add up."""
-
-    def __init__(self, stop: threading.Event) -> None:
-        self._stop = stop
-        self._start: float | None = None
-
-    def wait_for(self, t: float) -> bool:
-        """Wait until time t of the recording; False if stopped meanwhile."""
-        now = time.perf_counter()
-        if self._start is None:
-            self._start = now - t
-        wait = self._start + t - now
-        if wait < -MAX_BACKLOG:
-            self._start = now - t
-        return not (self._stop.wait(wait) if wait > 0 else self._stop.is_set())
 
 
 def _read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tactflow.stages import capture as capture_module
-from tactflow.stages.capture import Capture
 
 from tactflow.engine.errors import SourceError
+from tactflow.sources import pace as pace_module
+from tactflow.stages.capture import Capture
 
 
 @pytest.fixture
@@ -151,10 +151,10 @@ def test_delays_do_not_add_up_at_the_recordings_own_pace(
     reading: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = _Clock()
-    monkeypatch.setattr(capture_module.time, "perf_counter", clock.perf_counter)
+    monkeypatch.setattr(pace_module.time, "perf_counter", clock.perf_counter)
     stop = threading.Event()
     monkeypatch.setattr(stop, "wait", clock.wait)
-    pace = capture_module._Pace(stop)
+    pace = pace_module.Pace(stop)
     shown = []
     for index in range(1000):
         clock.now += reading
@@ -168,10 +168,10 @@ def test_after_a_long_interruption_the_recording_continues_instead_of_rushing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = _Clock()
-    monkeypatch.setattr(capture_module.time, "perf_counter", clock.perf_counter)
+    monkeypatch.setattr(pace_module.time, "perf_counter", clock.perf_counter)
     stop = threading.Event()
     monkeypatch.setattr(stop, "wait", clock.wait)
-    pace = capture_module._Pace(stop)
+    pace = pace_module.Pace(stop)
     pace.wait_for(0.0)
     clock.now += 3600.0
     pace.wait_for(0.1)

@@ -62,6 +62,12 @@ def read_image(path: Path) -> NDArray[Any]:
     return image
 
 
+def load_image(spec: str, directory: Path | None = None) -> BgrImage:
+    """Find and decode one image file: (H, W, 3) uint8 BGR. Raises as `find_path` and `read_image` do."""
+    path = find_path(spec, directory)
+    return Normaliser(str(path))(read_image(path))
+
+
 def _cut_off(data: bytes) -> bool:
     if data.startswith(b"\xff\xd8\xff"):
         # Behind the last start-of-scan marker there must be an end-of-image marker. Neither can occur
