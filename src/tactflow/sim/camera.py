@@ -37,6 +37,7 @@ class Camera:
 
     def __init__(self, size: tuple[int, int], perspective: float = 0.0, distortion: float = 0.0) -> None:
         self.size = size
+        self._key = (size, perspective, distortion)
         width, height = size
         self.identity = perspective == 0.0 and distortion == 0.0
         self._k = distortion
@@ -58,6 +59,12 @@ class Camera:
             )
             self._homography = homography(gel, raw)
         self._inverse = np.linalg.inv(self._homography).astype(np.float64)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Camera) and other._key == self._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
 
     def to_gel(self, raw: Points) -> Points:
         """Gel coordinates (N, 2) float64 of raw pixel positions (N, 2)."""

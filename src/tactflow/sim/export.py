@@ -25,6 +25,8 @@ from tactflow.sim.scenes import Scene
 VIDEO_SUFFIXES = (".avi", ".mkv")
 TRUTH_SUFFIXES = (".jsonl", ".npz")
 Report = Callable[[int], None]
+# Lossless through OpenCV, and every frame written so far can be read after a crash.
+_FOURCC = "HFYU"
 
 
 class NotLosslessError(RuntimeError):
@@ -112,7 +114,7 @@ def _write_npy(scene: Scene, path: Path, report: Report) -> None:
 
 
 def _write_video(scene: Scene, path: Path, report: Report) -> None:
-    fourcc = cv2.VideoWriter.fourcc(*"HFYU")
+    fourcc = cv2.VideoWriter.fourcc(*_FOURCC)
     writer = cv2.VideoWriter(str(path), fourcc, scene.fps, scene.size)
     if not writer.isOpened():
         raise OSError(f"{path}: the video file cannot be opened for writing")

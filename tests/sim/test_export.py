@@ -1,0 +1,114 @@
+"""What is written can be read back, and is what the scene shows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tactflow.sim import export, open_scene
+from tactflow.sim.scenes import Scene
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return open_scene("slide?frames=12")
+
+
+def test_npy_holds_every_frame_and_opens_as_a_memory_map(scene: Scene, tmp_path: Path) -> None:
+    export.write_frames(scene, tmp_path / "a.npy")
+    stored = np.load(tmp_path / "a.npy", mmap_mode="r")
+    assert stored.shape == (12, 600, 800, 3)
+    assert stored.dtype == np.uint8
+    for index in range(12):
+        np.testing.assert_array_equal(stored[index], scene.frame(index))
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mkv"])
+def test_videos_are_lossless(scene: Scene, tmp_path: Path, suffix: str) -> None:
+    export.write_frames(scene, tmp_path / f"a{suffix}")
+    reader = cv2.VideoCapture(str(tmp_path / f"a{suffix}"))
+    assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(60)
+    for index in range(12):
+        there, image = reader.read()
+        assert there
+        np.testing.assert_array_equal(image, scene.frame(index))
+    assert not reader.read()[0]
+    reader.release()
+
+
+def test_a_lossy_codec_is_noticed(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(export, "_FOURCC", "MJPG")
+    with pytest.raises(export.NotLosslessError, match="frame 0"):
+        export.write_frames(scene, tmp_path / "a.avi")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_holds_numbered_images(scene: Scene, tmp_path: Path) -> None:
+    export.write_frames(scene, tmp_path / "frames")
+    names = sorted(item.name for item in (tmp_path / "frames").iterdir())
+    assert names[0] == "000000.png"
+    assert len(names) == 12
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "frames" / names[5])), scene.frame(5))
+
+
+def test_an_interrupted_export_leaves_nothing_behind(scene: Scene, tmp_path: Path) -> None:
+    def stop(done: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    for name in ("a.npy", "a.avi", "frames", "a.jsonl", "a.npz"):
+        write = export.write_truth if name in ("a.jsonl", "a.npz") else export.write_frames
+        with pytest.raises(KeyboardInterrupt):
+            write(scene, tmp_path / name, stop)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_truth_as_json_lines_is_the_truth(scene: Scene, tmp_path: Path) -> None:
+    export.write_truth(scene, tmp_path / "a.jsonl")
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    assert len(lines) == 12
+    touched = 0
+    for index, line in enumerate(lines):
+        truth = scene.truth(index)
+        assert set(line) == {
+            "frame", "t", "touching", "center", "angle", "hull", "area", "depth", "origin", "position",
+            "visible", "mean_flow",
+        }  # fmt: skip
+        assert line["frame"] == index
+        assert line["t"] == pytest.approx(index / 60)
+        assert line["touching"] == truth.touching
+        assert (line["center"] is None) == (truth.center is None)
+        np.testing.assert_array_equal(line["position"], truth.position)
+        np.testing.assert_array_equal(line["origin"], truth.origin)
+        np.testing.assert_array_equal(line["visible"], truth.visible)
+        touched += truth.touching
+    assert touched > 3
+
+
+def test_truth_as_arrays_is_the_truth(scene: Scene, tmp_path: Path) -> None:
+    export.write_truth(scene, tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as stored:
+        assert stored["contact_mask"].shape == (12, 600, 800)
+        start = stored["hull_start"]
+        for index in range(12):
+            truth = scene.truth(index)
+            np.testing.assert_array_equal(stored["contact_mask"][index], truth.contact_mask)
+            np.testing.assert_array_equal(stored["hull"][start[index] : start[index + 1]], truth.hull)
+            np.testing.assert_array_equal(stored["position"][index], truth.position)
+            assert stored["touching"][index] == truth.touching
+            assert stored["directed"][index] == (truth.angle is not None)
+            assert stored["has_flow"][index] == (truth.mean_flow is not None)
+            if truth.center is not None:
+                np.testing.assert_array_equal(stored["center"][index], truth.center)
+        assert all(np.isfinite(stored[name]).all() for name in stored.files)
+
+
+def test_unknown_suffixes_are_an_error(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"\.npy"):
+        export.write_frames(scene, tmp_path / "a.gif")
+    with pytest.raises(ValueError, match=r"\.jsonl"):
+        export.write_truth(scene, tmp_path / "a.csv")
