@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tactflow.sinks.zmq import Zmq
 
 from tactflow.cli import listen
 from tactflow.client import Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
@@ -222,7 +222,7 @@ def test_listen_prints_the_messages_as_they_are(
 
 
 def test_listen_ends_well_when_messages_stop_coming(publisher: Publisher) -> None:
-    assert run_listen(publisher, "--timeout", "0.3", send=lambda: publisher.send(0)) == 0
+    assert run_listen(publisher, "--timeout", "1.5", send=lambda: publisher.send(0)) == 0
 
 
 def test_listen_reports_that_nothing_came(publisher: Publisher) -> None:

@@ -8,10 +8,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from tactflow.sinks.images import Images
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.sinks.images import Images
 
 SEQS_WITH_DROPS = [0, 1, 2, 4, 5, 8, 9, 10, 11, 12]
 

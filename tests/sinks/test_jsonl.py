@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tactflow.sinks import jsonl as jsonl_module
-from tactflow.sinks.jsonl import Jsonl
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.sinks import jsonl as jsonl_module
+from tactflow.sinks.jsonl import Jsonl
 
 IMAGE = np.zeros((3, 4, 3), np.uint8)
 

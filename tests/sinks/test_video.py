@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from tactflow.sinks import video as video_module
-from tactflow.sinks.video import Video
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.sinks import video as video_module
+from tactflow.sinks.video import Video
 
 Pixels = NDArray[np.uint8]
 

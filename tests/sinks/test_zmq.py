@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from tactflow.sinks.zmq import Zmq
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Markers
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
