@@ -16,7 +16,12 @@ _SCALE_RATIO: Final = 1.6
 # A difference of Gaussians with widths s and 1.6 s answers a disc of radius r most strongly at s = r / 1.83
 # (measured on rendered discs of radius 2 to 12 px).
 _RADIUS_PER_SIGMA: Final = 1.83
+_MOST_PEAKS: Final = 3000
+# Score of the weakest family that is believed to be a grid (see `_score`). Real and simulated gels score 100 and
+# more, dust, reflections and noise on gels without marks at most 14.
+_LEAST_SCORE: Final = 25.0
 _NO_MARKERS: Final = "0 markers found: is the sensor marker-less? then use pipelines/markerless.yaml"
+_FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels)"
 
 
 class NoMarkersError(ValueError):
@@ -68,8 +73,9 @@ def detect_markers(
     Parameters
     ----------
     image : (H, W, 3) uint8 BGR or (H, W) uint8, grey levels.
-    dot_radius : of a mark, px, 1 to a quarter of the shorter side; None finds it. For marks made of several
-        spots, the radius of the whole mark.
+    dot_radius : of a mark, px, 1 to a quarter of the shorter side; None finds it, but then wants at least four
+        marks in an even arrangement, lest dust passes for them. For marks made of several spots, the radius of
+        the whole mark.
     polarity : "dark" or "bright" against the gel; "auto" takes the stronger family.
 
     Returns
@@ -100,18 +106,19 @@ def detect_markers(
     )
     best: tuple[float, float, Literal["dark", "bright"], FloatArray] | None = None
     for sigma in _sigmas(dot_radius, shortest):
-        response = _difference_of_gaussians(gray, sigma)
+        narrow, wide = _blurred(gray, sigma)
         for sign in polarities:
-            signed = response if sign == "dark" else -response
-            peaks, strength = _peaks(signed, sigma)
+            peaks, strength = _peaks(wide - narrow if sign == "dark" else narrow - wide, sigma)
+            spots = _surrounded(narrow if sign == "dark" else -narrow, peaks, sigma * _RADIUS_PER_SIGMA)
+            peaks, strength = peaks[spots], strength[spots]
             kept = _family(peaks, strength, gray.shape, sigma * _RADIUS_PER_SIGMA)
             if len(kept) == 0:
                 continue
             score = _score(peaks[kept], strength[kept])
             if best is None or score > best[0]:
                 best = (score, sigma, sign, peaks[kept])
-    if best is None:
-        raise NoMarkersError(_NO_MARKERS)
+    if best is None or (dot_radius is None and best[0] < _LEAST_SCORE):
+        raise NoMarkersError(_NO_MARKERS + ("" if best is None else _FEW_MARKERS))
     _, sigma, found, peaks = best
     radius = sigma * _RADIUS_PER_SIGMA
     centers = refine_centers(gray if found == "dark" else 255 - gray, peaks, radius)
@@ -211,11 +218,28 @@ def _sigmas(dot_radius: float | None, shortest: int) -> list[float]:
     return [0.9 * 1.2**index for index in range(count)]
 
 
-def _difference_of_gaussians(gray: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """Positive on dark spots."""
-    wide = cv2.GaussianBlur(gray, (0, 0), _SCALE_RATIO * sigma, borderType=cv2.BORDER_REPLICATE)
+def _blurred(gray: NDArray[np.float32], sigma: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The image at a scale and at the next coarser one; their difference answers to spots of the scale."""
     narrow = cv2.GaussianBlur(gray, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(wide - narrow, np.float32)
+    step = sigma * float(np.sqrt(_SCALE_RATIO**2 - 1.0))
+    wide = cv2.GaussianBlur(narrow, (0, 0), step, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(narrow, np.float32), np.asarray(wide, np.float32)
+
+
+def _surrounded(smooth: NDArray[np.float32], peaks: FloatArray, radius: float) -> NDArray[np.int64]:
+    """Indices of the peaks that are darker than what lies around them in (almost) every direction.
+
+    Edges and lines also answer to a difference of Gaussians, but are as dark along themselves.
+    """
+    if len(peaks) == 0:
+        return np.zeros(0, np.int64)
+    angles = np.arange(8) * (np.pi / 4)
+    ring = peaks[:, None] + 1.9 * radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    limits = np.array([smooth.shape[1] - 1, smooth.shape[0] - 1])
+    column, row = np.clip(np.rint(ring).astype(np.int64), 0, limits).transpose(2, 0, 1)
+    own_column, own_row = np.clip(np.rint(peaks).astype(np.int64), 0, limits).T
+    above = np.sort(smooth[row, column] - smooth[own_row, own_column][:, None], axis=1)
+    return np.flatnonzero(above[:, 1] > 0.3 * above[:, 4])
 
 
 def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, FloatArray]:
@@ -223,10 +247,10 @@ def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, Flo
     size = 2 * max(1, round(1.5 * sigma)) + 1
     highest = cv2.dilate(response, np.ones((size, size), np.uint8))
     rows, columns = np.nonzero((response >= highest) & (response > 1.0))
-    inside = (
-        (rows > 0) & (columns > 0) & (rows < response.shape[0] - 1) & (columns < response.shape[1] - 1)
-    )
+    inside = (rows > 0) & (columns > 0) & (rows < response.shape[0] - 1) & (columns < response.shape[1] - 1)
     rows, columns = rows[inside], columns[inside]
+    strongest = np.argsort(-response[rows, columns], kind="stable")[:_MOST_PEAKS]
+    rows, columns = rows[strongest], columns[strongest]
     value = response[rows, columns].astype(np.float64)
     points = np.column_stack([columns, rows]).astype(np.float64)
     for axis, (step_y, step_x) in enumerate(((0, 1), (1, 0))):
@@ -291,10 +315,10 @@ def _nearest(points: FloatArray, count: int) -> tuple[FloatArray, NDArray[np.int
     count = min(count, len(points) - 1)
     if count < 1:
         return np.zeros((len(points), 0)), np.zeros((len(points), 0), np.int64)
-    squared = ((points[:, None] - points[None]) ** 2).sum(axis=2)
-    np.fill_diagonal(squared, np.inf)
-    near = np.argsort(squared, axis=1, kind="stable")[:, :count]
-    return np.sqrt(np.take_along_axis(squared, near, axis=1)), near
+    flat = np.ascontiguousarray(points - points.mean(axis=0), np.float32)
+    distances, near = cv2.batchDistance(flat, flat, cv2.CV_32F, None, None, cv2.NORM_L2, count + 1)
+    # The nearest is the point itself.
+    return np.asarray(distances[:, 1:], np.float64), np.asarray(near[:, 1:], np.int64)
 
 
 def _reading_order(centers: FloatArray, radius: float) -> NDArray[np.int64]:
