@@ -21,7 +21,7 @@ class FlowInMask:
         """Which markers count as inside, and how they are averaged."""
 
         dilate: float = Field(
-            8.0,
+            2.0,
             ge=0,
             le=1000,
             description="markers up to this far outside the contact count too, px; more markers make the "
