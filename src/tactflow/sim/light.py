@@ -11,6 +11,7 @@ a pressed place is a hill.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -82,11 +83,17 @@ def untouched_gel(
 
 def texture(shape: tuple[int, int], strength: float, seed: int) -> NDArray[np.float32]:
     """(H, W, 1) float32: the grain of the gel's coating, relative, standard deviation `strength` / 100."""
+    return _grain(shape, seed) * np.float32(strength / 100.0) + np.float32(1.0)
+
+
+@lru_cache(maxsize=2)
+def _grain(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
     draw = np.random.default_rng([seed, 0x7465]).standard_normal(shape, dtype=np.float32)
     grain = np.asarray(cv2.GaussianBlur(draw, (0, 0), 1.6), dtype=np.float32)
     grain += 2.0 * np.asarray(cv2.GaussianBlur(draw, (0, 0), 9.0), dtype=np.float32)
-    grain *= strength / 100.0 / float(grain.std())
-    return grain[..., None] + np.float32(1.0)
+    grain /= float(grain.std())
+    grain.setflags(write=False)
+    return grain[..., None]
 
 
 def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
