@@ -36,12 +36,15 @@ _CELL = 4
 _PRIOR = 8
 _LEVELS = 6
 _QUANTISATION = 1 / 12
-_CORRELATED = 1.5
+_CORRELATED = 2.5
 _DARK = 0.1
 _SHARP = 0.05
 _WEAK = 0.02
 _LEAVE = 0.7
 _BLOBS = 12
+_LEAST = 8
+_FADE = 0.96
+_BRIDGE = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +98,8 @@ class ContactDetector:
         place, as well as noise, 0..1. Higher misses lighter contacts.
     shift : distance by which the untouched gel may move against the camera, px. It makes sharp edges in the
         picture count less.
+    relaxation : part of the strongest recent change that a gel may still show after it was released, in
+        [0, 1): soft gels creep back within a second or so. Higher ends a contact earlier while it is lifted.
     distance : for `colour`: change of colour that is contact, grey levels.
 
     Raises
@@ -109,6 +114,7 @@ class ContactDetector:
         false_alarms: float = 1e-6,
         repeatability: float = 0.02,
         shift: float = 1.0,
+        relaxation: float = 0.2,
         distance: float = 24.0,
     ) -> None:
         if method not in ("noise", "colour", "seed"):
@@ -119,12 +125,15 @@ class ContactDetector:
             raise ValueError(f"repeatability: required in [0, 1], got {repeatability}")
         if not shift >= 0:
             raise ValueError(f"shift: required >= 0 px, got {shift}")
+        if not 0 <= relaxation < 1:
+            raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
         if not distance > 0:
             raise ValueError(f"distance: required > 0 grey levels, got {distance}")
         self._method = method
         self._false_alarms = false_alarms
         self._repeatability = repeatability
         self._shift = shift
+        self._relaxation = relaxation
         self._distance = distance
         self.reset()
 
@@ -137,7 +146,9 @@ class ContactDetector:
         self._squares: Float | None = None
         self._noise: Float | None = None
         self._known: _Reference | None = None
-        self._touching = False
+        self._before: NDArray[np.bool_] | None = None
+        self._limits: dict[int, float] = {}
+        self._strongest = 0.0
 
     @property
     def has_reference(self) -> bool:
@@ -230,55 +241,91 @@ class ContactDetector:
         known = self._reference()
         half, cells = _cells(image)
         change, found = self._change(np.asarray(cv2.blur(cells, (3, 3)), np.float32), known)
-        deviation = change * known.weight
-        square = np.einsum("ijk,ijk->ij", deviation, deviation)
-        largest = float(square.max())
-        limit = chi_square_threshold(self._false_alarms / square.size)
-        if largest < (limit * _LEAVE**2 if self._touching else limit):
-            self._touching = False
+        square = _squared_length(change * known.weight)
+        largest = float(cv2.minMaxLoc(square)[1])
+        before, self._before = self._before, None
+        remembered = self._relaxation**2 * self._strongest
+        limit = self._limit(square.size)
+        start, stay = max(limit, remembered), max(limit * _LEAVE**2, remembered)
+        blobs: list[_Blob] = []
+        if largest >= (start if before is None else stay):
+            blobs = _blobs(square, limit / 4, start, stay, before)
+        self._strongest = max(self._strongest * _FADE, largest if blobs else 0.0)
+        if not blobs:
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, math.sqrt(largest))
-        self._touching = True
+        self._before = np.zeros(square.shape, np.bool_)
         mask = np.zeros((cells.shape[0] * _CELL, cells.shape[1] * _CELL), np.uint8)
-        for rows, columns, inside in _blobs(change, square, limit, min(limit, largest)):
-            light = light_change(found, known.half_shade, rows, columns)
-            answer = (half[rows, columns] - known.half[rows, columns] - light) * known.half_scale[
-                rows, columns
+        for rows, columns, inside in blobs:
+            self._before[rows, columns] |= inside
+            level = _level(half, found, known, rows, columns, inside)
+            large = cv2.resize(level, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+            window = mask[
+                _CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop
             ]
-            answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8), np.float32)
-            level = imprint(answer, inside)
-            height, width = level.shape
-            large = cv2.resize(level, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR)
-            mask[2 * rows.start : 2 * rows.stop, 2 * columns.start : 2 * columns.stop][large > 0] = 255
+            window |= cv2.compare(large, 0.0, cv2.CMP_GT)
         mask = np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
         return ContactResult(mask, bool(mask.any()), math.sqrt(largest))
 
+    def _limit(self, cells: int) -> float:
+        if cells not in self._limits:
+            self._limits[cells] = chi_square_threshold(self._false_alarms / cells)
+        return self._limits[cells]
+
+
+_Blob = tuple[slice, slice, NDArray[np.bool_]]
+
+
+def _level(
+    half: Float, found: Float, known: _Reference, rows: slice, columns: slice, inside: NDArray[np.bool_]
+) -> Float:
+    """Level set of one contact's outline, at half resolution, over a window given in cells."""
+    fine = slice(2 * rows.start, 2 * rows.stop), slice(2 * columns.start, 2 * columns.stop)
+    answer = half[fine] - known.half[fine]
+    answer -= light_change(found, known.half_shade, *fine)
+    answer *= known.half_scale[fine]
+    answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8), np.float32)
+    size = (2 * inside.shape[1], 2 * inside.shape[0])
+    belongs = cv2.resize(inside.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    return imprint(answer, belongs, _BRIDGE / 2)
+
+
+def _squared_length(vectors: Float) -> Float:
+    """(h, w) float32: sum over the three channels of the squares of (h, w, 3) float32."""
+    return np.asarray(cv2.transform(vectors * vectors, np.ones((1, 3), np.float32)), np.float32)
+
 
 def _blobs(
-    change: Float, square: Float, limit: float, strong: float
-) -> list[tuple[slice, slice, NDArray[np.bool_]]]:
-    """Connected changes with a strong place: rows, columns at half resolution, and which pixels belong."""
-    support = (square > limit / 4).astype(np.uint8)
-    support = np.asarray(cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=8)
+    square: Float, weak: float, start: float, stay: float, before: NDArray[np.bool_] | None
+) -> list[_Blob]:
+    """Connected changes that are contact: rows and columns of a window of cells, and which of them belong.
+
+    square : (h, w) float32, squared deviations. weak : belongs to a contact if connected to it. start : makes a
+    new contact. stay : keeps one. before : the cells that were in contact in the frame before.
+    """
+    changed = cv2.compare(square, weak, cv2.CMP_GT)
+    changed = cv2.morphologyEx(changed, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
     height, width = square.shape
     found = []
     for index in range(1, count):
-        left, top, wide, high, _ = (int(value) for value in stats[index])
+        left, top, wide, high, area = (int(value) for value in stats[index])
+        if area < min(_LEAST, square.size // 4):
+            continue
         window = slice(top, top + high), slice(left, left + wide)
         inside = labels[window] == index
-        if float(square[window][inside].max()) >= strong:
-            found.append((float(square[window][inside].sum()), index, left, top, wide, high))
-    found.sort(reverse=True)
+        values = square[window][inside]
+        peak = float(values.max())
+        stays = before is not None and peak >= stay and bool(before[window][inside].any())
+        if peak >= start or stays:
+            found.append((float(values.sum()), index, window))
+    found.sort(key=lambda entry: -entry[0])
     blobs = []
-    for energy, index, left, top, wide, high in found[:_BLOBS]:
+    for energy, index, (high_rows, wide_columns) in found[:_BLOBS]:
         if energy < _WEAK * found[0][0]:
             break
-        rows = slice(max(top - 1, 0), min(top + high + 1, height))
-        columns = slice(max(left - 1, 0), min(left + wide + 1, width))
-        inside = (labels[rows, columns] == index).repeat(2, axis=0).repeat(2, axis=1)
-        blobs.append(
-            (slice(2 * rows.start, 2 * rows.stop), slice(2 * columns.start, 2 * columns.stop), inside)
-        )
+        rows = slice(max(high_rows.start - 1, 0), min(high_rows.stop + 1, height))
+        columns = slice(max(wide_columns.start - 1, 0), min(wide_columns.stop + 1, width))
+        blobs.append((rows, columns, labels[rows, columns] == index))
     return blobs
 
 
@@ -289,9 +336,9 @@ def _cells(image: NDArray[np.uint8]) -> tuple[Float, Float]:
     if bottom or right:
         padded = np.asarray(cv2.copyMakeBorder(padded, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
     height, width = padded.shape[:2]
-    half = cv2.resize(padded, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+    half = cv2.resize(padded, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
     cells = cv2.resize(half, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
-    return half, np.asarray(cells, np.float32)
+    return half.astype(np.float32), cells.astype(np.float32)
 
 
 def _steepness(picture: Float) -> Float:

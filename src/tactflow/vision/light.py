@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +62,7 @@ class LightChange:
         """
         excess = (self._coarse(cells) - self._reference).T[:, None, :]
         found = np.zeros((3, 1, 4), np.float32)
-        found[..., 0] = np.median(excess, axis=2)
+        found[..., 0] = np.sort(excess, axis=2)[..., excess.shape[2] // 2]
         for _ in range(_ROUNDS):
             residual = excess - found @ self._basis
             step = np.clip(residual, -self._limit, self._limit) @ self._solve - found @ self._shrink
@@ -81,11 +83,17 @@ def light_change(found: Float, shade: Float, rows: slice, columns: slice) -> Flo
     rows, columns : the window.
     """
     height, width = shade.shape[:2]
-    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[columns]
-    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[rows]
+    x, y = _positions(width)[columns], _positions(height)[rows]
     along = (found[:, 0] + x[:, None] * found[:, 1]).ravel()
-    across = np.broadcast_to(found[:, 2], (x.size, 3)).ravel()
-    plane = np.column_stack([np.ones_like(y), y]) @ np.stack([along, across])
-    gain = np.broadcast_to(found[:, 3], (x.size, 3)).ravel()
-    window = np.ascontiguousarray(shade[rows, columns]).reshape(y.size, -1)
-    return np.asarray(plane + window * gain, np.float32).reshape(y.size, x.size, 3)
+    across = np.tile(found[:, 2], x.size)
+    change: Float = shade[rows, columns].reshape(y.size, -1) * np.tile(found[:, 3], x.size)
+    change += along
+    change += y[:, None] * across
+    return change.reshape(y.size, x.size, 3)
+
+
+@lru_cache(maxsize=16)
+def _positions(count: int) -> Float:
+    positions = np.linspace(-0.5, 0.5, count, dtype=np.float32)
+    positions.setflags(write=False)
+    return positions
