@@ -44,6 +44,7 @@ class Outcome:
     markers: Markers | None
     contact_mask: NDArray[np.uint8] | None
     mapping: PixelMapping | None
+    image: NDArray[np.uint8] | None
     cpu: float
     wall: float
 
@@ -141,6 +142,7 @@ class LockstepPipeline:
             markers=last.get("markers"),
             contact_mask=last.get("contact_mask"),
             mapping=last.get("mapping"),
+            image=last.get("image"),
             cpu=self._turns.cpu,
             wall=self._turns.wall,
         )
@@ -218,6 +220,7 @@ def _rewired(pipeline: Pipeline, jsonl: Path | None, turns: _Turns) -> Pipeline:
         "markers": Markers,
         "contact_mask": NDArray[np.uint8],
         "mapping": PixelMapping,
+        "image": NDArray[np.uint8],
     }
     collect = Component(
         name=_COLLECT,

@@ -44,7 +44,7 @@ class Case:
         return f"{self.name}?frames={self.frames}" + (f"&{self.query}" if self.query else "")
 
 
-QUICK = (Case("press", 50), Case("bright_cable", 50), Case("jumps", 40))
+QUICK = (Case("press", 44), Case("bright_cable", 40), Case("jumps", 30))
 """One contact with each kind of light, and the hardest motion."""
 
 FULL = (
