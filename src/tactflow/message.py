@@ -23,6 +23,9 @@ SCHEMA = "tactflow.frame/1"
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
 """The word for each value of `MarkerStatus`."""
 
+_RESULTS = frozenset({"contact", "flow", "markers"})
+"""Ports whose absence or repetition the message explains: those that it publishes."""
+
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 
 _last_origin: tuple[bytes, orjson.Fragment] = (b"", orjson.Fragment(b"[]"))
@@ -64,7 +67,7 @@ def encode_message(
             "contact": None if contact is None else _contact(contact, detail),
             "flow": None if flow is None else _flow(flow, detail),
             "markers": None if markers is None else _markers(markers, detail),
-            "skipped": dict(tick.skipped),
+            "skipped": {port: reason for port, reason in tick.skipped.items() if port in _RESULTS},
         },
         option=_OPTIONS,
     )

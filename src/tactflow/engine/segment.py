@@ -223,7 +223,7 @@ class Segment:
             tick.values[key] = value
             tick.reasons[key] = reason
             if key in node.signals:
-                node.signals[key].add(value is True)
+                node.signals[key].add(not isinstance(value, Absent) and bool(value))
 
     def _run(self, node: RunningNode, tick: RunningTick) -> None:
         if node.disabled:
