@@ -34,6 +34,7 @@ from tactflow.engine.graph import Pipeline
 
 DEFAULT = "default"
 MARKERLESS = "markerless"
+WEDGE = "wedge"
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,11 +162,12 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
             _peak_memory(plan, general, result.measurements, scratch, step)
         if plan.data is not None:
             doing = "recordings"
-            for measured in recordings.measure_recordings(general, bare, plan.data, scratch, unit, step):
+            wedge = {WEDGE: loaded[WEDGE], **general} if WEDGE in loaded else general
+            for measured in recordings.measure_recordings(wedge, bare, plan.data, scratch, unit, step):
                 result.measurements += measured
     result.copy_ms, result.touch_ms = unit.copy_ms, unit.touch_ms
-    markerless = MARKERLESS if MARKERLESS in loaded else None
-    result.targets = judge(result, DEFAULT, markerless, grown)
+    markerless, wedge_name = (name if name in loaded else DEFAULT for name in (MARKERLESS, WEDGE))
+    result.targets = judge(result, DEFAULT, grown, wedge=wedge_name, markerless=markerless)
     result.wall_s = time.perf_counter() - began
     progress("done", total, total)
     return result

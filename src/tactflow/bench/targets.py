@@ -19,13 +19,14 @@ ALWAYS = frozenset({"idle", "drift", "flicker", "noisy"})
 """Scenes that tempt a method to see contacts."""
 
 
-def judge(result: Result, default: str, markerless: str | None, growth: float | None) -> list[Target]:
+def judge(result: Result, default: str, growth: float | None, *, wedge: str, markerless: str) -> list[Target]:
     """Every promise with its result; those that were not measured say so.
 
     Parameters
     ----------
-    result : of a run. default : name of the pipeline that made the promises. markerless : name of the one for
-        sensors without markers. growth : from `pipelines.growth`.
+    result : of a run. default : name of the pipeline that made the promises. growth : from
+        `pipelines.growth`. wedge, markerless : names of the pipelines for the real recordings with and
+        without markers.
     """
     simulated = [m for m in result.of("pipeline", default) if not m.scene.startswith(RECORDING)]
     nominal = [m for m in simulated if m.scene in NOMINAL]
@@ -56,18 +57,18 @@ def judge(result: Result, default: str, markerless: str | None, growth: float | 
         ),
         _recording(
             result,
-            default,
+            wedge,
             "wedge_ball",
             [("found_percent", 100.0), ("label_center_p50", 2.0), ("label_center_p95", 4.8)],
         ),
         _recording(
             result,
-            default,
+            wedge,
             "wedge_roll",
             [("markers_short", 0.0), ("shared_dots", 0.0), ("flow_jumps", 0.0)],
         ),
-        _tracker_time(result, default),
-        _recording(result, markerless or default, "wedge_grasp", [("force_right", 98.0)]),
+        _tracker_time(result, wedge),
+        _recording(result, markerless, "wedge_grasp", [("force_right", 98.0)]),
     ]
 
 

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tactflow.bench.pipelines import ORIGINAL
+from tactflow.bench.results import Measurement, Result
+from tactflow.bench.run import Plan, run_bench
+from tactflow.bench.scenes import FULL, Case
+from tactflow.bench.targets import judge
+from tactflow.cli.main import main
+from tactflow.cli.pipelines import find_pipeline
+from tactflow.engine.errors import ConfigError
+
+FILES = {name: find_pipeline(name) for name in ("default", "seed")}
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    plan = Plan(
+        FILES,
+        quick=True,
+        memory=False,
+        cases=(Case("bright_cable", 14), Case("unmarked", 6)),
+        stage_cases=(Case("press", 4),),
+    )
+    steps: list[tuple[int, int]] = []
+    made = run_bench(plan, lambda _what, done, total: steps.append((done, total)))
+    assert steps == sorted(steps)
+    assert steps[-1][0] == steps[-1][1]
+    return made
+
+
+def test_every_pipeline_is_measured_on_every_scene_with_markers(result: Result) -> None:
+    found = {m.method: m for m in result.of("pipeline") if m.scene == "bright_cable"}
+    assert found.keys() == {"default", "seed", ORIGINAL}
+    assert not [m.failure for m in found.values() if m.failure]
+    for m in found.values():
+        assert {"displacement_rms", "wrong_percent", "false_contacts", "missed_contacts"} <= m.errors.keys()
+        assert m.copies["contact"] > 0
+    assert found["default"].limits["displacement_rms"] < found["default"].errors["displacement_rms"]
+
+
+def test_the_script_costs_more_than_the_seed_pipeline_and_says_the_same(result: Result) -> None:
+    found = {m.method: m for m in result.of("pipeline") if m.scene == "bright_cable"}
+    assert found[ORIGINAL].errors == found["seed"].errors
+    # It does everything twice that costs most; half of that would already be a quarter more.
+    assert found[ORIGINAL].copies["contact"] > 1.25 * found["seed"].copies["contact"]
+
+
+def test_a_gel_without_markers_is_measured_without_a_tracker(result: Result) -> None:
+    found = [m for m in result.of("pipeline") if m.scene == "unmarked"]
+    assert found
+    for m in found:
+        assert m.failure is None
+        assert "displacement_rms" not in m.errors
+        assert "tracker" not in m.stages_ms
+
+
+def test_promises_name_what_was_not_measured(result: Result) -> None:
+    targets = {t.quantity: t for t in result.targets}
+    assert targets["marker displacement"].met is not None
+    assert targets["wedge_ball"].met is None
+    assert "--data" in targets["wedge_ball"].on
+
+
+def test_a_promise_is_judged_by_the_worst_scene() -> None:
+    made = Result(quick=True, copy_ms=0.1)
+    for scene, rms in (("press", 0.01), ("cable", 0.031)):
+        errors = {"displacement_rms": rms, "displacement_p99": 0.05}
+        made.measurements.append(Measurement("pipeline", "default", scene, errors=errors))
+    target = next(
+        t
+        for t in judge(made, "default", None, wedge="wedge", markerless="markerless")
+        if t.quantity == "marker displacement"
+    )
+    assert target.met is False
+    assert "cable" in target.on
+    made.measurements[1].errors["displacement_rms"] = 0.03
+    target = next(
+        t
+        for t in judge(made, "default", None, wedge="wedge", markerless="markerless")
+        if t.quantity == "marker displacement"
+    )
+    assert target.met is True
+
+
+def test_an_unknown_scene_is_refused_before_anything_is_measured() -> None:
+    with pytest.raises(ConfigError, match="nowhere"):
+        run_bench(Plan(FILES, scenes=frozenset({"nowhere"})))
+
+
+def test_scenes_can_be_chosen() -> None:
+    whole, alone = Plan(FILES, scenes=frozenset({"press"})).chosen()
+    assert [c.label for c in whole] == ["press"]
+    assert [c.label for c in alone] == ["press"]
+    assert Plan(FILES).chosen()[0] == FULL
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--against", "nothing.json"], "cannot be read"),
+        (["--html", "no/such/folder/x.html"], "no folder"),
+        (["nothing.yaml"], "no such pipeline"),
+        (["--scene", "nowhere"], "nowhere"),
+    ],
+)
+def test_mistakes_are_refused_before_anything_is_measured(
+    arguments: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "--quick", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_command_writes_results_and_fails_when_something_got_worse(
+    result: Result, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tactflow.cli.bench.run_bench", lambda _plan, _progress: result)
+    files = ["--json", "b.json", "--html", "b.html", "--errors", "e.json"]
+    assert main(["bench", "--quick", *files]) == 0
+    out, err = capsys.readouterr()
+    assert "Whole pipelines" in out
+    assert "b.html" in err
+    assert json.loads((tmp_path / "b.json").read_text())["schema"] == "tactflow.bench/1"
+    assert "Which method should I use" in (tmp_path / "b.html").read_text()
+    assert main(["bench", "--quick", "--against", "e.json"]) == 0
+    assert "nothing got worse" in capsys.readouterr().err
+    stored = json.loads((tmp_path / "e.json").read_text())
+    stored["errors"]["pipeline/default/bright_cable"]["displacement_rms"] /= 10
+    (tmp_path / "e.json").write_text(json.dumps(stored))
+    assert main(["bench", "--quick", "--against", "e.json"]) == 3
+    assert "pipeline/default/bright_cable: marker displacement error" in capsys.readouterr().err
