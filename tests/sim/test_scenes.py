@@ -206,16 +206,36 @@ def test_the_direction_is_that_of_the_indenter_and_a_disc_has_none(name: str, di
     assert checked >= 3
 
 
-def test_the_contact_of_a_ball_is_a_disc_of_the_stated_radius() -> None:
-    scene = open_scene("press")
+@pytest.mark.parametrize("sink", [0.1, gel_model.SINK_IN, 0.5])
+def test_the_contact_of_a_ball_is_a_disc_of_the_stated_radius(sink: float) -> None:
+    scene = open_scene(f"press?sink={sink}")
     index = deepest(scene)
     (press,) = scene.presses(index)
     truth = scene.truth(index)
-    # The ball reaches depth - r^2 / 2R; contact is where that exceeds SINK_IN x depth.
-    radius = math.sqrt(2 * 95.0 * (1 - gel_model.SINK_IN) * press.depth)
+    # The ball reaches depth - r^2 / 2R; contact is where that exceeds sink x depth. 0.5 gives Hertz's sqrt(R d).
+    radius = math.sqrt(2 * 95.0 * (1 - sink) * press.depth)
     # Counting pixel centres in a circle: the error of the area is of the order of the radius' square root.
     assert truth.contact_mask.sum() == pytest.approx(math.pi * radius**2, rel=0.004)
     assert truth.center == pytest.approx((press.x, press.y), abs=0.05)
+
+
+@pytest.mark.parametrize("rim", [0.4, gel_model.RIM, 1.0])
+def test_the_surface_follows_the_indenter_in_contact_and_decays_without_a_step_around_it(rim: float) -> None:
+    scene = open_scene(f"press?rim={rim}")
+    (press,) = scene.presses(deepest(scene))
+    line = np.arange(0, press.shape.reach, 0.05, dtype=np.float32)
+    depth = gel_model.reached(press, press.x + line, np.full_like(line, press.y))
+    sunk = gel_model.surface(press, depth)
+    touched = depth > press.sink * press.depth
+    np.testing.assert_array_equal(sunk[touched], depth[touched])
+    assert (np.diff(sunk) <= 0).all()
+    # The ball's steepest slope in contact is radius / R = 0.62; no step is steeper than that.
+    assert np.abs(np.diff(sunk)).max() <= 0.05 * 0.65
+    first = int(np.flatnonzero(~touched)[0])
+    slopes = np.diff(sunk)
+    # Derived: over the 0.15 px between the two differences the slope itself changes by 0.15 x 0.62 / 7.8 = 1 %.
+    assert slopes[first + 1] / slopes[first - 2] == pytest.approx(rim, abs=0.015)
+    assert sunk[-1] < 0.01 * press.depth
 
 
 @pytest.mark.parametrize("light", ["bright", "mixed"])

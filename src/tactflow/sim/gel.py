@@ -7,7 +7,7 @@ Mechanics, 1985, ch. 4 and 5.8). The gel of a sensor is a layer of moderate dept
 `SINK_IN` d at the rim, and for every shape the contact is where the indenter reaches deeper than that. There
 the gel's surface is the indenter's surface. Around it the surface decays smoothly to rest, as the pyramid of
 Gaussians of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors",
-RA-L 2022) makes it, but in closed form: with s = SINK_IN d it is s exp(FALL (reached / s - 1)).
+RA-L 2022) makes it, but in closed form: with s = SINK_IN d it is s exp(RIM (reached / s - 1)).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tactflow.sim.shapes import Array, Shape
 
 SINK_IN = 0.3
 """Share of the depth by which the gel has sunk at the rim of a contact."""
-FALL = 0.6
+RIM = 0.6
 """Slope of the surface just outside a contact, relative to just inside: the crease at the rim."""
 TOUCH_DEPTH = 0.25
 """Depth below which an indenter does not count as touching, px."""
@@ -38,6 +38,7 @@ class Press:
     depth : px, 0 when it is off the gel.
     shear : (sx, sy) by which the gel under it has been dragged, px. twist : the same for rotation, radians.
     dilation : largest displacement by which the press pushes the gel apart, px.
+    sink, rim : the gel's `SINK_IN` and `RIM`.
     """
 
     shape: Shape
@@ -48,6 +49,8 @@ class Press:
     shear: tuple[float, float] = (0.0, 0.0)
     twist: float = 0.0
     dilation: float = 0.0
+    sink: float = SINK_IN
+    rim: float = RIM
 
     @property
     def touching(self) -> bool:
@@ -68,14 +71,14 @@ def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_
     mask = np.zeros(x.shape, dtype=np.bool_)
     for press in presses:
         if press.touching:
-            mask |= reached(press, x, y) > SINK_IN * press.depth
+            mask |= reached(press, x, y) > press.sink * press.depth
     return mask
 
 
 def surface(press: Press, depth: Array) -> Array:
     """How far the gel's surface has sunk, px >= 0, from the depth that `reached` gives."""
-    sink = np.float32(SINK_IN * press.depth)
-    outside = sink * np.exp(np.float32(FALL) * (np.minimum(depth, sink) / sink - np.float32(1.0)))
+    sink = np.float32(press.sink * press.depth)
+    outside = sink * np.exp(np.float32(press.rim) * (np.minimum(depth, sink) / sink - np.float32(1.0)))
     return np.maximum(depth, outside)
 
 

@@ -89,11 +89,14 @@ def presses(
     depth: float,
     shear: float,
     twist: float,
+    sink: float,
+    rim: float,
 ) -> tuple[tuple[Press, ...], int]:
     """The indenters at one moment, and the number of the contact they belong to (-1 between contacts).
 
     moment : frame of the scene. frames : its length. depth : scales all depths. shear : pitches by which the
         gel is dragged at most. twist : degrees by which it is turned at most.
+    sink, rim : of the gel, see `Press`.
     """
     start = max(1, round(0.1 * frames)) if frames > 1 else 1
     usable = frames - start - max(1, frames // 30)
@@ -149,6 +152,8 @@ def presses(
                 (float(drag[0]), float(drag[1])),
                 float(turn),
                 programme.dilation * pitch,
+                sink,
+                rim,
             )
         )
     return tuple(made), cycle

@@ -153,6 +153,9 @@ _SCENES: dict[str, _Recipe] = {
         _PRESS,
         {"noise": 6.0, "shot": 3.0, "hot": 40, "jpeg": 70, "blur": 1.0},
     ),
+    "soft_rim": _Recipe(
+        "a deep gel, whose surface shows no crease at the rim of a contact", _PRESS, {"sink": 0.5, "rim": 1.0}
+    ),
     "stutter": _Recipe("a camera that drops and repeats frames", _PRESS, {"dropped": 0.1, "repeated": 0.1}),
     "strong_shear": _Recipe(
         "a ball that moves markers by up to 1.5 pitches",
@@ -326,6 +329,8 @@ class Scene:
             depth=settings.depth,
             shear=settings.shear,
             twist=settings.twist,
+            sink=settings.sink,
+            rim=settings.rim,
         )
 
     @cached_property
@@ -488,7 +493,7 @@ class Scene:
         if self._light.brightening:
             share = press.depth / press.shape.depth
             amount = self._light.brightening * (0.45 + 0.55 * share) * min(1.0, share / 0.1)
-            rim = (depth - np.float32(gel.SINK_IN * press.depth)) * np.float32(
+            rim = (depth - np.float32(press.sink * press.depth)) * np.float32(
                 1.0 / (0.05 * press.shape.depth)
             )
             extra = np.float32(0.5 * amount) * (np.float32(1.0) + np.tanh(rim * np.float32(0.5)))

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from tactflow.sim.gel import RIM, SINK_IN
 from tactflow.sim.light import LIGHTS
 from tactflow.sim.markers import SHAPES
 
@@ -48,6 +49,8 @@ class Settings:
     shear: float = 0.12
     twist: float = 0.0
     bend: float = 0.0
+    sink: float = SINK_IN
+    rim: float = RIM
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,10 @@ KEYS: dict[str, Key] = {
     "shear": Key("largest drag of the gel by a contact", "pitches", 0, 1.5),
     "twist": Key("largest turn of the gel by a contact", "degrees", -60, 60),
     "bend": Key("turn of a cable's direction from end to end", "degrees", -150, 150),
+    "sink": Key(
+        "share of the depth by which the gel has sunk at a contact's rim: 0.5 is a deep gel", "", 0.1, 0.6
+    ),
+    "rim": Key("slope just outside a contact relative to just inside: 1 is no crease", "", 0.4, 1),
 }
 
 
