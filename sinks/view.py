@@ -138,7 +138,7 @@ class View:
     def wants(self) -> bool:
         """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""
         hub = self._hub
-        return hub is not None and hub.wanted and time.perf_counter() >= self._due
+        return hub is not None and (hub.owed or (hub.wanted and time.perf_counter() >= self._due))
 
     def counters(self) -> dict[str, int]:
         """encoded : pictures made; and those of `Hub.counters`."""
@@ -157,8 +157,8 @@ class View:
         if self._hub is None or not self.wants():
             return
         now = time.perf_counter()
-        # Counted from when it was due, so that an uneven source does not lower the rate.
-        self._due = max(self._due + self._interval, now - self._interval)
+        # Counted from when this one was due, so that an uneven source does not lower the rate.
+        self._due = max(self._due, now - self._interval / 2) + self._interval
         frame = tick.frame
         message = encode_message(tick, image, contact, flow, markers, detail=True)
         jpeg = self._encode(frame.image if image is None else image)

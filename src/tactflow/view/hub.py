@@ -89,7 +89,9 @@ class Page:
 
 
 class Hub:
-    """The pages that are open now. All but `publish`, `wanted` and `counters` belong to the server's loop.
+    """The pages that are open now.
+
+    `publish`, `wanted`, `owed` and `counters` may be used from any thread, the rest in the server's loop.
 
     Parameters
     ----------
@@ -102,6 +104,9 @@ class Hub:
         self.sensor = sensor
         self.run_id = secrets.token_hex(8)
         self.wanted = False
+        """Whether a page has credit."""
+        self.owed = False
+        """Whether somebody asked for one single frame: it is shown however soon it comes."""
         self.pages: set[Page] = set()
         self._someone = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -133,6 +138,7 @@ class Hub:
         jpeg : the picture.
         captured : `time.perf_counter` at its capture, s.
         """
+        self.owed = False
         self._number += 1
         header = header + b',"number":%d}' % self._number
         # A little-endian length, the JSON header, the picture.
@@ -332,6 +338,7 @@ class Hub:
 
     def _step(self, _: Any) -> None:
         assert self.control is not None
+        self.owed = True
         self.control.step()
 
     def _reference(self, _: Any) -> None:

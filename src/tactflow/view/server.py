@@ -120,6 +120,12 @@ class Server:
             await self._server.serve(sockets=[self._listener])
         finally:
             reporter.cancel()
+            # A page that reads nothing would keep its connection, and what was sent to it, for ever.
+            for connection in list(self._server.server_state.connections):
+                transport = getattr(connection, "transport", None)
+                if transport is not None:
+                    transport.abort()
+            await asyncio.sleep(0)
 
     async def _report(self) -> None:
         try:
