@@ -212,7 +212,7 @@ def test_the_contact_of_a_ball_is_a_disc_of_the_stated_radius(sink: float) -> No
     index = deepest(scene)
     (press,) = scene.presses(index)
     truth = scene.truth(index)
-    # The ball reaches depth - r^2 / 2R; contact is where that exceeds sink x depth. 0.5 gives Hertz's sqrt(R d).
+    # The ball reaches depth - r^2 / 2R; contact is where that exceeds sink x depth (0.5: Hertz's sqrt(R d)).
     radius = math.sqrt(2 * 95.0 * (1 - sink) * press.depth)
     # Counting pixel centres in a circle: the error of the area is of the order of the radius' square root.
     assert truth.contact_mask.sum() == pytest.approx(math.pi * radius**2, rel=0.004)
@@ -233,7 +233,7 @@ def test_the_surface_follows_the_indenter_in_contact_and_decays_without_a_step_a
     assert np.abs(np.diff(sunk)).max() <= 0.05 * 0.65
     first = int(np.flatnonzero(~touched)[0])
     slopes = np.diff(sunk)
-    # Derived: over the 0.15 px between the two differences the slope itself changes by 0.15 x 0.62 / 7.8 = 1 %.
+    # Derived: over the 0.15 px between the two differences the slope itself changes by 0.15 x 0.62 / 7.8, 1 %.
     assert slopes[first + 1] / slopes[first - 2] == pytest.approx(rim, abs=0.015)
     assert sunk[-1] < 0.01 * press.depth
 
