@@ -4,41 +4,76 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
-from tactflow.vision.markers import detect_markers
+from tactflow.vision.markers import Detection, detect_markers
+from tactflow.vision.seed_tracker import SeedTracker
 from tactflow.vision.tracking import MarkerTracker
 from tactflow.vision.types import Markers
 
 
 class Tracker:
-    """Follow the marker dots of the reference frame (seed functions `marker_center`, `m.run`)."""
+    """Follow the marker dots of the reference frame.
+
+    Seed functions `marker_center`, `m.init`, `m.run` and `m.get_flow`.
+    """
 
     memory = "stateful"
 
     class Params(StageParams):
-        """dot, polarity : what the marks look like; found from the reference where not given."""
+        """What the marks look like, and how far they may go."""
 
-        method: Literal["grid", "seed"] = Field("grid", description="seed is the original's search")
+        method: Literal["appearance", "seed"] = Field(
+            "appearance",
+            description="appearance: each mark against its own look, identities by the whole field; "
+            "seed: the original's contour centres and depth-first search, limited in visits",
+        )
         dot: float | None = Field(
             None, ge=1, le=200, description="radius of a mark, processed px; null finds it"
         )
-        polarity: Literal["auto", "dark", "bright"] = Field("auto", description="marks against the gel")
+        polarity: Literal["auto", "dark", "bright"] = Field(
+            "auto", description="marks against the gel; auto takes the stronger family"
+        )
+        max_displacement: float | None = Field(
+            None,
+            gt=0,
+            description="farthest a mark may jump between two frames, processed px; "
+            "null: 1.3 times the pitch; larger costs time and admits more confusion",
+        )
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        self._tracker: MarkerTracker | None = None
+        self.reset()
 
     def reset(self) -> None:
         """Forget the reference; a new one follows."""
-        self._tracker = None
+        self._references: list[NDArray[np.uint8]] = []
+        self._detection: Detection | None = None
+        self._tracker: MarkerTracker | SeedTracker | None = None
 
     def process(self, image: Image, frame: Frame) -> Markers:
         """Position, status and standard error of every marker; the first frame serves as reference."""
-        if self._tracker is None or frame.reference:
-            detection = detect_markers(image, dot_radius=self._params.dot, polarity=self._params.polarity)
-            self._tracker = MarkerTracker(image, detection)
+        if self._tracker is None:
+            self._references.append(image)
+            self._tracker = self._first_tracker(image)
+        elif frame.reference:
+            self._references.append(image)
+        elif len(self._references) > 1 and self._detection is not None:
+            # All reference frames are in: their mean has less noise than the first of them.
+            self._tracker = self._tracker_of(self._references, self._detection)
+            self._references = self._references[:1]
         return self._tracker.track(image)
+
+    def _first_tracker(self, image: NDArray[np.uint8]) -> MarkerTracker | SeedTracker:
+        if self._params.method == "seed":
+            return SeedTracker(image)
+        self._detection = detect_markers(image, dot_radius=self._params.dot, polarity=self._params.polarity)
+        return self._tracker_of([image], self._detection)
+
+    def _tracker_of(self, references: list[NDArray[np.uint8]], detection: Detection) -> MarkerTracker:
+        return MarkerTracker(references, detection, max_displacement=self._params.max_displacement)

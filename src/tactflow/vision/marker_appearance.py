@@ -140,31 +140,26 @@ def _longer(vectors: FloatArray, length: float) -> BoolArray:
 
 
 def _resample(image: NDArray[np.float32], points: FloatArray, reach: int) -> FloatArray:
-    """Patches (N, 2 reach + 1, 2 reach + 1) centred on sub-pixel points, by cubic convolution (Keys 1981)."""
+    """Patches (N, 2 reach + 1, 2 reach + 1) centred on sub-pixel points, by a windowed sinc of six taps."""
     pad = reach + 4
     padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
     base = np.floor(points).astype(np.int64)
     fraction = points - base
-    span = np.arange(-reach - 1, reach + 3)
+    span = np.arange(-reach - 2, reach + 4)
     height, width = padded.shape
     rows = np.clip(base[:, 1, None] + pad + span, 0, height - 1)
     columns = np.clip(base[:, 0, None] + pad + span, 0, width - 1)
     patches = padded[rows[:, :, None], columns[:, None, :]].astype(np.float64)
-    weights_x, weights_y = _cubic(fraction[:, 0]), _cubic(fraction[:, 1])
+    weights_x, weights_y = _lanczos(fraction[:, 0]), _lanczos(fraction[:, 1])
     size = 2 * reach + 1
-    across = sum(patches[:, :, tap : tap + size] * weights_x[tap][:, None, None] for tap in range(4))
+    across = sum(patches[:, :, tap : tap + size] * weights_x[:, tap, None, None] for tap in range(6))
     return np.asarray(
-        sum(across[:, tap : tap + size] * weights_y[tap][:, None, None] for tap in range(4)), np.float64
+        sum(across[:, tap : tap + size] * weights_y[:, tap, None, None] for tap in range(6)), np.float64
     )
 
 
-def _cubic(fraction: FloatArray) -> FloatArray:
-    t = fraction
-    return np.stack(
-        [
-            ((-0.5 * t + 1.0) * t - 0.5) * t,
-            (1.5 * t - 2.5) * t * t + 1.0,
-            ((-1.5 * t + 2.0) * t + 0.5) * t,
-            (0.5 * t - 0.5) * t * t,
-        ]
-    )
+def _lanczos(fraction: FloatArray) -> FloatArray:
+    """Weights (N, 6) of the pixels at -2 .. 3 for points between 0 and 1 (Lanczos; Duchon 1979)."""
+    distance = fraction[:, None] - np.arange(-2, 4)
+    weights = np.sinc(distance) * np.sinc(distance / 3)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float64)

@@ -12,8 +12,8 @@ ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-# Costs, in units where neighbours that differ by half their distance cost 0.5: of not seeing a mark, of each of
-# its links then, and of a displacement one pitch away from what was expected.
+# Costs, in units where neighbours that differ by half their distance cost 0.5: of not seeing a mark, of each
+# of its links then, and of a displacement one pitch away from what was expected.
 _MISSING: Final = 1.0
 _MISSING_LINK: Final = 0.25
 _SURPRISE: Final = 0.25

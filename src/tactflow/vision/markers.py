@@ -17,8 +17,8 @@ _SCALE_RATIO: Final = 1.6
 # (measured on rendered discs of radius 2 to 12 px).
 _RADIUS_PER_SIGMA: Final = 1.83
 _MOST_PEAKS: Final = 3000
-# Score of the weakest family that is believed to be a grid (see `_score`). Real and simulated gels score 100 and
-# more, dust, reflections and noise on gels without marks at most 14.
+# Score of the weakest family that is believed to be a grid (see `_score`). Real and simulated gels score 100
+# and more; dust, reflections and noise on gels without marks at most 14.
 _LEAST_SCORE: Final = 25.0
 _NO_MARKERS: Final = "0 markers found: is the sensor marker-less? then use pipelines/markerless.yaml"
 _FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels)"
@@ -73,9 +73,9 @@ def detect_markers(
     Parameters
     ----------
     image : (H, W, 3) uint8 BGR or (H, W) uint8, grey levels.
-    dot_radius : of a mark, px, 1 to a quarter of the shorter side; None finds it, but then wants at least four
-        marks in an even arrangement, lest dust passes for them. For marks made of several spots, the radius of
-        the whole mark.
+    dot_radius : of a mark, px, 1 to a quarter of the shorter side; None finds it, but then wants at least
+        four marks in an even arrangement, lest dust passes for them. For marks made of several spots, the
+        radius of the whole mark.
     polarity : "dark" or "bright" against the gel; "auto" takes the stronger family.
 
     Returns
@@ -284,7 +284,7 @@ def _family(
         typical = float(np.median(members))
     kept = order[(ranked > 0.35 * typical) & (ranked > 2.0)]
     if len(kept) < 3:
-        return kept
+        return np.asarray(kept, np.int64)
     for _ in range(3):
         distances, near = _nearest(peaks[kept], min(4, len(kept) - 1))
         pitch = float(np.median(distances[:, 0]))
@@ -295,7 +295,7 @@ def _family(
         kept = kept[~(between | lonely)]
         if len(kept) < 3:
             break
-    return kept
+    return np.asarray(kept, np.int64)
 
 
 def _score(peaks: FloatArray, strength: FloatArray) -> float:

@@ -1,0 +1,284 @@
+"""The original script's marker tracking, kept as the yardstick: contour centres, and a search over a grid."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.markers import NoMarkersError, neighbour_graph
+from tactflow.vision.seed_contact import seed_marker_mask
+from tactflow.vision.types import Markers, MarkerStatus
+
+FloatArray = NDArray[np.float64]
+
+SEED_AREA: Final = (50.0, 500.0)
+"""Areas between which a contour is a marker, px^2."""
+
+SEED_VISITS: Final = 5000
+"""Nodes the search may visit per frame; about what the original's time limit of 33 ms allows in Python.
+A limit in visits instead of milliseconds gives the same answer on every run and every machine."""
+
+
+class SeedFlow(NamedTuple):
+    """The flow as the original returns it: five arrays of shape (rows, columns).
+
+    Ox, Oy : where the markers were, px. Cx, Cy : where they are, px. Occupied : number of the centre that was
+    matched, or -1 where none was.
+    """
+
+    Ox: FloatArray
+    Oy: FloatArray
+    Cx: FloatArray
+    Cy: FloatArray
+    Occupied: NDArray[np.int64]
+
+
+def seed_marker_centers(
+    image: NDArray[np.uint8], *, least_area: float = SEED_AREA[0], most_area: float = SEED_AREA[1]
+) -> FloatArray:
+    """Centres of the markers by contour moments, in the order OpenCV finds the contours.
+
+    A contour counts if its area lies strictly between the limits and the longer side of its bounding box is
+    less than twice the shorter one.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8, BGR grey levels. least_area, most_area : px^2.
+
+    Returns
+    -------
+    centers : (N, 2) float64, px, with the half-pixel shift of the seed's mask.
+
+    References
+    ----------
+    Seed function `marker_center`.
+    """
+    contours, _ = cv2.findContours(seed_marker_mask(image), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    centers = []
+    for contour in contours:
+        if not least_area < cv2.contourArea(contour) < most_area:
+            continue
+        _, _, width, height = cv2.boundingRect(contour)
+        if max(width, height) < 2 * min(width, height):
+            moments = cv2.moments(contour)
+            centers.append((moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]))
+    return np.array(centers, np.float64).reshape(-1, 2)
+
+
+class SeedMatcher:
+    """Matches centres to a grid of rows and columns by depth-first search.
+
+    Seed functions `m.init`, `m.run` and `m.get_flow`. The grid is visited row by row. Each node tries the
+    free centres that continue the motion of its left and upper neighbours best, or stays empty at a price; a
+    branch is given up when it costs more than the best complete one so far.
+
+    origin : (rows, columns, 2) float64, the grid, px; NaN where it has no marker.
+    spacing : typical distance of neighbours, px. max_visits : see `SEED_VISITS`.
+    """
+
+    def __init__(self, origin: FloatArray, spacing: float, *, max_visits: int = SEED_VISITS) -> None:
+        if origin.ndim != 3 or origin.shape[2] != 2:
+            raise ValueError(f"required origin of shape (rows, columns, 2), got {origin.shape}")
+        self._origin = origin
+        self._spacing = spacing
+        self._max_visits = max_visits
+        rows, columns = origin.shape[:2]
+        self._nodes = [
+            (row, column)
+            for row in range(rows)
+            for column in range(columns)
+            if np.isfinite(origin[row, column]).all()
+        ]
+        number = {node: index for index, node in enumerate(self._nodes)}
+        self._before = [
+            [
+                number[near]
+                for near in ((row, column - 1), (row - 1, column), (row - 1, column - 1))
+                if near in number
+            ][:2]
+            for row, column in self._nodes
+        ]
+        self._places: list[complex] = [complex(*origin[node]) for node in self._nodes]
+        self._centers: list[complex] = []
+        self._best: list[int] = [-1] * len(self._nodes)
+        self._moves: list[complex] = [0j] * len(self._nodes)
+
+    def init(self, centers: FloatArray) -> None:
+        """Take the centres (N, 2), px, of a frame."""
+        self._centers = [complex(x, y) for x, y in centers]
+
+    def run(self) -> None:
+        """Search for the cheapest assignment until it is found or the visits are used up."""
+        count = len(self._nodes)
+        empty_price = self._spacing**2
+        chosen = [-1] * count
+        moves = [0j] * count
+        used: set[int] = set()
+        best_cost = float("inf")
+        costs = [0.0] * (count + 1)
+        options: list[list[tuple[float, int, complex]]] = [[] for _ in range(count)]
+        depth, visits = 0, 0
+        if count:
+            options[0] = self._options(0, moves, used, empty_price)
+        while depth >= 0 and count:
+            if chosen[depth] >= 0:
+                used.discard(chosen[depth])
+                chosen[depth] = -1
+            if not options[depth]:
+                depth -= 1
+                continue
+            cost, center, move = options[depth].pop(0)
+            total = costs[depth] + cost
+            if total >= best_cost:
+                options[depth] = []
+                continue
+            visits += 1
+            if visits > self._max_visits:
+                break
+            chosen[depth], moves[depth] = center, move
+            if center >= 0:
+                used.add(center)
+            if depth + 1 == count:
+                best_cost = total
+                self._best, self._moves = chosen.copy(), moves.copy()
+                continue
+            costs[depth + 1] = total
+            depth += 1
+            options[depth] = self._options(depth, moves, used, empty_price)
+
+    def _options(
+        self, node: int, moves: list[complex], used: set[int], empty_price: float
+    ) -> list[tuple[float, int, complex]]:
+        """What a node may do, cheapest first: (cost, centre or -1, displacement)."""
+        near = [moves[other] for other in self._before[node]]
+        expected = sum(near) / len(near) if near else 0j
+        place = self._places[node]
+        found = []
+        for index, center in enumerate(self._centers):
+            move = center - place
+            surprise = abs(move - expected)
+            if index not in used and surprise < 0.6 * self._spacing:
+                found.append((surprise**2, index, move))
+        found.sort(key=lambda option: option[:2])
+        return [*found[:3], (empty_price, -1, expected)]
+
+    def get_flow(self) -> SeedFlow:
+        """The result of the last `run`; nodes without a centre follow their neighbours."""
+        shape = self._origin.shape[:2]
+        current = self._origin.copy()
+        occupied = np.full(shape, -1, np.int64)
+        for node, center, place, move in zip(self._nodes, self._best, self._places, self._moves, strict=True):
+            now = place + move
+            current[node] = now.real, now.imag
+            occupied[node] = center
+        return SeedFlow(
+            self._origin[..., 0].copy(),
+            self._origin[..., 1].copy(),
+            current[..., 0],
+            current[..., 1],
+            occupied,
+        )
+
+
+class SeedTracker:
+    """The original tracker on a grid that is read off the reference frame instead of being typed in.
+
+    reference : (H, W, 3) uint8, BGR. max_visits : see `SEED_VISITS`.
+    least_area, most_area : see `seed_marker_centers`.
+
+    Raises
+    ------
+    NoMarkersError : fewer than four centres, or no grid in them.
+    """
+
+    def __init__(
+        self,
+        reference: NDArray[np.uint8],
+        *,
+        max_visits: int = SEED_VISITS,
+        least_area: float = SEED_AREA[0],
+        most_area: float = SEED_AREA[1],
+    ) -> None:
+        self._areas = (least_area, most_area)
+        centers = seed_marker_centers(reference, least_area=least_area, most_area=most_area)
+        grid, spacing = grid_of(centers)
+        self._present = np.isfinite(grid[..., 0])
+        self._matcher = SeedMatcher(grid, spacing, max_visits=max_visits)
+
+    def track(self, image: NDArray[np.uint8]) -> Markers:
+        """Match one frame; markers without a centre are inferred. Standard errors are unknown (NaN)."""
+        least, most = self._areas
+        self._matcher.init(seed_marker_centers(image, least_area=least, most_area=most))
+        self._matcher.run()
+        flow = self._matcher.get_flow()
+        here = self._present
+        status = np.where(flow.Occupied[here] >= 0, MarkerStatus.TRACKED, MarkerStatus.INFERRED)
+        return Markers(
+            np.column_stack([flow.Ox[here], flow.Oy[here]]),
+            np.column_stack([flow.Cx[here], flow.Cy[here]]),
+            status.astype(np.uint8),
+            np.full(int(here.sum()), np.nan),
+        )
+
+
+def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
+    """Rows and columns of centres that lie on a (bent) grid.
+
+    Parameters
+    ----------
+    centers : (N, 2) float64, px.
+
+    Returns
+    -------
+    grid : (rows, columns, 2) float64, px, NaN where a node has no centre; centres that are not linked to the
+        grid are left out. spacing : median distance of linked centres, px.
+
+    Raises
+    ------
+    NoMarkersError : fewer than four centres, or none of them linked.
+    """
+    if len(centers) < 4:
+        raise NoMarkersError(
+            f"{len(centers)} markers found: is the sensor marker-less? then use pipelines/markerless.yaml"
+        )
+    squared = ((centers[:, None] - centers[None]) ** 2).sum(axis=2)
+    np.fill_diagonal(squared, np.inf)
+    nearest = float(np.median(np.sqrt(squared.min(axis=1))))
+    links: dict[int, list[tuple[int, int, int]]] = {}
+    lengths = []
+    for first, second in neighbour_graph(centers, 1.6 * nearest).tolist():
+        step = centers[second] - centers[first]
+        along, across = np.abs(step).max(), np.abs(step).min()
+        if across > 0.6 * along:
+            continue
+        lengths.append(float(np.hypot(*step)))
+        sign = 1 if step[np.argmax(np.abs(step))] > 0 else -1
+        down, right = (0, sign) if abs(step[0]) > abs(step[1]) else (sign, 0)
+        links.setdefault(first, []).append((second, down, right))
+        links.setdefault(second, []).append((first, -down, -right))
+    if not links:
+        raise NoMarkersError(
+            "0 markers found in a grid: is the sensor marker-less? then use pipelines/markerless.yaml"
+        )
+    place: dict[tuple[int, int], int] = {}
+    for seed in sorted(links, key=lambda center: -len(links[center])):
+        reached = {seed: (0, 0)}
+        queue = [seed]
+        for center in queue:
+            row, column = reached[center]
+            for other, down, right in links[center]:
+                if other not in reached:
+                    reached[other] = (row + down, column + right)
+                    queue.append(other)
+        parts = {node: center for center, node in reversed(reached.items())}
+        if len(parts) > len(place):
+            place = parts
+        if 2 * len(place) > len(centers):
+            break
+    rows, columns = np.array(list(place)).T
+    grid = np.full((int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1, 2), np.nan)
+    grid[rows - rows.min(), columns - columns.min()] = centers[list(place.values())]
+    return grid, float(np.median(lengths))
