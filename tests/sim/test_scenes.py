@@ -153,6 +153,15 @@ def test_creep_drags_the_gel_by_two_hundredths_of_a_pixel_a_frame() -> None:
     np.testing.assert_allclose(steps, 0.02, rtol=0.01)
 
 
+def test_a_long_recording_rests_for_two_seconds_and_stays_on_the_gel() -> None:
+    press, creep = open_scene("press?frames=200000"), open_scene("creep?frames=200000")
+    assert not press.truth(119).touching
+    assert press.truth(125).touching
+    origin, position = creep.markers(100_000)
+    assert 1 < np.hypot(*(position - origin).T).max() < 110
+    assert creep.truth(100_000).touching
+
+
 def test_a_tap_lasts_one_frame() -> None:
     touched = in_contact(open_scene("tap"))
     assert len(touched) >= 5
@@ -233,7 +242,7 @@ def test_the_surface_follows_the_indenter_in_contact_and_decays_without_a_step_a
     assert np.abs(np.diff(sunk)).max() <= 0.05 * 0.65
     first = int(np.flatnonzero(~touched)[0])
     slopes = np.diff(sunk)
-    # Derived: over the 0.15 px between the two differences the slope itself changes by 0.15 x 0.62 / 7.8, 1 %.
+    # Derived: over the 0.15 px between the two differences the slope changes by 0.15 x 0.62 / 7.8, or 1 %.
     assert slopes[first + 1] / slopes[first - 2] == pytest.approx(rim, abs=0.015)
     assert sunk[-1] < 0.01 * press.depth
 

@@ -1,6 +1,7 @@
 """What the indenters do: programmes of press, hold and release, random but reproducible.
 
-Frame 0 and the first tenth of a recording show the untouched gel, and so do its last frames.
+Frame 0 and the first tenth of a recording, at most two seconds, show the untouched gel, and so do its last
+frames.
 """
 
 from __future__ import annotations
@@ -13,6 +14,10 @@ import numpy as np
 
 from tactflow.sim.gel import Press
 from tactflow.sim.shapes import Shape
+
+
+_LONGEST_REST = 120
+_LARGEST_CREEP = 60.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ def presses(
         gel is dragged at most. twist : degrees by which it is turned at most.
     sink, rim : of the gel, see `Press`.
     """
-    start = max(1, round(0.1 * frames)) if frames > 1 else 1
+    start = min(max(1, round(0.1 * frames)), _LONGEST_REST)
     usable = frames - start - max(1, frames // 30)
     if moment < start or usable < 1:
         return (), -1
@@ -131,7 +136,9 @@ def presses(
         drag = radius * np.array([np.cos(angle), np.sin(angle)])
         travelled = drag
     elif programme.creep:
-        drag = travelled = programme.creep * max(phase - rise, 0.0) * ahead
+        # To and fro, so that the contact stays on the gel however long the recording is.
+        way = programme.creep * max(phase - rise, 0.0) % (2 * _LARGEST_CREEP)
+        drag = travelled = (_LARGEST_CREEP - abs(way - _LARGEST_CREEP)) * ahead
     elif programme.travel:
         # Stick until the gel has been dragged as far as friction holds it, then slip.
         way = programme.travel * progress
