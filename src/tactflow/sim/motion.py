@@ -15,7 +15,6 @@ import numpy as np
 from tactflow.sim.gel import Press
 from tactflow.sim.shapes import Shape
 
-
 _LONGEST_REST = 120
 _LARGEST_CREEP = 60.0
 
