@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.marker_appearance import MarkerAppearance
 from tactflow.vision.marker_matching import choose_spots
-from tactflow.vision.markers import Detection, to_gray
+from tactflow.vision.markers import Detection, refine_centers, to_gray
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]
@@ -23,7 +23,7 @@ _LEAST_SUPPORT: Final = 0.6
 
 
 class _Spots:
-    """Finds spots of the marks' size anywhere in a frame, fast: a difference of Gaussians at low resolution."""
+    """Finds spots of the marks' size anywhere in a frame: a difference of Gaussians at low resolution."""
 
     def __init__(self, reference: NDArray[np.uint8], detection: Detection) -> None:
         self._factor = 1
@@ -61,7 +61,8 @@ class _Spots:
         response = self._response(gray)
         highest = cv2.dilate(response, self._neighbourhood)
         peak = cv2.compare(response, highest, cv2.CMP_GE)
-        peak = cv2.bitwise_and(peak, cv2.compare(response, least * self.typical, cv2.CMP_GT))
+        _, strong = cv2.threshold(response, least * self.typical, 255, cv2.THRESH_BINARY)
+        peak = cv2.bitwise_and(peak, strong.astype(np.uint8))
         peak[0] = peak[-1] = 0
         peak[:, 0] = peak[:, -1] = 0
         at = np.flatnonzero(peak)
@@ -84,10 +85,10 @@ class MarkerTracker:
 
     What is known of a frame comes from three steps. First each mark is measured against its own look in the
     reference, starting where it was last seen; where all marks are found and their displacements form a
-    smooth field, this is the answer. Otherwise spots are searched in the whole frame, and the marks that do not
-    belong to the largest smooth part of the field choose among them, jointly, so that neighbours move alike
-    (min-sum belief propagation on the graph of neighbours). Then every choice is measured as before. Marks that
-    are not seen are placed by an affine fit to their neighbours.
+    smooth field, this is the answer. Otherwise spots are searched in the whole frame, and the marks that do
+    not belong to the largest smooth part of the field choose among them, jointly, so that neighbours move
+    alike (min-sum belief propagation on the graph of neighbours). Then every choice is measured as before.
+    Marks that are not seen are placed by an affine fit to their neighbours.
 
     A position is always measured against the reference, never against the frame before, so nothing drifts;
     what a mark did before only serves as a starting point, and identities rest on the smoothness of the whole
@@ -95,9 +96,9 @@ class MarkerTracker:
 
     Parameters
     ----------
-    reference : (H, W, 3) uint8 BGR or (H, W) uint8, the untouched gel; or several such frames of one size, whose
-        mean has less noise.
-    detection : the marks of the reference.
+    reference : (H, W, 3) uint8 BGR or (H, W) uint8, the untouched gel; or several such frames of one size,
+        whose mean has less noise.
+    detection : the marks of the reference; with several frames, their centres are taken again from the mean.
     max_displacement : farthest a mark may go between two frames, or from where its neighbours suggest, px.
         Larger values cost time in the search and admit more confusion. None: 1.3 times the pitch.
 
@@ -107,10 +108,10 @@ class MarkerTracker:
 
     References
     ----------
-    Lucas and Kanade (1981); Hager and Belhumeur, "Efficient region tracking with parametric models of geometry
-    and illumination", PAMI 20 (1998); Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 56 (2004); Lowe,
-    IJCV 60 (2004), for the spots; Felzenszwalb and Huttenlocher, "Efficient belief propagation for early
-    vision", IJCV 70 (2006). Seed functions `m.init`, `m.run`, `m.get_flow`.
+    Lucas and Kanade (1981); Hager and Belhumeur, "Efficient region tracking with parametric models of
+    geometry and illumination", PAMI 20 (1998); Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 56
+    (2004); Lowe, IJCV 60 (2004), for the spots; Felzenszwalb and Huttenlocher, "Efficient belief propagation
+    for early vision", IJCV 70 (2006). Seed functions `m.init`, `m.run`, `m.get_flow`.
     """
 
     def __init__(
@@ -128,9 +129,12 @@ class MarkerTracker:
             raise ValueError(f"required reference frames of one size, got {[gray.shape for gray in grays]}")
         if max_displacement is not None and not max_displacement > 0:
             raise ValueError(f"required max_displacement > 0 px, got {max_displacement:g}")
-        mean = np.mean(np.stack(grays), axis=0, dtype=np.float32)
+        mean = np.asarray(np.mean(np.stack(grays), axis=0, dtype=np.float32))
         self._shape = grays[0].shape
         self._origin = np.array(detection.centers, np.float64)
+        if len(grays) > 1:
+            dark = mean if detection.polarity == "dark" else 255 - mean
+            self._origin = refine_centers(dark, self._origin, detection.dot_radius)
         self._count = len(self._origin)
         self._pitch = detection.pitch
         self._radius = detection.dot_radius
@@ -189,7 +193,8 @@ class MarkerTracker:
     def _stretch(self, position: FloatArray) -> FloatArray:
         """By how much the displacements of neighbours differ, as a fraction of their distance: (E,)."""
         moved = position - self._origin
-        return _lengths(moved[self._edges[:, 0]] - moved[self._edges[:, 1]]) / self._edge_length
+        change = _lengths(moved[self._edges[:, 0]] - moved[self._edges[:, 1]])
+        return np.asarray(change / self._edge_length, np.float64)
 
     def _doubtful(self, seen: BoolArray, move: FloatArray, stretch: FloatArray) -> bool:
         """Whether measuring where the marks were last may have missed or mistaken one."""
@@ -218,7 +223,7 @@ class MarkerTracker:
         spots, strength = self._spots.find(gray, 0.25)
         settled = self._largest_part(seen, stretch)
         free = np.flatnonzero(~settled)
-        # What was measured without belonging to that part is a spot like any other, unless it was found anyway.
+        # What was measured without belonging to that part is a spot like any other, if it is not one already.
         own = position[free[seen[free]]]
         own = own[~self._near(own, spots, 0.35)]
         unclaimed = ~self._near(spots, position[settled], 0.3)
@@ -239,16 +244,40 @@ class MarkerTracker:
             farthest=self._farthest,
         )
         result, stderr, found = position.copy(), stderr.copy(), settled.copy()
-        taken = free[chosen >= 0]
-        if len(taken):
-            start = spots[chosen[chosen >= 0]]
-            measured, gain, share, error = self._appearance.measure(flat, start, taken)
-            sharp = _trusted(gain, share) & (_lengths(measured - start) < 0.6 * self._radius + 0.5)
-            result[taken] = np.where(sharp[:, None], measured, start)
-            # A spot that hardly looks like the mark any more is still its place, to a part of its radius.
-            stderr[taken] = np.where(sharp, error, 0.15 * self._radius)
-            found[taken] = sharp | ((gain > 0.3) & (gain < 3.0) & (share > 0.33))
+        given = chosen >= 0
+        self._take(flat, free[given], spots[chosen[given]], result, stderr, found)
+        unused = np.ones(len(spots), bool)
+        unused[chosen[given]] = False
+        if not found.all() and unused.any():
+            # Where the field is steep, an affine fit to the marks around foretells better than their motions.
+            self._infer(result, found, np.empty(self._count, np.uint8))
+            missing = np.flatnonzero(~found)
+            away = np.hypot(*(result[missing][:, None] - spots[unused]).transpose(2, 0, 1))
+            spot = away.argmin(axis=1)
+            mutual = (away.argmin(axis=0)[spot] == np.arange(len(missing))) & (
+                away.min(axis=1) < 0.4 * self._pitch
+            )
+            self._take(flat, missing[mutual], spots[unused][spot[mutual]], result, stderr, found)
         return result, found, stderr
+
+    def _take(
+        self,
+        flat: NDArray[np.uint8],
+        marks: IntArray,
+        spots: FloatArray,
+        position: FloatArray,
+        stderr: NDArray[Any],
+        found: BoolArray,
+    ) -> None:
+        """Measure marks at their spots and enter what is found, in place."""
+        if len(marks) == 0:
+            return
+        measured, gain, share, error = self._appearance.measure(flat, spots, marks)
+        sharp = _trusted(gain, share) & (_lengths(measured - spots) < 0.6 * self._radius + 0.5)
+        position[marks] = np.where(sharp[:, None], measured, spots)
+        # A spot that hardly looks like the mark any more is still its place, to a part of its radius.
+        stderr[marks] = np.where(sharp, error, 0.15 * self._radius)
+        found[marks] = sharp | ((gain > 0.3) & (gain < 3.0) & (share > 0.33))
 
     def _near(self, points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
         """Which points have one of the others within so many pitches, to a tenth of a pitch; by a raster, so
