@@ -33,18 +33,32 @@ ContactMethod = Literal["noise", "colour", "seed"]
 Float = NDArray[np.float32]
 
 _CELL = 4
+"""Side of a cell, px: averages 16 pixels, so that noise of 2 grey levels is half a level."""
 _PRIOR = 8
+"""Number of frames that the noise guessed from the first frame's own grain counts for."""
+_QUANTISATION = 12**-0.5
+"""Standard deviation of rounding to whole grey levels."""
 _LEVELS = 6
-_QUANTISATION = 1 / 12
+"""Ranges of brightness for which noise is guessed separately (shot noise grows with the light)."""
 _CORRELATED = 2.5
+"""How much less than white noise the guessed noise shrinks by smoothing: demosaicing and video compression
+leave little noise between neighbours, and more over distances."""
 _DARK = 0.1
+"""Part of the mean brightness that is added before changes are taken relative to the brightness."""
 _SHARP = 0.05
+"""Relative change by which an edge, moved by `shift`, begins to count less for the outline."""
 _WEAK = 0.02
+"""Places with less of the summed squared deviation than this part of the main one's are wrinkles of it."""
 _LEAVE = 0.7
+"""Part of the threshold, in standard deviations, that is enough to stay in contact."""
 _BLOBS = 12
+"""At most so many places are outlined."""
 _LEAST = 8
+"""Cells that must change together; 128 px^2 is the halo of a ball's first touch."""
 _FADE = 0.96
+"""How fast the strongest recent change is forgotten, per frame: half in 17 frames."""
 _BRIDGE = 8.0
+"""Radius of the gaps in an outline that a removed marker may have left, px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,7 +276,7 @@ class ContactDetector:
             window = mask[
                 _CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop
             ]
-            window |= cv2.compare(large, 0.0, cv2.CMP_GT)
+            window[large > 0] = 255
         mask = np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
         return ContactResult(mask, bool(mask.any()), math.sqrt(largest))
 
@@ -286,7 +300,7 @@ def _level(
     answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8), np.float32)
     size = (2 * inside.shape[1], 2 * inside.shape[0])
     belongs = cv2.resize(inside.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    return imprint(answer, belongs, _BRIDGE / 2)
+    return imprint(answer, np.asarray(belongs, np.uint8), _BRIDGE / 2)
 
 
 def _squared_length(vectors: Float) -> Float:
@@ -299,11 +313,10 @@ def _blobs(
 ) -> list[_Blob]:
     """Connected changes that are contact: rows and columns of a window of cells, and which of them belong.
 
-    square : (h, w) float32, squared deviations. weak : belongs to a contact if connected to it. start : makes a
-    new contact. stay : keeps one. before : the cells that were in contact in the frame before.
+    square : (h, w) float32, squared deviations. weak : belongs to a contact if connected to it. start : makes
+    a new contact. stay : keeps one. before : the cells that were in contact in the frame before.
     """
-    changed = cv2.compare(square, weak, cv2.CMP_GT)
-    changed = cv2.morphologyEx(changed, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    changed = cv2.morphologyEx((square > weak).view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
     height, width = square.shape
     found = []
@@ -354,7 +367,7 @@ def _spatial_noise(cells: Float) -> Float:
     Second differences of neighbouring cells see the noise and hardly the shading; their median is not moved
     by markers. Grain of the gel counts as noise here, which errs on the side of silence.
     """
-    noise = np.full_like(cells, math.sqrt(_QUANTISATION))
+    noise = np.full_like(cells, _QUANTISATION)
     if cells.shape[1] < 3:
         return noise
     second = np.abs(cells[:, :-2] - 2 * cells[:, 1:-1] + cells[:, 2:]) * np.float32(1.4826 / math.sqrt(6))
@@ -367,7 +380,7 @@ def _spatial_noise(cells: Float) -> Float:
         noise[..., channel] = np.interp(cells[..., channel], center, spread)
     # Smoothing 3 x 3 would divide by three were the cells independent; demosaicing and compression see to
     # it that they are not quite.
-    return np.asarray(np.hypot(noise / 3 * _CORRELATED, math.sqrt(_QUANTISATION) / 4), np.float32)
+    return np.asarray(np.hypot(noise / 3 * _CORRELATED, _QUANTISATION / 4), np.float32)
 
 
 def _colour_distance(

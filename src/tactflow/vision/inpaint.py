@@ -15,8 +15,11 @@ SEED_RADIUS = 7
 """Inpainting radius of the original script, px."""
 
 _CELL = 4
+"""Side of the blocks on which averages are formed, px."""
 _FAR = 0.01
+"""Weight of the wide window against the near neighbours."""
 _TRACE = 1e-6
+"""Weight of the mean of the whole frame: where a window has no valid pixel at all."""
 
 
 def remove_markers(

@@ -15,9 +15,13 @@ from tactflow.vision.markers import NoMarkersError, detect_markers
 Polarity = Literal["dark", "bright"]
 
 _DIRECTIONS = 12
+"""Points on the circle around a spot that are compared with it."""
 _RIM = 1.5
+"""Soft rim of a dot that is covered too, pixels at half resolution."""
 _SHARE = 0.25
+"""Part of the dots' median contrast from which on something is a dot: worn dots keep that much."""
 _LEAST = 6.0
+"""Least contrast of a dot, grey levels: what the seed's threshold of 120 / 20 lets through."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +119,8 @@ def _response(half: NDArray[np.uint8], radius: float, polarity: Polarity) -> NDA
         contrast = cv2.subtract(half, cv2.dilate(half, circle))
     first, second, third = cv2.split(contrast)
     median = np.asarray(cv2.max(cv2.min(first, second), cv2.min(cv2.max(first, second), third)), np.uint8)
-    # In a corner of the frame three quarters of the circle are missing: any dark corner would be a spot.
-    reach = len(circle) // 2
+    # In a corner of the frame most of the circle is missing: any dark corner would be a spot.
+    reach = len(circle) // 4
     for rows in (slice(0, reach), slice(-reach, None)):
         median[rows, :reach] = 0
         median[rows, -reach:] = 0
