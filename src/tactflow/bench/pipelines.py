@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.bench import metrics
 from tactflow.bench.lockstep import LockstepPipeline, Outcome
 from tactflow.bench.methods import SEED, fill_times
 from tactflow.bench.results import Measurement
@@ -21,6 +22,7 @@ from tactflow.bench.score import ContactScore, FlowScore, MarkerScore
 from tactflow.bench.timing import CopyUnit, Samples, quiet, timed
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
+from tactflow.sim import Truth
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.inpaint import SEED_RADIUS, remove_markers
 from tactflow.vision.seed_contact import seed_contact_mask, seed_difference, seed_marker_mask
@@ -41,11 +43,30 @@ def on_recording(pipeline: Pipeline, path: Path, **params: Any) -> Pipeline:
 
 
 @dataclass(slots=True)
+class Worst:
+    """The frame on which a pipeline was worst, by the overlap of the hulls, in frames of at least half depth.
+
+    overlap : 0 to 1, or 2 before anything was seen. outcome, truth : of that frame.
+    """
+
+    overlap: float = 2.0
+    outcome: Outcome | None = None
+    truth: Truth | None = None
+
+    def see(self, outcome: Outcome, truth: Truth) -> None:
+        """Keep this frame if it is worse."""
+        overlap = metrics.convex_iou(outcome.contact.hull, truth.hull) if outcome.contact else 0.0
+        if overlap < self.overlap:
+            self.overlap, self.outcome, self.truth = overlap, outcome, truth
+
+
+@dataclass(slots=True)
 class _Score:
     contact: ContactScore = field(default_factory=ContactScore)
     markers: MarkerScore = field(default_factory=MarkerScore)
     flow: FlowScore = field(default_factory=FlowScore)
     limit: float | None = None
+    worst: Worst = field(default_factory=Worst)
 
     def add(self, outcome: Outcome, rendered: Rendered) -> str:
         """Judge one frame; returns whether it shows a contact, as a kind of time."""
@@ -55,7 +76,10 @@ class _Score:
             height, width = outcome.frame.image.shape[:2]
             mapping = PixelMapping.identity((width, height))
         truth = rendered.truths(mapping)[index]
-        if self.contact.detected(outcome.contact is not None, truth, rendered.deep(index)):
+        deep = rendered.deep(index)
+        if deep and truth.touching:
+            self.worst.see(outcome, truth)
+        if self.contact.detected(outcome.contact is not None, truth, deep):
             assert outcome.contact is not None
             self.contact.geometry(outcome.contact, truth)
             if outcome.contact_mask is not None:
@@ -197,13 +221,14 @@ def measure_pipelines(
     folder: Path,
     unit: CopyUnit,
     step: Callable[[], None],
+    worst: Callable[[str, Worst], None] = lambda *_: None,
 ) -> list[Measurement]:
     """Every pipeline on one scene, frame by frame in turns.
 
     Parameters
     ----------
     pipelines : name -> pipeline; `SEED` is the yardstick. rendered : the scene. folder : for scratch files.
-    step : called after each frame.
+    step : called after each frame. worst : called with each pipeline's name and worst frame.
     """
     scores = {name: _Score() for name in pipelines}
     repeats = OriginalRepeats()
@@ -222,6 +247,7 @@ def measure_pipelines(
         measurement.failure = failures.get(name)
         if measurement.failure is None:
             measurement.errors = scores[name].errors()
+            worst(name, scores[name].worst)
             limit = scores[name].limit
             if limit is not None:
                 measurement.limits["displacement_rms"] = limit

@@ -171,7 +171,9 @@ def scatter(candidates: Sequence[Point], quantity: Quantity, limit: float | None
         positive.append(limit)
     bottom = HEIGHT - _BOTTOM - (_ZERO_BAND if has_zero else 0)
     costs = [p.cost for p in candidates] + ([floor] if floor else [])
-    x_axis = _Axis(*_span(costs, 1.2), _LEFT, WIDTH - _RIGHT)
+    low, high = _span(costs, 1.2)
+    # Room for the name of the slowest one.
+    x_axis = _Axis(low, high + 0.15 * (high - low), _LEFT, WIDTH - _RIGHT)
     y_axis = _Axis(*_span(positive or [1.0], 1.2), bottom, _TOP)
     zero_y = HEIGHT - _BOTTOM - _ZERO_BAND / 2
 
@@ -181,6 +183,7 @@ def scatter(candidates: Sequence[Point], quantity: Quantity, limit: float | None
     out: list[str] = []
     add = out.append
     unit = f", {quantity.unit}" if quantity.unit else ""
+    measured = f"error{unit}" if quantity.best == 0 else f"distance from {format_number(quantity.best)}{unit}"
     shown = quantity.title if quantity.best == 0 else f"{format_number(quantity.best)} - {quantity.title}"
     add(
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
@@ -211,7 +214,7 @@ def scatter(candidates: Sequence[Point], quantity: Quantity, limit: float | None
         f'<text class="axis" x="{(_LEFT + WIDTH - _RIGHT) / 2}" y="{HEIGHT - 12}" text-anchor="middle">'
         "CPU time of a frame, copies of a raw frame (log)</text>"
         f'<text class="axis" transform="translate(16 {(HEIGHT - _BOTTOM + _TOP) / 2}) rotate(-90)" '
-        f'text-anchor="middle">error{escape(unit)} (log)</text>'
+        f'text-anchor="middle">{escape(measured)} (log)</text>'
     )
 
     taken: list[_Box] = []

@@ -15,7 +15,8 @@ import numpy as np
 
 from tactflow.bench import recordings
 from tactflow.bench.methods import SEED, measure_methods
-from tactflow.bench.pipelines import growth, measure_pipelines, peak_memory_mb
+from tactflow.bench.pictures import draw
+from tactflow.bench.pipelines import Worst, growth, measure_pipelines, peak_memory_mb
 from tactflow.bench.results import Measurement, Result
 from tactflow.bench.scenes import (
     FULL,
@@ -44,6 +45,7 @@ class Plan:
     files : pipeline name -> file. `DEFAULT` and `SEED` must be among them.
     quick : a short run. data : folder of real recordings, or None. scenes : only these, or None for all.
     memory : whether to start each pipeline once more in a process of its own for its peak memory.
+    pictures : folder for a picture of each pipeline's worst frame in each scene, or None.
     """
 
     files: Mapping[str, Path]
@@ -51,6 +53,7 @@ class Plan:
     data: Path | None = None
     scenes: frozenset[str] | None = None
     memory: bool = True
+    pictures: Path | None = None
     cases: tuple[Case, ...] = field(default=())
     stage_cases: tuple[Case, ...] = field(default=())
 
@@ -147,7 +150,8 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
         for rendered in render_all(whole, scratch):
             doing = f"pipelines on {rendered.case.label}"
             suited = general if len(rendered.scene.layout.rest) else bare
-            result.measurements += measure_pipelines(suited, rendered, scratch, unit, step)
+            worst = _keeper(plan.pictures, rendered.case.label)
+            result.measurements += measure_pipelines(suited, rendered, scratch, unit, step, worst)
         for rendered in render_all(alone, scratch):
             doing = f"methods on {rendered.case.label}"
             result.measurements += measure_methods(general, rendered, unit, step)
@@ -171,6 +175,21 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
     result.wall_s = time.perf_counter() - began
     progress("done", total, total)
     return result
+
+
+def _keeper(folder: Path | None, scene: str) -> Callable[[str, Worst], None]:
+    """Writes pictures of worst frames to a folder, or does nothing."""
+
+    def keep(pipeline: str, worst: Worst) -> None:
+        if folder is None or worst.outcome is None or worst.truth is None:
+            return
+        caption = f"{scene}, frame {worst.outcome.frame.seq}, {pipeline}: hull IoU {worst.overlap:.2f}"
+        picture = draw(worst.outcome, worst.truth, caption)
+        if picture is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / f"{scene}-{pipeline.replace('/', '_')}.png"), picture)
+
+    return keep
 
 
 def _peak_memory(

@@ -49,6 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="PATH", help="write every number here, as JSON")
     parser.add_argument("--html", type=Path, metavar="PATH", help="write the report here, as one HTML file")
     parser.add_argument(
+        "--pictures",
+        type=Path,
+        metavar="DIR",
+        help="write a picture of every pipeline's worst frame in every scene, the truth beside the answer",
+    )
+    parser.add_argument(
         "--against",
         type=Path,
         metavar="FILE",
@@ -70,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
         quick=args.quick,
         data=args.data,
         scenes=frozenset(args.scene) if args.scene else None,
+        pictures=args.pictures,
     )
     with _quiet_log(), _progress_bar() as progress:
         result = run_bench(plan, progress)
