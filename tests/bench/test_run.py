@@ -3,6 +3,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from tactflow.bench.pipelines import ORIGINAL
@@ -139,3 +141,22 @@ def test_the_command_writes_results_and_fails_when_something_got_worse(
     (tmp_path / "e.json").write_text(json.dumps(stored))
     assert main(["bench", "--quick", "--against", "e.json"]) == 3
     assert "pipeline/default/bright_cable: marker displacement error" in capsys.readouterr().err
+
+
+def test_pictures_show_the_worst_frame_of_every_pipeline(tmp_path: Path) -> None:
+    plan = Plan(
+        FILES,
+        quick=True,
+        memory=False,
+        pictures=tmp_path / "pictures",
+        cases=(Case("bright_cable", 8),),
+        stage_cases=(Case("press", 2),),
+    )
+    run_bench(plan)
+    names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
+    assert names == ["bright_cable-default.png", "bright_cable-seed.png"]
+    picture = cv2.imread(str(tmp_path / "pictures" / names[0]))
+    assert picture is not None
+    assert picture.shape == (2 * 400 + 24, 2 * 300, 3)
+    # The truth's outline is drawn in green.
+    assert np.any(np.all(picture == (80, 220, 60), axis=2))

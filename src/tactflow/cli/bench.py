@@ -87,10 +87,15 @@ def run(args: argparse.Namespace) -> int:
     return WORSE if worse else 0
 
 
-def _files(given: list[str]) -> dict[str, Path]:
-    """Name -> pipeline file: the default first, then the other packaged ones, then those that were given."""
+def packaged_files() -> dict[str, Path]:
+    """Name -> file of the packaged pipelines, the default one first."""
     others = [name for name in packaged_pipelines() if name not in (DEFAULT, SEED)]
-    files = {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, SEED, *others)}
+    return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, SEED, *others)}
+
+
+def _files(given: list[str]) -> dict[str, Path]:
+    """The packaged pipelines, `./pipeline.yaml` where it differs, and those that were given."""
+    files = packaged_files()
     local = Path("pipeline.yaml")
     if local.exists() and local.read_bytes() != files[DEFAULT].read_bytes():
         files["./pipeline"] = local
