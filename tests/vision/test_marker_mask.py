@@ -13,7 +13,9 @@ from tactflow.vision.marker_mask import Dot, find_dot, marker_mask
 Image = NDArray[np.uint8]
 
 
-def _dots(shape: tuple[int, int] = (200, 160), radius: float = 5.0, pitch: int = 30, dark: bool = True) -> Image:
+def _dots(
+    shape: tuple[int, int] = (200, 160), radius: float = 5.0, pitch: int = 30, dark: bool = True
+) -> Image:
     """Anti-aliased dots on a shaded gel."""
     fine = np.zeros((shape[0] * 4, shape[1] * 4), np.uint8)
     for y in range(pitch // 2, shape[0], pitch):

@@ -380,7 +380,7 @@ def _spatial_noise(cells: Float) -> Float:
         noise[..., channel] = np.interp(cells[..., channel], center, spread)
     # Smoothing 3 x 3 would divide by three were the cells independent; demosaicing and compression see to
     # it that they are not quite.
-    return np.asarray(np.hypot(noise / 3 * _CORRELATED, _QUANTISATION / 4), np.float32)
+    return np.asarray(np.hypot(noise, _QUANTISATION) * (_CORRELATED / 3), np.float32)
 
 
 def _colour_distance(
