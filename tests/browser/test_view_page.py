@@ -1,0 +1,608 @@
+"""The view's page in a real browser: headless Chromium, driven by Playwright.
+
+Screenshots go to the folder named by TACTFLOW_SCREENSHOTS, else to a temporary one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: playwright is not installed")
+pytest.importorskip("uvicorn", reason="NO BROWSER TESTS: the extra tactflow[view] is not installed")
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+PATIENCE = 30_000
+"""ms; how long a test waits for what must happen. Nothing is asserted about the time it takes."""
+
+FLAGS = [
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    *(["--no-sandbox"] if os.geteuid() == 0 else []),
+]
+
+ENDLESS = "sim:twist?frames=100000"
+
+DRAWN = """() => ['area', 'angle', 'flow'].every(
+    name => document.getElementById('value-' + name).textContent !== '–')"""
+"""A contact, its direction and its flow are shown."""
+
+
+class Run:
+    """A run in a process of its own, and the address of its page."""
+
+    def __init__(self, *options: str, cwd: Path = REPOSITORY, port: int = 0, pipeline: str = "pipeline.yaml"):
+        shipped = ("--set", "sinks.zmq=null", "--set", "sinks.jsonl=null") if cwd == REPOSITORY else ()
+        self.process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "tactflow", "run", pipeline, *shipped),
+                *("--set", f"sinks.view={{use: view, port: {port}}}", *options),
+            ],
+            cwd=cwd,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.errors: list[str] = []
+        self.url = ""
+        told = threading.Event()
+
+        def read() -> None:
+            assert self.process.stderr is not None
+            for line in self.process.stderr:
+                self.errors.append(line)
+                if found := re.search(r"view: (http://\S+)", line):
+                    self.url = found[1]
+                    told.set()
+            told.set()
+
+        self._reader = threading.Thread(target=read)
+        self._reader.start()
+        assert told.wait(PATIENCE / 1000)
+        assert self.url, "".join(self.errors)
+
+    @property
+    def port(self) -> int:
+        return int(self.url.rstrip("/").rpartition(":")[2])
+
+    def exit_code(self) -> int:
+        return self.process.wait(PATIENCE / 1000)
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self._reader.join()
+        assert self.process.stderr is not None
+        self.process.stderr.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """One Chromium for all tests."""
+    if CHROMIUM is None:
+        pytest.skip("NO BROWSER TESTS: there is no chromium here; `make system-deps` installs it")
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def run() -> Iterator[Callable[..., Run]]:
+    """Starts runs; what is left of them is ended after the test."""
+    runs: list[Run] = []
+
+    def start(*options: str, **keywords: Any) -> Run:
+        runs.append(Run(*options, **keywords))
+        return runs[-1]
+
+    yield start
+    for started in runs:
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def watched() -> Iterator[Run]:
+    """A run for the tests that leave it as they found it."""
+    started = Run("--realtime", "--source", ENDLESS)
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
+    """Opens pages. A complaint in the console, a script error or a request to elsewhere fails the test."""
+    contexts: list[Any] = []
+    complaints: list[str] = []
+
+    def open_(url: str = "", *, lost: bool = False, prepare: Any = None, **options: Any) -> Any:
+        options = {"viewport": {"width": 1400, "height": 860}, "color_scheme": "dark"} | options
+        context = browser.new_context(**options)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE)
+
+        def complain(message: Any) -> None:
+            # Attempts to reach a run that is gone are the page's business, and Chromium reports each.
+            expected = lost and "ERR_CONNECTION_REFUSED" in message.text
+            if message.type in ("error", "warning") and not expected:
+                complaints.append(message.text)
+
+        page.on("console", complain)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda r: r.url.startswith(url) or complaints.append(f"asked for {r.url}"))
+        if prepare is not None:
+            prepare(page)
+        page.goto(url)
+        return page
+
+    yield open_
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+@pytest.fixture(scope="module")
+def screenshots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where pictures of the page go."""
+    folder = os.environ.get("TACTFLOW_SCREENSHOTS")
+    path = Path(folder) if folder else tmp_path_factory.mktemp("screenshots")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def until(page: Any, condition: str, argument: Any = None) -> None:
+    """Wait until a JavaScript expression holds."""
+    page.wait_for_function(condition, arg=argument)
+
+
+def status(page: Any, wanted: str) -> None:
+    """Wait until the page is in a state."""
+    until(page, "wanted => document.body.dataset.status === wanted", wanted)
+
+
+def seq(page: Any) -> int:
+    """The frame that is shown."""
+    return int(page.get_attribute("#picture", "data-seq"))
+
+
+def pixels(page: Any, canvas: str) -> str:
+    """What a canvas shows."""
+    return str(page.evaluate("id => document.getElementById(id).toDataURL()", canvas))
+
+
+def advance(page: Any, frames: int = 1) -> None:
+    """Wait until later frames are shown."""
+    until(page, "seq => Number(document.getElementById('picture').dataset.seq) >= seq", seq(page) + frames)
+
+
+def watch(page: Any) -> None:
+    """Wait for the first frame."""
+    status(page, "live")
+    until(page, "() => document.getElementById('picture').dataset.seq !== undefined")
+
+
+def pause_in_contact(page: Any) -> None:
+    """Hold the run at a frame that shows everything there is to draw."""
+    for _ in range(20):
+        until(page, DRAWN)
+        page.click("#pause")
+        status(page, "paused")
+        settled(page)
+        if page.evaluate(DRAWN):
+            return
+        page.click("#pause")
+        status(page, "live")
+    raise AssertionError("no frame with a contact, a direction and flow could be held")
+
+
+def settled(page: Any) -> None:
+    """Wait until the frames that were under way are shown."""
+    before = -1
+    while before != (now := seq(page)):
+        before = now
+        page.wait_for_timeout(300)
+
+
+def test_frames_and_plots_move(watched: Run, open_page: Callable[..., Any]) -> None:
+    page = open_page(watched.url)
+    watch(page)
+    until(page, "() => Number(document.getElementById('plot-latency').dataset.points) > 20")
+    until(page, "() => document.getElementById('value-area').textContent !== '–'")
+    before = {name: pixels(page, name) for name in ("picture", "plot-area", "plot-latency")}
+    advance(page, 30)
+    page.wait_for_timeout(200)
+    for name, picture in before.items():
+        assert pixels(page, name) != picture, name
+    until(page, "() => document.querySelectorAll('#stage-rows tr').length > 5")
+    rows = page.inner_text("#stage-rows")
+    assert "preprocess" in rows
+    assert "no contact" in rows
+    assert re.fullmatch(r"\d+ of 100000", page.inner_text("#frame-number"))
+    until(page, "() => /^[0-9.]+.s$/.test(document.getElementById('rate').textContent)")
+    until(page, "() => /^[0-9]+ ms$/.test(document.getElementById('screen').textContent)")
+    assert "dropped" in page.inner_text("#links")
+    assert page.inner_text("#source") == f"{ENDLESS}, 100000 frames at 60 fps"
+
+
+def test_a_recording_is_paused_stepped_and_resumed(
+    run: Callable[..., Run], open_page: Callable[..., Any]
+) -> None:
+    page = open_page(run("--source", ENDLESS).url)
+    watch(page)
+    assert page.get_attribute("#step", "title") == "pause first"
+    page.click("#pause")
+    status(page, "paused")
+    assert page.inner_text("#pause .label") == "Resume"
+    settled(page)
+    # A fast recording has gone on since the frame that is shown; the first step catches up with it.
+    first = seq(page)
+    page.click("#step")
+    until(page, "seq => Number(document.getElementById('picture').dataset.seq) > seq", first)
+    for press in (lambda: page.click("#step"), lambda: page.keyboard.press("s")) * 2:
+        before = seq(page)
+        press()
+        until(page, "seq => Number(document.getElementById('picture').dataset.seq) > seq", before)
+        settled(page)
+        assert seq(page) == before + 1
+    page.keyboard.press("Escape")
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press(" ")
+    status(page, "live")
+    advance(page, 10)
+
+
+def test_a_live_source_cannot_be_stepped_and_says_so(watched: Run, open_page: Callable[..., Any]) -> None:
+    page = open_page(watched.url)
+    watch(page)
+    assert page.is_disabled("#step")
+    assert page.get_attribute("#step", "title") == "a live source cannot be stepped"
+    page.keyboard.press("s")
+    assert "a live source cannot be stepped" in page.inner_text("#note")
+
+
+@pytest.mark.parametrize("press", ["button", "key"])
+def test_a_new_reference_is_taken(press: str, watched: Run, open_page: Callable[..., Any]) -> None:
+    page = open_page(watched.url)
+    watch(page)
+    if press == "button":
+        page.click("#reference")
+    else:
+        page.keyboard.press("n")
+    until(page, "() => /^new reference taken at frame/.test(document.getElementById('note').textContent)")
+
+
+def test_without_a_record_sink_the_button_says_so(watched: Run, open_page: Callable[..., Any]) -> None:
+    page = open_page(watched.url)
+    watch(page)
+    assert page.is_disabled("#record")
+    assert page.get_attribute("#record", "title") == "no record sink in this pipeline"
+
+
+RECORDER = """
+from tactflow.engine.stage import StageParams
+from tactflow.ports import Image
+
+class Recorder:
+    def __init__(self, params: StageParams) -> None:
+        self.recording = False
+
+    def start_recording(self) -> None:
+        self.recording = True
+
+    def stop_recording(self) -> None:
+        self.recording = False
+
+    def write(self, image: Image) -> None:
+        pass
+"""
+
+
+def test_the_record_button_starts_and_stops_a_record_sink(
+    run: Callable[..., Run], open_page: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "recorder.py").write_text(RECORDER)
+    (tmp_path / "pipeline.yaml").write_text(
+        f"stages:\n  capture: {{source: '{ENDLESS}', realtime: true}}\n  preprocess: {{downsample: 2}}\n"
+        "sinks:\n  view: {}\n  recorder: {use: './recorder.py:Recorder'}\n"
+    )
+    page = open_page(run(cwd=tmp_path).url)
+    watch(page)
+    page.click("#record")
+    until(page, "() => document.getElementById('record').getAttribute('aria-pressed') === 'true'")
+    assert page.inner_text("#record .label") == "Stop recording"
+    page.keyboard.press("r")
+    until(page, "() => document.getElementById('record').getAttribute('aria-pressed') === 'false'")
+
+
+@pytest.mark.parametrize("press", ["button", "key"])
+def test_q_and_the_stop_button_end_the_process(
+    press: str, run: Callable[..., Run], open_page: Callable[..., Any]
+) -> None:
+    started = run("--realtime", "--source", ENDLESS)
+    page = open_page(started.url, lost=True)
+    watch(page)
+    if press == "button":
+        page.click("#stop")
+    else:
+        page.keyboard.press("q")
+    assert started.exit_code() == 0
+    status(page, "ended")
+    assert page.inner_text("#empty-title") == "The run has ended"
+    assert "It was stopped." in page.inner_text("#empty-text")
+    assert page.is_disabled("#stop")
+
+
+def test_a_page_finds_the_run_again_after_a_restart(
+    run: Callable[..., Run], open_page: Callable[..., Any], screenshots: Path
+) -> None:
+    first = run("--realtime", "--source", ENDLESS)
+    page = open_page(first.url, lost=True)
+    watch(page)
+    advance(page, 20)
+    first.process.send_signal(signal.SIGKILL)
+    first.exit_code()
+    status(page, "disconnected")
+    assert "Next attempt" in page.inner_text("#empty-text")
+    page.screenshot(path=screenshots / "view-disconnected.png")
+    second = run("--realtime", "--source", "sim:slide?frames=100000", port=first.port)
+    assert second.url == first.url
+    watch(page)
+    until(page, "() => document.getElementById('source').textContent.startsWith('sim:slide')")
+    advance(page, 5)
+
+
+def test_two_browsers_watch_one_run(run: Callable[..., Run], open_page: Callable[..., Any]) -> None:
+    started = run("--realtime", "--source", ENDLESS)
+    one, other = open_page(started.url), open_page(started.url)
+    for page in (one, other):
+        watch(page)
+    for page in (one, other):
+        advance(page, 10)
+    one.click("#pause")
+    status(other, "paused")
+
+
+def test_a_token_is_asked_for_and_leaves_the_address(
+    run: Callable[..., Run], open_page: Callable[..., Any]
+) -> None:
+    secret = "a-secret-of-some-length"
+    started = run("--realtime", "--source", ENDLESS, "--set", f"sinks.view.token={secret}")
+    assert started.url.endswith(f"?token={secret}")
+    address = started.url.partition("?")[0]
+    page = open_page(address)
+    status(page, "token")
+    page.fill("#token", "a-wrong-one")
+    page.keyboard.press("Enter")
+    status(page, "token")
+    page.fill("#token", secret)
+    page.keyboard.press("Enter")
+    watch(page)
+    other = open_page(address)
+    other.goto(started.url)
+    watch(other)
+    assert secret not in other.url
+
+
+def test_everything_can_be_reached_by_keyboard_and_has_a_name(
+    watched: Run, open_page: Callable[..., Any]
+) -> None:
+    page = open_page(watched.url)
+    watch(page)
+    reached: list[str] = []
+    for _ in range(20):
+        page.keyboard.press("Tab")
+        focus = page.evaluate(
+            """() => {
+                const e = document.activeElement, style = getComputedStyle(e);
+                const name = e.getAttribute('aria-label') ?? e.textContent.trim();
+                return [e.id, name, style.outlineStyle, parseFloat(style.outlineWidth)];
+            }"""
+        )
+        if focus[0] == "":
+            continue
+        reached.append(focus[0])
+        assert focus[1], focus
+        assert focus[2] == "solid", focus
+        assert focus[3] >= 2, focus
+    assert {"pause", "reference", "stop", "layer-image", "layer-mean", "magnify"} <= set(reached)
+    unnamed = page.evaluate(
+        """() => [...document.querySelectorAll('canvas, progress, [role=tablist], [role=toolbar]')]
+            .filter(e => !e.getAttribute('aria-label')).map(e => e.id)"""
+    )
+    assert unnamed == []
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("view-dark", {}),
+        ("view-light", {"color_scheme": "light"}),
+        ("view-wide", {"viewport": {"width": 1920, "height": 1000}}),
+        (
+            "view-phone",
+            {
+                "viewport": {"width": 390, "height": 844},
+                "device_scale_factor": 2,
+                "is_mobile": True,
+                "has_touch": True,
+            },
+        ),
+    ],
+)
+def test_the_page_fits_its_window(
+    name: str,
+    options: dict[str, Any],
+    watched: Run,
+    open_page: Callable[..., Any],
+    screenshots: Path,
+) -> None:
+    page = open_page(watched.url, **options)
+    watch(page)
+    pause_in_contact(page)
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    for button in ("pause", "stop", "layer-arrows"):
+        box = page.locator(f"#{button}").bounding_box()
+        assert box["x"] >= 0, button
+        assert box["x"] + box["width"] <= options.get("viewport", {"width": 1400})["width"], button
+    # A finger needs room.
+    if options.get("is_mobile"):
+        assert page.locator("#stop").bounding_box()["height"] >= 44
+    background = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
+    brightness = np.mean([float(part) for part in re.findall(r"[\d.]+", background)[:3]])
+    assert (brightness > 128) == (options.get("color_scheme") == "light")
+    page.click("#pause")
+    status(page, "live")
+    advance(page, 40)
+    until(page, DRAWN)
+    page.screenshot(path=screenshots / f"{name}.png")
+
+
+# -- a server of the test's own -----------------------------------------------------------------------------
+
+
+def frame(sensor: str, number: int, colour: int, *, contact: bool = False, directed: bool = False) -> bytes:
+    """A frame as the view sends it."""
+    image = np.full((40, 60, 3), colour, np.uint8)
+    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+    points = [[10.0, 10.0], [30.0, 10.0], [50.0, 20.0]]
+    message: dict[str, Any] = {
+        "schema": "tactflow.frame/1",
+        "sensor": sensor,
+        "seq": number,
+        "t": number / 30,
+        "size": [60, 40],
+        "contact": None,
+        "flow": None,
+        "markers": {
+            "origin": points,
+            "position": [[x + 3, y + 2] for x, y in points],
+            "status": ["tracked", "inferred", "lost"],
+        },
+        "skipped": {},
+    }
+    if contact:
+        message["contact"] = {
+            "area": 300.0,
+            "center": [30.0, 20.0],
+            "angle": None,
+            "slope": None,
+            "hull": [[20.0, 10.0], [40.0, 10.0], [30.0, 30.0]],
+            "ellipse": None,
+            "confidence": 0.0,
+        }
+        message["flow"] = {"mean": None, "count": 0}
+    if directed:
+        message["contact"] |= {
+            "angle": -30.0,
+            "ellipse": {"center": [30.0, 20.0], "axes": [30.0, 12.0], "angle": -30.0},
+        }
+        message["flow"] = {"mean": [4.0, -2.0], "count": 3, "rotation": None}
+    header = json.dumps({"latency_ms": 3.0, "epoch": 0, "message": message, "number": number}).encode()
+    return struct.pack("<I", len(header)) + header + jpeg
+
+
+def state(sensor: str, **changes: Any) -> str:
+    """A state as the view sends it."""
+    names = ("pause", "step", "reference", "record", "stop")
+    source = {"description": f"camera of {sensor}", "live": True, "total": None, "state": "connected"}
+    whole = {
+        **{"type": "state", "sensor": sensor, "paused": False, "recording": False, "end": None},
+        **{"source": source, "refused": dict.fromkeys(names)},
+    }
+    return json.dumps(whole | changes)
+
+
+def test_each_layer_is_drawn_and_can_be_hidden(watched: Run, open_page: Callable[..., Any]) -> None:
+    def serve(wire: Any) -> None:
+        wire.on_message(json.loads)
+        wire.send(json.dumps({"type": "hello", "run": "1", "sensors": ["main"]}))
+        wire.send(state("main"))
+        wire.send(frame("main", 1, 120, contact=True, directed=True))
+
+    page = open_page(watched.url, prepare=lambda p: p.route_web_socket("**/live", serve))
+    watch(page)
+    until(page, "() => document.getElementById('value-angle').textContent === '−30.0°'")
+    assert page.get_attribute("#layer-ellipse", "aria-pressed") == "false"
+    page.click("#layer-ellipse")
+    whole = pixels(page, "picture")
+    for key, layer in enumerate(("image", "arrows", "hull", "axis", "ellipse", "mean"), start=1):
+        page.click(f"#layer-{layer}")
+        assert page.get_attribute(f"#layer-{layer}", "aria-pressed") == "false"
+        assert pixels(page, "picture") != whole, layer
+        page.keyboard.press(str(key))
+        assert page.get_attribute(f"#layer-{layer}", "aria-pressed") == "true"
+        assert pixels(page, "picture") == whole, layer
+    page.keyboard.press("x")
+    assert page.inner_text("#magnify span") == "Arrows × 5"
+    assert pixels(page, "picture") != whole
+
+
+def test_a_tab_per_sensor_and_honest_empty_states(watched: Run, open_page: Callable[..., Any]) -> None:
+    wires: list[Any] = []
+    acks: list[int] = []
+
+    def hear(text: str) -> None:
+        message = json.loads(text)
+        if "ack" in message:
+            acks.append(message["ack"])
+
+    def serve(wire: Any) -> None:
+        wires.append(wire)
+        wire.on_message(hear)
+        wire.send(json.dumps({"type": "hello", "run": "1", "sensors": ["left", "right"]}))
+
+    page = open_page(watched.url, prepare=lambda p: p.route_web_socket("**/live", serve))
+    status(page, "waiting")
+    assert page.inner_text("#empty-title") == "Waiting for frames"
+    assert page.inner_text("#tabs").split() == ["left", "right"]
+    wire = wires[0]
+    for sensor in ("left", "right"):
+        wire.send(state(sensor))
+    wire.send(frame("left", 1, 200))
+    watch(page)
+    wire.send(frame("right", 2, 90, contact=True))
+    until(page, "() => document.getElementById('count-lost').textContent === '1'")
+    left = pixels(page, "picture")
+    assert page.inner_text("#unit-area") == "no contact"
+    page.click("#tabs button:nth-child(2)")
+    assert page.get_attribute("#tabs button:nth-child(2)", "aria-selected") == "true"
+    assert pixels(page, "picture") != left
+    until(page, "() => document.getElementById('unit-angle').textContent === 'no direction'")
+    assert page.inner_text("#unit-flow") == "no marker inside"
+    assert page.inner_text("#source") == "camera of right"
+    assert page.inner_text("#source-state").endswith("connected")
+    page.keyboard.press("ArrowLeft")
+    assert page.get_attribute("#tabs button:nth-child(1)", "aria-selected") == "true"
+    assert pixels(page, "picture") == left
+    status(page, "stalled")
+    assert re.match(r"no frames for \d+ s", page.inner_text("#status-text"))
+    wire.send(frame("left", 3, 100))
+    status(page, "live")
+    deadline = time.monotonic() + PATIENCE / 1000
+    while acks != [1, 2, 3] and time.monotonic() < deadline:
+        page.wait_for_timeout(20)
+    assert acks == [1, 2, 3]
+    wire.send(state("left", end="eos"))
+    status(page, "ended")
+    assert "The source has ended." in page.inner_text("#empty-text")
