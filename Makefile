@@ -1,11 +1,15 @@
-# make run   the pipeline on the simulated sensor, publishing over ZeroMQ
-# make test  lint, types, tests
+# make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
+# make test         lint, types, tests
+# make system-deps  what the tests need from the system: a browser (Debian; needs root)
 
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 
-.PHONY: run test lint types clean
+# Debian packages that tests use; without them those tests say that they were skipped.
+SYSTEM_DEPS := chromium
+
+.PHONY: run test lint types system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -24,12 +28,20 @@ $(VENV)/bin/python:
 	python3 -m venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) install --constraint constraints.txt --editable .
+	$(PIP) install --constraint constraints.txt --editable ".[view]"
 	@touch $@
 
 $(VENV)/.installed-test: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(PIP) install --constraint constraints.txt --editable ".[test]"
 	@touch $@ $(VENV)/.installed
+
+# apt may be busy with something else: try again for a while.
+system-deps:
+	@dpkg --status $(SYSTEM_DEPS) >/dev/null 2>&1 || for attempt in 1 2 3 4 5 6 7 8 9 10; do \
+		apt-get -qq update && DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=300 \
+			install --yes --no-install-recommends $(SYSTEM_DEPS) >/dev/null && exit 0; \
+		echo "system-deps: attempt $$attempt failed" >&2; sleep 10; \
+	done; dpkg --status $(SYSTEM_DEPS) >/dev/null
 
 clean:
 	rm -rf $(VENV) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -135,7 +135,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
     contexts: list[Any] = []
     complaints: list[str] = []
 
-    def open_(url: str = "", *, lost: bool = False, prepare: Any = None, **options: Any) -> Any:
+    def open_(url: str, *, lost: bool = False, prepare: Any = None, **options: Any) -> Any:
         options = {"viewport": {"width": 1400, "height": 860}, "color_scheme": "dark"} | options
         context = browser.new_context(**options)
         contexts.append(context)
@@ -148,9 +148,13 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
             if message.type in ("error", "warning") and not expected:
                 complaints.append(message.text)
 
+        def check_target(request: Any) -> None:
+            if not request.url.startswith(url):
+                complaints.append(f"asked for {request.url}")
+
         page.on("console", complain)
         page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda r: r.url.startswith(url) or complaints.append(f"asked for {r.url}"))
+        page.on("request", check_target)
         if prepare is not None:
             prepare(page)
         page.goto(url)
@@ -259,9 +263,12 @@ def test_a_recording_is_paused_stepped_and_resumed(
     first = seq(page)
     page.click("#step")
     until(page, "seq => Number(document.getElementById('picture').dataset.seq) > seq", first)
-    for press in (lambda: page.click("#step"), lambda: page.keyboard.press("s")) * 2:
+    for way in ("button", "key") * 2:
         before = seq(page)
-        press()
+        if way == "button":
+            page.click("#step")
+        else:
+            page.keyboard.press("s")
         until(page, "seq => Number(document.getElementById('picture').dataset.seq) > seq", before)
         settled(page)
         assert seq(page) == before + 1
