@@ -123,6 +123,11 @@ _SCENES: dict[str, _Recipe] = {
         "one long contact that drags the gel by 0.02 px a frame",
         motion.Programme(_sphere, single=True, period=300, rise=15, hold=225, depths=(0.9,), creep=0.02),
     ),
+    "hold": _Recipe(
+        "one long contact that does not move",
+        motion.Programme(_sphere, single=True, period=300, rise=15, hold=225, depths=(0.9,)),
+        {"shear": 0.0},
+    ),
     "drift": _Recipe("presses while the lights warm up", _PRESS, {"drift": 0.18}),
     "flicker": _Recipe("presses under flickering light", _PRESS, {"flicker": 0.06, "gain": 0.03}),
     "jumps": _Recipe(

@@ -5,8 +5,8 @@ steepest gradients (edges of dots, where motion shows most) and some spread even
 shows). The difference to the samples of the *anchor*, the last frame that was worked on, is tested tile by
 tile against the sensor's own noise:
 
-- motion: the projection on the anchor's gradients, which is the least-squares estimate of a displacement
-  (Lucas and Kanade, 1981) in units of its standard error;
+- motion: the projection on the gel's gradients, which is the least-squares estimate of a displacement
+  (Lucas and Kanade, 1981) in units of its standard error, also of neighbouring tiles together;
 - light: the mean;
 - anything else: the sum of squares (chi-squared; Wilson and Hilferty's cube root turns it into a normal
   deviate, 1931).
@@ -33,6 +33,9 @@ _LINES = 150
 """Lines of the frame that are read, spread evenly."""
 _WARM_UP = 6
 """Pairs of frames from which the noise is learned before any frame is called unchanged."""
+_REACHES = (0, 1, 3)
+"""Motion is tested in a tile and in its neighbourhoods up to so many tiles away: a contact drags its
+surroundings along, and together they show a displacement that none of them shows alone."""
 _QUANTISATION = 1 / 12
 """Variance of rounding to whole grey levels: noise below it cannot be seen."""
 _FORGETTING = 0.05
@@ -62,11 +65,15 @@ class ChangeProbe:
         # Whole lines are read in one sweep; scattered reads of a frame that is not in the cache cost more.
         step = max(1, frame.shape[0] // _LINES)
         self._lines = slice(step // 2, None, step)
-        self._places, gradients = _choose_places(frame, self._lines, tile)
-        length = np.linalg.norm(gradients, axis=1, keepdims=True)
-        self._across, self._down = gradients / np.maximum(length, np.float32(1e-6))
+        self._places, gradients, self._grid = _choose_places(frame, self._lines, tile)
+        strength = np.square(gradients).sum(axis=1)
+        self._strength = [
+            np.maximum([_neighbourhood(one, reach, self._grid) for one in strength], np.float32(1e-3))
+            for reach in _REACHES
+        ]
+        self._gradients = gradients
         _, tiles = self._places.shape
-        tests = 4 * tiles + 2
+        tests = (2 + 2 * len(_REACHES)) * tiles + 2
         self.bound = -NormalDist().inv_cdf(false_alarms / (2 * tests))
         """What the strongest test value must exceed, in standard deviations."""
         self.strongest = float("inf")
@@ -136,13 +143,31 @@ class ChangeProbe:
         light = scaled.sum(axis=0)
         squares = _sums(scaled, scaled)
         return max(
-            float(np.abs(_sums(scaled, self._across)).max()),
-            float(np.abs(_sums(scaled, self._down)).max()),
+            self._motion(scaled),
             float(np.abs(light).max()) / math.sqrt(n),
             abs(float(light.sum())) / math.sqrt(n * tiles),
             _normal_deviate(float(squares.max()), n),
             _normal_deviate(float(squares.sum()), n * tiles),
         )
+
+    def _motion(self, scaled: NDArray[np.float32]) -> float:
+        """The strongest displacement of a tile, or of the tiles of a neighbourhood together."""
+        pulls = [_sums(scaled, gradients) for gradients in self._gradients]
+        squares = [
+            float((np.square(_neighbourhood(pull, reach, self._grid)) / strength).max())
+            for reach, strengths in zip(_REACHES, self._strength, strict=True)
+            for pull, strength in zip(pulls, strengths, strict=True)
+        ]
+        return math.sqrt(max(squares))
+
+
+def _neighbourhood(values: NDArray[np.float32], reach: int, grid: tuple[int, int]) -> NDArray[np.float32]:
+    """Sum over each tile and its neighbours up to `reach` tiles away, (tiles,)."""
+    if reach == 0:
+        return values
+    size = (2 * reach + 1, 2 * reach + 1)
+    total = cv2.boxFilter(values.reshape(grid), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return total.ravel().astype(np.float32, copy=False)
 
 
 def _sums(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -159,8 +184,12 @@ def _normal_deviate(squares: float, degrees: int) -> float:
 
 def _choose_places(
     frame: NDArray[np.uint8], lines: slice, tile: int
-) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Where to sample: flat indices (samples, tiles) into the frame's lines; x and y gradients there."""
+) -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, int]]:
+    """Where to sample.
+
+    Returns flat indices (samples, tiles) into the frame's lines, the x and y gradients there (2, samples,
+    tiles), and the rows and columns of tiles.
+    """
     image = np.atleast_3d(frame).astype(np.float32)
     height, width, channels = image.shape
     smooth = np.atleast_3d(cv2.GaussianBlur(image, (5, 5), 0))
@@ -171,8 +200,9 @@ def _choose_places(
     random = np.random.default_rng(0)
     chosen = []
     bands = max(1, min(len(steepness), round(height / tile)))
+    across_tiles = max(1, round(width / tile))
     for rows in np.array_split(np.arange(len(steepness)), bands):
-        for columns in np.array_split(np.arange(width), max(1, round(width / tile))):
+        for columns in np.array_split(np.arange(width), across_tiles):
             pixels = (rows[:, None] * width + columns).ravel()
             places = pixels * channels + best.ravel()[pixels]
             order = np.argsort(steepness.ravel()[places], kind="stable")[::-1]
@@ -180,7 +210,7 @@ def _choose_places(
             spread = random.choice(pixels, _SPREAD) * channels + random.integers(0, channels, _SPREAD)
             chosen.append(np.concatenate([edges, spread]))
     index = np.ascontiguousarray(np.array(chosen, dtype=np.intp).T)
-    return index, np.stack([across.ravel()[index], down.ravel()[index]])
+    return index, np.stack([across.ravel()[index], down.ravel()[index]]), (bands, across_tiles)
 
 
 def _checked(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
