@@ -88,7 +88,7 @@ class MarkerTracker:
     smooth field, this is the answer. Otherwise spots are searched in the whole frame, and the marks that do
     not belong to the largest smooth part of the field choose among them, jointly, so that neighbours move
     alike (min-sum belief propagation on the graph of neighbours). Then every choice is measured as before.
-    Marks that are not seen are placed by an affine fit to their neighbours.
+    Marks that are not seen are placed by a quadratic fit to the displacements around them.
 
     A position is always measured against the reference, never against the frame before, so nothing drifts;
     what a mark did before only serves as a starting point, and identities rest on the smoothness of the whole
@@ -249,7 +249,7 @@ class MarkerTracker:
         unused = np.ones(len(spots), bool)
         unused[chosen[given]] = False
         if not found.all() and unused.any():
-            # Where the field is steep, an affine fit to the marks around foretells better than their motions.
+            # Where the field is steep, a fit to the marks around foretells better than their motions do.
             self._infer(result, found, np.empty(self._count, np.uint8))
             missing = np.flatnonzero(~found)
             away = np.hypot(*(result[missing][:, None] - spots[unused]).transpose(2, 0, 1))
@@ -322,17 +322,18 @@ class MarkerTracker:
         return settled
 
     def _infer(self, position: FloatArray, found: BoolArray, status: NDArray[np.uint8]) -> None:
-        """Place the marks that were not found by an affine fit to the displacements around them, in place."""
+        """Place the marks that were not found by a quadratic fit to the displacements around, in place."""
         missing = np.flatnonzero(~found)
         status[missing] = MarkerStatus.INFERRED
         around = self._around[missing]
         weight = self._around_weight[missing] * found[around]
         offset = (self._origin[around] - self._origin[missing][:, None]) / self._pitch
         moved = (position - self._origin)[around]
-        basis = np.concatenate([np.ones((*offset.shape[:2], 1)), offset], axis=2)
+        x, y = offset[..., 0], offset[..., 1]
+        basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)
         weighted = basis * weight[:, :, None]
-        # The ridge on the slopes turns the fit into a mean where there is too little to fit them.
-        normal = weighted.transpose(0, 2, 1) @ basis + np.diag([1e-9, 0.05, 0.05])
+        # The ridge turns the fit into a plane, and a plane into a mean, where there is too little to fit it.
+        normal = weighted.transpose(0, 2, 1) @ basis + np.diag([1e-9, 0.05, 0.05, 0.3, 0.3, 0.3])
         fitted = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ moved)[:, 0]
         support = weight.sum(axis=1)
         placed = support > _LEAST_SUPPORT
