@@ -46,7 +46,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="also measure on the real recordings in DIR (wedge_ball, wedge_roll, wedge_grasp)",
     )
-    parser.add_argument("--json", type=Path, metavar="PATH", help="write every number here, as JSON")
+    parser.add_argument(
+        "--json",
+        type=Path,
+        default=Path("bench.json"),
+        metavar="PATH",
+        help="write every number here, as JSON (default: bench.json)",
+    )
     parser.add_argument("--html", type=Path, metavar="PATH", help="write the report here, as one HTML file")
     parser.add_argument(
         "--pictures",
