@@ -20,29 +20,55 @@ class ContactPorts(NamedTuple):
 
 
 class Difference:
-    """Compare the unmarked frame with the untouched gel (seed function `difference`)."""
+    """Compare the unmarked frame with the untouched gel (seed function `difference`).
+
+    All frames marked as reference are learned from (`seed` and `colour`: the last one); the first frame
+    serves where there is none.
+    """
 
     memory = "stateful"
 
     class Params(StageParams):
-        """method : how contact is told from no contact."""
+        """method : how contact is told from no contact. The others belong to one method each."""
 
         method: Literal["noise", "colour", "seed"] = Field(
-            "noise", description="noise tests against the sensor's noise; seed is the original rule"
+            "noise",
+            description="noise tests against the sensor's own noise, for gels that answer with brightness or "
+            "colour; colour is a plain distance of colours; seed is the original rule",
         )
-        distance: float = Field(
-            24.0, gt=0, le=441, description="`colour`: change of colour that is contact, grey levels"
+        false_alarms: float = Field(
+            1e-6, gt=0, lt=1, description="noise: frames of the untouched gel called contact, per frame"
         )
+        repeatability: float = Field(
+            0.02, ge=0, le=1, description="noise: how far the light of the gel itself varies, relative"
+        )
+        shift: float = Field(
+            1.0, ge=0, le=100, description="noise: how far the untouched gel moves against the camera, px"
+        )
+        relaxation: float = Field(
+            0.2,
+            ge=0,
+            lt=1,
+            description="noise: what a released gel still shows, relative to the strongest change",
+        )
+        distance: float = Field(24.0, gt=0, le=441, description="colour: change that is contact, grey levels")
 
     def __init__(self, params: Params) -> None:
-        self._detector = ContactDetector(params.method, distance=params.distance)
+        self._detector = ContactDetector(
+            params.method,
+            false_alarms=params.false_alarms,
+            repeatability=params.repeatability,
+            shift=params.shift,
+            relaxation=params.relaxation,
+            distance=params.distance,
+        )
 
     def reset(self) -> None:
         """Forget the reference; a new one follows."""
         self._detector.reset()
 
     def process(self, unmarked: Unmarked, frame: Frame) -> ContactPorts:
-        """The contact mask of this frame; the first frame serves as reference where none came before."""
+        """The contact mask of this frame."""
         if frame.reference or not self._detector.has_reference:
             self._detector.add_reference(unmarked)
         result = self._detector.detect(unmarked)

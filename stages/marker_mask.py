@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -24,19 +24,16 @@ class MarkerMaskStage:
         method: Literal["dog", "seed"] = Field(
             "dog", description="dog scales with the dots; seed is the original rule, for dark dots"
         )
-        dot: float | Literal["auto"] = Field(
+        dot: Literal["auto"] | Annotated[float, Field(ge=1, le=100)] = Field(
             "auto", description="radius of a dot, processed px, 1 to 100; auto finds it in the first frame"
         )
         polarity: Literal["auto", "dark", "bright"] = Field("auto", description="dots against the gel")
-        contrast: float | Literal["auto"] = Field(
+        contrast: Literal["auto"] | Annotated[float, Field(ge=1, le=255)] = Field(
             "auto",
             description="least difference to the gel, grey levels, 1 to 255; auto: a quarter of the dots'",
         )
 
     def __init__(self, params: Params) -> None:
-        for name, value, top in (("dot", params.dot, 100), ("contrast", params.contrast, 255)):
-            if value != "auto" and not 1 <= value <= top:
-                raise ValueError(f"{name}: required 1 to {top} or auto, got {value}")
         self._params = params
         self._dot: Dot | None = None
         self._looked = False

@@ -26,8 +26,27 @@ RIDGE = 0.9
 """The rim is where the mean profile reaches this fraction of its peak: the peak itself is flat on a knife
 edge, whose flanks have the same slope all the way in."""
 
-HALF = 0.5
-"""Fraction of the plateau at which a brightened contact ends."""
+GLOSS = 2.0
+"""A change of more than so many times its typical value (the mean weighted by the change itself) is a mirror
+image of a lamp, and is cut back to that."""
+
+SKIRT = 0.6
+"""Fraction of its peak to which the mean profile has fallen in the surroundings of the contact."""
+
+SHARP_SKIRT = 0.11
+"""Distance from there to the rim where the slope breaks at the rim, as on a half-space (Hertz), in half
+widths of the contact."""
+
+BLUR = 0.6
+"""What smoothing adds to that distance, pixels at half resolution."""
+
+SOFTNESS = 1.0
+"""Where the distance is larger, the gel is coated or soft and the slope has no break: the peak of the profile
+is as blunt as its skirt is wide, and `RIDGE` is reached too early by this part of the excess."""
+
+HALF = 0.45
+"""Fraction of the peak at which a brightened contact ends: half of the plateau, of which noise and shading
+make the peak a little more."""
 
 _PROFILE_STEP = 0.5
 _FEW = 8
@@ -48,14 +67,14 @@ def imprint(change: Float, inside: Mask, bridge: float = 4.0) -> Float:
     """
     sums = np.array([[1, 1, 1]], np.float32)
     mean = cv2.copyTo(cv2.transform(change, sums / 3), inside)
-    square = cv2.copyTo(cv2.transform(change * change, sums), inside)
-    darkest, brightest, _, _ = cv2.minMaxLoc(mean)
-    if -darkest > brightest:
-        mean = -mean
-    brightening = _peak(np.asarray(mean, np.float32))
-    if 3 * brightening**2 > _peak(np.asarray(square - 3 * mean * mean, np.float32)):
-        return _brightened(np.asarray(mean, np.float32), brightening)
-    strength = np.asarray(cv2.sqrt(square), np.float32)
+    strength = np.asarray(cv2.sqrt(cv2.copyTo(cv2.transform(change * change, sums), inside)), np.float32)
+    typical = cv2.norm(strength, cv2.NORM_L2SQR) / max(cv2.norm(strength, cv2.NORM_L1), 1e-9)
+    cap = max(GLOSS * typical, 1e-9)
+    strength = np.minimum(strength, np.float32(cap))
+    mean = np.asarray(-mean if cv2.sumElems(mean)[0] < 0 else mean, np.float32)
+    mean = np.asarray(np.minimum(mean, np.float32(cap / 3**0.5)), np.float32)
+    if 6 * cv2.norm(mean, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
+        return _brightened(mean, _peak(mean))
     return _tilted(strength, _peak(strength), bridge)
 
 
@@ -83,15 +102,20 @@ def _tilted(strength: Float, peak: float, bridge: float) -> Float:
     known = np.flatnonzero(count >= _FEW)
     if known.size < 2:
         return np.asarray(depth - np.float32(0.5), np.float32)
-    profile = total[known] / count[known]
-    at = (known + 1.5) * _PROFILE_STEP
-    wanted = RIDGE * float(profile.max())
+    profile = np.asarray(total[known] / count[known], np.float64)
+    at = np.asarray((known + 1.5) * _PROFILE_STEP, np.float64)
+    rim, skirt = (_crossing(profile, at, part) for part in (RIDGE, SKIRT))
+    soft = rim - skirt - SHARP_SKIRT * (float(depth.max()) - rim) - BLUR
+    return np.asarray(depth - np.float32(rim + SOFTNESS * max(soft, 0.0)), np.float32)
+
+
+def _crossing(profile: NDArray[np.float64], at: NDArray[np.float64], part: float) -> float:
+    """Where, coming from outside, a profile first reaches a part of its peak."""
+    wanted = part * float(profile.max())
     first = int(np.argmax(profile >= wanted))
-    rim = float(at[first])
-    if first > 0:
-        below, above = float(profile[first - 1]), float(profile[first])
-        rim = float(np.interp(wanted, [below, above], [at[first - 1], at[first]]))
-    return np.asarray(depth - np.float32(rim), np.float32)
+    if first == 0:
+        return float(at[0])
+    return float(np.interp(wanted, profile[first - 1 : first + 1], at[first - 1 : first + 1]))
 
 
 def _without_gaps(mask: Mask, bridge: float) -> Mask:

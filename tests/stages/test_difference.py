@@ -1,0 +1,91 @@
+"""Stage `difference`: which frames are the reference, and what comes out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from tactflow.engine.frame import Frame
+from tactflow.sim import open_scene
+from tactflow.stages.difference import Difference
+
+Image = NDArray[np.uint8]
+
+
+def _stage(**params: Any) -> Difference:
+    return Difference(Difference.Params(**params))
+
+
+def _frame(image: Image, seq: int, *, reference: bool = False) -> Frame:
+    return Frame("main", seq, seq / 60, image, reference=reference)
+
+
+def _touched() -> tuple[Image, Image]:
+    scene = open_scene("unmarked?frames=60")
+    return scene.frame(0), scene.frame(25)
+
+
+@pytest.mark.parametrize("method", ["noise", "colour"])
+def test_a_touched_gel_is_told_from_the_reference(method: str) -> None:
+    untouched, touched = _touched()
+    stage = _stage(method=method)
+    mask, touching = stage.process(untouched, _frame(untouched, 0, reference=True))
+    assert not touching
+    assert not mask.any()
+    mask, touching = stage.process(touched, _frame(touched, 1))
+    assert touching
+    assert mask.shape == touched.shape[:2]
+    assert set(np.unique(mask)) == {0, 255}
+
+
+def test_the_first_frame_serves_as_reference_where_none_is_marked() -> None:
+    untouched, touched = _touched()
+    stage = _stage()
+    assert not stage.process(untouched, _frame(untouched, 0)).touching
+    assert stage.process(touched, _frame(touched, 1)).touching
+
+
+def test_all_marked_frames_are_learned_from() -> None:
+    rng = np.random.default_rng(9)
+    images = [rng.normal(120, 4, (64, 64, 3)).round().astype(np.uint8) for _ in range(9)]
+    one, many = _stage(repeatability=0, shift=0), _stage(repeatability=0, shift=0)
+    for seq, image in enumerate(images[:8]):
+        many.process(image, _frame(image, seq, reference=True))
+    one.process(images[0], _frame(images[0], 0, reference=True))
+    change = images[8].copy()
+    change[20:44, 20:44] += 3
+    # The mean of eight frames is less noisy than one frame, and their spread is known rather than guessed.
+    assert many.process(change, _frame(change, 9)).touching
+    assert not one.process(change, _frame(change, 9)).touching
+
+
+def test_reset_forgets_the_reference() -> None:
+    untouched, touched = _touched()
+    stage = _stage()
+    stage.process(untouched, _frame(untouched, 0, reference=True))
+    stage.reset()
+    assert not stage.process(touched, _frame(touched, 1, reference=True)).touching
+
+
+def test_the_same_frames_give_the_same_masks() -> None:
+    scene = open_scene("unmarked?frames=60")
+    runs = []
+    for _ in range(2):
+        stage = _stage()
+        frames = [scene.frame(index) for index in range(0, 60, 6)]
+        runs.append([stage.process(image, _frame(image, seq)) for seq, image in enumerate(frames)])
+    for (first, touching), (second, again) in zip(*runs, strict=True):
+        assert np.array_equal(first, second)
+        assert touching == again
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"false_alarms": 0}, {"repeatability": 2}, {"relaxation": 1}, {"method": "magic"}, {"edge": 1}]
+)
+def test_values_out_of_range_and_unknown_ones_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        _stage(**wrong)

@@ -1,0 +1,62 @@
+"""Stage `marker_mask`: finds out how the dots look, once per reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from tactflow.sim import open_scene
+from tactflow.stages.marker_mask import MarkerMaskStage
+from tactflow.vision.marker_mask import Dot, marker_mask
+from tactflow.vision.seed_contact import seed_marker_mask
+
+
+def _stage(**params: Any) -> MarkerMaskStage:
+    return MarkerMaskStage(MarkerMaskStage.Params(**params))
+
+
+def test_dots_are_looked_for_in_the_first_frame_and_again_after_reset() -> None:
+    dark, bright = (open_scene(f"{name}?frames=2").frame(0) for name in ("idle", "bright_dots"))
+    stage = _stage()
+    first = stage.process(dark)
+    assert first.any()
+    assert not stage.process(bright).astype(bool).mean() > 0.05
+    stage.reset()
+    again = stage.process(bright)
+    assert (first.astype(bool) & again.astype(bool)).sum() > 0.7 * first.astype(bool).sum()
+
+
+def test_a_gel_without_markers_gets_an_empty_mask() -> None:
+    frame = open_scene("unmarked?frames=2").frame(0)
+    mask = _stage().process(frame)
+    assert mask.shape == frame.shape[:2]
+    assert not mask.any()
+
+
+def test_given_values_replace_what_would_be_found() -> None:
+    frame = open_scene("idle?frames=2").frame(0)
+    mask = _stage(dot=9.0, polarity="dark", contrast=30.0).process(frame)
+    assert np.array_equal(mask, marker_mask(frame, Dot(9.0, "dark", 30.0)))
+
+
+def test_seed_method_is_the_seed_function() -> None:
+    frame = open_scene("idle?frames=2").frame(0)
+    assert np.array_equal(_stage(method="seed").process(frame), seed_marker_mask(frame))
+
+
+def test_each_mask_is_fresh() -> None:
+    frame = open_scene("idle?frames=2").frame(0)
+    stage = _stage()
+    first = stage.process(frame)
+    kept = first.copy()
+    stage.process(np.zeros_like(frame))[:] = 7
+    assert np.array_equal(first, kept)
+
+
+@pytest.mark.parametrize("wrong", [{"dot": 0}, {"dot": "big"}, {"contrast": 300}, {"polarity": "green"}])
+def test_values_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        _stage(**wrong)
