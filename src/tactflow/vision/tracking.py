@@ -35,6 +35,7 @@ class _Spots:
         self._sign = 1.0 if detection.polarity == "dark" else -1.0
         size = 2 * max(1, round(0.7 * radius)) + 1
         self._neighbourhood = np.ones((size, size), np.uint8)
+        self._margin = 3 * detection.dot_radius + 2 * self._factor
         response = self._response(reference)
         where = np.rint(self._shrink_points(detection.centers)).astype(np.int64)
         where = np.clip(where, 0, np.array([response.shape[1] - 1, response.shape[0] - 1]))
@@ -56,8 +57,16 @@ class _Spots:
         response = cv2.subtract(wide, narrow) if self._sign > 0 else cv2.subtract(narrow, wide)
         return np.asarray(response, np.float32)
 
-    def find(self, gray: NDArray[np.uint8], least: float) -> tuple[FloatArray, FloatArray]:
-        """Spots (M, 2), px, and their strength (M,) relative to the reference's marks."""
+    def find(
+        self, gray: NDArray[np.uint8], least: float, low: FloatArray, high: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Spots (M, 2), px, between two corners, and their strength (M,), 1 for a typical mark."""
+        factor = self._factor
+        left, top = np.maximum((low - self._margin) // factor * factor, 0).astype(np.int64).tolist()
+        right, bottom = (high + self._margin).astype(np.int64).tolist()
+        gray = gray[top : max(bottom, 0), left : max(right, 0)]
+        if min(gray.shape) < 3 * factor:
+            return np.zeros((0, 2)), np.zeros(0)
         response = self._response(gray)
         highest = cv2.dilate(response, self._neighbourhood)
         peak = cv2.compare(response, highest, cv2.CMP_GE)
@@ -77,7 +86,7 @@ class _Spots:
             offset = 0.5 * (before - after) / bend
             points[:, axis] = whole + np.minimum(np.maximum(offset, -0.5), 0.5)
         strength = np.asarray(value / self.typical, np.float64)
-        return points * self._factor + (self._factor - 1) / 2, strength
+        return points * factor + ((factor - 1) / 2 + left, (factor - 1) / 2 + top), strength
 
 
 class MarkerTracker:
@@ -220,24 +229,28 @@ class MarkerTracker:
         stretch: FloatArray,
     ) -> tuple[FloatArray, BoolArray, NDArray[Any]]:
         """Joint choice among the spots of the whole frame, for marks outside the largest smooth part."""
-        spots, strength = self._spots.find(gray, 0.25)
         settled = self._largest_part(seen, stretch)
         free = np.flatnonzero(~settled)
+        if len(free) == 0:
+            return position, seen, stderr
+        moved = position - self._origin
+        common = np.median(moved[settled], axis=0) if settled.any() else np.zeros(2)
+        expected = np.stack([self._position[free], self._origin[free] + common])
+        low, high = expected.min(axis=(0, 1)) - self._farthest, expected.max(axis=(0, 1)) + self._farthest
+        spots, strength = self._spots.find(gray, 0.25, low, high)
         # What was measured without belonging to that part is a spot like any other, if it is not one already.
         own = position[free[seen[free]]]
         own = own[~self._near(own, spots, 0.35)]
         unclaimed = ~self._near(spots, position[settled], 0.3)
         spots = np.concatenate([spots[unclaimed], own])
         strength = np.concatenate([strength[unclaimed], np.full(len(own), 0.5)])
-        moved = position - self._origin
-        common = np.median(moved[settled], axis=0) if settled.any() else np.zeros(2)
         chosen = choose_spots(
             self._origin,
             self._edges,
             free,
             settled,
             moved,
-            np.stack([self._position[free], self._origin[free] + common]),
+            expected,
             spots,
             strength,
             pitch=self._pitch,
