@@ -71,10 +71,10 @@ def imprint(change: Float, inside: Mask, bridge: float = 4.0) -> Float:
     typical = cv2.norm(strength, cv2.NORM_L2SQR) / max(cv2.norm(strength, cv2.NORM_L1), 1e-9)
     cap = max(GLOSS * typical, 1e-9)
     strength = np.minimum(strength, np.float32(cap))
-    mean = np.asarray(-mean if cv2.sumElems(mean)[0] < 0 else mean, np.float32)
-    mean = np.asarray(np.minimum(mean, np.float32(cap / 3**0.5)), np.float32)
-    if 6 * cv2.norm(mean, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
-        return _brightened(mean, _peak(mean))
+    sign = -1 if cv2.sumElems(mean)[0] < 0 else 1
+    common: Float = np.asarray(np.minimum(sign * mean, cap / 3**0.5), np.float32)
+    if 6 * cv2.norm(common, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
+        return _brightened(common, _peak(common))
     return _tilted(strength, _peak(strength), bridge)
 
 

@@ -95,18 +95,24 @@ def _normalized(image: NDArray[np.uint8], mask: NDArray[np.uint8], radius: float
     # Only whole 2 x 2 blocks count: the soft rim of a marker is left out with it.
     valid = cv2.inRange(cv2.resize(hidden, half, interpolation=cv2.INTER_AREA), (0.0,), (0.0,))
     kept = cv2.copyTo(cv2.resize(whole, half, interpolation=cv2.INTER_AREA), valid)
-    total = cv2.resize(kept.astype(np.float32), quarter, interpolation=cv2.INTER_AREA)
-    weight = cv2.resize(valid.astype(np.float32), quarter, interpolation=cv2.INTER_AREA) / np.float32(255)
-    if not weight.any():
+    # At a scale of two, linear interpolation is the mean of 2 x 2, and faster than the area method here.
+    total = cv2.resize(kept.astype(np.float32), quarter, interpolation=cv2.INTER_LINEAR)
+    weight = cv2.resize(valid.astype(np.float32), quarter, interpolation=cv2.INTER_LINEAR)
+    if not cv2.countNonZero(weight):
         return unmarked
     # Near neighbours decide wherever there are any; the wide window and the mean of all fill the rest.
     size = 2 * math.ceil(radius / _CELL + 1) + 1
-    near, far = cv2.GaussianBlur(total, (3, 3), 0), cv2.blur(total, (size, size))
-    near_weight, far_weight = cv2.GaussianBlur(weight, (3, 3), 0), cv2.blur(weight, (size, size))
-    everywhere = np.asarray(cv2.mean(total)[:3], np.float32) * np.float32(_TRACE)
-    share = near_weight + np.float32(_FAR) * far_weight + np.float32(_TRACE * float(weight.mean()))
-    near += np.float32(_FAR) * far + everywhere
-    filled = np.rint(near / share[..., None]).astype(np.uint8)
+    colours = _smoothed(np.asarray(total, np.float32), size)
+    shares = _smoothed(np.asarray(weight, np.float32), size)
+    filled = cv2.convertScaleAbs(cv2.divide(colours, cv2.merge([shares, shares, shares]), scale=255))
     large = cv2.resize(filled, (width + right, height + bottom), interpolation=cv2.INTER_LINEAR)
     cv2.copyTo(large[:height, :width], mask, unmarked)
     return unmarked
+
+
+def _smoothed(values: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Mean over the near cells, with a trace of the wide window's and of the whole frame's."""
+    near = cv2.GaussianBlur(values, (3, 3), 0)
+    mixed = cv2.scaleAdd(cv2.blur(values, (size, size)), _FAR, near)
+    everywhere = np.asarray(cv2.mean(values), np.float64) * _TRACE
+    return np.asarray(cv2.add(mixed, everywhere), np.float32)
