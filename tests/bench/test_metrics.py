@@ -177,8 +177,9 @@ def test_a_marker_that_moves_unlike_its_neighbours_is_a_jump() -> None:
     assert metrics.flow_jumps(flow, ALL, pairs, 20) == 1
 
 
-def test_neighbours_of_a_grid_are_the_eight_around() -> None:
-    pairs = metrics.neighbours(GRID)
+def test_neighbours_of_a_grid_are_the_four_beside_or_the_eight_around() -> None:
+    assert np.bincount(metrics.neighbours(GRID).ravel(), minlength=25)[12] == 4
+    pairs = metrics.neighbours(GRID, reach=1.5)
     degree = np.bincount(pairs.ravel(), minlength=25)
     assert degree[12] == 8
     assert degree[0] == 3

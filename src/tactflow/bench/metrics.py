@@ -322,7 +322,7 @@ def shared_dots(position: FloatArray, trusted: BoolArray, pitch: float) -> int:
     return int(np.count_nonzero(distance.min(axis=1) < pitch / 4))
 
 
-def neighbours(origin: FloatArray, reach: float = 1.5) -> NDArray[np.int64]:
+def neighbours(origin: FloatArray, reach: float = 1.25) -> NDArray[np.int64]:
     """(E, 2) int64, pairs of markers that are neighbours in the grid.
 
     Parameters
