@@ -48,6 +48,9 @@ HALF = 0.45
 """Fraction of the peak at which a brightened contact ends: half of the plateau, of which noise and shading
 make the peak a little more."""
 
+SOLID = 0.98
+"""Part of its convex hull that a region fills at least, if no gap is to be looked for."""
+
 _PROFILE_STEP = 0.5
 _FEW = 8
 
@@ -92,7 +95,9 @@ def _brightened(mean: Float, peak: float) -> Float:
 
 def _tilted(strength: Float, peak: float, bridge: float) -> Float:
     changed = (strength > OUTER * peak).astype(np.uint8)
-    filled = fill(_without_gaps(changed, bridge))
+    filled = fill(changed)
+    if _solidity(filled) < SOLID:
+        filled = fill(_without_gaps(changed, bridge))
     if filled.all():
         return np.ones_like(strength)
     depth = cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5)
@@ -118,13 +123,17 @@ def _crossing(profile: NDArray[np.float64], at: NDArray[np.float64], part: float
     return float(np.interp(wanted, profile[first - 1 : first + 1], at[first - 1 : first + 1]))
 
 
+def _solidity(mask: Mask) -> float:
+    """Part of its convex hull that a region fills; 1 for an empty one."""
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if not outlines:
+        return 1.0
+    around = cv2.contourArea(cv2.convexHull(np.vstack(outlines)))
+    return sum(cv2.contourArea(outline) for outline in outlines) / max(around, 1.0)
+
+
 def _without_gaps(mask: Mask, bridge: float) -> Mask:
     """Close gaps that are narrower than the ring itself is thick, or than a marker."""
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    hull = cv2.convexHull(np.vstack(outlines))
-    solid = sum(cv2.contourArea(outline) for outline in outlines)
-    if solid > 0.98 * cv2.contourArea(hull):
-        return mask
     reach = max(float(cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
     margin = int(reach) + 2
     padded = np.pad(mask, margin)
