@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import threading
 import time
 import webbrowser
 from pathlib import Path
@@ -133,7 +134,8 @@ class View:
         with_token = self.description + (f"?token={p.token}" if p.token else "")
         log.info("view: %s", with_token)
         if p.open_browser:
-            webbrowser.open(with_token)
+            # It may take its time, or wait for the browser to end.
+            threading.Thread(target=webbrowser.open, args=(with_token,), daemon=True).start()
 
     def wants(self) -> bool:
         """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""

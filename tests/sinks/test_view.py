@@ -517,6 +517,7 @@ def test_on_all_interfaces_any_name_is_ours_but_the_token_is_needed(
     port = sink.description.rstrip("/").rpartition(":")[2]
     sink.description = f"http://127.0.0.1:{port}/"
     assert get(sink, Host="lab-pc.local:8765").status == 200
+    assert get(sink, Host="lab-pc.local:8765 https://evil.example").status == 421
     assert page(sink).close_code() == 4401
     assert page(sink, path=f"live?token={SECRET}").next("hello")
 
@@ -572,6 +573,17 @@ def test_the_address_is_logged(view: Callable[..., View], caplog: pytest.LogCapt
     with caplog.at_level(logging.INFO, "tactflow"):
         sink = view(token=SECRET)
     assert caplog.messages == [f"view: {sink.description}?token={SECRET}"]
+
+
+def test_the_browser_is_opened_only_on_request(
+    monkeypatch: pytest.MonkeyPatch, view: Callable[..., View]
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("tactflow.sinks.view.webbrowser.open", opened.append)
+    view()
+    asked = view(open_browser=True)
+    wait_for(lambda: opened)
+    assert opened == [asked.description]
 
 
 @pytest.mark.parametrize(

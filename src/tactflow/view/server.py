@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import hmac
 import logging
+import re
 import socket
 import threading
 from importlib import resources
@@ -29,6 +30,8 @@ from tactflow.view.address import LOOPBACK_NAMES, WILDCARDS, bracketed
 from tactflow.view.hub import MAX_PAGES, Hub
 
 log = logging.getLogger("tactflow")
+
+HOST_HEADER = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?")
 
 START_SECONDS = 10.0
 CLOSE_SECONDS = 3.0
@@ -194,12 +197,17 @@ class _Guard:
         # On all interfaces our names cannot be known; there a token is required, and it protects.
         self._names = None if wildcard else LOOPBACK_NAMES | {bracketed(host).lower()}
 
+    def _is_ours(self, host: str) -> bool:
+        # The header goes into the policy below, so it must be nothing but a name and a port.
+        parts = HOST_HEADER.fullmatch(host)
+        return parts is not None and (self._names is None or parts[1].lower() in self._names)
+
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
         host = Headers(scope=scope).get("host", "")
-        if self._names is not None and _name_of(host) not in self._names:
+        if not self._is_ours(host):
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})
             else:
@@ -247,9 +255,3 @@ def _same_origin(headers: Headers) -> bool:
     except ValueError:
         return False
     return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower() != ""
-
-
-def _name_of(host: str) -> str:
-    """The name in a Host header, lower case, without the port."""
-    name, separator, port = host.rpartition(":")
-    return (name if separator and port.isdigit() else host).lower()
