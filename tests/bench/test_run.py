@@ -63,7 +63,7 @@ def test_a_gel_without_markers_is_measured_without_a_tracker(result: Result) -> 
 
 def test_promises_name_what_was_not_measured(result: Result) -> None:
     targets = {t.quantity: t for t in result.targets}
-    assert targets["marker displacement"].met is not None
+    assert targets["marker displacement: RMS; 99th percentile"].met is not None
     assert targets["wedge_ball"].met is None
     assert "--data" in targets["wedge_ball"].on
 

@@ -224,7 +224,7 @@ class IdentityTally:
             return
         if self._pairs is None:
             self._pitch = metrics.grid_pitch(origin)
-            # Only the nearest four: with the diagonals, a steep but smooth edge of a moving region looks torn.
+            # Not the diagonal ones: with them, a steep but smooth edge of a moving region looks torn.
             self._pairs = metrics.neighbours(origin)
         jumps = metrics.flow_jumps(position - origin, ~lost, self._pairs, self._pitch)
         self._shared += metrics.shared_dots(position, ~lost, self._pitch)

@@ -173,7 +173,7 @@ def scatter(candidates: Sequence[Point], quantity: Quantity, limit: float | None
     costs = [p.cost for p in candidates] + ([floor] if floor else [])
     low, high = _span(costs, 1.2)
     # Room for the name of the slowest one.
-    x_axis = _Axis(low, high + 0.15 * (high - low), _LEFT, WIDTH - _RIGHT)
+    x_axis = _Axis(low, high + 0.28 * (high - low), _LEFT, WIDTH - _RIGHT)
     y_axis = _Axis(*_span(positive or [1.0], 1.2), bottom, _TOP)
     zero_y = HEIGHT - _BOTTOM - _ZERO_BAND / 2
 
@@ -318,11 +318,13 @@ def limit_of(result: Result, group: str, quantity: Quantity) -> float | None:
     return median(limits) if limits else None
 
 
-def _verdict(point: Point, everyone: Sequence[Point], front: Sequence[Point]) -> str:
+def _verdict(point: Point, everyone: Sequence[Point], front: Sequence[Point], quantity: Quantity) -> str:
     if len(everyone) == 1:
         return "the only method"
     if point.missing:
         return f"fails: nothing to show in {point.missing} of {point.missing + point.scenes} scenes"
+    if quantity.best == 1 and point.error > 0.95:
+        return "fails in most scenes"
     whole = [p for p in everyone if not p.missing]
     most_accurate = min(whole, key=lambda p: (p.error, p.cost))
     fastest = min(whole, key=lambda p: (p.cost, p.error))
@@ -376,7 +378,7 @@ def _answers(result: Result) -> str:
                 row = [
                     f'<span class="{"on" if point in front else "off"}">{mark}</span> '
                     f"<b>{escape(point.method)}</b>",
-                    escape(_verdict(point, candidates, front)),
+                    escape(_verdict(point, candidates, front, quantity)),
                     format_number(point.cost),
                     f"{point.cost * result.copy_ms:.2f}",
                     _value_with_worst(result, group, point.method, quantity),
@@ -531,7 +533,8 @@ p { max-width:860px; margin:6px 0 } small, .soft { color:var(--soft) }
 th, td { padding:4px 12px 4px 0; text-align:left; vertical-align:baseline;
   border-bottom:1px solid var(--line) }
 th { color:var(--soft); font-weight:600; max-width:170px; vertical-align:bottom }
-td { font-variant-numeric:tabular-nums } .n { text-align:right; padding-left:12px }
+td { font-variant-numeric:tabular-nums } td:first-child { white-space:nowrap }
+.n { text-align:right; padding-left:12px }
 .on { color:var(--on) } .off { color:var(--off) } .met { color:var(--good); font-weight:600 }
 .missed { color:var(--bad); font-weight:600 } .unknown { color:var(--soft) }
 .figures { display:grid; grid-template-columns:repeat(auto-fill, minmax(min(560px,100%),1fr)); gap:18px }

@@ -35,11 +35,21 @@ def judge(result: Result, default: str, growth: float | None, *, wedge: str, mar
     return [
         _time("frame with contact", nominal, script, "contact", 13, 60, copies),
         _time("frame without contact", nominal, script, "idle", 5, 150, copies),
-        _worst("marker displacement", nominal, [("displacement_rms", 0.03), ("displacement_p99", 0.1)]),
+        _worst(
+            "marker displacement: RMS; 99th percentile",
+            nominal,
+            [("displacement_rms", 0.03), ("displacement_p99", 0.1)],
+        ),
         _wrong("identities", nominal, 0.1),
         _wrong("identities: jumps of 0.9 pitch; 5 % worn, missing", _of(simulated, HARD_MARKERS), 0.5),
-        _worst("contact", nominal, [("hull_iou", 0.88), ("center_error", 1.0), ("area_error", 8.0)]),
-        _worst("direction", _of(simulated, DIRECTED), [("angle_mean", 0.7), ("angle_max", 2.5)]),
+        _worst(
+            "contact: hull IoU; centre; area",
+            nominal,
+            [("hull_iou", 0.88), ("center_error", 1.0), ("area_error", 8.0)],
+        ),
+        _worst(
+            "direction: mean; maximum", _of(simulated, DIRECTED), [("angle_mean", 0.7), ("angle_max", 2.5)]
+        ),
         _worst("mean flow in contact", nominal, [("flow_error", 0.15)]),
         _worst(
             "idle frames called contact; half-depth contacts missed",
