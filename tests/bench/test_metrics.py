@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactflow.bench import metrics
@@ -111,6 +111,7 @@ def test_a_point_shares_nothing_with_a_square() -> None:
     assert metrics.convex_iou(SQUARE[:1], SQUARE) == 0
 
 
+@settings(deadline=None, max_examples=60)
 @given(st.floats(-8, 8), st.floats(-8, 8), st.floats(0, 3), st.integers(3, 12), st.integers(3, 12))
 def test_iou_of_polygons_agrees_with_counting_pixels(
     dx: float, dy: float, turn: float, corners_a: int, corners_b: int

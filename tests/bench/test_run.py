@@ -76,7 +76,7 @@ def test_a_promise_is_judged_by_the_worst_scene() -> None:
     target = next(
         t
         for t in judge(made, "default", None, wedge="wedge", markerless="markerless")
-        if t.quantity == "marker displacement"
+        if t.quantity.startswith("marker displacement")
     )
     assert target.met is False
     assert "cable" in target.on
@@ -84,7 +84,7 @@ def test_a_promise_is_judged_by_the_worst_scene() -> None:
     target = next(
         t
         for t in judge(made, "default", None, wedge="wedge", markerless="markerless")
-        if t.quantity == "marker displacement"
+        if t.quantity.startswith("marker displacement")
     )
     assert target.met is True
 
