@@ -5,6 +5,10 @@ from __future__ import annotations
 import argparse
 
 from tactflow.cli.options import add_pipeline, load_plan
+from tactflow.cli.pipelines import find_pipeline
+from tactflow.engine.config import sensor_names
+from tactflow.engine.graph import Pipeline
+from tactflow.engine.plan import Plan
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -13,8 +17,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one line if the pipeline is right. Raises ConfigError with every mistake if it is not."""
-    pipeline, plan = load_plan(args)
+    """Print one line for each sensor if all is right. Raises ConfigError with every mistake if it is not."""
+    names: list[str] = sensor_names(find_pipeline(args.pipeline), args.overrides)
+    for name in names or (None,):
+        print(_summary(*load_plan(args, name), name))
+    return 0
+
+
+def _summary(pipeline: Pipeline, plan: Plan, sensor: str | None) -> str:
     sinks = len(pipeline.sinks)
     counts = (
         _count(len(pipeline.nodes) - sinks, "stage"),
@@ -22,10 +32,8 @@ def run(args: argparse.Namespace) -> int:
         _count(len(plan.segments), "segment"),
     )
     warnings = len(pipeline.warnings) + len(plan.warnings)
-    print(
-        f"{pipeline.file}: OK ({', '.join(counts)}{', ' + _count(warnings, 'warning') if warnings else ''})"
-    )
-    return 0
+    told = ", ".join([*counts, _count(warnings, "warning")] if warnings else counts)
+    return f"{pipeline.file}: {f'sensor {sensor} ' if sensor else ''}OK ({told})"
 
 
 def _count(number: int, noun: str) -> str:

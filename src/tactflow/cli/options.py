@@ -26,9 +26,12 @@ def add_pipeline(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def load_plan(args: argparse.Namespace) -> tuple[Pipeline, Plan]:
-    """Read the pipeline that the arguments name and plan it; warnings go to standard error."""
-    pipeline = load_pipeline(find_pipeline(args.pipeline), overrides=args.overrides)
+def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipeline, Plan]:
+    """Read the pipeline that the arguments name and plan it; warnings go to standard error.
+
+    sensor : which one of several; None is the first.
+    """
+    pipeline = load_pipeline(find_pipeline(args.pipeline), overrides=args.overrides, sensor=sensor)
     live = bool(getattr(pipeline.source.params, "realtime", False))
     plan = make_plan(pipeline, live=live)
     for warning in (*pipeline.warnings, *plan.warnings):

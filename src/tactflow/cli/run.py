@@ -17,9 +17,11 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from tactflow.cli.fleet import run_fleet
 from tactflow.cli.pipelines import find_pipeline
-from tactflow.engine.config import load_pipeline
+from tactflow.engine.config import load_pipeline, sensor_names
 from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Progress as RunProgress
 from tactflow.engine.run import Runner, RunResult
 
@@ -47,6 +49,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="play a recording at its own pace, dropping frames like a camera",
     )
+    parser.add_argument(
+        "--sensor",
+        metavar="NAME",
+        help="of a pipeline with several sensors, run only this one, in this process",
+    )
     parser.add_argument("--stats", metavar="PATH", help="write run statistics as JSON at exit")
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
     parser.add_argument(
@@ -57,7 +64,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started."""
     console = Console(stderr=True, highlight=False, soft_wrap=True)
-    runner = Runner(_load(args), max_frames=args.max_frames, check=args.check)
+    file = find_pipeline(args.pipeline)
+    several = sensor_names(file, args.overrides) if args.sensor is None else []
+    if len(several) > 1:
+        return run_fleet(args, file, {name: _load(args, file, name) for name in several})
+    runner = Runner(_load(args, file, args.sensor), max_frames=args.max_frames, check=args.check)
     _refuse_unwritable(args.stats)
     with _logging_to(console), _signals(runner):
         for warning in (*runner.pipeline.warnings, *runner.plan.warnings):
@@ -73,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     return result.exit_code
 
 
-def _load(args: argparse.Namespace) -> Any:
+def _load(args: argparse.Namespace, file: Path, sensor: str | None) -> Pipeline:
     source_values: dict[str, Any] = {}
     if args.source is not None:
         source_values["source"] = args.source
@@ -83,10 +94,11 @@ def _load(args: argparse.Namespace) -> Any:
     if args.jsonl is not None:
         extra_sinks["--jsonl"] = {"use": "jsonl", "path": args.jsonl}
     return load_pipeline(
-        find_pipeline(args.pipeline),
+        file,
         overrides=args.overrides,
         extra_sinks=extra_sinks,
         source_values=source_values,
+        sensor=sensor,
     )
 
 

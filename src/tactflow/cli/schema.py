@@ -56,6 +56,13 @@ def pipeline_schema(components: Sequence[Component]) -> Schema:
                 "default": "main",
                 "description": "name in topics",
             },
+            "sensors": {
+                "type": "object",
+                "minProperties": 1,
+                "propertyNames": {"pattern": _WORD},
+                "additionalProperties": {"type": ["object", "null"]},
+                "description": "name -> changes to this file, for several sensors with the same graph",
+            },
             "skipping": {
                 "type": "boolean",
                 "default": True,

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from tactflow.engine import envelope, wiring
+from tactflow.engine import envelope, sensors, wiring
 from tactflow.engine.complaints import complain
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import ErrorAction, FullPolicy, Mark, Node, OnError, Pipeline, Queue
@@ -18,7 +18,7 @@ from tactflow.engine.stage import StageParams
 from tactflow.engine.wiring import Draft
 from tactflow.engine.yamlmap import Entry, Item, Problems, read_value, read_yaml, wrap
 
-TOP_LEVEL = ("sensor", "skipping", "opencv_threads", "stages", "sinks")
+TOP_LEVEL = ("sensor", "sensors", "skipping", "opencv_threads", "stages", "sinks")
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 
 
@@ -28,6 +28,7 @@ def load_pipeline(
     extra_sinks: Mapping[str, Mapping[str, Any]] | None = None,
     extra_stage_values: Mapping[str, Mapping[str, Any]] | None = None,
     source_values: Mapping[str, Any] | None = None,
+    sensor: str | None = None,
 ) -> Pipeline:
     """Read and check a pipeline file.
 
@@ -37,23 +38,17 @@ def load_pipeline(
         is the option's name, with a number if that is taken.
     extra_stage_values : stage id -> parameters that replace those of the file.
     source_values : parameters of the source stage, as `--NAME` on the command line sets them.
+    sensor : which sensor of a file with `sensors:`; None is the first.
 
     Raises
     ------
     ConfigError : the message holds every mistake with file, line, column, source line and a caret.
     """
     problems = Problems()
-    root = read_yaml(path, problems)
-    if root.content is None:
-        problems.add(root.mark, "the file is empty; required: a mapping with sensor, stages and sinks")
-    elif not isinstance(root.content, dict):
-        problems.add(root.mark, f"expected a mapping with sensor, stages and sinks, got {root.words()}")
-    if not isinstance(root.content, dict):
-        problems.raise_if_any()
-    for text in overrides:
-        root = _override(root, text, problems)
+    root = _read(path, overrides, problems)
     root = _add_sinks(root, extra_sinks or {})
     envelope.check_keys(root.entries, TOP_LEVEL, "", problems)
+    root, name = sensors.select(root, sensor, problems)
     drafts = [draft for section in _SECTIONS for draft in _drafts(root, section, problems)]
     _check_ids(drafts, problems)
     for draft in drafts:
@@ -73,7 +68,7 @@ def load_pipeline(
     pipeline = Pipeline(
         file=str(path),
         directory=path.parent,
-        sensor=envelope.word(root.entries, "sensor", "", problems) or "main",
+        sensor=name,
         nodes=nodes,
         skipping=_flag(root.entries, "skipping", True, problems),
         opencv_threads=envelope.whole(root.entries, "opencv_threads", 0, "", problems),
@@ -81,6 +76,33 @@ def load_pipeline(
     )
     problems.raise_if_any()
     return pipeline
+
+
+def sensor_names(path: Path, overrides: Sequence[str] = ()) -> list[str]:
+    """The sensors under `sensors:` of a pipeline file, in order; empty if it has no such key.
+
+    Raises
+    ------
+    ConfigError : the file is no YAML mapping, or an override cannot be applied.
+    """
+    problems = Problems()
+    root = _read(path, overrides, problems)
+    problems.raise_if_any()
+    return sensors.names(root)
+
+
+def _read(path: Path, overrides: Sequence[str], problems: Problems) -> Item:
+    """The document with its overrides."""
+    root = read_yaml(path, problems)
+    if root.content is None:
+        problems.add(root.mark, "the file is empty; required: a mapping with sensor, stages and sinks")
+    elif not isinstance(root.content, dict):
+        problems.add(root.mark, f"expected a mapping with sensor, stages and sinks, got {root.words()}")
+    if not isinstance(root.content, dict):
+        problems.raise_if_any()
+    for text in overrides:
+        root = _override(root, text, problems)
+    return root
 
 
 def _override(root: Item, text: str, problems: Problems) -> Item:
