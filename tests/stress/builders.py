@@ -1,0 +1,287 @@
+"""What the stress tests share: a small gel on an endless canvas, motions, and what a "defined" answer is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.frame import Absent, Frame
+from tactflow.vision.contact import ContactDetector
+from tactflow.vision.inpaint import remove_markers
+from tactflow.vision.marker_mask import find_dot, marker_mask
+from tactflow.vision.markers import detect_markers
+from tactflow.vision.seed_contact import seed_marker_mask
+from tactflow.vision.seed_tracker import SeedTracker
+from tactflow.vision.tracking import MarkerTracker
+from tactflow.vision.types import Markers
+
+Image = NDArray[np.uint8]
+Points = NDArray[np.float64]
+
+SIZE = (176, 128)
+"""Width and height of the small gel, px."""
+PITCH = 28
+RADIUS = 6.0
+CONTACT = (90.0, 61.0)
+"""Centre of the contact, px."""
+AXES = (34.0, 19.0)
+"""Half axes of the contact, px; the long one at `TURN` degrees, counter-clockwise on the screen."""
+TURN = 25.0
+
+
+@dataclass(frozen=True)
+class Gel:
+    """Pictures of a gel, untouched and touched, and the truth about the second one."""
+
+    reference: Image
+    touched: Image
+    origin: Points
+    position: Points
+    contact: NDArray[np.bool_]
+
+    @property
+    def mask(self) -> Image:
+        """(H, W) uint8, 255 in contact."""
+        return self.contact.astype(np.uint8) * np.uint8(255)
+
+
+@lru_cache(maxsize=32)
+def gel(shift: tuple[int, int] = (0, 0), *, dots: bool = True, noise: float = 1.0) -> Gel:
+    """The same gel, everywhere: `shift` moves the camera by whole pixels, and noise moves with the gel.
+
+    The gel brightens by 45 grey levels in all channels where it is touched, which every method sees. Dots
+    move by up to 2.5 px, and less with the distance from the contact; `dots` = False leaves them out.
+    """
+    margin = 40
+    width, height = SIZE
+    x, y = np.meshgrid(
+        np.arange(-margin, width + margin, dtype=np.float64),
+        np.arange(-margin, height + margin, dtype=np.float64),
+    )
+    columns = np.arange(-margin + 4, width + margin, PITCH)
+    rows = np.arange(-margin + 7, height + margin, PITCH)
+    origin = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+    away = np.hypot(*(origin - CONTACT).T)
+    position = origin + np.exp(-((away / 45) ** 2))[:, None] * [2.3, 1.1]
+    inside = elliptical(x, y)
+    rise = np.clip((1 - inside) * 8 + 0.5, 0, 1) * 45
+    shade = np.stack([110 + 0.10 * x, 120 + 0.08 * y, 115 - 0.05 * x + 0.05 * y], axis=-1)
+    random = np.random.default_rng(5)
+    grain = [random.normal(0, noise, shade.shape) for _ in range(2)]
+    pictures = []
+    for centers, light, rough in ((origin, 0.0, grain[0]), (position, rise, grain[1])):
+        coverage = np.zeros_like(x)
+        for dot_x, dot_y in centers if dots else ():
+            np.maximum(coverage, np.clip(RADIUS + 0.5 - np.hypot(x - dot_x, y - dot_y), 0, 1), out=coverage)
+        lit = shade + np.asarray(light)[..., None]
+        picture = lit * (1 - 0.85 * coverage[..., None]) + rough
+        pictures.append(np.clip(np.rint(picture), 0, 255).astype(np.uint8))
+    left, top = margin + shift[0], margin + shift[1]
+    view = slice(top, top + height), slice(left, left + width)
+    seen = ((origin >= shift) & (origin < np.array(SIZE) + shift)).all(axis=1)
+    for picture in pictures:
+        picture.flags.writeable = False
+    return Gel(
+        pictures[0][view],
+        pictures[1][view],
+        origin[seen] - shift,
+        position[seen] - shift,
+        np.ascontiguousarray(inside[view] < 1),
+    )
+
+
+def elliptical(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance from the contact's centre in units of its half axis in that direction."""
+    turn = np.radians(TURN)
+    along = (x - CONTACT[0]) * np.cos(turn) - (y - CONTACT[1]) * np.sin(turn)
+    across = (x - CONTACT[0]) * np.sin(turn) + (y - CONTACT[1]) * np.cos(turn)
+    return np.hypot(along / AXES[0], across / AXES[1])
+
+
+# -- transformations --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Transformation:
+    """What is done to a picture, and what that does to points (given the old width, height) and to angles."""
+
+    name: str
+    picture: Callable[[NDArray[Any]], NDArray[Any]]
+    points: Callable[[Points, int, int], Points]
+    angle: Callable[[float], float]
+    scale: float = 1.0
+
+
+def _turned(k: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    return lambda picture: np.ascontiguousarray(np.rot90(picture, k))
+
+
+def _twice(picture: NDArray[Any]) -> NDArray[Any]:
+    """Twice as large: masks by repetition, which is exact; pictures by interpolation, since blocks of equal
+    pixels have no slope inside and are not what a lens makes."""
+    how = cv2.INTER_NEAREST if picture.ndim == 2 else cv2.INTER_LINEAR
+    return cv2.resize(np.ascontiguousarray(picture), None, fx=2, fy=2, interpolation=how)
+
+
+def _stack(x: NDArray[Any], y: NDArray[Any]) -> Points:
+    return np.column_stack([x, y]).astype(np.float64)
+
+
+ROTATIONS = (
+    Transformation("turned by 0", _turned(0), lambda p, _w, _h: p, lambda a: a),
+    Transformation(
+        "turned by 90", _turned(1), lambda p, w, _h: _stack(p[:, 1], w - 1 - p[:, 0]), lambda a: a + 90
+    ),
+    Transformation(
+        "turned by 180", _turned(2), lambda p, w, h: _stack(w - 1 - p[:, 0], h - 1 - p[:, 1]), lambda a: a
+    ),
+    Transformation(
+        "turned by 270", _turned(3), lambda p, _w, h: _stack(h - 1 - p[:, 1], p[:, 0]), lambda a: a + 90
+    ),
+)
+MIRRORS = (
+    Transformation(
+        "mirrored left to right",
+        lambda picture: np.ascontiguousarray(picture[:, ::-1]),
+        lambda p, w, _h: _stack(w - 1 - p[:, 0], p[:, 1]),
+        lambda a: -a,
+    ),
+    Transformation(
+        "mirrored top to bottom",
+        lambda picture: np.ascontiguousarray(picture[::-1]),
+        lambda p, _w, h: _stack(p[:, 0], h - 1 - p[:, 1]),
+        lambda a: -a,
+    ),
+)
+DOUBLED = Transformation("doubled", _twice, lambda p, _w, _h: 2 * p + 0.5, lambda a: a, 2.0)
+MOTIONS = (*ROTATIONS, *MIRRORS)
+
+
+def axis_difference(a: float, b: float) -> float:
+    """Angle between two axes, degrees, 0 to 90."""
+    return abs((a - b + 90) % 180 - 90)
+
+
+def matched(found: Points, expected: Points) -> NDArray[np.float64]:
+    """Distance of each expected point to the nearest found one, px; infinite where none was found."""
+    if len(found) == 0:
+        return np.full(len(expected), np.inf)
+    return np.asarray(np.hypot(*(expected[:, None] - found[None]).transpose(2, 0, 1)).min(axis=1))
+
+
+def apart(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Hausdorff distance of two masks, px: no pixel of one is farther from the other than this.
+
+    0 for two empty masks, infinite where only one is empty.
+    """
+    if not a.any() or not b.any():
+        return 0.0 if a.any() == b.any() else float("inf")
+    far = 0.0
+    for one, other in ((a, b), (b, a)):
+        away = cv2.distanceTransform((other == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        far = max(far, float(away[one > 0].max()))
+    return far
+
+
+def overlap(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Intersection over union of two masks; 1 for two empty ones."""
+    both, either = np.count_nonzero((a > 0) & (b > 0)), np.count_nonzero((a > 0) | (b > 0))
+    return both / either if either else 1.0
+
+
+# -- every method of every stage that looks at pictures ---------------------------------------------------
+
+
+def dog_mask(reference: Image, image: Image) -> Image:
+    """The default marker mask; empty where the reference shows no markers, as in the stage."""
+    dot = find_dot(reference)
+    return np.zeros(image.shape[:2], np.uint8) if dot is None else marker_mask(image, dot)
+
+
+MARKER_MASKS: Mapping[str, Callable[[Image, Image], Image]] = {
+    "dog": dog_mask,
+    "seed": lambda _reference, image: seed_marker_mask(image),
+}
+INPAINTING = ("normalized", "telea", "ns", "none")
+DIFFERENCES = ("noise", "colour", "seed")
+HULLS = ("moments", "seed")
+FLOWS = ("mean", "seed")
+
+
+def contact_mask(method: Any, reference: Image, image: Image) -> Image:
+    """The contact mask of one image against one reference."""
+    detector = ContactDetector(method)
+    detector.add_reference(reference)
+    return detector.detect(image).mask
+
+
+TRACKERS: Mapping[str, Callable[[Image], Any]] = {
+    "appearance": lambda reference: MarkerTracker(reference, detect_markers(reference)),
+    "seed": SeedTracker,
+}
+
+
+def tracked(make: Callable[[Image], Any], reference: Image, image: Image) -> Markers:
+    """The markers of the reference in one image."""
+    markers: Markers = make(reference).track(image)
+    return markers
+
+
+def filled(method: Any, _reference: Image, image: Image) -> Image:
+    """The image without what the seed's mask takes for markers."""
+    return remove_markers(image, seed_marker_mask(image), method=method)
+
+
+PICTURE_METHODS: Mapping[str, Callable[[Image, Image], Any]] = {
+    **{f"marker_mask-{name}": method for name, method in MARKER_MASKS.items()},
+    **{f"inpaint-{name}": partial(filled, name) for name in INPAINTING},
+    **{f"difference-{name}": partial(contact_mask, name) for name in DIFFERENCES},
+    **{f"tracker-{name}": partial(tracked, make) for name, make in TRACKERS.items()},
+}
+"""Name -> callable of (reference, image)."""
+
+
+# -- defined answers --------------------------------------------------------------------------------------
+
+
+def assert_defined(value: Any) -> None:
+    """No NaN and no infinity anywhere in a result, except for standard errors that are not known."""
+    if value is None or isinstance(value, bool | str | Absent | np.bool_):
+        return
+    if isinstance(value, int | float | complex):
+        assert np.isfinite(value), value
+    elif isinstance(value, np.ndarray):
+        assert value.dtype != object
+        assert np.isfinite(value).all()
+    elif isinstance(value, Markers):
+        for part in (value.origin, value.position, value.status):
+            assert_defined(part)
+        assert not np.isinf(value.stderr).any()
+        assert len(value.origin) == len(value.position) == len(value.status) == len(value.stderr)
+    elif dataclasses.is_dataclass(value):
+        for part in dataclasses.fields(value):
+            assert_defined(getattr(value, part.name))
+    else:
+        for part in value:
+            assert_defined(part)
+
+
+def assert_mask(mask: Image, shape: tuple[int, int]) -> None:
+    """(H, W) uint8 of 0 and 255."""
+    assert mask.shape == shape
+    assert mask.dtype == np.uint8
+    assert set(np.unique(mask).tolist()) <= {0, 255}
+
+
+def frame(image: Image, seq: int = 0, *, reference: bool = False) -> Frame:
+    """A frame as the capture stage hands it over: read-only."""
+    image = image.copy()
+    image.flags.writeable = False
+    return Frame("stress", seq, seq / 60, image, reference=reference)
