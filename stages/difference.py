@@ -46,7 +46,7 @@ class Difference:
             1.0, ge=0, le=100, description="noise: how far the untouched gel moves against the camera, px"
         )
         relaxation: float = Field(
-            0.2,
+            0.16,
             ge=0,
             lt=1,
             description="noise: what a released gel still shows, relative to the strongest change",

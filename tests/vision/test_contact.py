@@ -178,7 +178,7 @@ def test_a_weak_contact_lasts_longer_than_it_takes_to_start_one() -> None:
 
 def test_a_gel_that_creeps_back_is_not_contact() -> None:
     gel = _gel()
-    frames = [_noisy(_pressed(gel, (61, 83), 20, strength), 3) for strength in (0.9, 0.16)]
+    frames = [_noisy(_pressed(gel, (61, 83), 20, strength), 3) for strength in (0.9, 0.13)]
     memory, none = _detector(_noisy(gel, 0)), _detector(_noisy(gel, 0), relaxation=0)
     assert [memory.detect(frame).touching for frame in frames] == [True, False]
     assert [none.detect(frame).touching for frame in frames] == [True, True]

@@ -40,7 +40,7 @@ _QUANTISATION = 12**-0.5
 """Standard deviation of rounding to whole grey levels."""
 _LEVELS = 6
 """Ranges of brightness for which noise is guessed separately (shot noise grows with the light)."""
-_CORRELATED = 2.5
+_CORRELATED = 2.0
 """How much less than white noise the guessed noise shrinks by smoothing: demosaicing and video compression
 leave little noise between neighbours, and more over distances."""
 _DARK = 0.1
@@ -128,7 +128,7 @@ class ContactDetector:
         false_alarms: float = 1e-6,
         repeatability: float = 0.02,
         shift: float = 1.0,
-        relaxation: float = 0.2,
+        relaxation: float = 0.16,
         distance: float = 24.0,
     ) -> None:
         if method not in ("noise", "colour", "seed"):

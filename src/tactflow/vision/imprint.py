@@ -44,6 +44,10 @@ SOFTNESS = 1.0
 """Where the distance is larger, the gel is coated or soft and the slope has no break: the peak of the profile
 is as blunt as its skirt is wide, and `RIDGE` is reached too early by this part of the excess."""
 
+DEEPEST = 0.5
+"""The rim is sought no further in than this part of the way to the middle: where the contact's own relief has
+steeper slopes than its rim, the profile peaks anywhere."""
+
 HALF = 0.45
 """Fraction of the peak at which a brightened contact ends: half of the plateau, of which noise and shading
 make the peak a little more."""
@@ -110,8 +114,9 @@ def _tilted(strength: Float, peak: float, bridge: float) -> Float:
     profile = np.asarray(total[known] / count[known], np.float64)
     at = np.asarray((known + 1.5) * _PROFILE_STEP, np.float64)
     rim, skirt = (_crossing(profile, at, part) for part in (RIDGE, SKIRT))
-    soft = rim - skirt - SHARP_SKIRT * (float(depth.max()) - rim) - BLUR
-    return np.asarray(depth - np.float32(rim + SOFTNESS * max(soft, 0.0)), np.float32)
+    middle = float(depth.max())
+    soft = rim - skirt - SHARP_SKIRT * (middle - rim) - BLUR
+    return np.asarray(depth - np.float32(min(rim + SOFTNESS * max(soft, 0.0), DEEPEST * middle)), np.float32)
 
 
 def _crossing(profile: NDArray[np.float64], at: NDArray[np.float64], part: float) -> float:
