@@ -41,10 +41,10 @@ class Zmq:
             "tcp://*:PORT for the network, ipc:///path",
         )
         backlog: int = Field(
-            8,
+            32,
             ge=1,
-            description="messages that may wait for each subscriber; more bridges its pauses, fewer keep it "
-            "fresher",
+            description="messages that may wait for each subscriber (32: half a second at 60 Hz); more bridges "
+            "its pauses, fewer keep it fresher",
         )
         send_buffer: int = Field(
             32768,

@@ -117,7 +117,7 @@ def test_a_subscriber_in_another_process_gets_every_message_of_a_run(
         [
             *(sys.executable, "-m", "tactflow", "run", "pipeline.yaml", *ONLY_ZMQ, "--quiet"),
             *("--set", f"sinks.zmq.endpoint={endpoint}", "--set", "sinks.zmq.wait_for_subscriber=20"),
-            *("--source", "sim:press?frames=50", "--stats", str(stats)),
+            *("--set", "sinks.zmq.backlog=50", "--source", "sim:press?frames=50", "--stats", str(stats)),
         ],
         cwd=REPOSITORY,
     ) as process:

@@ -57,7 +57,8 @@ def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipe
         relays = _relays(pipelines)
         for endpoint, ids in relays.items():
             upstream = [_private(scratch, name, id_) for name, id_ in ids]
-            stack.enter_context(_relay(endpoint, upstream))
+            backlog = sum(getattr(pipelines[name].nodes[id_].params, "backlog", 1) for name, id_ in ids)
+            stack.enter_context(_relay(endpoint, upstream, backlog))
         members = []
         for name in pipelines:
             private = [
@@ -134,14 +135,17 @@ def _private(scratch: Path, sensor: str, id_: str) -> str:
 
 
 @contextmanager
-def _relay(endpoint: str, upstream: Sequence[str]) -> Iterator[None]:
-    """Bind `endpoint` and pass on what the upstream publishers send, while the block lasts."""
+def _relay(endpoint: str, upstream: Sequence[str], backlog: int) -> Iterator[None]:
+    """Bind `endpoint` and pass on what the upstream publishers send, while the block lasts.
+
+    backlog : messages that may wait for each subscriber.
+    """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     front, back = context.socket(zmq.XPUB), context.socket(zmq.XSUB)
     front.linger = 500
     back.linger = 0
     # As in the sink: a slow reader shall not be seconds behind.
-    front.sndhwm = back.rcvhwm = 8
+    front.sndhwm = back.rcvhwm = backlog
     front.setsockopt(zmq.SNDBUF, 32768)
     try:
         front.bind(endpoint)
