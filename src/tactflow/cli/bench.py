@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from tactflow.bench.compare import Regression, against
+from tactflow.bench.markdown import write_markdown
 from tactflow.bench.methods import SEED
 from tactflow.bench.report import html
 from tactflow.bench.results import Result, load_errors
@@ -55,6 +56,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--html", type=Path, metavar="PATH", help="write the report here, as one HTML file")
     parser.add_argument(
+        "--markdown",
+        type=Path,
+        metavar="PATH",
+        help="write tables for a page of documentation; an existing page keeps the rest of its text",
+    )
+    parser.add_argument(
         "--pictures",
         type=Path,
         metavar="DIR",
@@ -75,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, print the table, write what was asked for; returns the exit code."""
     if args.against is not None:
         load_errors(args.against)
-    for path in (args.json, args.html, args.errors):
+    for path in (args.json, args.html, args.errors, args.markdown):
         _refuse_unwritable(path)
     plan = Plan(
         files=_files(args.pipelines),
@@ -127,6 +134,7 @@ def _write(args: argparse.Namespace, result: Result) -> None:
         (args.json, result.save),
         (args.errors, result.save_errors),
         (args.html, lambda path: path.write_text(html(result), encoding="utf-8")),
+        (args.markdown, lambda path: write_markdown(result, path, DEFAULT)),
     ]
     for path, write in writers:
         if path is None:

@@ -1,0 +1,150 @@
+"""The result as Markdown tables, to be kept in a page of the documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from statistics import median
+
+from tactflow.bench.methods import SEED
+from tactflow.bench.pipelines import ORIGINAL
+from tactflow.bench.quantities import QUANTITIES
+from tactflow.bench.report import PRIMARY, TITLES, format_number, limit_of
+from tactflow.bench.results import RECORDING, Measurement, Result
+
+BEGIN = "<!-- tables of tactflow bench: written by --markdown -->"
+END = "<!-- end of tables -->"
+
+_PER_SCENE = (
+    ("marker RMS, px", ("displacement_rms",)),
+    ("wrong or lost, %", ("wrong_percent", "lost_percent")),
+    ("contact missed, %", ("missed_contacts",)),
+    ("hull IoU", ("hull_iou",)),
+    ("centre, px", ("center_error",)),
+    ("direction, deg", ("angle_mean",)),
+    ("mean flow, px", ("flow_error",)),
+)
+
+
+def write_markdown(result: Result, path: Path, default: str) -> None:
+    """Write the tables to a file; where the file has a place for them, only that place is replaced."""
+    tables = f"{BEGIN}\n\n{markdown(result, default)}\n{END}"
+    if path.exists():
+        text = path.read_text(encoding="utf-8")
+        before, begin, rest = text.partition(BEGIN)
+        _, end, after = rest.partition(END)
+        if begin and end:
+            path.write_text(before + tables + after, encoding="utf-8")
+            return
+    path.write_text(tables + "\n", encoding="utf-8")
+
+
+def markdown(result: Result, default: str) -> str:
+    """Promises, whole pipelines per scene, and the methods of each stage.
+
+    Parameters
+    ----------
+    default : name of the pipeline that is put beside the yardstick.
+    """
+    machine = ", ".join(f"{key} {value}" for key, value in result.machine.items())
+    kind = "quick" if result.quick else "full"
+    parts = [
+        f"Measured by a {kind} run of {result.wall_s:.0f} s on {machine}. One copy of a raw frame took "
+        f"{result.copy_ms:.3f} ms; to read and write every byte of it once, "
+        f"{format_number(result.touch_ms / result.copy_ms)} copies.",
+        "### Promises and results",
+        _targets(result),
+        "### Whole pipelines, scene by scene",
+        f"Each cell: `{SEED}`, then `{default}`. Times are CPU times of a frame with contact, ms; the script "
+        f"is `{SEED}` plus what the script computes twice. A dash: nothing to measure.",
+        _scenes(result, default),
+        "### Methods alone, on the same inputs",
+        "Median over the scenes, in brackets the worst scene. Times are copies of a raw frame.",
+        *_methods(result),
+    ]
+    if any(m.scene.startswith(RECORDING) for m in result.measurements):
+        parts += ["### Real recordings", _recordings(result)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def _targets(result: Result) -> str:
+    words = {True: "met", False: "**missed**", None: "not measured"}
+    rows = [
+        [t.quantity, _signs(t.target), t.result, words[t.met], t.on.replace("\n", " ")]
+        for t in result.targets
+    ]
+    return _table(["quantity", "target", "result", "", "measured on"], rows)
+
+
+def _signs(text: str) -> str:
+    return text.replace("<=", "≤").replace(">=", "≥")
+
+
+def _value(measurement: Measurement | None, keys: Sequence[str]) -> str:
+    if measurement is None or any(key not in measurement.errors for key in keys):
+        return "-"
+    return format_number(sum(measurement.errors[key] for key in keys))
+
+
+def _scenes(result: Result, default: str) -> str:
+    by_key = {m.key: m for m in result.of("pipeline")}
+    scenes = dict.fromkeys(m.scene for m in result.of("pipeline") if not m.scene.startswith(RECORDING))
+    rows = []
+    for scene in scenes:
+        own = [m for m in result.of("pipeline") if m.scene == scene and m.method not in (SEED, ORIGINAL)]
+        mine = by_key.get(f"pipeline/{default}/{scene}", own[0] if own else None)
+        seed, script = (by_key.get(f"pipeline/{name}/{scene}") for name in (SEED, ORIGINAL))
+        times = []
+        for measurement in (script, seed, mine):
+            time = measurement.time if measurement else {}
+            chosen = time.get("contact", time.get("idle"))
+            times.append(format_number(chosen["cpu_ms_p50"]) if chosen else "-")
+        cells = [f"{_value(seed, keys)}, {_value(mine, keys)}" for _, keys in _PER_SCENE]
+        rows.append([scene, *times, *cells])
+    header = ["scene", "script", f"`{SEED}`", f"`{default}`", *(title for title, _ in _PER_SCENE)]
+    return _table(header, rows)
+
+
+def _methods(result: Result) -> list[str]:
+    parts = []
+    for group in result.groups():
+        quantities = [QUANTITIES[name] for name in PRIMARY.get(group, ())]
+        if group == "pipeline" or not quantities:
+            continue
+        header = ["method", "contact", "idle"]
+        for quantity in quantities:
+            limit = limit_of(result, group, quantity)
+            unit = f", {quantity.unit}" if quantity.unit else ""
+            header.append(quantity.title + unit + (f" (limit {format_number(limit)})" if limit else ""))
+        rows = []
+        for method in result.methods(group):
+            measured = result.of(group, method)
+            cells = [f"`{method}`"]
+            for kind in ("contact", "idle"):
+                copies = [m.copies[kind] for m in measured if kind in m.copies]
+                cells.append(format_number(median(copies)) if copies else "-")
+            for quantity in quantities:
+                values = [m.errors[quantity.key] for m in measured if quantity.key in m.errors]
+                worst = max(values, key=quantity.distance, default=0.0)
+                cells.append(f"{format_number(median(values))} ({format_number(worst)})" if values else "-")
+            rows.append(cells)
+        parts += [f"**{TITLES.get(group, group)}**", _table(header, rows)]
+    return parts
+
+
+def _recordings(result: Result) -> str:
+    rows = []
+    for m in result.measurements:
+        if not m.scene.startswith(RECORDING):
+            continue
+        said = "; ".join(f"{QUANTITIES[key].title}: {format_number(v)}" for key, v in m.errors.items())
+        time = m.time.get("contact", m.time.get("idle", {}))
+        milliseconds = format_number(time["cpu_ms_p50"]) if time else "-"
+        failure = (m.failure or "").splitlines()
+        rows.append([m.scene.removeprefix(RECORDING), f"`{m.method}`", milliseconds, said or failure[0]])
+    return _table(["recording", "pipeline", "ms", "result"], rows)
