@@ -125,6 +125,18 @@ def test_a_jump_from_one_side_to_the_other_with_missing_and_worn_dots() -> None:
     assert wrong <= 0.005 * total
 
 
+@pytest.mark.parametrize("fraction", [0.4, 0.6, 0.9])
+@pytest.mark.parametrize("angle", [0.05, 1.5, 2.4, 3.9, 5.3])
+def test_a_jump_of_the_whole_grid_is_not_taken_for_one_the_other_way(fraction: float, angle: float) -> None:
+    rng = np.random.default_rng(int(10 * angle))
+    printed = grid(8, 6, PITCH, corner=(62.2, 80.7), jitter=0.4)[rng.random(48) > 0.05]
+    jump = fraction * PITCH * np.array([np.cos(angle), np.sin(angle)])
+    shown = rng.random(len(printed)) > 0.05
+    markers = tracker(picture(printed)).track(picture((printed + jump)[shown], seed=1))
+    assert (np.abs(markers.displacement - jump)[shown] < 0.1).all()
+    assert (markers.status[~shown] == MarkerStatus.INFERRED).all()
+
+
 def test_a_steadily_growing_drag_of_more_than_a_pitch_is_followed_and_undone() -> None:
     under_test = tracker()
     way = np.concatenate([np.linspace(0, 1.3, 14), np.linspace(1.3, 0, 9)]) * PITCH

@@ -160,6 +160,7 @@ class MarkerTracker:
             self._neighbours[second].append((first, number))
         degree = [len(links) for links in self._neighbours]
         usual = sorted(degree)[len(degree) // 2]
+        self._rim = np.array([links < usual for links in degree])
         self._rim_weight = [3 if links < usual else 1 for links in degree]
         self._cell = 0.12 * self._pitch
         self._raster_shape = tuple(int(side / self._cell) + 2 for side in self._shape)
@@ -229,6 +230,13 @@ class MarkerTracker:
         stretch: FloatArray,
     ) -> tuple[FloatArray, BoolArray, NDArray[Any]]:
         """Joint choice among the spots of the whole frame, for marks outside the largest smooth part."""
+        if int(self._rim[seen].sum()) < 0.85 * int(self._rim.sum()):
+            jump = self._common_jump(gray)
+            if jump is not None:
+                start = self._position + jump
+                position, gain, share, stderr = self._appearance.measure(flat, start)
+                seen = _trusted(gain, share) & (_lengths(position - start) < 0.8 * self._radius)
+                stretch = self._stretch(position)
         settled = self._largest_part(seen, stretch)
         free = np.flatnonzero(~settled)
         if len(free) == 0:
@@ -272,6 +280,36 @@ class MarkerTracker:
             )
             self._take(flat, missing[mutual], spots[unused][spot[mutual]], result, stderr, found)
         return result, found, stderr
+
+    def _common_jump(self, gray: NDArray[np.uint8]) -> FloatArray | None:
+        """The displacement since the last frame that nearly all marks share, if there is clearly one.
+
+        Every pair of a mark and a spot votes for its displacement (a Hough transform; Ballard 1981). Only
+        this tells a jump of the whole grid by nearly a pitch from a small one the other way, which all marks
+        but those of one side would agree with.
+        """
+        size = np.array([self._shape[1], self._shape[0]], np.float64)
+        spots, _ = self._spots.find(gray, 0.4, np.zeros(2), size)
+        if len(spots) == 0:
+            return None
+        cell = 0.1 * self._pitch
+        reach = int(self._farthest / cell)
+        votes = (spots[None] - self._position[:, None]).reshape(-1, 2)
+        bins = np.rint(votes / cell).astype(np.int64)
+        votes = votes[(np.abs(bins) <= reach).all(axis=1)]
+        bins = bins[(np.abs(bins) <= reach).all(axis=1)] + reach
+        side = 2 * reach + 1
+        counts = np.bincount(bins[:, 1] * side + bins[:, 0], minlength=side * side).reshape(side, side)
+        around = cv2.boxFilter(
+            counts.astype(np.float32), -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+        row, column = np.unravel_index(int(np.argmax(around)), around.shape)
+        agree = (np.abs(bins - (column, row)) <= 2).all(axis=1)
+        most = int(agree.sum())
+        around[max(row - 5, 0) : row + 6, max(column - 5, 0) : column + 6] = 0
+        if most < 0.75 * self._count or most < float(around.max()) + max(2.0, 0.05 * self._count):
+            return None
+        return np.asarray(votes[agree].mean(axis=0), np.float64)
 
     def _take(
         self,
