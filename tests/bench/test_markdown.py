@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tactflow.bench.markdown import BEGIN, END, markdown, write_markdown
+from tactflow.bench.pipelines import ORIGINAL
+from tactflow.bench.results import Measurement, Result, Target
+
+
+@pytest.fixture
+def result() -> Result:
+    made = Result(quick=True, copy_ms=0.1, touch_ms=0.05)
+    for method, milliseconds, rms in (("default", 1.5, 0.01), ("seed", 50.0, 0.3), (ORIGINAL, 100.0, 0.3)):
+        measurement = Measurement("pipeline", method, "press", errors={"displacement_rms": rms})
+        measurement.time["contact"] = {"cpu_ms_p50": milliseconds}
+        made.measurements.append(measurement)
+    made.measurements.append(
+        Measurement("inpaint", "ns", "press", copies={"idle": 9}, errors={"inpaint_mae": 1.5})
+    )
+    made.measurements.append(Measurement("pipeline", "seed", "data:wedge_roll", failure="no markers\nmore"))
+    made.targets.append(Target("markers", "<= 0.03 px", "0.01", True, "press"))
+    return made
+
+
+def test_a_scene_has_one_row_with_script_yardstick_and_default(result: Result) -> None:
+    (row,) = [line for line in markdown(result, "default").splitlines() if line.startswith("| press |")]
+    assert row.startswith("| press | 100 | 50 | 1.5 | 0.3, 0.01 | -, - |")
+
+
+def test_every_table_has_as_many_cells_in_each_row(result: Result) -> None:
+    lines = markdown(result, "default").splitlines()
+    for above, below in zip(lines, lines[1:], strict=False):
+        if above.startswith("|") and below.startswith("|"):
+            assert above.count("|") == below.count("|")
+
+
+def test_methods_promises_and_failures_are_listed(result: Result) -> None:
+    text = markdown(result, "default")
+    assert "| markers | ≤ 0.03 px | 0.01 | met | press |" in text
+    assert "| `ns` | - | 9 | 1.5 (1.5) |" in text
+    assert "| wedge_roll | `seed` | - | no markers |" in text
+
+
+def test_an_existing_page_keeps_its_own_text(result: Result, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"# Title\n\n{BEGIN}\nold\n{END}\n\nmore text\n", encoding="utf-8")
+    for _ in range(2):
+        write_markdown(result, page, "default")
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("# Title\n\n")
+    assert text.endswith(f"{END}\n\nmore text\n")
+    assert "old" not in text
+    assert text.count("| press |") == 1
+
+
+def test_a_new_file_holds_the_tables(result: Result, tmp_path: Path) -> None:
+    write_markdown(result, tmp_path / "new.md", "default")
+    assert "| press |" in (tmp_path / "new.md").read_text(encoding="utf-8")
