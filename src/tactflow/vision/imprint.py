@@ -52,7 +52,7 @@ HALF = 0.45
 """Fraction of the peak at which a brightened contact ends: half of the plateau, of which noise and shading
 make the peak a little more."""
 
-SOLID = 0.98
+SOLID = 0.96
 """Part of its convex hull that a region fills at least, if no gap is to be looked for."""
 
 _PROFILE_STEP = 0.5
