@@ -43,8 +43,8 @@ class Zmq:
         backlog: int = Field(
             32,
             ge=1,
-            description="messages that may wait for each subscriber (32: half a second at 60 Hz); more bridges "
-            "its pauses, fewer keep it fresher",
+            description="messages that may wait for each subscriber (32: half a second at 60 Hz); more "
+            "bridges its pauses, fewer keep it fresher",
         )
         send_buffer: int = Field(
             32768,

@@ -69,7 +69,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
         "§stagse: {}\n" + HEAD + SINK,
         ["stagse: unknown key", "did you mean stages?"],
     ),
-    "unknown top-level key": (HEAD + SINK + "§colour: red\n", ["colour: unknown key", "sensor, sensors, skipping"]),
+    "unknown top-level key": (HEAD + SINK + "§colour: red\n", ["colour: unknown key", "sensor, sensors"]),
     "no stages": ("§sensor: main\n", ["stages is missing"]),
     "stages that are a list": (
         "stages:\n  §- capture\n" + SINK,

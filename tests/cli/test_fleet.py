@@ -89,10 +89,8 @@ def test_all_sensors_publish_at_one_address(folder: Path) -> None:
         process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "tactflow", "run", "--quiet"),
-                *(
-                    "--set",
-                    f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}', wait_for_subscriber: 20, backlog: 100}}",
-                ),
+                *("--set", f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}', wait_for_subscriber: 20}}"),
+                *("--set", "sinks.zmq.backlog=100"),
             ],
             cwd=folder,
             stderr=subprocess.DEVNULL,
