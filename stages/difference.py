@@ -40,7 +40,7 @@ class Difference:
             1e-6, gt=0, lt=1, description="noise: frames of the untouched gel called contact, per frame"
         )
         repeatability: float = Field(
-            0.02, ge=0, le=1, description="noise: how far the light of the gel itself varies, relative"
+            0.025, ge=0, le=1, description="noise: how far the light of the gel itself varies, relative"
         )
         shift: float = Field(
             1.0, ge=0, le=100, description="noise: how far the untouched gel moves against the camera, px"

@@ -126,7 +126,7 @@ class ContactDetector:
         method: ContactMethod = "noise",
         *,
         false_alarms: float = 1e-6,
-        repeatability: float = 0.02,
+        repeatability: float = 0.025,
         shift: float = 1.0,
         relaxation: float = 0.16,
         distance: float = 24.0,
