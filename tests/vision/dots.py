@@ -1,7 +1,10 @@
-"""Gels with dots drawn at exactly known places, for tests of detection and tracking."""
+"""Gels with dots for tests of detection and tracking: drawn at exactly known places, and real ones."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,3 +73,16 @@ def match(found: FloatArray, truth: FloatArray) -> tuple[NDArray[np.int64], Floa
     """For each found point the nearest true one, and their distance, px."""
     distance = np.linalg.norm(found[:, None] - truth[None], axis=2)
     return distance.argmin(axis=1), distance.min(axis=1)
+
+
+CORNERS = np.array([[33, 58], [208, 61], [56, 250], [185, 244]], np.float32)
+TARGET = np.array([[0, 0], [240, 0], [0, 320], [240, 320]], np.float32)
+
+
+def rectified(path: Path) -> NDArray[np.uint8]:
+    """A picture of the real wedge, its gel mapped to 240 x 320 px."""
+    image = cv2.imread(str(path))
+    assert image is not None
+    return np.asarray(
+        cv2.warpPerspective(image, cv2.getPerspectiveTransform(CORNERS, TARGET), (240, 320)), np.uint8
+    )

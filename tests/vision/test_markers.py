@@ -10,18 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.markers import NoMarkersError, detect_markers, neighbour_graph, to_gray
-from tests.vision.dots import grid, match, render
-
-CORNERS = np.array([[33, 58], [208, 61], [56, 250], [185, 244]], np.float32)
-TARGET = np.array([[0, 0], [240, 0], [0, 320], [240, 320]], np.float32)
-
-
-def rectified(path: Path) -> NDArray[np.uint8]:
-    image = cv2.imread(str(path))
-    assert image is not None
-    return np.asarray(
-        cv2.warpPerspective(image, cv2.getPerspectiveTransform(CORNERS, TARGET), (240, 320)), np.uint8
-    )
+from tests.vision.dots import grid, match, rectified, render
 
 
 @pytest.mark.parametrize(
