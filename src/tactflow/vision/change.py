@@ -59,7 +59,7 @@ class ChangeProbe:
     def __init__(self, frame: NDArray[np.uint8], *, false_alarms: float = 1e-3, tile: int = 40) -> None:
         if not 0 < false_alarms <= 0.5:
             raise ValueError(f"required false_alarms in (0, 0.5], got {false_alarms}")
-        if tile < 8:
+        if not (tile >= 8 and math.isfinite(tile)):
             raise ValueError(f"required a tile of at least 8 px, got {tile}")
         self._shape = _checked(frame).shape
         # Whole lines are read in one sweep; scattered reads of a frame that is not in the cache cost more.

@@ -135,7 +135,8 @@ class PixelMapping:
         """Where points of the raw frame lie in the processed frame.
 
         points : (N, 2) or (2,), raw pixels, x right, y down. Returns the same shape, float64, processed
-        pixels; points outside the frame are mapped all the same. Raises ValueError on another shape.
+        pixels; points outside the frame are mapped all the same. Raises ValueError on another shape, or for
+        coordinates that are not finite.
         """
         given = _points(points)
         raw = given.reshape(-1, 2)
@@ -190,7 +191,7 @@ class Preprocessor:
             raise ValueError(f"required raw_size (width, height) >= 1, got {raw_size}")
         if rotate not in (0, 90, 180, 270):
             raise ValueError(f"required rotate to be 0, 90, 180 or 270 degrees clockwise, got {rotate}")
-        if downsample < 1 or downsample & (downsample - 1):
+        if not _is_whole(downsample) or downsample < 1 or downsample & (downsample - 1):
             raise ValueError(f"required downsample to be 1, 2, 4, 8, ..., got {downsample}")
         if method not in ("area", "pyramid"):
             raise ValueError(f"required method to be 'area' or 'pyramid', got {method!r}")
@@ -199,7 +200,7 @@ class Preprocessor:
         size = (int(width), int(height))
         if homography is not None:
             source, destination, target = homography
-            if len(target) != 2 or min(target) < 1:
+            if len(target) != 2 or not all(map(_is_whole, target)) or min(target) < 1:
                 raise ValueError(f"required a homography size (width, height) >= 1, got {tuple(target)}")
             matrix = find_homography(source, destination)
             size = (int(target[0]), int(target[1]))
@@ -364,7 +365,13 @@ def _points(points: ArrayLike) -> FloatArray:
     given = np.asarray(points, dtype=np.float64)
     if given.ndim not in (1, 2) or given.shape[-1:] != (2,):
         raise ValueError(f"required points of shape (N, 2), got {given.shape}")
+    if not np.isfinite(given).all():
+        raise ValueError("required finite points, got NaN or infinity among them")
     return given
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _project(matrix: FloatArray, points: FloatArray) -> FloatArray:
@@ -465,8 +472,8 @@ def find_homography(source: ArrayLike, destination: ArrayLike) -> FloatArray:
 
 
 def _crop(crop: Sequence[int], size: tuple[int, int]) -> tuple[int, int, tuple[int, int]]:
-    if len(crop) != 4:
-        raise ValueError(f"required crop (x, y, width, height), got {tuple(crop)}")
+    if len(crop) != 4 or not all(map(_is_whole, crop)):
+        raise ValueError(f"required crop (x, y, width, height) in whole px, got {tuple(crop)}")
     x, y, width, height = (int(value) for value in crop)
     if x < 0 or y < 0 or width < 1 or height < 1 or x + width > size[0] or y + height > size[1]:
         raise ValueError(

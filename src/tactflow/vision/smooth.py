@@ -41,6 +41,7 @@ class OneEuro:
         _require("min_cutoff", min_cutoff, "> 0 Hz", min_cutoff > 0)
         _require("speed_coefficient", speed_coefficient, ">= 0", speed_coefficient >= 0)
         _require("speed_cutoff", speed_cutoff, "> 0 Hz", speed_cutoff > 0)
+        _require("period", period, ">= 0", period >= 0)
         self._min_cutoff = min_cutoff
         self._coefficient = speed_coefficient
         self._speed_cutoff = speed_cutoff
@@ -78,6 +79,7 @@ class AlphaBeta:
             beta = alpha * alpha / (2 - alpha)
         # Beyond this bound the filter oscillates without end.
         _require("beta", beta, f"in [0, {4 - 2 * alpha:g})", 0 <= beta < 4 - 2 * alpha)
+        _require("period", period, ">= 0", period >= 0)
         self._alpha = alpha
         self._beta = beta
         self._period = period
