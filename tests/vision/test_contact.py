@@ -168,8 +168,8 @@ def test_a_weak_contact_lasts_longer_than_it_takes_to_start_one() -> None:
     between = None
     for strength in np.arange(0.01, 0.3, 0.005):
         frame = _noisy(_pressed(gel, (61, 83), 20, strength), 5)
-        fresh = _detector(reference)
-        touched = _detector(reference)
+        fresh = _detector(reference, repeatability=0.01)
+        touched = _detector(reference, repeatability=0.01)
         assert touched.detect(_noisy(_pressed(gel, (61, 83), 20, 1.1 * 0.16), 4)).touching
         if touched.detect(frame).touching and not fresh.detect(frame).touching:
             between = strength
@@ -179,7 +179,8 @@ def test_a_weak_contact_lasts_longer_than_it_takes_to_start_one() -> None:
 def test_a_gel_that_creeps_back_is_not_contact() -> None:
     gel = _gel()
     frames = [_noisy(_pressed(gel, (61, 83), 20, strength), 3) for strength in (0.9, 0.13)]
-    memory, none = _detector(_noisy(gel, 0)), _detector(_noisy(gel, 0), relaxation=0)
+    memory = _detector(_noisy(gel, 0), repeatability=0.01)
+    none = _detector(_noisy(gel, 0), repeatability=0.01, relaxation=0)
     assert [memory.detect(frame).touching for frame in frames] == [True, False]
     assert [none.detect(frame).touching for frame in frames] == [True, True]
 
