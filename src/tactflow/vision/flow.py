@@ -44,10 +44,7 @@ def flow_in_mask(
     Raises ValueError if mask is not (H, W) uint8, if dilate is negative or not finite, or for an unknown
     method.
     """
-    if mask.ndim != 2 or mask.dtype != np.uint8:
-        raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
-    if not (dilate >= 0 and math.isfinite(dilate)):
-        raise ValueError(f"required dilate >= 0 px, got {dilate}")
+    _check(mask, dilate)
     if method not in ("mean", "seed"):
         raise ValueError(f"required method to be 'mean' or 'seed', got {method!r}")
     if method == "seed":
@@ -84,14 +81,23 @@ def flow_in_mask(
     return Flow((float(mean[0]), float(mean[1])), count, stderr, rotation, divergence, residual)
 
 
+def _check(mask: NDArray[np.uint8], dilate: float) -> None:
+    if mask.ndim != 2 or mask.dtype != np.uint8:
+        raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
+    if not (dilate >= 0 and math.isfinite(dilate)):
+        raise ValueError(f"required dilate >= 0 px, got {dilate}")
+
+
 def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0.0) -> NDArray[np.bool_]:
     """Which points fall on a pixel that has a non-zero pixel of the mask within `dilate` px.
 
     points : (N, 2) float, px, x right, y down; points outside the frame are judged by their distance too.
     mask : (H, W) uint8. dilate : px, >= 0, between pixel centres.
     Returns (N,) bool. The same as dilating the mask by a disc and looking the points up, at the cost of the
-    mask's bounding box instead of the frame.
+    mask's bounding box instead of the frame. Raises ValueError if mask is not (H, W) uint8, or if dilate is
+    negative or not finite.
     """
+    _check(mask, dilate)
     inside = np.zeros(len(points), np.bool_)
     if len(points) == 0 or mask.size == 0:
         return inside
