@@ -162,6 +162,7 @@ class MarkerTracker:
         usual = sorted(degree)[len(degree) // 2]
         self._rim = np.array([links < usual for links in degree])
         self._rim_weight = [3 if links < usual else 1 for links in degree]
+        self._island = _islands(self._neighbours)
         self._cell = 0.12 * self._pitch
         self._raster_shape = tuple(int(side / self._cell) + 2 for side in self._shape)
         self._around, self._around_weight = _surroundings(self._origin, self._pitch)
@@ -350,11 +351,11 @@ class MarkerTracker:
         """The largest set of seen marks that are linked by edges along which the displacement is smooth.
 
         Marks at the rim count three times: they hardly move, so the part that holds them is the right one.
+        Where the marks of the reference fall into several grids without links, each has its own part.
         """
         linked = (stretch < 0.3).tolist()
         waiting = seen.tolist()
-        best: list[int] = []
-        most = 0
+        best: dict[int, tuple[int, list[int]]] = {}
         for seed in range(self._count):
             if not waiting[seed]:
                 continue
@@ -366,10 +367,12 @@ class MarkerTracker:
                     if waiting[other] and linked[edge]:
                         waiting[other] = False
                         part.append(other)
-            if weight > most:
-                best, most = part, weight
+            island = self._island[seed]
+            if weight > best.get(island, (0, []))[0]:
+                best[island] = (weight, part)
         settled = np.zeros(self._count, bool)
-        settled[best] = True
+        for _, part in best.values():
+            settled[part] = True
         return settled
 
     def _infer(self, position: FloatArray, found: BoolArray, status: NDArray[np.uint8]) -> None:
@@ -399,6 +402,22 @@ def _lengths(vectors: FloatArray) -> FloatArray:
 
 def _trusted(gain: NDArray[Any], share: NDArray[Any]) -> BoolArray:
     return np.asarray((gain > 0.2) & (gain < 3.0) & (share > 0.5), np.bool_)
+
+
+def _islands(neighbours: list[list[tuple[int, int]]]) -> list[int]:
+    """For each mark the smallest mark that it is linked to, directly or through others."""
+    island = [-1] * len(neighbours)
+    for seed in range(len(neighbours)):
+        if island[seed] >= 0:
+            continue
+        island[seed] = seed
+        part = [seed]
+        for mark in part:
+            for other, _ in neighbours[mark]:
+                if island[other] < 0:
+                    island[other] = seed
+                    part.append(other)
+    return island
 
 
 def _surroundings(origin: FloatArray, pitch: float) -> tuple[IntArray, FloatArray]:
