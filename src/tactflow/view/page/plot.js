@@ -1,7 +1,7 @@
 // A line plot of the last ten seconds. A missing value leaves a gap: nothing is invented between two contacts.
 
 export const SECONDS = 10;
-const GAP = 0.3;  // s; points further apart are not joined
+const GAP = 0.6;  // s; points further apart are not joined
 
 export class Plot {
   // series: one function (point) -> number or null each. range: [low, high], or "positive", or "symmetric".
