@@ -18,6 +18,7 @@ from tactflow.engine.link import Link
 from tactflow.engine.plan import Plan, make_plan
 from tactflow.engine.segment import NodeFailedError, RunningNode, RunningTick, Segment
 from tactflow.engine.stats import Durations, NodeStats
+from tactflow.engine.trace import Trace
 
 logger = logging.getLogger("tactflow")
 
@@ -50,7 +51,8 @@ class Runner:
     """One run of a pipeline.
 
     pipeline : validated. max_frames : stop after so many captured frames. check : check arrays against
-    their port types, and hand inputs over read-only, in every tick.
+    their port types, and hand inputs over read-only, in every tick. trace : filled with what each thread
+    does when; write it when the run has ended.
 
     Raises
     ------
@@ -58,10 +60,18 @@ class Runner:
         If the pipeline cannot be planned. Nothing was started.
     """
 
-    def __init__(self, pipeline: Pipeline, *, max_frames: int | None = None, check: bool = False) -> None:
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        *,
+        max_frames: int | None = None,
+        check: bool = False,
+        trace: Trace | None = None,
+    ) -> None:
         self.pipeline = pipeline
         self.max_frames = max_frames
         self.check = check
+        self.trace = trace
         self.latency = Durations()
         self.nodes: dict[str, RunningNode] = {}
         self.plan: Plan = make_plan(pipeline)
@@ -213,7 +223,9 @@ class Runner:
         return instance
 
     def _connect(self) -> None:
-        self._segments = {name: Segment(name, self) for name in self.plan.segments}
+        for name in self.plan.segments:
+            track = None if self.trace is None else self.trace.track(name)
+            self._segments[name] = Segment(name, self, track)
         for link_plan in self.plan.links:
             link: Link[RunningTick] = Link(link_plan.name, link_plan.capacity, link_plan.when_full)
             self._links.append(link)
@@ -284,15 +296,17 @@ class Runner:
                     break
                 if not self._may_go_on():
                     continue
+                ended = time.perf_counter()
                 self._source_stats.runs += 1
-                self._source_stats.durations.add(time.perf_counter() - began)
+                self._source_stats.durations.add(ended - began)
+                if segment.track is not None:
+                    segment.track.add(node.id, began, ended, {"seq": frame.seq})
                 if frame.seq >= 0:
                     self._frames += 1
                 tick = RunningTick(index, frame, self._demand(sinks, frame))
                 tick.values[key] = frame
                 index += 1
-                segment.execute(tick)
-                segment.forward(tick)
+                segment.handle(tick)
                 if self.max_frames is not None and self._frames >= self.max_frames:
                     self.stop("max_frames")
         except NodeFailedError:
@@ -326,9 +340,7 @@ class Runner:
         return frozenset(
             sink.id
             for sink in sinks
-            if not sink.disabled
-            and sink.due(frame)
-            and (not hasattr(sink.instance, "wants") or sink.instance.wants())
+            if not sink.disabled and sink.due(frame) and (sink.wants is None or sink.wants())
         )
 
     # -- statistics ---------------------------------------------------------------------------------------
@@ -345,7 +357,8 @@ class Runner:
         stages: dict[str, Any] = {self.pipeline.source.id: _node_stats(self._source_stats)}
         sinks: dict[str, Any] = {}
         signals: dict[str, Any] = {}
-        for node in self.nodes.values():
+        # A sink may ask while others are still being opened.
+        for node in list(self.nodes.values()):
             entry = _node_stats(node.stats)
             if node.is_sink:
                 if hasattr(node.instance, "counters"):
@@ -385,6 +398,7 @@ def _node_stats(stats: NodeStats) -> dict[str, Any]:
         "runs": stats.runs,
         "skips": dict(stats.skips),
         "errors": stats.errors,
+        "total_ms": round(stats.durations.total * 1000, 4),
         "p50_ms": stats.durations.milliseconds(0.5),
         "p99_ms": stats.durations.milliseconds(0.99),
     }

@@ -11,6 +11,7 @@ import logging
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from operator import is_
 from typing import Any, Protocol
 
 from tactflow.engine.check import ArrayCheck
@@ -21,6 +22,7 @@ from tactflow.engine.link import Link
 from tactflow.engine.plan import Plan
 from tactflow.engine.stage import Port, SignalPort, port_type
 from tactflow.engine.stats import Durations, NodeStats, SignalStats
+from tactflow.engine.trace import Track
 
 logger = logging.getLogger("tactflow")
 
@@ -100,6 +102,7 @@ class RunningNode:
             ref = node.inputs.get(port.name)
             self.inputs.append((port, (ref.node, ref.port) if ref else None))
         self.names = [port.name for port, _ in self.inputs]
+        self.input_keys = [key for _, key in self.inputs if key is not None]
         self.outputs: list[Key] = [(node.id, port.name) for port in node.component.ports.outputs]
         self.gates = [_RunningGate(gate) for gate in node.gates] if skipping else []
         self.stateful = node.component.memory == "stateful" or any(g.has_memory for g in self.gates)
@@ -110,15 +113,14 @@ class RunningNode:
             if isinstance(port_type(port.annotation), SignalPort)
         }
         self.disabled = False
+        self.wants: Callable[[], bool] | None = getattr(instance, "wants", None)
+        self.takes_tick = node.component.ports.takes_tick
+        self.repeats = any(gate.plan.otherwise == "repeat" for gate in self.gates)
         self.reuses = skipping and not self.stateful and not self.is_sink
         self.last: list[Any] | None = None
         self.last_arguments: list[Any] | None = None
         self.check = ArrayCheck(node) if check else None
         self.next_due = float("-inf")
-
-    @property
-    def repeats(self) -> bool:
-        return any(gate.plan.otherwise == "repeat" for gate in self.gates)
 
     def due(self, frame: Frame) -> bool:
         """Whether a rate-limited sink's next time has come; goes by capture time."""
@@ -149,24 +151,74 @@ class NodeFailedError(Exception):
     """Ends a segment because one of its nodes failed for good."""
 
 
-class Segment:
-    """Evaluates the nodes of one segment for a tick."""
+class _Step:
+    """A node as one segment sees it, with all that it pulls looked up once.
 
-    def __init__(self, name: str, run: Run) -> None:
+    own : evaluated here; else it belongs to a later segment and is only walked through, to what it needs from
+    here. gates : each with the step that makes its signal (None: made earlier) and whether it decides here.
+    before : steps that make its inputs. seen : index of the tick in which it was visited last.
+    """
+
+    __slots__ = ("before", "gates", "node", "own", "seen")
+
+    def __init__(self, node: RunningNode, own: bool, known: set[str], steps: dict[str, _Step]) -> None:
+        self.node = node
+        self.own = own
+        self.seen = -1
+        self.gates: list[tuple[_RunningGate, _Step | None, bool]] = []
+        for gate in node.gates:
+            # The memory of a later segment's gate is not known here: such a gate may be open.
+            plain = not gate.plan.hold and gate.plan.at_least_every is None
+            decides = own or (plain and gate.key[0] in known)
+            self.gates.append((gate, steps.get(gate.key[0]), decides))
+        makers = dict.fromkeys(key[0] for key in node.input_keys)
+        self.before = [steps[maker] for maker in makers if maker in steps]
+
+
+class Segment:
+    """Evaluates the nodes of one segment for a tick.
+
+    track : where to note what is done when; None for nowhere.
+    """
+
+    def __init__(self, name: str, run: Run, track: Track | None = None) -> None:
         self.name = name
         self.run = run
+        self.track = track
         plan = run.plan
         self.nodes = [run.nodes[i] for i in plan.segments[name] if i in run.nodes]
-        self.mine = {node.id for node in self.nodes}
-        self.known = self.mine | {i for a in plan.ancestors[name] for i in plan.segments[a]}
-        below = [i for i in plan.pipeline.nodes if i in run.nodes and i not in self.known]
-        self.stateful = [n for n in run.nodes.values() if n.stateful and (n.id in self.mine or n.id in below)]
-        self.sinks = [n for n in run.nodes.values() if n.is_sink and (n.id in self.mine or n.id in below)]
+        mine = {node.id for node in self.nodes}
+        known = mine | {i for a in plan.ancestors[name] for i in plan.segments[a]}
+        # Every input comes before its user in the pipeline, so a step finds those it needs.
+        steps: dict[str, _Step] = {}
+        for id_ in plan.pipeline.nodes:
+            if id_ in run.nodes and (id_ in mine or id_ not in known):
+                steps[id_] = _Step(run.nodes[id_], id_ in mine, known, steps)
+        self._own = [steps[node.id] for node in self.nodes]
+        self._stateful = [step for step in steps.values() if step.node.stateful]
+        self._sinks = [step for step in steps.values() if step.node.is_sink]
         self.data_sinks = [n for n in self.nodes if n.is_sink and not getattr(n.instance, "observer", False)]
         self.inputs: list[Link[RunningTick]] = []
         self.outputs: list[tuple[Link[RunningTick], frozenset[str] | None]] = []
         self.epoch = 0
         self.current: str | None = None
+
+    def handle(self, tick: RunningTick) -> None:
+        """Compute this segment's part of a tick and hand the tick on."""
+        track = self.track
+        if track is None:
+            self.execute(tick)
+            self.forward(tick)
+            return
+        began = time.perf_counter()
+        for link in self.inputs:
+            track.arrives((link.name, tick.index), began)
+        self.execute(tick)
+        self.forward(tick)
+        mine = {node.id for node in self.nodes}
+        skipped = {node: reason for (node, _), reason in list(tick.reasons.items()) if node in mine}
+        name = f"frame {tick.frame.seq}" if tick.frame.seq >= 0 else "reference image"
+        track.add(name, began, time.perf_counter(), {"seq": tick.frame.seq, "skipped": skipped})
 
     def execute(self, tick: RunningTick) -> None:
         """Compute what this tick needs from this segment."""
@@ -174,47 +226,45 @@ class Segment:
             self.epoch = tick.frame.epoch
             for node in self.nodes:
                 node.reset()
-        visited: set[str] = set()
-        for node in self.stateful:
-            self._visit(node, tick, visited)
-        for node in self.sinks:
-            if node.id in tick.demand:
-                self._visit(node, tick, visited)
-        for node in self.nodes:
-            if node.id not in visited:
-                node.stats.skips["no_demand"] += 1
-        if self.data_sinks and tick.demand:
+        for step in self._stateful:
+            self._visit(step, tick)
+        demand = tick.demand
+        if demand:
+            for step in self._sinks:
+                if step.node.id in demand:
+                    self._visit(step, tick)
+        index = tick.index
+        for step in self._own:
+            if step.seen != index:
+                step.node.stats.skips["no_demand"] += 1
+        if demand and self.data_sinks:
             self.run.latency.add(time.perf_counter() - tick.frame.captured)
 
-    def _visit(self, node: RunningNode, tick: RunningTick, visited: set[str]) -> None:
-        """Pull one node. A node of a later segment is only walked through, to what it needs from here."""
-        if node.id in visited:
+    def _visit(self, step: _Step, tick: RunningTick) -> None:
+        """Pull one node, at most once a tick: first its gates, then its inputs, then the node itself."""
+        if step.seen == tick.index:
             return
-        visited.add(node.id)
-        own = node.id in self.mine
-        if not own and node.id in self.known:
-            return
+        step.seen = tick.index
         reason = None
-        for gate in node.gates:
-            signal_node = self.run.nodes.get(gate.key[0])
-            if signal_node is not None:
-                self._visit(signal_node, tick, visited)
-            if own:
-                if not gate.is_open(tick.values.get(gate.key)):
-                    signal = tick.values.get(gate.key)
+        for gate, maker, decides in step.gates:
+            if maker is not None:
+                self._visit(maker, tick)
+            if not decides:
+                continue
+            signal = tick.values.get(gate.key)
+            if step.own:
+                if not gate.is_open(signal):
                     reason = reason or (signal.reason if isinstance(signal, Absent) else gate.plan.reason)
-            elif gate.key[0] in self.known and not gate.plan.hold and gate.plan.at_least_every is None:
-                signal = tick.values.get(gate.key)
-                if isinstance(signal, Absent) or not signal:
-                    return
+            elif isinstance(signal, Absent) or not signal:
+                return
         if reason is not None:
-            self._skip(node, tick, reason, repeat=node.repeats)
+            self._skip(step.node, tick, reason, repeat=step.node.repeats)
             return
-        for _, key in node.inputs:
-            if key is not None and key[0] in self.run.nodes:
-                self._visit(self.run.nodes[key[0]], tick, visited)
-        if own:
-            self._run(node, tick)
+        for maker in step.before:
+            if maker.seen != tick.index:
+                self._visit(maker, tick)
+        if step.own:
+            self._run(step.node, tick)
 
     def _skip(self, node: RunningNode, tick: RunningTick, reason: str, *, repeat: bool = False) -> None:
         node.stats.skips[reason] += 1
@@ -240,7 +290,7 @@ class Segment:
             arguments.append(value)
         # A pure stage with the very inputs of its last run would give the very outputs of its last run.
         same = node.last_arguments
-        if same is not None and all(a is b for a, b in zip(arguments, same, strict=True)):
+        if same is not None and all(map(is_, arguments, same)):
             assert node.last is not None
             node.stats.skips["unchanged"] += 1
             self._publish(node, tick, node.last)
@@ -254,8 +304,11 @@ class Segment:
             return
         finally:
             self.current = None
+        ended = time.perf_counter()
         node.stats.runs += 1
-        node.stats.durations.add(time.perf_counter() - began)
+        node.stats.durations.add(ended - began)
+        if self.track is not None:
+            self.track.add(node.id, began, ended, {"seq": tick.frame.seq})
         if node.repeats or node.reuses:
             node.last = values
         if node.reuses:
@@ -266,7 +319,7 @@ class Segment:
         """Call a node's function; under check, with read-only inputs and a look at what it returns."""
         given = arguments if node.check is None else [node.check.read_only(value) for value in arguments]
         named = dict(zip(node.names, given, strict=True))
-        if node.node.component.ports.takes_tick:
+        if node.takes_tick:
             named["tick"] = Tick(tick.frame, self._skipped(node, tick))
         values = _values(node.function(**named), len(node.outputs))
         if node.check is not None:
@@ -280,8 +333,8 @@ class Segment:
         not by whether the node had run before, so that an observer changes no reason either.
         """
         inherited = None
-        if node.reuses:
-            reasons = [tick.reasons.get(key) for _, key in node.inputs if key is not None]
+        if node.reuses and tick.reasons:
+            reasons = [tick.reasons.get(key) for key in node.input_keys]
             if reasons and None not in reasons:
                 inherited = reasons[0]
         for key, value in zip(node.outputs, values, strict=True):
@@ -322,6 +375,8 @@ class Segment:
         keep = tick.frame.reference
         for link, only_sinks in self.outputs:
             if only_sinks is None or not only_sinks.isdisjoint(tick.demand):
+                if self.track is not None:
+                    self.track.leaves((link.name, tick.index))
                 link.put(tick, keep=keep)
 
     def next_tick(self) -> RunningTick | None:
@@ -346,8 +401,7 @@ class Segment:
         """Body of the segment's thread."""
         try:
             while (tick := self.next_tick()) is not None:
-                self.execute(tick)
-                self.forward(tick)
+                self.handle(tick)
         except NodeFailedError:
             for link in self.inputs:
                 link.abort()
@@ -364,6 +418,8 @@ def _values(result: Any, count: int) -> list[Any]:
     """What a node returned, as one value per output port; None stands for absent."""
     if isinstance(result, Absent) or (result is None and count):
         return [result or Absent("none")] * count
+    if count == 1 and not isinstance(result, tuple):
+        return [result]
     values = list(result) if isinstance(result, tuple) else [result] if count else []
     if len(values) != count:
         raise TypeError(f"required {count} outputs, got {len(values)}")
