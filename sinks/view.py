@@ -115,13 +115,13 @@ class View:
                 " and ".join(missing),
             )
             return
-        from tactflow.view.hub import Hub
-        from tactflow.view.server import Server
-
         p = self.params
         try:
+            from tactflow.view.hub import Hub
+            from tactflow.view.server import Server
+
             listener = bind(p.host, p.port)
-        except OSError as error:
+        except (ImportError, OSError, UnicodeError) as error:
             log.warning("view: not shown, because %s:%d cannot be served: %s", p.host, p.port, error)
             return
         port = listener.getsockname()[1]

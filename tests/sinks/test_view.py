@@ -8,6 +8,7 @@ import json
 import logging
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -587,7 +588,12 @@ def test_the_browser_is_opened_only_on_request(
 
 
 @pytest.mark.parametrize(
-    "params", [{"host": "192.0.2.1", "token": SECRET}, {"host": "no-such-host.invalid", "token": SECRET}]
+    "params",
+    [
+        {"host": "192.0.2.1", "token": SECRET},
+        {"host": "no-such-host.invalid", "token": SECRET},
+        {"host": "a..b" * 90, "token": SECRET},
+    ],
 )
 def test_an_address_that_is_not_ours_disables_the_view_only(
     params: dict[str, Any], view: Callable[..., View], caplog: pytest.LogCaptureFixture
@@ -612,6 +618,14 @@ def test_without_the_extra_there_is_one_warning_and_no_view(
     assert not sink.wants()
     sink.write(tick(), picture(), None, None, None)
     assert sink.counters() == {"encoded": 0}
+
+
+def test_an_extra_that_cannot_be_imported_disables_the_view_only(
+    monkeypatch: pytest.MonkeyPatch, view: Callable[..., View], caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(sys.modules, "tactflow.view.server", None)
+    assert not view().wants()
+    assert "not shown" in caplog.text
 
 
 def test_at_the_end_pages_learn_how_it_ended(view: Callable[..., View], page: Callable[..., Page]) -> None:
