@@ -1,0 +1,346 @@
+"""What limited precision costs: large coordinates, single against double, angles across the seam."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.vision import (
+    change,
+    contact,
+    imprint,
+    inpaint,
+    light,
+    marker_appearance,
+    marker_mask,
+    markers,
+    seed_contact,
+    tracking,
+)
+from tactflow.vision.draw import Annotator
+from tactflow.vision.flow import flow_in_mask, inside_mask
+from tactflow.vision.geometry import PixelMapping, Preprocessor
+from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
+from tactflow.vision.types import Contact, Ellipse, Markers
+from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, SIZE, apart, axis_difference, gel
+from tests.stress.doubles import in_double
+
+FAR = 1e6
+"""Offset of coordinates, px."""
+ULP = float(np.spacing(FAR))
+"""Distance of neighbouring float64 numbers at `FAR`: 1.2e-10 px."""
+
+# -- coordinates that are far from zero -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", HULLS)
+def test_moments_ellipse_and_line_of_a_contact_a_million_pixels_away(method: str) -> None:
+    """One mask a million pixels wide: the same contact at its left and at its right end."""
+    mask = gel().mask[20:100]
+    wide = np.zeros((mask.shape[0], 1_000_000 + mask.shape[1]), np.uint8)
+    wide[:, -mask.shape[1] :] = mask
+    here, there = (contact_geometry(part, method=method) for part in (mask, wide))  # type: ignore[arg-type]
+    assert here is not None
+    assert there is not None
+    assert here.angle is not None
+    assert there.angle is not None
+    assert here.ellipse is not None
+    assert there.ellipse is not None
+    assert there.area == here.area
+    np.testing.assert_array_equal(there.hull - (FAR, 0), here.hull)
+    if method == "moments":
+        # Moments are taken relative to the contact, in whole numbers: only the final sum is rounded.
+        assert abs(there.center[0] - FAR - here.center[0]) <= ULP
+        assert there.angle == here.angle
+        assert there.ellipse.axes == here.ellipse.axes
+    else:
+        # Fitted relative to the contact too; the bound of the docstring: float32 rounds coordinates up to
+        # 176 px by 1.5e-5 px, over a length of 68 px: derived 2e-5 degrees, a tenfold for sums.
+        assert axis_difference(there.angle, here.angle) <= 2e-4
+        np.testing.assert_allclose(there.ellipse.axes, here.ellipse.axes, rtol=1e-5)
+        assert abs(there.ellipse.center[0] - FAR - here.ellipse.center[0]) <= 1e-4
+
+
+@pytest.mark.parametrize("offset", [(FAR, 0), (0, FAR), (FAR, -FAR), (-3 * FAR, FAR / 7)], ids=str)
+@pytest.mark.parametrize("angle", [0, 30, 45, 89, 90, -30, -89.9])
+def test_a_line_through_points_a_million_pixels_away(angle: float, offset: tuple[float, float]) -> None:
+    turn = math.radians(angle)
+    along = np.linspace(-40, 40, 81)[:, None] * [math.cos(turn), -math.sin(turn)]
+    near, far = regress_line(along), regress_line(along + offset)
+    assert near.angle is not None
+    assert far.angle is not None
+    # Each coordinate is rounded by up to half an ulp of 3e6 (2.3e-10 px): over 40 px, 3e-10 degrees each.
+    assert axis_difference(near.angle, angle) <= 1e-12 * 90
+    assert axis_difference(far.angle, angle) <= 1e-9
+    assert np.abs(np.subtract(far.point, offset)).max() <= 4 * float(np.spacing(3 * FAR))
+
+
+def test_points_a_million_pixels_away_without_a_direction_get_none() -> None:
+    around = np.arange(12) * (math.pi / 6)
+    circle = 30 * np.column_stack([np.cos(around), np.sin(around)])
+    assert regress_line(circle).angle is None
+    assert regress_line(circle + FAR).angle is None
+    assert regress_line(np.full((7, 2), FAR)).angle is None
+
+
+@pytest.mark.parametrize("method", FLOWS)
+def test_the_flow_of_markers_a_million_pixels_away(method: str) -> None:
+    """A mask that is a million pixels wide, with the markers at its right end."""
+    pictures = gel()
+    wide = np.zeros((SIZE[1], 1_000_000 + SIZE[0]), np.uint8)
+    wide[:, -SIZE[0] :] = pictures.mask
+    far = np.array([FAR, 0.0])
+    given = Markers(pictures.origin, pictures.position, np.zeros(24, np.uint8), np.full(24, 0.1))
+    moved = Markers(pictures.origin + far, pictures.position + far, given.status, given.stderr)
+    here = flow_in_mask(given, pictures.mask, dilate=3, method=method)  # type: ignore[arg-type]
+    there = flow_in_mask(moved, wide, dilate=3, method=method)  # type: ignore[arg-type]
+    assert here.mean is not None
+    assert there.mean is not None
+    assert here.count == there.count >= 3
+    # Each displacement is a difference of two rounded coordinates.
+    np.testing.assert_allclose(there.mean, here.mean, rtol=0, atol=2 * ULP)
+    if method == "mean":
+        assert here.rotation is not None
+        assert there.rotation is not None
+        # Over a pitch of 28 px.
+        assert abs(there.rotation - here.rotation) <= math.degrees(4 * ULP / 28)
+
+
+def test_neighbours_a_million_pixels_away_are_the_same_neighbours() -> None:
+    origin = gel().origin
+    expected = markers.neighbour_graph(origin, 70)
+    assert len(expected) == 38
+    for offset in ((FAR, 0), (-FAR, FAR)):
+        np.testing.assert_array_equal(markers.neighbour_graph(origin + offset, 70), expected)
+
+
+def test_a_mapping_and_its_inverse_a_million_pixels_away() -> None:
+    mapping = Preprocessor((800, 600), rotate=90, downsample=4, crop=(7, 5, 700, 500)).mapping
+    points = np.random.default_rng(0).uniform(-FAR, FAR, (100, 2))
+    # Affine: some ten operations, each of half an ulp.
+    assert np.abs(mapping.to_raw(mapping.to_processed(points)) - points).max() <= 10 * ULP
+    assert np.array_equal(PixelMapping.identity((3, 3)).to_raw(points), points)
+
+
+def test_results_a_million_pixels_away_are_drawn_without_overflow() -> None:
+    hull = np.array([[FAR, FAR], [FAR + 9, FAR], [FAR, FAR + 9]])
+    far = Contact(40, (FAR, FAR), 30.0, -0.577, hull, Ellipse((FAR, FAR), (9, 5), 30.0))
+    image = np.zeros((40, 60, 3), np.uint8)
+    assert Annotator(ellipse=True, text=False)(image, contact=far).shape == image.shape
+
+
+# -- single against double --------------------------------------------------------------------------------
+
+
+def both(compute: Callable[[], Any], *modules: Any) -> tuple[Any, Any]:
+    """The result in single precision, and in double precision."""
+    single = compute()
+    light._positions.cache_clear()
+    with in_double(*modules):
+        double = compute()
+    light._positions.cache_clear()
+    return single, double
+
+
+@pytest.mark.parametrize("method", DIFFERENCES)
+def test_single_precision_costs_the_contact_nothing(method: str) -> None:
+    pictures = gel(dots=False)
+
+    def compute() -> contact.ContactResult:
+        detector = contact.ContactDetector(method)  # type: ignore[arg-type]
+        detector.add_reference(pictures.reference)
+        return detector.detect(pictures.touched)
+
+    single, double = both(compute, contact, light, imprint)
+    # The bound of the docstring; measured 0 px and 1.4e-7.
+    assert apart(single.mask, double.mask) <= 1
+    assert single.strength == pytest.approx(double.strength, rel=1e-5)
+
+
+def test_single_precision_costs_the_fit_of_the_light_nothing() -> None:
+    cells = contact._cells(gel(dots=False).reference)[1], contact._cells(gel(dots=False).touched)[1]
+
+    def compute() -> NDArray[Any]:
+        return light.LightChange(cells[0], np.full_like(cells[0], 0.25)).fit(cells[1])
+
+    single, double = both(compute, light)
+    assert double.dtype == np.float64
+    # The bound of the docstring, grey levels; measured 2.4e-6.
+    assert np.abs(single - double).max() <= 1e-3
+
+
+def test_single_precision_costs_the_filling_at_most_a_rounding() -> None:
+    pictures = gel()
+    dot = marker_mask.find_dot(pictures.reference)
+    assert dot is not None
+    mask = marker_mask.marker_mask(pictures.touched, dot)
+    single, double = both(lambda: inpaint.remove_markers(pictures.touched, mask), inpaint)
+    assert int(np.abs(single.astype(int) - double).max()) <= 1
+
+
+def test_single_precision_moves_the_border_of_the_seeds_mask_by_at_most_a_pixel() -> None:
+    single, double = both(lambda: seed_contact.seed_marker_mask(gel().touched), seed_contact)
+    assert single.any()
+    assert apart(single, double) <= 1
+
+
+def test_single_precision_costs_the_tracker_nothing() -> None:
+    pictures = gel()
+    found = markers.detect_markers(pictures.reference)
+
+    def compute() -> Markers:
+        return tracking.MarkerTracker(pictures.reference, found).track(pictures.touched)
+
+    single, double = both(compute, tracking, marker_appearance)
+    # The bound of the docstring, px; measured 1.5e-7 and 4e-6.
+    assert np.abs(single.position - double.position).max() <= 1e-4
+    assert np.abs(single.stderr - double.stderr).max() <= 1e-4
+    assert np.array_equal(single.status, double.status)
+
+
+def test_single_precision_costs_the_search_for_marks_nothing() -> None:
+    single, double = both(lambda: markers.detect_markers(gel().reference), markers)
+    # The bound of the docstring, px: the search for centres ends within 1e-3 px.
+    assert np.abs(single.centers - double.centers).max() <= 1e-3
+    assert np.array_equal(single.edges, double.edges)
+
+
+def test_centres_do_not_depend_on_the_precision_of_whole_grey_levels() -> None:
+    """Grey levels are exact in float32, and everything after is float64."""
+    gray = markers.to_gray(gel().reference)
+    start = np.rint(gel().origin)
+    single, double = (
+        markers.refine_centers(gray.astype(kind), start, 6.0) for kind in (np.float32, np.float64)
+    )
+    assert np.array_equal(single, double)
+
+
+def test_single_precision_costs_the_probe_nothing() -> None:
+    pictures = gel()
+
+    def compute() -> list[float]:
+        random = np.random.default_rng(0)
+        probe = change.ChangeProbe(pictures.reference)
+        values = []
+        for _ in range(12):
+            rough = pictures.reference + random.normal(0, 1, pictures.reference.shape)
+            probe.look(np.clip(np.rint(rough), 0, 255).astype(np.uint8))
+            values.append(probe.strongest)
+        probe.look(pictures.touched)
+        return [*values[8:], probe.strongest]
+
+    single, double = both(compute, change)
+    # The bound of the docstring; measured 1.3e-7.
+    assert single == pytest.approx(double, rel=1e-5)
+
+
+def test_the_flow_of_single_precision_markers_is_good_to_their_own_rounding() -> None:
+    pictures = gel()
+    double = Markers(pictures.origin, pictures.position, np.zeros(24, np.uint8), np.full(24, 0.1))
+    single = Markers(
+        pictures.origin.astype(np.float32),  # type: ignore[arg-type]
+        pictures.position.astype(np.float32),  # type: ignore[arg-type]
+        double.status,
+        double.stderr,
+    )
+    a, b = (flow_in_mask(given, pictures.mask, dilate=3) for given in (single, double))
+    assert a.mean is not None
+    assert b.mean is not None
+    # The bound of the docstring: two coordinates below 256 px, each rounded by 2^-17 px.
+    np.testing.assert_allclose(a.mean, b.mean, rtol=0, atol=2 * 2.0**-17)
+    assert a.rotation == pytest.approx(b.rotation, abs=math.degrees(2 * 2.0**-17 / 28))
+    inside = [inside_mask(given.position, pictures.mask, 3) for given in (single, double)]
+    assert np.array_equal(*inside)
+
+
+def test_a_line_through_single_precision_points_is_good_to_their_own_rounding() -> None:
+    points = gel().position[:10]
+    a, b = regress_line(points.astype(np.float32)), regress_line(points)
+    assert a.angle is not None
+    assert b.angle is not None
+    assert axis_difference(a.angle, b.angle) <= math.degrees(2.0**-17 / 28)
+
+
+# -- angles across the seam -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["one_euro", "alpha_beta"])
+def test_an_axis_that_turns_through_the_vertical_is_smoothed_without_a_jump(method: str) -> None:
+    smoother = ContactSmoother(method)  # type: ignore[arg-type]
+    last = None
+    for index, raw in enumerate(np.arange(60.0, 480.0, 0.5)):
+        angle = float(raw - 180 * math.ceil(raw / 180 - 0.5))
+        out = smoother.update(touched(angle), index / 60)
+        assert out.angle is not None
+        assert -90 < out.angle <= 90
+        if abs(abs(out.angle) - 90) > 1e-3:
+            assert out.slope == pytest.approx(-math.tan(math.radians(out.angle)), rel=1e-9)
+        if last is not None:
+            # alpha-beta overshoots its first step by less than that step; steps are half a degree.
+            assert axis_difference(out.angle, last) < 1.0
+        last = out.angle
+    assert axis_difference(last or 0.0, angle) < 20
+
+
+def touched(angle: float) -> Contact:
+    return Contact(10.0, (5.0, 5.0), angle, None, np.zeros((3, 2)), None)
+
+
+@pytest.mark.parametrize("method", ["one_euro", "alpha_beta"])
+def test_an_axis_that_trembles_about_the_vertical_stays_there(method: str) -> None:
+    """The mean of +89 and -89 degrees is 90, not 0."""
+    smoother = ContactSmoother(method)  # type: ignore[arg-type]
+    for index in range(200):
+        out = smoother.update(touched(89.0 if index % 2 else -89.0), index / 60)
+        assert out.angle is not None
+        assert abs(out.angle) >= 88.9
+    assert abs(out.angle) > 89
+
+
+@pytest.mark.parametrize("period", [180.0, 360.0, 1.0])
+@pytest.mark.parametrize("make", [OneEuro, AlphaBeta])
+def test_a_filter_with_a_period_commutes_with_a_turn(make: type, period: float) -> None:
+    random = np.random.default_rng(1)
+    values = np.cumsum(random.normal(0, 0.02 * period, 200))
+    turned = 0.31 * period
+
+    def wrapped(value: float) -> float:
+        return float(value - period * math.ceil(value / period - 0.5))
+
+    plain, other = make(period=period), make(period=period)
+    for value in values:
+        a = plain.update(wrapped(value), 0.01)
+        b = other.update(wrapped(value + turned), 0.01)
+        off = abs(wrapped(b - a - turned))
+        # Sums of numbers below one period: some ulps of it.
+        assert min(off, period - off) <= 1e-12 * period
+
+
+@pytest.mark.parametrize("method", HULLS)
+def test_the_direction_of_a_bar_is_continuous_through_the_vertical(method: str) -> None:
+    rows, columns = np.indices((121, 121)) - 60.0
+    last = None
+    for angle in np.arange(85.0, 95.5, 0.5):
+        turn = math.radians(angle)
+        along = columns * math.cos(turn) - rows * math.sin(turn)
+        across = columns * math.sin(turn) + rows * math.cos(turn)
+        mask = ((np.abs(along) < 50) & (np.abs(across) < 6)).astype(np.uint8) * np.uint8(255)
+        found = contact_geometry(mask, method=method)  # type: ignore[arg-type]
+        assert found is not None
+        assert found.angle is not None
+        assert -90 < found.angle <= 90
+        # moments: the pixel grid turns a bar of 100 x 12; measured 0.24. seed: a line through the hull's
+        # vertices, few and uneven; measured 2.3.
+        assert axis_difference(found.angle, angle) <= {"moments": 0.5, "seed": 4.6}[method]
+        if angle == 90 and method == "moments":
+            assert found.slope is None
+        if last is not None:
+            # A step of half a degree, and both ends' errors.
+            assert axis_difference(found.angle, last) <= {"moments": 1.5, "seed": 9.7}[method]
+        last = found.angle
