@@ -262,7 +262,7 @@ def test_a_stage_that_raises_ends_the_run_with_what_and_where(
     assert result.exit_code == 3
     assert result.error is not None
     assert f"{stage} failed at frame 7: ArithmeticError: cannot count 7" in result.error
-    assert "toys.py:" in result.error
+    assert "in " + str(runner.pipeline.directory / "toys.py:") in result.error
     assert "toy.yaml:" in result.error
     assert "inputs: " in result.error
     assert result.stats["end"].startswith(f"error: {stage} failed at frame 7")

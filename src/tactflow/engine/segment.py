@@ -431,8 +431,8 @@ def describe_failure(node: Node, frame: Frame, arguments: Sequence[Any], error: 
     if isinstance(error, TactflowError):
         return StageError(f"{node.id}, frame {frame.seq} ({node.mark}): {error}")
     place = traceback.extract_tb(error.__traceback__)
-    # The first entry is the engine's own call; the second is the node's own code.
-    code = place[1] if len(place) > 1 else place[-1]
+    # The first entries are the engine's own calls; after them comes the node's own code.
+    code = next((entry for entry in place if entry.filename != __file__), place[-1])
     where = f"{code.filename}:{code.lineno}"
     if place[-1] is not code:
         where += f" (raised at {place[-1].filename}:{place[-1].lineno})"
