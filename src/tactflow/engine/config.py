@@ -13,6 +13,7 @@ from tactflow.engine import envelope, sensors, wiring
 from tactflow.engine.complaints import complain
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import ErrorAction, FullPolicy, Mark, Node, OnError, Pipeline, Queue
+from tactflow.engine.plan import plan_problems
 from tactflow.engine.registry import RESERVED, Section, code_place, did_you_mean, resolve
 from tactflow.engine.stage import StageParams
 from tactflow.engine.wiring import Draft
@@ -73,7 +74,11 @@ def load_pipeline(
         skipping=_flag(root.entries, "skipping", True, problems),
         opencv_threads=envelope.whole(root.entries, "opencv_threads", 0, "", problems),
         warnings=_warnings(root, drafts),
+        settings=_settings(root, name, drafts),
     )
+    problems.raise_if_any()
+    for mark, message in plan_problems(pipeline):
+        problems.add(mark, message)
     problems.raise_if_any()
     return pipeline
 
@@ -298,6 +303,7 @@ def _node(draft: Draft, params: StageParams | None, problems: Problems) -> Node 
         queue=queue,
         on_error=on_error,
         max_rate=max_rate,
+        marks={key: entries[key].item.mark for key in ("segment", "queue") if key in entries},
     )
 
 
@@ -358,6 +364,15 @@ def _flag(entries: Mapping[str, Entry], key: str, default: bool, problems: Probl
         return value
     problems.add(entry.item.mark, f"{key}: expected true or false, got {entry.item.words()}")
     return default
+
+
+def _settings(root: Item, sensor: str, drafts: Sequence[Draft]) -> dict[str, Any]:
+    plain = {key: entry.item.plain() for key, entry in root.entries.items() if key not in _SECTIONS}
+    sections = {
+        section: {draft.id: draft.item.plain() for draft in drafts if draft.section == section}
+        for section in _SECTIONS
+    }
+    return plain | {"sensor": sensor} | sections
 
 
 def _warnings(root: Item, drafts: Sequence[Draft]) -> list[str]:

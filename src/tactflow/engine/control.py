@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from tactflow.engine.graph import Pipeline
+
 
 class Control(Protocol):
     """A handle on the run, given to a stage or sink whose constructor has a parameter `control`.
@@ -34,3 +36,13 @@ class Control(Protocol):
     @property
     def source(self) -> Any:
         """The source stage's instance."""
+
+    @property
+    def pipeline(self) -> Pipeline:
+        """What is run."""
+
+    def recorder(self) -> Any:
+        """The first sink that can start and stop a recording, or None.
+
+        It has the methods `start_recording` and `stop_recording` and the property `recording`.
+        """

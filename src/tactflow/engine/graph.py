@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tactflow.engine.stage import Memory, Ports, StageParams
 
@@ -92,7 +92,8 @@ class Node:
     """One stage or sink of a pipeline.
 
     inputs : every input port of the component -> the output it is connected to, or None for an optional
-    input that nothing provides. segment : name given in the file, or None. max_rate : a sink's limit in Hz.
+    input that nothing provides. segment : name given in the file, or None. marks : key of the node -> the
+    place of its value, for those that the plan may refuse. max_rate : a sink's limit in Hz.
     """
 
     id: str
@@ -105,11 +106,15 @@ class Node:
     queue: Queue = Queue()
     on_error: OnError = OnError()
     max_rate: float | None = None
+    marks: Mapping[str, Mark] = field(default_factory=dict[str, Mark])
 
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """A pipeline that is known to be right. `nodes` is ordered so that every input comes before its user."""
+    """A pipeline that is known to be right. `nodes` is ordered so that every input comes before its user.
+
+    settings : what the file and all overrides come to, as plain values that can be written as YAML again.
+    """
 
     file: str
     directory: Path
@@ -118,6 +123,7 @@ class Pipeline:
     skipping: bool = True
     opencv_threads: int | None = None
     warnings: Sequence[str] = field(default_factory=list[str])
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
     def source(self) -> Node:

@@ -10,11 +10,11 @@ also leaves a single place where a live source drops frames: in front of the fir
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import FullPolicy, Node, Pipeline
+from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline
 
 CAPTURE = "capture"
 COMPUTE = "compute"
@@ -79,23 +79,11 @@ def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
         If the segments named in the file depend on each other in a circle, or a queue is given to a node
         that shares its segment with the node before it.
     """
-    needed = _needed(pipeline)
-    pruned = [node for node in pipeline.nodes.values() if node.id not in needed]
-    nodes = [node for node in pipeline.nodes.values() if node.id in needed]
-    names = _segment_names(nodes)
+    problems = plan_problems(pipeline)
+    if problems:
+        raise ConfigError("\n".join(f"{mark}  {message}" for mark, message in problems))
+    pruned, names, members, before = _cut(pipeline)
     source = names[pipeline.source.id]
-    members: dict[str, list[str]] = {source: []}
-    for node in nodes:
-        members.setdefault(names[node.id], []).append(node.id)
-
-    before: dict[str, set[str]] = {name: set() for name in members}
-    for node in nodes:
-        mine = names[node.id]
-        before[mine] |= {names[other] for other in dependencies(node)} - {mine}
-        if mine != source and not dependencies(node):
-            before[mine].add(source)
-    _refuse_circles(pipeline, before, members)
-
     ancestors = {name: frozenset(_ancestors(name, before)) for name in members}
     links: list[LinkPlan] = []
     for consumer, producers in before.items():
@@ -104,8 +92,34 @@ def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
             _link(pipeline, producer, consumer, members[consumer], source, live=live)
             for producer in sorted(direct, key=list(members).index)
         )
-    _refuse_idle_queues(pipeline, members)
     return Plan(pipeline, members, links, pruned, ancestors)
+
+
+def plan_problems(pipeline: Pipeline) -> list[tuple[Mark, str]]:
+    """What keeps a pipeline from being planned: every mistake, at the place that is to be changed."""
+    _, _, members, before = _cut(pipeline)
+    return [*_circles(pipeline, before, members), *_idle_queues(pipeline, members)]
+
+
+def _cut(
+    pipeline: Pipeline,
+) -> tuple[list[Node], dict[str, str], dict[str, list[str]], dict[str, set[str]]]:
+    """Pruned nodes; node -> its segment; segment -> its nodes; segment -> those directly or not before it."""
+    needed = _needed(pipeline)
+    pruned = [node for node in pipeline.nodes.values() if node.id not in needed]
+    nodes = [node for node in pipeline.nodes.values() if node.id in needed]
+    names = _segment_names(nodes)
+    source = names[pipeline.source.id]
+    members: dict[str, list[str]] = {source: []}
+    for node in nodes:
+        members.setdefault(names[node.id], []).append(node.id)
+    before: dict[str, set[str]] = {name: set() for name in members}
+    for node in nodes:
+        mine = names[node.id]
+        before[mine] |= {names[other] for other in dependencies(node)} - {mine}
+        if mine != source and not dependencies(node):
+            before[mine].add(source)
+    return pruned, names, members, before
 
 
 def _needed(pipeline: Pipeline) -> set[str]:
@@ -159,19 +173,24 @@ def _ancestors(name: str, before: Mapping[str, Iterable[str]]) -> set[str]:
     return seen
 
 
-def _refuse_circles(
+def _circles(
     pipeline: Pipeline, before: Mapping[str, set[str]], members: Mapping[str, list[str]]
-) -> None:
+) -> Iterator[tuple[Mark, str]]:
+    """Each set of segments that wait for each other, once, at a node that was put into one of them."""
+    reported: set[str] = set()
     for name in before:
-        if name in _ancestors(name, before):
-            others = sorted(
-                o for o in before if name in _ancestors(o, before) and o in _ancestors(name, before)
-            )
-            where = pipeline.nodes[members[name][0]].mark
-            raise ConfigError(
-                f"{where}  segments {', '.join(others)} feed each other in a circle, so none could start; "
-                f"segment {name} holds {', '.join(members[name])}: move one of them to another segment"
-            )
+        if name in reported or name not in _ancestors(name, before):
+            continue
+        others = [o for o in before if name in _ancestors(o, before) and o in _ancestors(name, before)]
+        reported.update(others)
+        inside = [pipeline.nodes[id_] for other in others for id_ in members[other]]
+        placed = [node for node in inside if node.segment] or inside
+        held = "; ".join(f"{other} holds {', '.join(members[other])}" for other in others)
+        yield (
+            placed[0].marks.get("segment", placed[0].mark),
+            f"{placed[0].id}: segments {', '.join(others)} feed each other in a circle, so none could start; "
+            f"{held}: move one of them to another segment",
+        )
 
 
 def _link(
@@ -190,17 +209,23 @@ def _link(
                 policy = "latest"
         elif live and producer == source:
             policy = "latest"
-    return LinkPlan(producer, consumer, capacity or BLOCK_CAPACITY, policy)
+    if capacity is None:
+        capacity = max(getattr(node.component.cls, "queue_capacity", BLOCK_CAPACITY) for node in nodes)
+    return LinkPlan(producer, consumer, capacity, policy)
 
 
-def _refuse_idle_queues(pipeline: Pipeline, members: Mapping[str, Sequence[str]]) -> None:
+def _idle_queues(pipeline: Pipeline, members: Mapping[str, Sequence[str]]) -> Iterator[tuple[Mark, str]]:
     for nodes in members.values():
         queued = [n for n in (pipeline.nodes[i] for i in nodes) if n.queue.capacity or n.queue.when_full]
-        if len(queued) > 1:
-            raise ConfigError(
-                f"{queued[1].mark}  {queued[1].id}: queue: segment has a queue already, given at "
-                f"{queued[0].mark} by {queued[0].id}; a segment has one queue in front of it"
+        for node in queued[1:]:
+            yield (
+                node.marks.get("queue", node.mark),
+                f"{node.id}.queue: its segment has a queue already, given at {queued[0].mark} by "
+                f"{queued[0].id}; a segment has one queue in front of it",
             )
         for node in queued:
             if node.component.kind == "source":
-                raise ConfigError(f"{node.mark}  {node.id}: queue: nothing comes before the source")
+                yield (
+                    node.marks.get("queue", node.mark),
+                    f"{node.id}.queue: nothing comes before the source",
+                )

@@ -179,6 +179,14 @@ class Runner:
         """The instance of the source stage, once opened."""
         return self._source
 
+    def recorder(self) -> Any:
+        """The first sink that has `start_recording`, `stop_recording` and `recording`, or None."""
+        wanted = ("start_recording", "stop_recording", "recording")
+        for node in list(self.nodes.values()):
+            if node.is_sink and all(hasattr(node.instance, name) for name in wanted):
+                return node.instance
+        return None
+
     def progress(self) -> Progress:
         """How far the run is."""
         return Progress(self._frames, self._dropped(), time.perf_counter() - self._began)
