@@ -57,6 +57,12 @@ def test_a_quantity_that_is_no_longer_measured_is_a_regression(tmp_path: Path) -
     assert len(compare.against(run(scene="cable", displacement_rms=0.02), path)) == 1
 
 
+def test_scenes_that_were_not_chosen_are_not_missed(tmp_path: Path) -> None:
+    path = stored(tmp_path, run(displacement_rms=0.02))
+    assert compare.against(run(scene="cable", displacement_rms=0.02), path, scenes={"cable"}) == []
+    assert len(compare.against(run(scene="cable"), path, scenes={"cable", "press"})) == 1
+
+
 def test_recordings_that_are_not_here_are_not_missed(tmp_path: Path) -> None:
     path = stored(tmp_path, run(scene="data:wedge_ball", found_percent=100.0))
     assert compare.against(run(), path) == []

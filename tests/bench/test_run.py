@@ -108,6 +108,7 @@ def test_scenes_can_be_chosen() -> None:
         (["--html", "no/such/folder/x.html"], "no folder"),
         (["nothing.yaml"], "no such pipeline"),
         (["--scene", "nowhere"], "nowhere"),
+        (["--data", "."], "wedge_ball"),
     ],
 )
 def test_mistakes_are_refused_before_anything_is_measured(

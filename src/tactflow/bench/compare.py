@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,23 +48,38 @@ def regressions(
     return found
 
 
-def against(result: Result, path: Path) -> list[Regression]:
-    """Compare a run with a stored one of the same kind.
+def load_comparable(path: Path, quick: bool) -> dict[str, dict[str, float]]:
+    """Errors of a stored run of the same kind, by measurement.
 
     Raises
     ------
     ConfigError
         If the stored run is unreadable, or one is quick and the other is not: they differ in their scenes.
     """
-    quick, stored = load_errors(path)
-    if quick != result.quick:
-        kind = "quick" if quick else "full"
+    was_quick, stored = load_errors(path)
+    if was_quick != quick:
+        kind = "quick" if was_quick else "full"
         raise ConfigError(f"{path}: is the result of a {kind} run; compare it with a {kind} run")
-    # Recordings are not everywhere; simulated scenes are, so a missing one is a regression.
+    return stored
+
+
+def against(result: Result, path: Path, scenes: Collection[str] | None = None) -> list[Regression]:
+    """Compare a run with a stored one of the same kind.
+
+    Parameters
+    ----------
+    scenes : the simulated scenes that were chosen, or None for all.
+
+    Raises
+    ------
+    ConfigError
+        As `load_comparable`.
+    """
     here = {m.scene for m in result.measurements}
-    comparable = {
-        key: value
-        for key, value in stored.items()
-        if not (scene := key.rsplit("/", 1)[-1]).startswith(RECORDING) or scene in here
-    }
+    comparable = {}
+    for key, value in load_comparable(path, result.quick).items():
+        scene = key.rsplit("/", 1)[-1]
+        # Recordings are not everywhere; simulated scenes are, so a missing one is a regression.
+        if scene in here or not (scene.startswith(RECORDING) or (scenes is not None and scene not in scenes)):
+            comparable[key] = value
     return regressions({m.key: m.errors for m in result.measurements}, comparable)

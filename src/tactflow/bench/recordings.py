@@ -63,12 +63,10 @@ def measure_recordings(
     ConfigError
         If the folder holds none of the known recordings.
     """
-    found = False
+    check(data)
     if (data / "wedge_ball" / "labels.csv").exists():
-        found = True
         yield _ball(pipelines, data / "wedge_ball", scratch, unit, step)
     if (data / "wedge_roll").is_dir():
-        found = True
         yield _roll(pipelines, data / "wedge_roll", scratch, unit, step)
     grasps = sorted((data / "wedge_grasp").glob("*.csv"))
     if grasps:

@@ -118,10 +118,12 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
     Raises
     ------
     ConfigError
-        If a pipeline file is wrong, or a scene is unknown.
+        If a pipeline file is wrong, a scene is unknown, or there are no recordings where they should be.
     """
     began = time.perf_counter()
     whole, alone = plan.chosen()
+    if plan.data is not None:
+        recordings.check(plan.data)
     loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
     general = {name: p for name, p in loaded.items() if not _needs_rectifying(p) and name != MARKERLESS}
     # For gels without markers: the pipeline made for them, else the default one without its tracker.

@@ -12,11 +12,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from tactflow.bench.compare import Regression, against
+from tactflow.bench.compare import Regression, against, load_comparable
 from tactflow.bench.markdown import write_markdown
 from tactflow.bench.methods import SEED
 from tactflow.bench.report import html
-from tactflow.bench.results import Result, load_errors
+from tactflow.bench.results import Result
 from tactflow.bench.run import DEFAULT, Plan, run_bench
 from tactflow.bench.table import print_result
 from tactflow.cli.pipelines import find_pipeline, packaged_pipelines
@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print the table, write what was asked for; returns the exit code."""
     if args.against is not None:
-        load_errors(args.against)
+        load_comparable(args.against, args.quick)
     for path in (args.json, args.html, args.errors, args.markdown):
         _refuse_unwritable(path)
     plan = Plan(
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         result = run_bench(plan, progress)
     print_result(result, Console(file=sys.stdout, highlight=False))
     _write(args, result)
-    worse = against(result, args.against) if args.against is not None else []
+    worse = against(result, args.against, plan.scenes) if args.against is not None else []
     _report(worse, args.against)
     return WORSE if worse else 0
 
