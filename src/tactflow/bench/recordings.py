@@ -70,9 +70,18 @@ def measure_recordings(
         yield _roll(pipelines, data / "wedge_roll", scratch, unit, step)
     grasps = sorted((data / "wedge_grasp").glob("*.csv"))
     if grasps:
-        found = True
         yield _grasps(markerless, grasps, scratch, unit, step)
-    if not found:
+
+
+def check(data: Path) -> None:
+    """Find out before a long run that there is nothing to measure.
+
+    Raises
+    ------
+    ConfigError
+        If the folder holds none of the known recordings.
+    """
+    if not any((data / name).is_dir() for name in ("wedge_ball", "wedge_roll", "wedge_grasp")):
         raise ConfigError(
             f"--data {data}: required a folder with wedge_ball, wedge_roll or wedge_grasp in it"
         )
