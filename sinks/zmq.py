@@ -8,9 +8,11 @@ import threading
 import time
 from pathlib import Path
 
+import orjson
 import zmq
 from pydantic import Field
 
+from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.stage import StageParams
@@ -20,12 +22,18 @@ from tactflow.vision.types import Contact, Flow, Markers
 
 log = logging.getLogger("tactflow")
 
+STATS_TOPIC = b"tactflow.stats "
+
 
 class Zmq:
     """Publishes one message per frame: `tactflow.<sensor>`, a space, the JSON of `tactflow.frame/1`.
 
     Knows who listens: while nobody has subscribed to this sensor, nothing is wanted and nothing encoded.
     A subscriber that does not keep up loses messages; it never slows the run.
+
+    Whoever subscribes to `tactflow.stats` by that name gets the statistics of the run every `stats_every`
+    seconds: `tactflow.stats`, a space, the JSON of the statistics file with the sensor's name. A shorter
+    prefix, such as `tactflow.`, does not ask for them, but receives them while somebody else does.
     """
 
     threaded = True
@@ -61,17 +69,33 @@ class Zmq:
             False, description="also send confidence, standard errors, rotation, divergence, residual"
         )
 
-    def __init__(self, params: Params, sensor: str = "main", directory: Path | None = None) -> None:
+        stats_every: float = Field(
+            1.0,
+            ge=0,
+            le=3600,
+            description="time between two messages of statistics (topic tactflow.stats), s; 0: none",
+        )
+
+    def __init__(
+        self,
+        params: Params,
+        sensor: str = "main",
+        directory: Path | None = None,
+        control: Control | None = None,
+    ) -> None:
         """Prepare; nothing is bound yet.
 
         Parameters
         ----------
         sensor : names the topic.
+        control : the run, asked for its statistics; None: there are none to publish.
         """
         del directory
         self.params = params
         self.endpoint = params.endpoint
         self.description = params.endpoint
+        self._sensor = sensor
+        self._control = control
         self._topic = f"tactflow.{sensor} ".encode()
         # Sockets belong to one thread at a time: `wants` is called by another thread than `write`.
         self._lock = threading.Lock()
@@ -80,6 +104,9 @@ class Zmq:
         self._subscriptions: set[bytes] = set()
         self._wanted = False
         self._serialised = 0
+        self._stats_wanted = False
+        self._closing = threading.Event()
+        self._stats_thread: threading.Thread | None = None
 
     def open(self) -> None:
         """Bind the socket; afterwards `endpoint` is the real address.
@@ -104,6 +131,12 @@ class Zmq:
         self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
         log.info("publishing %s", self.description)
         self._wait_for_subscriber(self.params.wait_for_subscriber)
+        if self._control is not None and self.params.stats_every:
+            # Not in the run's threads: statistics shall also come while no frame does.
+            self._stats_thread = threading.Thread(
+                target=self._publish_statistics, args=(self._control,), name="tactflow-stats", daemon=True
+            )
+            self._stats_thread.start()
 
     def _wait_for_subscriber(self, seconds: float) -> None:
         deadline = time.monotonic() + seconds
@@ -142,8 +175,24 @@ class Zmq:
             if self._socket is not None:
                 self._socket.send(self._topic + body, zmq.NOBLOCK)
 
+    def _publish_statistics(self, control: Control) -> None:
+        """Body of the thread that publishes the statistics while somebody has asked for them."""
+        while not self._closing.wait(self.params.stats_every):
+            with self._lock:
+                self._read_subscriptions()
+                wanted = self._stats_wanted
+            if not wanted:
+                continue
+            body = orjson.dumps({"sensor": self._sensor, **control.snapshot()})
+            with self._lock:
+                if self._socket is not None:
+                    self._socket.send(STATS_TOPIC + body, zmq.NOBLOCK)
+
     def close(self) -> None:
         """Deliver what is under way, for at most `linger` seconds, and free the address."""
+        self._closing.set()
+        if self._stats_thread is not None:
+            self._stats_thread.join()
         with self._lock:
             socket, context = self._socket, self._context
             self._socket = self._context = None
@@ -170,6 +219,7 @@ class Zmq:
         # A subscription is a prefix of the message; it may be longer than the topic.
         topic = self._topic
         self._wanted = any(topic.startswith(s) or s.startswith(topic) for s in self._subscriptions)
+        self._stats_wanted = any(s.startswith(STATS_TOPIC.rstrip()) for s in self._subscriptions)
 
 
 def _bind_problem(endpoint: str, error: zmq.ZMQError) -> str:

@@ -429,12 +429,20 @@ CASES: dict[str, tuple[str, list[str]]] = {
     # what only the plan can see
     "segments in a circle": (
         HEAD
-        + "  §prepare: {use: './parts.py:Prepare'}\n"
-        + "  compare: {use: './parts.py:Compare', segment: a}\n"
+        + "  prepare: {use: './parts.py:Prepare'}\n"
+        + "  compare: {use: './parts.py:Compare', segment: §a}\n"
         + "  outline: {use: './parts.py:Outline', segment: b}\n"
         + "  refine: {use: './parts.py:Refine', segment: a}\n"
         + SINK,
-        ["segments", "circle"],
+        ["compare: segments", "circle"],
+    ),
+    "a second queue in front of a segment": (
+        HEAD
+        + "  prepare: {use: './parts.py:Prepare', queue: {capacity: 2}}\n"
+        + "  compare: {use: './parts.py:Compare', queue: §{capacity: 3}}\n"
+        + "  outline: {use: './parts.py:Outline'}\n"
+        + SINK,
+        ["compare.queue: its segment has a queue already", "by prepare"],
     ),
 }
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tactflow.cli.main import main
+from tactflow.cli.story import share
 
 PARTS = Path(__file__).resolve().parents[1] / "engine" / "parts.py"
 TEXT = """\
@@ -32,7 +33,13 @@ STATISTICS: dict[str, Any] = {
     "end": "eos",
     "stages": {
         "capture": {"runs": 102, "skips": {}, "p50_ms": 0.1, "p99_ms": 0.2},
-        "outline": {"runs": 40, "skips": {"no_contact": 60, "unused": 0}, "p50_ms": 0.25, "p99_ms": 0.5},
+        "outline": {
+            "runs": 40,
+            "skips": {"unchanged": 15, "no_contact": 44, "error": 1, "unused": 0},
+            "total_ms": 12.0,
+            "p50_ms": 0.25,
+            "p99_ms": 0.5,
+        },
         "compare": {"runs": 0, "skips": {}, "p50_ms": None, "p99_ms": None},
     },
     "links": {},
@@ -107,8 +114,13 @@ def test_statistics_say_how_often_and_what_it_cost(
     out = capsys.readouterr().out
     assert "the run: 100 frames in 1.5 s, 2 dropped, latency p50 2.00 ms, p99 5.00 ms, end: eos" in out
     facts = paragraphs(out)
-    assert facts["outline"]["statistics"] == "ran 40 times, p50 0.25 ms, p99 0.50 ms; skipped: 60 no_contact"
-    assert facts["compare"]["statistics"] == "ran 0 times"
+    # 59 frames left out at 0.3 ms each, over 100 frames; the failed one is no gain.
+    assert facts["outline"]["statistics"] == (
+        "ran 40 %, skipped 44 % no contact, 15 % unchanged, 1 % error; "
+        "a run: mean 0.300 ms, p50 0.250 ms, p99 0.500 ms; saved 0.177 ms of 0.297 ms a frame"
+    )
+    assert "all stages: saved 0.177 ms of 0.297 ms a frame\n" in out
+    assert facts["compare"]["statistics"] == "never reached by a frame"
     assert facts["prepare"]["statistics"] == "not part of that run"
     assert "statistics" not in facts["unused"]
 
@@ -127,6 +139,9 @@ def test_statistics_say_how_often_and_what_it_cost(
         json.dumps({**STATISTICS, "sinks": {"out": {}}}),
         json.dumps({**STATISTICS, "sinks": 3}),
         json.dumps({**STATISTICS, "wall_s": "long"}),
+        json.dumps(
+            {**STATISTICS, "sinks": {"a": {"runs": 1, "skips": {"x": "y"}, "p50_ms": 1, "p99_ms": 1}}}
+        ),
     ],
 )
 def test_a_file_that_is_no_statistics_is_refused(
@@ -165,3 +180,23 @@ def test_check_counts_and_warns_on_standard_error(capsys: pytest.CaptureFixture[
     assert (
         err == "tactflow: warning: pipeline.yaml:4:3  unused: not run, because no sink needs what it makes\n"
     )
+
+
+def test_statistics_stand_on_the_nodes_of_the_graph(
+    pipeline: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (pipeline / "run.json").write_text(json.dumps(STATISTICS))
+    assert main(["graph", "--stats", "run.json"]) == 0
+    out = capsys.readouterr().out
+    label = "outline<br/>0.300 ms<br/>ran 40 %<br/>44 % no contact<br/>15 % unchanged<br/>1 % error"
+    (key,) = re.findall(rf'(n\d)\["{label}"\]', out)
+    assert re.search(rf"class {key} costly", out)
+    assert '["compare"]' in out
+
+
+@pytest.mark.parametrize(
+    ("part", "whole", "text"),
+    [(0, 7, "0 %"), (1, 1000, "<1 %"), (999, 1000, ">99 %"), (7, 7, "100 %"), (0, 0, "0 %")],
+)
+def test_a_share_is_rounded_to_none_or_all_only_if_it_is(part: int, whole: int, text: str) -> None:
+    assert share(part, whole) == text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -288,3 +288,59 @@ def test_writing_and_asking_after_the_end_is_harmless() -> None:
     sink.close()
     write(sink, range(1))
     assert not sink.wants()
+
+
+class Run:
+    """Stands for a run; counts how often it is asked."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self.ready = threading.Event()
+
+    def snapshot(self) -> dict[str, Any]:
+        self.asked += 1
+        self.ready.set()
+        return {"frames": self.asked, "stages": {}}
+
+
+def with_statistics(run: Run) -> Zmq:
+    sink = Zmq(
+        Zmq.Params(endpoint="tcp://127.0.0.1:*", stats_every=0.01), sensor="left", control=cast(Any, run)
+    )
+    sink.open()
+    return sink
+
+
+def test_statistics_come_on_their_own_topic_without_any_frame(subscribe: Subscribing) -> None:
+    run = Run()
+    sink = with_statistics(run)
+    socket = subscribe(sink.endpoint, b"tactflow.stats")
+    topic, first = receive(socket)
+    _, second = receive(socket)
+    sink.close()
+    assert topic == b"tactflow.stats"
+    assert first["sensor"] == "left"
+    assert second["frames"] > first["frames"]
+    assert sink.counters()["serialised"] == 0
+
+
+def test_nobody_pays_for_statistics_until_they_are_asked_for_by_name(subscribe: Subscribing) -> None:
+    run = Run()
+    sink = with_statistics(run)
+    frames = subscribe(sink.endpoint, b"tactflow.")
+    wait_until_wanted(sink)
+    # Ten times the interval: the thread has looked at the subscriptions several times.
+    assert not run.ready.wait(0.1)
+    write(sink, range(1))
+    assert receive(frames)[0] == b"tactflow.left"
+    subscribe(sink.endpoint, b"tactflow.stats ")
+    assert run.ready.wait(WAIT / 1000)
+    sink.close()
+
+
+def test_a_subscriber_to_statistics_asks_for_no_frames(subscribe: Subscribing) -> None:
+    run = Run()
+    sink = with_statistics(run)
+    receive(subscribe(sink.endpoint, b"tactflow.stats"))
+    assert not sink.wants()
+    sink.close()

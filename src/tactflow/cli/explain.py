@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tactflow.cli.options import add_pipeline, load_plan
+from tactflow.cli.story import Story, milliseconds, saving
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
@@ -24,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph for each stage and sink."""
-    statistics = None if args.stats is None else _read_statistics(Path(args.stats))
+    statistics = None if args.stats is None else read_statistics(Path(args.stats))
     pipeline, plan = load_plan(args)
     print("\n".join(explanation(pipeline, plan, statistics)))
     return 0
@@ -39,6 +40,7 @@ def explanation(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | 
     yield f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"
     if statistics is not None:
         yield _run_line(statistics)
+        yield from _saving(pipeline, statistics)
     users = _sinks_behind(pipeline)
     uncertain = _may_be_absent(pipeline)
     pruned = {node.id for node in plan.pruned}
@@ -146,22 +148,36 @@ def _run_line(statistics: Mapping[str, Any]) -> str:
     )
 
 
+def _saving(pipeline: Pipeline, statistics: Mapping[str, Any]) -> Iterator[str]:
+    """What skipping saved in all stages together, and how that is counted."""
+    stages = [node.id for node in pipeline.nodes.values() if node.component.kind == "stage"]
+    stories = [Story.of(entry) for id_, entry in statistics["stages"].items() if id_ in stages]
+    saved = sum(story.saved_ms or 0.0 for story in stories)
+    spent = sum(story.spent_ms for story in stories)
+    if statistics["frames"] and saved + spent > 0:
+        yield f"all stages: {saving(saved, saved + spent, statistics['frames'])}"
+        yield "            (saved = frames skipped x mean time of a run; of = that + the time spent)"
+
+
 def _cost(node: Node, statistics: Mapping[str, Any]) -> str:
     entry = {**statistics.get("sinks", {}), **statistics["stages"]}.get(node.id)
     if entry is None:
         return "not part of that run"
-    text = "ran once" if entry["runs"] == 1 else f"ran {entry['runs']} times"
-    if entry["runs"]:
-        text += f", p50 {_ms(entry['p50_ms'])}, p99 {_ms(entry['p99_ms'])}"
-    skips = ", ".join(f"{count} {reason}" for reason, count in entry["skips"].items() if count)
-    return text + (f"; skipped: {skips}" if skips else "")
+    story = Story.of(entry)
+    if node.component.kind != "sink":
+        return story.told()
+    # A sink in its own thread only gets the frames that it asked for.
+    times = "once" if story.runs == 1 else f"{story.runs} times"
+    cost = f", {milliseconds(story.mean_ms)} each (p99 {milliseconds(story.p99_ms)})" if story.runs else ""
+    return f"written {times} in {statistics['frames']} frames{cost}"
 
 
 def _ms(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.2f} ms"
 
 
-def _read_statistics(path: Path) -> Mapping[str, Any]:
+def read_statistics(path: Path) -> Mapping[str, Any]:
+    """The content of a statistics file; raises ConfigError if it is none."""
     try:
         data = json.loads(path.read_bytes())
     except OSError as error:
@@ -188,6 +204,8 @@ def _are_statistics(data: Any) -> bool:
             _is_pair(node, "p50_ms", "p99_ms")
             and isinstance(node.get("runs"), int)
             and isinstance(node.get("skips"), dict)
+            and all(isinstance(count, int) for count in node["skips"].values())
+            and isinstance(node.get("total_ms"), int | float | None)
             for node in (*stages.values(), *sinks.values())
         )
     )

@@ -91,6 +91,8 @@ def _command(args: argparse.Namespace, file: Path, sensor: str, overrides: Seque
             command += [f"--{option}", with_name(path, sensor)]
     if args.max_frames is not None:
         command += ["--max-frames", str(args.max_frames)]
+    if args.stats_every is not None:
+        command += ["--stats-every", str(args.stats_every)]
     command += [f"--{flag}" for flag in ("realtime", "quiet", "check") if getattr(args, flag)]
     return command
 

@@ -3,40 +3,56 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
 
+from tactflow.cli.explain import read_statistics
 from tactflow.cli.options import add_pipeline, load_plan
+from tactflow.cli.story import Story, milliseconds, share
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.plan import Plan
+
+_COSTLY = 0.1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `graph`."""
     add_pipeline(parser)
+    parser.add_argument(
+        "--stats", metavar="run.json", help="statistics of a run (tactflow run --stats), shown on the nodes"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the flowchart."""
+    statistics = None if args.stats is None else read_statistics(Path(args.stats))
     pipeline, plan = load_plan(args)
-    print("\n".join(mermaid(pipeline, plan)))
+    print("\n".join(mermaid(pipeline, plan, statistics)))
     return 0
 
 
-def mermaid(pipeline: Pipeline, plan: Plan) -> Iterator[str]:
+def mermaid(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | None = None) -> Iterator[str]:
     """Lines of a flowchart: segments as boxes, the queues between them as thick arrows, gates dotted.
 
-    Stages that no sink needs stand outside, with a dashed outline.
+    Stages that no sink needs stand outside, with a dashed outline. statistics : content of a statistics file;
+    nodes then tell how often they ran, why not and how long a run took, and those that took more than a tenth
+    of the time after the source are filled.
     """
+    told = {} if statistics is None else {**statistics.get("sinks", {}), **statistics["stages"]}
+    stories = {id_: Story.of(entry) for id_, entry in told.items() if id_ in pipeline.nodes}
+    spent = {id_: story.spent_ms for id_, story in stories.items() if id_ != pipeline.source.id}
+    costly = [id_ for id_, time in spent.items() if time > _COSTLY * sum(spent.values())]
     names = {id_: f"n{index}" for index, id_ in enumerate(pipeline.nodes)}
     boxes = {segment: f"s{index}" for index, segment in enumerate(plan.segments)}
     yield "flowchart LR"
     for segment, members in plan.segments.items():
         yield f'  subgraph {boxes[segment]}["segment {segment}"]'
         for id_ in members:
-            yield f"    {names[id_]}{_shape(pipeline.nodes[id_])}"
+            yield f"    {names[id_]}{_shape(pipeline.nodes[id_], stories.get(id_))}"
         yield "  end"
     for node in plan.pruned:
-        yield f"  {names[node.id]}{_shape(node)}:::pruned"
+        yield f"  {names[node.id]}{_shape(node, None)}:::pruned"
     for node in pipeline.nodes.values():
         takes: dict[str, list[str]] = {}
         for ref in node.inputs.values():
@@ -51,8 +67,20 @@ def mermaid(pipeline: Pipeline, plan: Plan) -> Iterator[str]:
         yield f'  {boxes[link.producer]} ==>|"queue: {queue}"| {boxes[link.consumer]}'
     if plan.pruned:
         yield "  classDef pruned stroke-dasharray: 4"
+    if costly:
+        yield "  classDef costly fill:#fdd0a2,stroke:#d94801,color:#000"
+        yield f"  class {','.join(names[id_] for id_ in costly)} costly"
 
 
-def _shape(node: Node) -> str:
+def _shape(node: Node, story: Story | None) -> str:
     left, right = {"source": ("([", "])"), "stage": ("[", "]"), "sink": ("[/", "/]")}[node.component.kind]
-    return f'{left}"{node.id}"{right}'
+    lines = [node.id]
+    if story is not None and node.component.kind == "sink":
+        lines.append(f"{story.runs} times")
+    elif story is not None and story.ticks:
+        lines += [f"ran {share(story.runs, story.ticks)}", *story.reasons()]
+    if story is not None and story.mean_ms is not None:
+        lines.insert(1, milliseconds(story.mean_ms))
+    # A quotation mark would end the label, and < begin a tag.
+    label = "<br/>".join(line.replace('"', "'").replace("<", "&lt;") for line in lines)
+    return f'{left}"{label}"{right}'

@@ -7,7 +7,7 @@ import json
 import logging
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -19,11 +19,16 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 from tactflow.cli.fleet import run_fleet
 from tactflow.cli.pipelines import find_pipeline
+from tactflow.cli.story import share
 from tactflow.engine.config import load_pipeline, sensor_names
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Progress as RunProgress
 from tactflow.engine.run import Runner, RunResult
+from tactflow.engine.trace import Trace
+
+_COSTLIEST = 4
+"""Stages named in a line of statistics."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +60,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of a pipeline with several sensors, run only this one, in this process",
     )
     parser.add_argument("--stats", metavar="PATH", help="write run statistics as JSON at exit")
+    parser.add_argument(
+        "--stats-every",
+        type=_seconds,
+        metavar="SECONDS",
+        help="a line on standard error every so often: rate, drops, latency, and what each stage cost since",
+    )
+    parser.add_argument(
+        "--trace",
+        metavar="FILE",
+        help="write what each thread did when, as Chrome trace events; open it at ui.perfetto.dev",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
     parser.add_argument(
         "--check", action="store_true", help="check every array against its port type (slower)"
@@ -68,13 +84,21 @@ def run(args: argparse.Namespace) -> int:
     several = sensor_names(file, args.overrides) if args.sensor is None else []
     if len(several) > 1:
         return run_fleet(args, file, {name: _load(args, file, name) for name in several})
-    runner = Runner(_load(args, file, args.sensor), max_frames=args.max_frames, check=args.check)
-    _refuse_unwritable(args.stats)
+    pipeline = _load(args, file, args.sensor)
+    trace = None if args.trace is None else Trace(f"tactflow {pipeline.sensor}")
+    runner = Runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
+    _refuse_unwritable("--stats", args.stats)
+    _refuse_unwritable("--trace", args.trace)
     with _logging_to(console), _signals(runner):
-        for warning in (*runner.pipeline.warnings, *runner.plan.warnings):
-            logging.getLogger("tactflow").warning("%s", warning)
+        logger = logging.getLogger("tactflow")
+        for warning in runner.pipeline.warnings:
+            logger.warning("%s", warning)
+        if runner.plan.pruned:
+            logger.info("not run, as no sink needs it: %s", ", ".join(n.id for n in runner.plan.pruned))
         with _progress_display(console, runner, shown=not args.quiet) as on_progress:
-            result = runner.run(on_progress)
+            result = runner.run(_with_statistics(on_progress, runner, args.stats_every, console))
+    if trace is not None:
+        trace.write(Path(args.trace))
     if args.stats:
         Path(args.stats).write_text(json.dumps(result.stats, indent=1) + "\n", encoding="utf-8")
     if result.error is not None:
@@ -109,15 +133,25 @@ def _positive(text: str) -> int:
     return value
 
 
-def _refuse_unwritable(path: str | None) -> None:
-    """Find out before the run, not after it, that the statistics cannot be written."""
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.1 <= value <= 86400:
+        raise argparse.ArgumentTypeError(f"required seconds from 0.1 to 86400, got {text!r}")
+    return value
+
+
+def _refuse_unwritable(option: str, path: str | None) -> None:
+    """Find out before the run, not after it, that a file cannot be written."""
     if path is None:
         return
     try:
         with open(path, "a", encoding="utf-8"):
             pass
     except OSError as error:
-        raise ConfigError(f"--stats {path}: cannot be written: {error.strerror}") from None
+        raise ConfigError(f"{option} {path}: cannot be written: {error.strerror}") from None
 
 
 @contextmanager
@@ -184,6 +218,55 @@ def _progress_display(
             display.update(task, completed=now.frames, total=total, rate=rate, dropped=now.dropped)
 
         yield update
+
+
+def _with_statistics(
+    on_progress: Callable[[RunProgress], None] | None, runner: Runner, every: float | None, console: Console
+) -> Callable[[RunProgress], None] | None:
+    """Also print a line of statistics every so many seconds."""
+    if every is None:
+        return on_progress
+    last: Mapping[str, Any] | None = None
+    due = every
+
+    def update(now: RunProgress) -> None:
+        nonlocal last, due
+        if on_progress is not None:
+            on_progress(now)
+        if now.elapsed_s >= due:
+            due = now.elapsed_s + every
+            stats = runner.snapshot()
+            console.print(statistics_line(stats, last), markup=False)
+            last = stats
+
+    return update
+
+
+def statistics_line(stats: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> str:
+    """Rate, drops and latency, and for the costliest stages their time a frame and how often they ran.
+
+    stats, before : statistics of a run now and earlier (None: at its start); what is told happened between
+    them, except for the latency, which is that of the run so far.
+    """
+    if before is None:
+        before = {"frames": 0, "dropped": 0, "wall_s": 0.0, "stages": {}}
+    frames, dropped = stats["frames"] - before["frames"], stats["dropped"] - before["dropped"]
+    seconds = stats["wall_s"] - before["wall_s"]
+    parts = [f"{stats['wall_s']:.1f} s: {frames / seconds if seconds > 0 else 0:.1f} frames/s"]
+    parts.append(f"{dropped} dropped")
+    latency = stats["latency_ms"]
+    if latency["p50"] is not None:
+        parts.append(f"latency p50 {latency['p50']:.2f} p99 {latency['p99']:.2f} ms")
+    costs = []
+    for name, entry in stats["stages"].items():
+        earlier = before["stages"].get(name, {"runs": 0, "total_ms": 0.0})
+        runs, spent = entry["runs"] - earlier["runs"], entry["total_ms"] - earlier["total_ms"]
+        if runs > 0 and frames > 0:
+            costs.append((spent / frames, f"{name} {spent / frames:.2f} ms (ran {share(runs, frames)})"))
+    costs.sort(reverse=True)
+    if costs:
+        parts.append("a frame: " + ", ".join(text for _, text in costs[:_COSTLIEST]))
+    return "; ".join(parts)
 
 
 def _summary(result: RunResult, runner: Runner) -> str:
