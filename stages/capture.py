@@ -14,7 +14,7 @@ from pydantic import Field, field_validator
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
-from tactflow.sources import CameraRequest, Source, open_source
+from tactflow.sources import CameraRequest, Source, StampedSource, open_source
 from tactflow.sources.files import load_image
 from tactflow.sources.pace import Pace
 
@@ -32,7 +32,7 @@ class Capture:
         source: str = Field(
             "sim:press",
             description="sim:NAME?query, camera index or /dev/videoN, video file, folder or glob of images, "
-            ".npy file, http:// rtsp:// udp:// stream",
+            ".npy file, .mcap recording, http:// rtsp:// udp:// stream",
         )
         realtime: bool = Field(
             False, description="play a recording at its own pace, with a live camera's drop policy"
@@ -127,6 +127,8 @@ class Capture:
     def frames(self) -> Iterator[Frame]:
         """Every frame of the source, in order, until its end or `stop()`.
 
+        A recording of tactflow's own knows its references; `reference` and `skip` do not apply to it.
+
         Raises
         ------
         SourceError
@@ -138,6 +140,9 @@ class Capture:
         count = self.params.reference if isinstance(self.params.reference, int) else 1
         references_left = count if self._reference_image is None else 0
         pace = Pace(self._stop) if self.params.realtime and not source.live else None
+        if isinstance(source, StampedSource):
+            yield from self._replay(source, pace, count)
+            return
         epoch = 0
         seq = -1
         while not self._stop.is_set():
@@ -160,6 +165,25 @@ class Capture:
             reference = references_left > 0
             references_left -= reference
             yield Frame(self._sensor, seq, t, image, time.perf_counter(), reference, epoch)
+
+    def _replay(self, source: StampedSource, pace: Pace | None, count: int) -> Iterator[Frame]:
+        """Frames as they were captured the first time; references that are retaken now come on top."""
+        retaken = references_left = 0
+        while not self._stop.is_set():
+            item = source.read_stamped()
+            if item is None:
+                return
+            image, t, stamp = item
+            if pace is not None and stamp.paced and not pace.wait_for(t):
+                return
+            if self._retake.is_set() and stamp.seq >= 0:
+                self._retake.clear()
+                retaken += 1
+                references_left = count
+            again = references_left > 0
+            references_left -= again
+            reference, epoch = stamp.reference or again, stamp.epoch + retaken
+            yield Frame(self._sensor, stamp.seq, t, _read_only(image), time.perf_counter(), reference, epoch)
 
     def _reference_frame(self, first: NDArray[np.uint8], t: float) -> Frame:
         image = self._reference_image

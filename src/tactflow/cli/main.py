@@ -20,6 +20,8 @@ COMMANDS = {
     "stages": "list the stages and sinks that can be used, their ports and parameters",
     "listen": "print what a running tactflow publishes",
     "bench": "measure run time against error, per method and for whole pipelines",
+    "record": "run a pipeline and record its frames and results",
+    "repair": "give a recording that was cut off its index",
     "sim": "write a simulated recording and its ground truth",
     "schema": "print the JSON Schema of the result message or of a pipeline file",
 }

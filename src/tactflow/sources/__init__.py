@@ -5,19 +5,20 @@
 
 from __future__ import annotations
 
+import glob
 import re
 from pathlib import Path
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import Source
+from tactflow.sources.base import Source, StampedSource
 from tactflow.sources.devices import Camera, CameraRequest, Stream
 from tactflow.sources.files import open_recording
 
-__all__ = ["KINDS", "CameraRequest", "Source", "open_source"]
+__all__ = ["KINDS", "CameraRequest", "Source", "StampedSource", "open_source"]
 
 KINDS = (
     "sim:NAME (simulated sensor), a camera index or /dev/videoN, a video file, a folder or glob of images, "
-    "a .npy file, an http://, rtsp:// or udp:// stream"
+    "a .npy file, an .mcap recording of tactflow, an http://, rtsp:// or udp:// stream"
 )
 """What a source can be, for messages."""
 
@@ -36,7 +37,7 @@ def open_source(
     Parameters
     ----------
     spec : `sim:NAME?frames=300&seed=7`, a camera index, `/dev/videoN`, a video file, a folder or glob of
-        images, a `.npy` file, or an `http://`, `rtsp://`, `udp://` stream.
+        images, a `.npy` file, an `.mcap` recording, or an `http://`, `rtsp://`, `udp://` stream.
     directory : where a relative path is looked for if it is not in the current directory.
     fps : rate of recordings that do not know their own (images, arrays), frames per second; 30 by default.
     camera : size, rate and format to ask a camera for.
@@ -61,4 +62,8 @@ def open_source(
         raise SourceError(f"{spec}: unknown kind of source {scheme[0]}{hint}; required one of: {KINDS}")
     if spec.isdecimal() or spec.startswith(("/dev/video", "/dev/v4l/")):
         return Camera(spec, camera)
+    if re.search(r"\.mcap($|\?)", spec, re.IGNORECASE) and not glob.has_magic(spec.partition("?")[0]):
+        from tactflow.sources.mcap import Recording
+
+        return Recording(spec, directory)
     return open_recording(spec, directory, fps)

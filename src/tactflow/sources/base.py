@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -54,6 +54,31 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Let go of the file or device. May be called twice."""
+        ...
+
+
+class Stamp(NamedTuple):
+    """What a recording remembers of how a frame was taken.
+
+    seq, reference, epoch : as in `Frame`. paced : False for a frame that is shown ahead of its time, because
+    those after it are compared with it.
+    """
+
+    seq: int
+    reference: bool
+    epoch: int
+    paced: bool = True
+
+
+@runtime_checkable
+class StampedSource(Protocol):
+    """A source whose frames went through `capture` once before.
+
+    Capture then decides nothing by itself: seq, references and epochs are the recorded ones.
+    """
+
+    def read_stamped(self) -> tuple[BgrImage, float, Stamp] | None:
+        """Like `Source.read`, with the frame's stamp."""
         ...
 
 

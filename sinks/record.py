@@ -1,0 +1,388 @@
+"""Record: every accepted frame without loss, and its results, in an MCAP file that can be played again."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import platform
+import re
+import threading
+from collections import deque
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+import yaml
+from pydantic import Field, model_validator
+
+from tactflow import __version__
+from tactflow.engine.control import Control
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Tick
+from tactflow.engine.stage import StageParams
+from tactflow.message import encode_message
+from tactflow.ports import Image
+from tactflow.recording import missing_packages
+from tactflow.vision.types import Contact, Flow, Markers
+
+if TYPE_CHECKING:
+    from tactflow.recording.frames import FrameCoder
+    from tactflow.recording.writer import About, Entry, RecordingWriter
+
+log = logging.getLogger("tactflow")
+
+BACKLOG_SHARE = 4
+"""Frames from memory that are written per new frame, so that saving them never holds up the run."""
+
+
+class Record:
+    """Records to a file from the start, when told to, or when something touches the gel.
+
+    With `ring`, the last seconds are kept in memory, compressed, and become the beginning of the file. A
+    recording always holds the reference frames that its frames are compared with.
+
+    A recording from the start goes to `path` itself and all others to `path` with a number, `press-001.mcap`;
+    those never replace a file. `start_recording` and `stop_recording` may be called from any thread.
+    """
+
+    threaded = True
+    when_live = "block"
+    observer = False
+    takes_references = True
+    queue_capacity = 32
+
+    class Params(StageParams):
+        """Where to record to, and what begins a recording."""
+
+        path: str = Field(
+            "recording.mcap", pattern=r"\.mcap$", description="file, relative to the current directory"
+        )
+        overwrite: bool = Field(False, description="replace an existing file")
+        trigger: Literal["start", "button", "contact"] | None = Field(
+            None,
+            description="what begins a recording: the start of the run, the button of the view, or a contact "
+            "(each contact its own file); null: the button if there is a ring, else the start",
+        )
+        ring: float | None = Field(
+            None,
+            gt=0,
+            le=3600,
+            description="keep so many last seconds in memory, s; the button saves them, and a contact's "
+            "recording begins with them",
+        )
+        memory: int = Field(
+            1024, ge=16, description="most that the ring may take, MB; if it is less, the ring is shorter"
+        )
+        after: float = Field(1.0, ge=0, description="a contact's recording ends so long after the contact, s")
+        preview: float = Field(
+            10.0, ge=0, le=240, description="rate of the JPEG pictures for people, Hz; 0 leaves them out"
+        )
+        quality: int = Field(80, ge=1, le=100, description="of those; higher is sharper and larger")
+
+        @model_validator(mode="after")
+        def _ring_needs_a_moment(self) -> Record.Params:
+            if self.ring is not None and self.trigger == "start":
+                raise ValueError("ring keeps what came before a trigger: set trigger to button or contact")
+            return self
+
+    def __init__(
+        self,
+        params: Params,
+        sensor: str = "main",
+        directory: Path | None = None,
+        control: Control | None = None,
+    ) -> None:
+        """Prepare; nothing is written yet.
+
+        Parameters
+        ----------
+        sensor : names the channels of the file.
+        control : handle on the run, for the settings that are written beside the frames.
+        """
+        del directory
+        self.params = params
+        self.description = params.path
+        self._path = Path(params.path).expanduser()
+        self._trigger = params.trigger or ("start" if params.ring is None else "button")
+        self._sensor = sensor
+        self._control = control
+        self._lock = threading.RLock()
+        self._coder: FrameCoder | None = None
+        self._file: RecordingWriter | None = None
+        self._ends = False
+        self._backlog: deque[Entry] = deque()
+        self._late: list[Entry] = []
+        self._references: list[Entry] = []
+        self._ring: deque[Entry] = deque()
+        self._ring_bytes = 0
+        self._touching = False
+        self._touched = 0.0
+        self._preview_due = float("-inf")
+        self._counts = {"frames": 0, "files": 0, "bytes": 0}
+
+    def open(self) -> None:
+        """Begin the file, if recording starts with the run.
+
+        Raises
+        ------
+        StageError
+            If the file exists and `overwrite` is not set, it cannot be written, or a package is missing.
+        """
+        problem = missing_packages()
+        if problem is not None:
+            raise StageError(problem)
+        from tactflow.recording.frames import FrameCoder
+
+        self._coder = FrameCoder()
+        if self._trigger == "start":
+            self._begin(self._path, overwrite=self.params.overwrite)
+
+    @property
+    def recording(self) -> bool:
+        """Whether a file is being written. In ring mode it ends by itself."""
+        return self._file is not None
+
+    def start_recording(self) -> None:
+        """Begin a new file with a number of its own; with a ring, save what it holds. Nothing if recording.
+
+        Raises
+        ------
+        StageError
+            If it cannot be written.
+        """
+        with self._lock:
+            if self._file is None and self._coder is not None:
+                self._begin_next()
+                self._ends = self.params.ring is not None
+
+    def stop_recording(self) -> None:
+        """Finish the file, with all that belongs to it. Nothing if not recording.
+
+        Raises
+        ------
+        StageError
+            If it cannot be written.
+        """
+        with self._lock:
+            if self._file is not None:
+                self._write_backlog(len(self._backlog))
+                self._finish()
+
+    def wants(self) -> bool:
+        """Whether frames are written or kept."""
+        return self._file is not None or self.params.ring is not None or self._trigger == "contact"
+
+    def counters(self) -> dict[str, int]:
+        """frames, files : written so far. bytes : of the finished files. ring_frames, ring_bytes : kept."""
+        return self._counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
+
+    def write(
+        self,
+        tick: Tick,
+        image: Image | None,
+        contact: Contact | None,
+        flow: Flow | None,
+        markers: Markers | None,
+    ) -> None:
+        """Record one frame, or keep it for later.
+
+        Raises
+        ------
+        StageError
+            If it cannot be written. The file then ends with the frame before and can be played.
+        """
+        with self._lock:
+            if not self.wants() and not tick.frame.reference:
+                return
+            entry = self._entry(tick, image, contact, flow, markers)
+            if self._trigger == "contact":
+                self._follow(contact is not None, tick.frame.t)
+            if self._file is not None and not self._ends:
+                self._backlog.append(entry)
+            self._write_backlog(BACKLOG_SHARE)
+            if self._ends and not self._backlog:
+                self._finish()
+            self._keep(entry)
+
+    def close(self) -> None:
+        """Write what is left, and finish the file."""
+        try:
+            self.stop_recording()
+        finally:
+            self._coder = None
+            self._ring.clear()
+
+    def _entry(
+        self,
+        tick: Tick,
+        image: Image | None,
+        contact: Contact | None,
+        flow: Flow | None,
+        markers: Markers | None,
+    ) -> Entry:
+        from tactflow.recording.frames import nanoseconds
+        from tactflow.recording.schemas import encode_picture
+        from tactflow.recording.writer import Entry
+
+        assert self._coder is not None
+        frame = tick.frame
+        time = nanoseconds(frame.t)
+        message = picture = None
+        # A reference image that is not part of the source has no results of its own.
+        if frame.seq >= 0:
+            message = encode_message(tick, image, contact, flow, markers, detail=True)
+            if self._preview_is_due(frame.t):
+                jpeg = self._jpeg(frame.image if image is None else image)
+                picture = encode_picture(jpeg, self._sensor, time)
+        pixels = self._coder.encode(frame)
+        return Entry(time, frame.seq, frame.reference, frame.epoch, pixels, message, picture)
+
+    def _preview_is_due(self, t: float) -> bool:
+        rate = self.params.preview
+        # Half a microsecond of slack: times of a recording are multiples of 1 / fps in floating point.
+        if rate == 0 or t + 5e-7 < self._preview_due:
+            return False
+        start = self._preview_due if t - self._preview_due < 1 / rate else t
+        self._preview_due = start + 1 / rate
+        return True
+
+    def _jpeg(self, image: Image) -> bytes:
+        done, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, self.params.quality))
+        if not done:
+            raise ValueError(f"required an image that JPEG can hold, got {image.shape} {image.dtype}")
+        return jpeg.tobytes()
+
+    def _follow(self, touching: bool, t: float) -> None:
+        """Begin a file when a contact begins, and end it some time after the contact."""
+        if touching:
+            if self._file is None and not self._touching:
+                self._begin_next()
+            elif self._ends:
+                # Touched again while the rest is being written: go on with what came meanwhile.
+                self._ends = False
+                written = self._backlog[-1].time if self._backlog else 0
+                self._backlog.extend(entry for entry in self._ring if entry.time > written)
+            self._touched = t
+        elif self._file is not None and t - self._touched > self.params.after:
+            self._ends = True
+        self._touching = touching
+
+    def _keep(self, entry: Entry) -> None:
+        """Remember the entry in the ring, and references for as long as frames of their epoch may follow."""
+        ring, seconds = self._ring, self.params.ring
+        if seconds is not None:
+            ring.append(entry)
+            self._ring_bytes += entry.size
+            limit = self.params.memory * 1_000_000
+            while ring and (ring[0].time < entry.time - seconds * 1e9 or self._ring_bytes > limit):
+                self._ring_bytes -= ring.popleft().size
+        if entry.reference:
+            self._references.append(entry)
+        oldest = ring[0].epoch if ring else entry.epoch
+        self._references = [reference for reference in self._references if reference.epoch >= oldest]
+
+    def _begin_next(self) -> None:
+        while True:
+            try:
+                self._begin(_next_name(self._path), overwrite=False)
+            except FileExistsError:
+                continue
+            return
+
+    def _begin(self, path: Path, *, overwrite: bool) -> None:
+        """Open a file; the references and what the ring holds are to be written first."""
+        from tactflow.recording.writer import RecordingWriter
+
+        try:
+            self._file = RecordingWriter(path, self._about(), overwrite=overwrite)
+        except FileExistsError as error:
+            if path != self._path:
+                raise
+            raise StageError(
+                f"{path}: this file exists; set overwrite: true to replace it, or give another path"
+            ) from error
+        except OSError as error:
+            raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        self.description = str(path)
+        self._ends = False
+        self._backlog = deque(self._ring)
+        first = self._ring[0] if self._ring else None
+        self._late = [
+            reference
+            for reference in self._references
+            if first is None or (reference.epoch == first.epoch and reference.seq < first.seq)
+        ]
+        if path != self._path:
+            log.info("record: %s", path)
+
+    def _write_backlog(self, most: int) -> None:
+        file = self._file
+        if file is None:
+            return
+        try:
+            for _ in range(min(most, len(self._backlog))):
+                entry = self._backlog.popleft()
+                # The references of before stand where the file's time line begins.
+                for reference in self._late:
+                    file.write(reference, entry.time)
+                self._late = []
+                file.write(entry)
+                self._counts["frames"] += 1
+        except OSError as error:
+            self._give_up(file, error)
+
+    def _finish(self) -> None:
+        file, self._file = self._file, None
+        self._ends = False
+        assert file is not None
+        try:
+            file.finish()
+        except OSError as error:
+            self._give_up(file, error)
+        self._counts["files"] += 1
+        self._counts["bytes"] += file.path.stat().st_size
+
+    def _give_up(self, file: RecordingWriter, error: OSError) -> None:
+        self._file = None
+        self._backlog.clear()
+        file.abandon()
+        hint = "free some space, then " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        raise StageError(
+            f"{file.path}: cannot be written: {error.strerror or error}; the {file.frames} frames written "
+            f"before are complete and can be played; {hint}tactflow repair {file.path} adds the index"
+        ) from error
+
+    def _about(self) -> About:
+        from tactflow.recording.writer import About
+
+        facts = {
+            "tactflow": __version__,
+            "numpy": np.__version__,
+            "opencv": cv2.__version__,
+            "python": platform.python_version(),
+            "machine": f"{platform.system()} {platform.machine()}",
+            "sensor": self._sensor,
+        }
+        texts: dict[str, str] = {}
+        if self._control is not None:
+            pipeline = self._control.pipeline
+            facts["source"] = str(getattr(self._control.source, "description", ""))
+            texts["pipeline.yaml"] = yaml.safe_dump(dict(pipeline.settings), sort_keys=False)
+            try:
+                texts["pipeline.original.yaml"] = Path(pipeline.file).read_text(encoding="utf-8")
+            except (OSError, UnicodeDecodeError) as error:
+                log.debug("%s: not recorded: %s", pipeline.file, error)
+        return About(self._sensor, facts, texts)
+
+
+def _next_name(path: Path) -> Path:
+    """The first numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ..."""
+    taken = 0
+    pattern = re.compile(re.escape(path.stem) + r"-(\d+)" + re.escape(path.suffix))
+    if path.parent.is_dir():
+        for name in os.listdir(path.parent):
+            found = pattern.fullmatch(name)
+            taken = max(taken, int(found[1]) if found else 0)
+    return path.with_name(f"{path.stem}-{taken + 1:03d}{path.suffix}")

@@ -1,0 +1,89 @@
+"""`tactflow repair`: give a recording that was cut off its index."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+from tactflow.engine.errors import ConfigError, SourceError, StageError
+from tactflow.recording import missing_packages
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `repair`."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="an .mcap file that was not finished")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="write here and leave FILE as it is; default: replace FILE"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace the file --out if it is there")
+    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Repair the file; returns the exit code.
+
+    The repaired copy takes the file's place only when it is complete, so an interrupted repair harms nothing.
+
+    Raises
+    ------
+    ConfigError
+        If a path is wrong (nothing was written). SourceError if the file cannot be read or is no MCAP file.
+        StageError if the copy cannot be written.
+    """
+    problem = missing_packages()
+    if problem is not None:
+        raise ConfigError(problem)
+    path: Path = args.file
+    out: Path = args.out or path
+    if not path.is_file():
+        raise SourceError(f"{path}: no such file")
+    if args.out is not None and out.exists() and not args.overwrite:
+        raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
+    try:
+        handle, name = tempfile.mkstemp(dir=out.absolute().parent, prefix=f".{out.stem}-", suffix=".mcap")
+        os.close(handle)
+    except OSError as error:
+        raise StageError(f"{out}: cannot be written: {error.strerror or error}") from error
+    copy = Path(name)
+    try:
+        return _repair(path, copy, out, quiet=args.quiet)
+    finally:
+        copy.unlink(missing_ok=True)
+
+
+def _repair(path: Path, copy: Path, out: Path, *, quiet: bool) -> int:
+    from tactflow.recording.reader import NotARecordingError
+    from tactflow.recording.repair import repair
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as progress:
+        task = progress.add_task(path.name, total=path.stat().st_size)
+        try:
+            result = repair(path, copy, lambda done: progress.update(task, completed=done))
+        except NotARecordingError as error:
+            raise SourceError(f"{path}: {error}") from None
+        except OSError as error:
+            raise StageError(
+                f"{copy.parent}: the repaired copy cannot be written: {error.strerror or error}; "
+                "--out puts it on another disk"
+            ) from error
+    if result.finished and out == path:
+        _say(f"{path}: is whole already, nothing to repair ({result.messages} messages)", quiet=quiet)
+        return 0
+    os.chmod(copy, path.stat().st_mode & 0o777)
+    os.replace(copy, out)
+    lost = f", {result.lost} bytes at the end belonged to no whole message" if result.lost else ""
+    _say(f"{out}: repaired, {result.messages} messages{lost}", quiet=quiet)
+    return 0
+
+
+def _say(text: str, *, quiet: bool) -> None:
+    if not quiet:
+        print(text, file=sys.stderr)

@@ -1,0 +1,157 @@
+"""As much of Protocol Buffers as recordings need: writing and reading one message, and describing its type.
+
+The wire format is described at https://protobuf.dev/programming-guides/encoding; a `FileDescriptorSet` (what
+an MCAP schema of a protobuf channel holds) is itself such a message.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+Value = bool | int | float | str | bytes | memoryview
+FieldType = Literal["double", "int64", "int32", "bool", "string", "bytes", "uint32", "sint64", "Timestamp"]
+
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+_TYPE_NUMBERS: dict[FieldType, int] = {
+    "double": 1,
+    "int64": 3,
+    "int32": 5,
+    "bool": 8,
+    "string": 9,
+    "Timestamp": 11,
+    "bytes": 12,
+    "uint32": 13,
+    "sint64": 18,
+}
+_OPTIONAL = 1
+_TIMESTAMP_FILE = "google/protobuf/timestamp.proto"
+
+
+def encode(fields: Iterable[tuple[int, Value]]) -> bytes:
+    """One message. Integers are written as varints, floats as doubles.
+
+    fields : (number, value) in the order they are to be written; a number may come several times.
+    """
+    parts: list[bytes | memoryview] = []
+    for number, value in fields:
+        if isinstance(value, int):
+            parts += (_varint(number << 3 | _VARINT), _varint(value & 0xFFFFFFFFFFFFFFFF))
+        elif isinstance(value, float):
+            parts += (_varint(number << 3 | _FIXED64), struct.pack("<d", value))
+        else:
+            data = value.encode() if isinstance(value, str) else value
+            parts += (_varint(number << 3 | _BYTES), _varint(len(data)), data)
+    return b"".join(parts)
+
+
+def decode(data: bytes | memoryview) -> dict[int, int | float | memoryview]:
+    """The fields of one message by number; of one that comes several times, the last.
+
+    Varints come as unsigned integers, 64-bit fields as doubles, all else as bytes; nothing is copied.
+
+    Raises
+    ------
+    ValueError
+        If the bytes are no such message.
+    """
+    view = memoryview(data)
+    fields: dict[int, int | float | memoryview] = {}
+    at = 0
+    try:
+        while at < len(view):
+            key, at = _read_varint(view, at)
+            kind = key & 7
+            if kind == _VARINT:
+                fields[key >> 3], at = _read_varint(view, at)
+            elif kind == _FIXED64:
+                (fields[key >> 3],) = struct.unpack_from("<d", view, at)
+                at += 8
+            elif kind == _BYTES:
+                length, at = _read_varint(view, at)
+                if at + length > len(view):
+                    raise ValueError(f"required {length} bytes, got {len(view) - at}")
+                fields[key >> 3] = view[at : at + length]
+                at += length
+            elif kind == _FIXED32:
+                at += 4
+            else:
+                raise ValueError(f"required a wire type of 0, 1, 2 or 5, got {kind}")
+    except (IndexError, struct.error):
+        raise ValueError("the message is cut off") from None
+    return fields
+
+
+def zigzag(number: int) -> int:
+    """A signed integer as `sint64` stores it: 0, -1, 1, -2, ... become 0, 1, 2, 3, ..."""
+    return number * 2 if number >= 0 else -number * 2 - 1
+
+
+def unzigzag(number: int) -> int:
+    """The inverse of `zigzag`."""
+    return number >> 1 if number & 1 == 0 else -(number >> 1) - 1
+
+
+def timestamp(nanoseconds: int) -> bytes:
+    """A `google.protobuf.Timestamp`, from ns."""
+    seconds, rest = divmod(nanoseconds, 1_000_000_000)
+    return encode([(1, seconds), (2, rest)])
+
+
+def describe(name: str, fields: Sequence[tuple[str, int, FieldType]]) -> bytes:
+    """The `FileDescriptorSet` of one flat message type.
+
+    name : with its package, such as "foxglove.CompressedImage". fields : (name, number, type).
+    """
+    package, _, short = name.rpartition(".")
+    file = encode(
+        [
+            (1, f"{package}/{short}.proto"),
+            (2, package),
+            (3, _TIMESTAMP_FILE),
+            (4, _message_type(short, fields)),
+            (12, "proto3"),
+        ]
+    )
+    timestamp_file = encode(
+        [
+            (1, _TIMESTAMP_FILE),
+            (2, "google.protobuf"),
+            (4, _message_type("Timestamp", [("seconds", 1, "int64"), ("nanos", 2, "int32")])),
+            (12, "proto3"),
+        ]
+    )
+    return encode([(1, timestamp_file), (1, file)])
+
+
+def _message_type(name: str, fields: Sequence[tuple[str, int, FieldType]]) -> bytes:
+    described: list[tuple[int, Value]] = [(1, name)]
+    for field, number, kind in fields:
+        parts: list[tuple[int, Value]] = [(1, field), (3, number), (4, _OPTIONAL), (5, _TYPE_NUMBERS[kind])]
+        if kind == "Timestamp":
+            parts.append((6, ".google.protobuf.Timestamp"))
+        described.append((2, encode(parts)))
+    return encode(described)
+
+
+def _varint(number: int) -> bytes:
+    parts = bytearray()
+    while number > 0x7F:
+        parts.append(number & 0x7F | 0x80)
+        number >>= 7
+    parts.append(number)
+    return bytes(parts)
+
+
+def _read_varint(view: memoryview, at: int) -> tuple[int, int]:
+    number = shift = 0
+    while True:
+        byte = view[at]
+        at += 1
+        number |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return number, at
+        shift += 7
+        if shift > 63:
+            raise ValueError("required a number of 64 bits, got a longer one")

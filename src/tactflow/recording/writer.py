@@ -1,0 +1,190 @@
+"""Writes recordings."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, cast
+
+from mcap.writer import CompressionType, Writer
+
+from tactflow.message import message_schema
+from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
+from tactflow.recording.schemas import PICTURE_DESCRIPTOR, PICTURE_TYPE, RESULT_TYPE, plain_schema
+
+_NEVER = 1 << 62
+"""Chunks are ended by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What is recorded about one frame, ready to be written.
+
+    time : of the frame, ns. seq, reference, epoch : as in `Frame`.
+    frame : `tactflow.RawFrame`. message : the result message, or None. picture : `foxglove.CompressedImage`.
+    """
+
+    time: int
+    seq: int
+    reference: bool
+    epoch: int
+    frame: bytes
+    message: bytes | None = None
+    picture: bytes | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes of memory, about."""
+        return len(self.frame) + len(self.message or b"") + len(self.picture or b"") + 200
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a recording says about itself.
+
+    sensor : name. facts : metadata, such as versions. texts : attachments by name, in UTF-8.
+    """
+
+    sensor: str
+    facts: Mapping[str, str] = field(default_factory=dict[str, str])
+    texts: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+class RecordingWriter:
+    """One file that is being recorded.
+
+    After each `write` all of it is with the operating system.
+
+    Parameters
+    ----------
+    path : the file; its folder is created.
+    about : written at once.
+    overwrite : replace an existing file.
+
+    Raises
+    ------
+    OSError
+        If the file is there already (FileExistsError) or cannot be written.
+    """
+
+    def __init__(self, path: Path, about: About, *, overwrite: bool = False) -> None:
+        self.path = path
+        self.frames = 0
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = _WholeRecords(path, overwrite=overwrite)
+        try:
+            self._writer = Writer(
+                cast("IO[bytes]", self._file), chunk_size=_NEVER, compression=CompressionType.NONE
+            )
+            self._writer.start(profile="", library="tactflow")
+            self._describe(about)
+            self._file.keep()
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def bytes(self) -> int:
+        """Length of the file so far."""
+        return self._file.tell()
+
+    def _describe(self, about: About) -> None:
+        writer, name = self._writer, about.sensor
+        frame_type = writer.register_schema(TYPE_NAME, "protobuf", DESCRIPTOR)
+        picture_type = writer.register_schema(PICTURE_TYPE, "protobuf", PICTURE_DESCRIPTOR)
+        schema = message_schema()
+        result_type = writer.register_schema(
+            RESULT_TYPE, "jsonschema", json.dumps(plain_schema(schema)).encode()
+        )
+        self._frames = writer.register_channel(f"/{name}/frames", "protobuf", frame_type)
+        self._references = writer.register_channel(f"/{name}/references", "protobuf", frame_type)
+        self._results = writer.register_channel(f"/{name}/results", "json", result_type)
+        self._pictures = writer.register_channel(f"/{name}/image", "protobuf", picture_type)
+        writer.add_metadata("tactflow", dict(about.facts))
+        texts = {"message.schema.json": json.dumps(schema, indent=1)} | dict(about.texts)
+        for file, text in texts.items():
+            kind = "application/json" if file.endswith(".json") else "application/yaml"
+            writer.add_attachment(0, 0, file, kind, text.encode())
+
+    def write(self, entry: Entry, time: int | None = None) -> None:
+        """Add one frame and what belongs to it.
+
+        time : on the file's time line, ns, if it is not the frame's own.
+
+        Raises
+        ------
+        OSError
+            If not all of it could be written. The file then ends after the frame before.
+        """
+        at = entry.time if time is None else time
+        number = max(entry.seq, 0) & 0xFFFFFFFF
+        frames = self._references if entry.reference else self._frames
+        parts: Sequence[tuple[int, bytes | None]] = (
+            (frames, entry.frame),
+            (self._results, entry.message),
+            (self._pictures, entry.picture),
+        )
+        for channel, data in parts:
+            if data is not None:
+                self._writer.add_message(
+                    channel, log_time=max(at, 0), publish_time=max(at, 0), sequence=number, data=data
+                )
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._file.keep()
+        self.frames += 1
+
+    def finish(self) -> None:
+        """Add the index and close the file. Raises OSError as `write` does."""
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.keep()
+        finally:
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is, without an index."""
+        self._file.close()
+
+
+class _WholeRecords(io.BufferedIOBase):
+    """A file that, after a failed write, ends where `keep` was called last.
+
+    Nothing is held back in this process: what was written survives it.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool) -> None:
+        super().__init__()
+        self._file = path.open("wb" if overwrite else "xb", buffering=0)
+        self._kept = 0
+        self._at = 0
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        view = memoryview(data)
+        done = 0
+        try:
+            # An unbuffered file may take only a part, and says why at the next attempt.
+            while done < len(view):
+                done += self._file.write(view[done:])
+        except OSError:
+            os.ftruncate(self._file.fileno(), self._kept)
+            raise
+        self._at += done
+        return done
+
+    def tell(self) -> int:
+        return self._at
+
+    def keep(self) -> None:
+        """Everything so far is whole."""
+        self._kept = self._at
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()

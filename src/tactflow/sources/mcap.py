@@ -1,0 +1,181 @@
+"""Recordings of ours, played again: the frames bit for bit, with the seq, t and flags of the first time."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qsl
+
+from tactflow.engine.errors import SourceError
+from tactflow.recording import missing_packages
+from tactflow.sources.base import BgrImage, Stamp, find_path, log
+
+if TYPE_CHECKING:
+    from tactflow.recording.frames import StoredFrame
+    from tactflow.recording.reader import Contents
+
+OPTIONS = "start=SECONDS (from the beginning), loop=N (play N times; 0 is for ever)"
+
+
+class Recording:
+    """An .mcap file that tactflow recorded.
+
+    A recording brings its own references: capture's parameters `reference` and `skip` do not apply. With
+    `start`, the references that were in force at that time come first.
+
+    With `loop`, seq and t go on growing from lap to lap, and every lap is an epoch of its own: it takes its
+    references anew, so that it gives the same results as the first.
+
+    Parameters
+    ----------
+    spec : `file.mcap`, or `file.mcap?start=2.5&loop=2`.
+    directory : where a relative path is looked for if it is not in the current directory.
+
+    Raises
+    ------
+    SourceError
+        If it is not there, is no recording of ours, or an option is wrong.
+    """
+
+    live = False
+
+    def __init__(self, spec: str, directory: Path | None = None) -> None:
+        problem = missing_packages()
+        if problem is not None:
+            raise SourceError(f"{spec}: {problem}")
+        name, start, self._laps = _parse(spec, directory)
+        self._path = find_path(name, directory)
+        self._contents = self._look()
+        contents = self._contents
+        self._start = None if not start or contents.start is None else contents.start + round(start * 1e9)
+        self._frames = self._play()
+        self._first = self._next()
+        if self._first is None:
+            end = "" if contents.end is None or contents.start is None else _length(contents)
+            raise SourceError(f"{spec}: there is no frame {f'after {start:g} s{end}' if start else 'in it'}")
+        self.size: tuple[int, int] | None = self._first[0].size
+        self.fps: float | None = None
+        self.total: int | None = None
+        if contents.frames is not None:
+            seconds = ((contents.end or 0) - (contents.start or 0)) / 1e9
+            self.fps = (contents.frames - 1) / seconds if seconds > 0 else None
+            self.total = contents.frames * self._laps if self._laps and self._start is None else None
+        frames = "an unknown number of" if contents.frames is None else str(contents.frames)
+        self.description = f"{spec}, {frames} frames, {self.size[0]} x {self.size[1]}"
+        if not contents.finished:
+            log.info(
+                "%s: was not finished (killed?); it is played up to where it ends; "
+                "tactflow repair makes it whole for other programs too",
+                self._path,
+            )
+
+    def _look(self) -> Contents:
+        from tactflow.recording.reader import NotARecordingError, look_into
+
+        try:
+            return look_into(self._path)
+        except NotARecordingError as error:
+            raise SourceError(f"{self._path}: {error}") from None
+        except OSError as error:
+            raise SourceError(f"{self._path}: cannot be read: {error.strerror or error}") from error
+
+    def read(self) -> tuple[BgrImage, float] | None:
+        """The next frame and its time; see `Source.read`."""
+        item = self.read_stamped()
+        return None if item is None else item[:2]
+
+    def read_stamped(self) -> tuple[BgrImage, float, Stamp] | None:
+        """The next frame, its time and what else is known of it; see `StampedSource`."""
+        item, self._first = self._first or self._next(), None
+        if item is None:
+            return None
+        frame, t, stamp = item
+        try:
+            return frame.image(), t, stamp
+        except ValueError as error:
+            raise SourceError(f"{self._path}, frame {frame.seq}: {error}") from error
+
+    def close(self) -> None:
+        """Read no more."""
+        self._frames.close()
+        self._first = None
+
+    def _next(self) -> tuple[StoredFrame, float, Stamp] | None:
+        from tactflow.recording.reader import DAMAGE
+
+        try:
+            return next(self._frames, None)
+        except DAMAGE as error:
+            raise SourceError(
+                f"{self._path}: is damaged ({error or type(error).__name__}); "
+                "tactflow repair keeps what lies before the damage"
+            ) from error
+        except OSError as error:
+            raise SourceError(f"{self._path}: cannot be read: {error.strerror or error}") from error
+
+    def _play(self) -> Generator[tuple[StoredFrame, float, Stamp], None, None]:
+        """All laps: each frame, its time, and its stamp."""
+        lap = seqs = epochs = 0
+        seconds = latest = 0.0
+        while not self._laps or lap < self._laps:
+            lap += 1
+            times: list[float] = []
+            last_seq = last_epoch = -1
+            for frame, due in self._lap():
+                seq = frame.seq if frame.seq < 0 else frame.seq + seqs
+                if due:
+                    times = [times[0] if times else frame.t, *times[-1:], frame.t]
+                last_seq, last_epoch = max(last_seq, frame.seq), max(last_epoch, frame.epoch)
+                t = latest = frame.t if lap == 1 else max(frame.t + seconds, latest)
+                yield frame, t, Stamp(seq, frame.reference, frame.epoch + epochs, due)
+            if not times:
+                return
+            # From the last frame to the first of the next lap as long as from the last but one to the last.
+            seconds += times[-1] - times[0] + (times[-1] - times[-2])
+            seqs += last_seq + 1
+            epochs += last_epoch + 1
+
+    def _lap(self) -> Iterator[tuple[StoredFrame, bool]]:
+        """The frames of one lap, and whether each comes at its time (True) or ahead of it."""
+        from tactflow.recording.frames import StoredFrame, nanoseconds
+        from tactflow.recording.reader import messages
+
+        contents, start = self._contents, self._start
+        topics = {contents.frame_topic, contents.reference_topic}
+        if start is not None:
+            before = messages(self._path, contents, {contents.reference_topic}, end=start)
+            yield from ((frame, False) for frame in _in_force([StoredFrame.parse(m.data) for m in before]))
+        for message in messages(self._path, contents, topics, start=start):
+            frame = StoredFrame.parse(message.data)
+            # A recording begun late brings the references of before, at the time it began.
+            late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
+            yield frame, not late and frame.seq >= 0
+
+
+def _in_force(references: list[StoredFrame]) -> list[StoredFrame]:
+    epoch = max((frame.epoch for frame in references), default=0)
+    return [frame for frame in references if frame.epoch == epoch]
+
+
+def _parse(spec: str, directory: Path | None) -> tuple[str, float, int]:
+    """Path, start in s, and number of laps."""
+    name, mark, query = spec.rpartition("?")
+    if not mark or any((base / spec).exists() for base in (Path(), directory or Path())):
+        return spec, 0.0, 1
+    start, laps = 0.0, 1
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        try:
+            if key == "start" and 0 <= float(value) < float("inf"):
+                start = float(value)
+            elif key == "loop" and int(value) >= 0:
+                laps = int(value)
+            else:
+                raise ValueError
+        except ValueError:
+            raise SourceError(f"{spec}: {key}={value}: required {OPTIONS}") from None
+    return name, start, laps
+
+
+def _length(contents: Contents) -> str:
+    return f"; it is {((contents.end or 0) - (contents.start or 0)) / 1e9:g} s long"
