@@ -82,18 +82,20 @@ def with_name(path: str, sensor: str) -> str:
 
 
 def _command(args: argparse.Namespace, file: Path, sensor: str, overrides: Sequence[str]) -> list[str]:
-    command = [sys.executable, "-m", "tactflow", "run", str(file), "--sensor", sensor]
+    verb = "run" if getattr(args, "out", None) is None else "record"
+    command = [sys.executable, "-m", "tactflow", verb, str(file), "--sensor", sensor]
     for text in (*args.overrides, *overrides):
         command += ["--set", text]
-    for option in ("jsonl", "stats", "trace"):
+    for option in ("jsonl", "stats", "trace", "out"):
         path = getattr(args, option, None)
         if path is not None:
-            command += [f"--{option}", with_name(path, sensor)]
+            command += [f"--{option}", with_name(str(path), sensor)]
     if args.max_frames is not None:
         command += ["--max-frames", str(args.max_frames)]
     if args.stats_every is not None:
         command += ["--stats-every", str(args.stats_every)]
-    command += [f"--{flag}" for flag in ("realtime", "quiet", "check") if getattr(args, flag)]
+    flags = ("realtime", "quiet", "check", "overwrite")
+    command += [f"--{flag}" for flag in flags if getattr(args, flag, False)]
     return command
 
 

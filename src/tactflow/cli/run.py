@@ -114,7 +114,7 @@ def _load(args: argparse.Namespace, file: Path, sensor: str | None) -> Pipeline:
         source_values["source"] = args.source
     if args.realtime:
         source_values["realtime"] = True
-    extra_sinks: dict[str, dict[str, Any]] = {}
+    extra_sinks: dict[str, dict[str, Any]] = dict(getattr(args, "extra_sinks", {}))
     if args.jsonl is not None:
         extra_sinks["--jsonl"] = {"use": "jsonl", "path": args.jsonl}
     return load_pipeline(
