@@ -17,6 +17,10 @@ _SCALE_RATIO: Final = 1.6
 # (measured on rendered discs of radius 2 to 12 px).
 _RADIUS_PER_SIGMA: Final = 1.83
 _MOST_PEAKS: Final = 3000
+# Scales from here on are looked at in a smaller picture, px.
+_LARGEST_SIGMA: Final = 4.0
+# Nearest marks are at least so many radii apart.
+_OVERLAP: Final = 1.3
 # Score of the weakest family that is believed to be a grid (see `_score`). Real and simulated gels score 100
 # and more; dust, reflections and noise on gels without marks at most 14.
 _LEAST_SCORE: Final = 25.0
@@ -106,11 +110,16 @@ def detect_markers(
     )
     best: tuple[float, float, Literal["dark", "bright"], FloatArray] | None = None
     for sigma in _sigmas(dot_radius, shortest):
-        narrow, wide = _blurred(gray, sigma)
+        # Large scales hold no detail: a smaller picture gives the same peaks at a cost that does not grow.
+        factor = 1
+        while sigma >= factor * _LARGEST_SIGMA:
+            factor *= 2
+        fine = sigma / factor
+        narrow, wide = _blurred(_shrunk(gray, factor), fine)
         for sign in polarities:
-            peaks, strength = _peaks(wide - narrow if sign == "dark" else narrow - wide, sigma)
-            spots = _surrounded(narrow if sign == "dark" else -narrow, peaks, sigma * _RADIUS_PER_SIGMA)
-            peaks, strength = peaks[spots], strength[spots]
+            peaks, strength = _peaks(wide - narrow if sign == "dark" else narrow - wide, fine)
+            spots = _surrounded(narrow if sign == "dark" else -narrow, peaks, fine * _RADIUS_PER_SIGMA)
+            peaks, strength = peaks[spots] * factor + (factor - 1) / 2, strength[spots]
             kept = _family(peaks, strength, gray.shape, sigma * _RADIUS_PER_SIGMA)
             if len(kept) == 0:
                 continue
@@ -218,6 +227,15 @@ def _sigmas(dot_radius: float | None, shortest: int) -> list[float]:
     return [0.9 * 1.2**index for index in range(count)]
 
 
+def _shrunk(gray: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Means over blocks of factor x factor pixels; what is left at the right and at the bottom is cut off."""
+    if factor == 1:
+        return gray
+    height, width = gray.shape[0] // factor, gray.shape[1] // factor
+    cut = gray[: height * factor, : width * factor]
+    return np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
 def _blurred(gray: NDArray[np.float32], sigma: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The image at a scale and at the next coarser one; their difference answers to spots of the scale."""
     narrow = cv2.GaussianBlur(gray, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
@@ -244,7 +262,8 @@ def _surrounded(smooth: NDArray[np.float32], peaks: FloatArray, radius: float) -
 
 def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, FloatArray]:
     """Local maxima, refined to sub-pixels by a parabola along each axis: positions (N, 2), strengths (N,)."""
-    size = 2 * max(1, round(1.5 * sigma)) + 1
+    # Marks do not overlap: peaks that are nearer to each other are the rim of one spot of a larger scale.
+    size = 2 * max(1, round(_OVERLAP * _RADIUS_PER_SIGMA * sigma)) + 1
     highest = cv2.dilate(response, np.ones((size, size), np.uint8))
     rows, columns = np.nonzero((response >= highest) & (response > 1.0))
     inside = (rows > 0) & (columns > 0) & (rows < response.shape[0] - 1) & (columns < response.shape[1] - 1)
@@ -295,6 +314,9 @@ def _family(
         kept = kept[~(between | lonely)]
         if len(kept) < 3:
             break
+    # Evenly spaced spots that overlap are the ridges of a pattern.
+    if len(kept) > 1 and float(np.median(_nearest(peaks[kept], 1)[0])) < _OVERLAP * radius:
+        return np.zeros(0, np.int64)
     return np.asarray(kept, np.int64)
 
 
