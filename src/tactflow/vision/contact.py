@@ -137,11 +137,11 @@ class ContactDetector:
             raise ValueError(f"false_alarms: required in (0, 1), got {false_alarms}")
         if not 0 <= repeatability <= 1:
             raise ValueError(f"repeatability: required in [0, 1], got {repeatability}")
-        if not shift >= 0:
+        if not (shift >= 0 and math.isfinite(shift)):
             raise ValueError(f"shift: required >= 0 px, got {shift}")
         if not 0 <= relaxation < 1:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
-        if not distance > 0:
+        if not (distance > 0 and math.isfinite(distance)):
             raise ValueError(f"distance: required > 0 grey levels, got {distance}")
         self._method = method
         self._false_alarms = false_alarms

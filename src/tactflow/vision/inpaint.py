@@ -66,7 +66,7 @@ def remove_markers(
         raise ValueError(
             f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
         )
-    if not radius > 0:
+    if not (radius > 0 and math.isfinite(radius)):
         raise ValueError(f"radius: required > 0 px, got {radius}")
     if method == "none":
         return image.copy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -37,11 +38,11 @@ class Dot:
     contrast: float = _LEAST
 
     def __post_init__(self) -> None:
-        if not self.radius > 0:
+        if not (self.radius > 0 and math.isfinite(self.radius)):
             raise ValueError(f"radius: required > 0 px, got {self.radius}")
         if self.polarity not in ("dark", "bright"):
             raise ValueError(f"polarity: required 'dark' or 'bright', got {self.polarity!r}")
-        if not self.contrast > 0:
+        if not (self.contrast > 0 and math.isfinite(self.contrast)):
             raise ValueError(f"contrast: required > 0 grey levels, got {self.contrast}")
 
 

@@ -192,6 +192,7 @@ class SeedTracker:
     Raises
     ------
     NoMarkersError : fewer than four centres, or no grid in them.
+    ValueError : the areas are no finite range.
     """
 
     def __init__(
@@ -202,6 +203,8 @@ class SeedTracker:
         least_area: float = SEED_AREA[0],
         most_area: float = SEED_AREA[1],
     ) -> None:
+        if not 0 <= least_area < most_area < np.inf:
+            raise ValueError(f"required 0 <= least_area < most_area, px^2, got {least_area}, {most_area}")
         self._areas = (least_area, most_area)
         centers = seed_marker_centers(reference, least_area=least_area, most_area=most_area)
         grid, spacing = grid_of(centers)

@@ -136,7 +136,7 @@ class MarkerTracker:
         grays = [to_gray(frame) for frame in frames]
         if any(gray.shape != grays[0].shape for gray in grays):
             raise ValueError(f"required reference frames of one size, got {[gray.shape for gray in grays]}")
-        if max_displacement is not None and not max_displacement > 0:
+        if max_displacement is not None and not 0 < max_displacement < np.inf:
             raise ValueError(f"required max_displacement > 0 px, got {max_displacement:g}")
         mean = np.asarray(np.mean(np.stack(grays), axis=0, dtype=np.float32))
         self._shape = grays[0].shape
