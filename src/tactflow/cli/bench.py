@@ -11,6 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
 from tactflow.bench.compare import Regression, against, load_comparable
 from tactflow.bench.markdown import write_markdown
@@ -18,8 +19,10 @@ from tactflow.bench.methods import SEED
 from tactflow.bench.report import html
 from tactflow.bench.results import Result
 from tactflow.bench.run import DEFAULT, Plan, run_bench
+from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
 from tactflow.cli.pipelines import find_pipeline, packaged_pipelines
+from tactflow.engine.config import load_pipeline
 from tactflow.engine.errors import ConfigError
 
 WORSE = 3
@@ -76,10 +79,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--errors", type=Path, metavar="PATH", help="write the errors alone, to be used with --against"
     )
+    parser.add_argument(
+        "--stress",
+        nargs="?",
+        type=frame_count,
+        const=100_000,
+        metavar="FRAMES",
+        help="instead: press and release, 100000 frames unless told otherwise, through the first PIPELINE; "
+        "exit code 3 if error, memory or time creep",
+    )
+
+
+def frame_count(word: str) -> int:
+    """A number of frames, >= 1, from the command line."""
+    if not word.isdecimal() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"required a whole number of frames >= 1, got {word}")
+    return int(word)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print the table, write what was asked for; returns the exit code."""
+    if args.stress is not None:
+        return _stress(args.pipelines, args.stress)
     if args.against is not None:
         load_comparable(args.against, args.quick)
     for path in (args.json, args.html, args.errors, args.markdown):
@@ -98,6 +119,23 @@ def run(args: argparse.Namespace) -> int:
     worse = against(result, args.against, plan.scenes) if args.against is not None else []
     _report(worse, args.against)
     return WORSE if worse else 0
+
+
+def _stress(given: list[str], frames: int) -> int:
+    """Run the long stress, print its blocks and what crept."""
+    pipeline = load_pipeline(find_pipeline(given[0] if given else f"pipelines/{DEFAULT}.yaml"))
+    with _quiet_log(), _progress_bar() as progress:
+        drift = measure_drift(pipeline, frames, progress)
+    table = Table("frames", "marker error", "lost", "CPU a frame", "memory", box=None)
+    for row in drift.rows():
+        table.add_row(*row)
+    Console(file=sys.stdout, highlight=False).print(table)
+    complaints = drift.complaints()
+    for complaint in complaints:
+        print(f"tactflow: {complaint}", file=sys.stderr)
+    if not complaints:
+        print("tactflow: nothing crept", file=sys.stderr)
+    return WORSE if complaints else 0
 
 
 def packaged_files() -> dict[str, Path]:
