@@ -36,6 +36,9 @@ log = logging.getLogger("tactflow")
 BACKLOG_SHARE = 4
 """Frames from memory that are written per new frame, so that saving them never holds up the run."""
 
+SLACK = 5e-7
+"""Times of a recording are multiples of 1 / fps in floating point; so much, s, they may be off."""
+
 
 class Record:
     """Records to a file from the start, when told to, or when something touches the gel.
@@ -241,8 +244,7 @@ class Record:
 
     def _preview_is_due(self, t: float) -> bool:
         rate = self.params.preview
-        # Half a microsecond of slack: times of a recording are multiples of 1 / fps in floating point.
-        if rate == 0 or t + 5e-7 < self._preview_due:
+        if rate == 0 or t + SLACK < self._preview_due:
             return False
         start = self._preview_due if t - self._preview_due < 1 / rate else t
         self._preview_due = start + 1 / rate
@@ -265,7 +267,7 @@ class Record:
                 written = self._backlog[-1].time if self._backlog else 0
                 self._backlog.extend(entry for entry in self._ring if entry.time > written)
             self._touched = t
-        elif self._file is not None and t - self._touched > self.params.after:
+        elif self._file is not None and t - self._touched > self.params.after + SLACK:
             self._ends = True
         self._touching = touching
 

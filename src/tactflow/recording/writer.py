@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -74,7 +75,7 @@ class RecordingWriter:
     def __init__(self, path: Path, about: About, *, overwrite: bool = False) -> None:
         self.path = path
         self.frames = 0
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_folder(path.parent)
         self._file = _WholeRecords(path, overwrite=overwrite)
         try:
             self._writer = Writer(
@@ -148,6 +149,13 @@ class RecordingWriter:
     def abandon(self) -> None:
         """Close the file as it is, without an index."""
         self._file.close()
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder)) from None
 
 
 class _WholeRecords(io.BufferedIOBase):

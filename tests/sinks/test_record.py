@@ -1,0 +1,300 @@
+"""The record sink: nothing lost, nothing replaced, and the right moments."""
+
+from __future__ import annotations
+
+import importlib.util
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+import pytest
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame, Tick
+from tactflow.sinks.record import Record
+from tactflow.sources import open_source
+from tactflow.sources.mcap import Recording
+from tactflow.vision.types import Contact
+
+FPS = 10.0
+TOUCH = Contact(
+    area=4.0,
+    center=(1.0, 1.0),
+    angle=None,
+    slope=None,
+    hull=np.array([[0.0, 0], [2, 0], [2, 2]]),
+    ellipse=None,
+)
+
+
+def image(seq: int) -> NDArray[np.uint8]:
+    return np.random.default_rng(seq + 1000).integers(0, 256, (12, 17, 3), np.uint8)
+
+
+def tick(seq: int, **more: Any) -> Tick:
+    return Tick(Frame("main", seq, seq / FPS, image(seq), reference=seq == 0, **more))
+
+
+def opened(path: Path, **params: Any) -> Record:
+    sink = Record(Record.Params(path=str(path), **params))
+    sink.open()
+    return sink
+
+
+def write(sink: Record, seqs: range, contact: Contact | None = None) -> None:
+    for seq in seqs:
+        if sink.wants() or seq == 0:
+            sink.write(tick(seq), None, contact, None, None)
+
+
+def seqs_in(path: Path) -> list[int]:
+    """The frames of a recording, after comparing their pixels with what was written."""
+    source = open_source(str(path))
+    assert isinstance(source, Recording)
+    seqs = []
+    while (item := source.read_stamped()) is not None:
+        pixels, t, stamp = item
+        np.testing.assert_array_equal(pixels, image(stamp.seq))
+        assert t == stamp.seq / FPS
+        assert stamp.reference == (stamp.seq == 0)
+        seqs.append(stamp.seq)
+    source.close()
+    return seqs
+
+
+@contextmanager
+def disk_full_after(size: int) -> Iterator[None]:
+    """Files cannot grow beyond `size` bytes: the kernel then refuses writes as it does on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_every_frame_comes_back_bit_for_bit_with_its_seq_time_and_flag(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "a.mcap")
+    assert sink.recording
+    write(sink, range(0, 30, 3))
+    sink.close()
+    assert seqs_in(tmp_path / "a.mcap") == list(range(0, 30, 3))
+    assert sink.counters()["frames"] == 10
+    assert sink.counters()["bytes"] == (tmp_path / "a.mcap").stat().st_size
+
+
+def test_an_existing_file_is_replaced_only_when_told_to(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(StageError, match="this file exists; set overwrite: true"):
+        opened(path)
+    assert path.read_bytes() == b"precious"
+    sink = opened(path, overwrite=True)
+    write(sink, range(3))
+    sink.close()
+    assert seqs_in(path) == [0, 1, 2]
+
+
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StageError, match="cannot be written"):
+        opened(tmp_path / "file" / "a.mcap")
+
+
+def test_the_button_makes_numbered_files_each_with_the_references(tmp_path: Path) -> None:
+    (tmp_path / "press-007.mcap").write_bytes(b"older")
+    sink = opened(tmp_path / "press.mcap", trigger="button")
+    assert not sink.recording
+    assert not sink.wants()
+    write(sink, range(5))
+    for first in (5, 20):
+        sink.start_recording()
+        assert sink.recording
+        sink.start_recording()
+        write(sink, range(first, first + 4))
+        sink.stop_recording()
+        assert not sink.recording
+        write(sink, range(first + 4, first + 6))
+    sink.stop_recording()
+    sink.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "press-007.mcap",
+        "press-008.mcap",
+        "press-009.mcap",
+    ]
+    assert seqs_in(tmp_path / "press-008.mcap") == [0, 5, 6, 7, 8]
+    assert seqs_in(tmp_path / "press-009.mcap") == [0, 20, 21, 22, 23]
+
+
+def test_after_the_first_file_the_button_goes_on_with_numbers(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "press.mcap")
+    write(sink, range(3))
+    sink.stop_recording()
+    write(sink, range(3, 5))
+    sink.start_recording()
+    write(sink, range(5, 7))
+    sink.close()
+    assert seqs_in(tmp_path / "press.mcap") == [0, 1, 2]
+    assert seqs_in(tmp_path / "press-001.mcap") == [0, 5, 6]
+
+
+def test_the_ring_saves_its_last_seconds_while_frames_go_on(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "ring.mcap", ring=2.0)
+    write(sink, range(100))
+    assert not list(tmp_path.iterdir())
+    assert sink.counters()["ring_frames"] == 21
+    sink.start_recording()
+    assert sink.recording
+    write(sink, range(100, 110))
+    assert not sink.recording
+    sink.close()
+    assert seqs_in(tmp_path / "ring-001.mcap") == [0, *range(79, 100)]
+
+
+def test_the_ring_is_saved_even_if_the_run_ends_at_once(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "ring.mcap", ring=2.0)
+    write(sink, range(50))
+    sink.start_recording()
+    sink.close()
+    assert seqs_in(tmp_path / "ring-001.mcap") == [0, *range(29, 50)]
+
+
+def test_the_ring_never_takes_more_memory_than_allowed(tmp_path: Path) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (500, 700, 3), np.uint8)
+    sink = opened(tmp_path / "ring.mcap", ring=1000.0, memory=16, preview=0)
+    for seq in range(30):
+        sink.write(Tick(Frame("main", seq, seq / FPS, noise)), None, None, None, None)
+        assert sink.counters()["ring_bytes"] <= 16_000_000
+    assert 10 <= sink.counters()["ring_frames"] < 30
+    sink.close()
+
+
+def test_each_contact_gets_a_file_with_what_came_before_and_after(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "touch.mcap", ring=1.0, trigger="contact", after=0.5)
+    write(sink, range(30))
+    write(sink, range(30, 40), TOUCH)
+    write(sink, range(40, 80))
+    assert not sink.recording
+    write(sink, range(80, 83), TOUCH)
+    sink.close()
+    first, second = sorted(tmp_path.iterdir())
+    # The ring holds 1 s = frames 19 to 29 (both ends count); 0.5 s after the last touch is frame 44.
+    assert seqs_in(first) == [0, *range(19, 45)]
+    assert seqs_in(second) == [0, *range(69, 83)]
+
+
+def test_a_contact_that_comes_back_goes_into_the_same_file(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "touch.mcap", ring=5.0, trigger="contact", after=0.1)
+    write(sink, range(60))
+    write(sink, range(60, 62), TOUCH)
+    write(sink, range(62, 66))
+    write(sink, range(66, 68), TOUCH)
+    write(sink, range(68, 120))
+    sink.close()
+    (path,) = tmp_path.iterdir()
+    assert seqs_in(path) == [0, *range(9, 69)]
+
+
+def test_a_contact_that_was_stopped_by_hand_does_not_begin_again_by_itself(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "touch.mcap", trigger="contact")
+    write(sink, range(1, 4), TOUCH)
+    sink.stop_recording()
+    write(sink, range(4, 8), TOUCH)
+    assert not sink.recording
+    write(sink, range(8, 10))
+    write(sink, range(10, 12), TOUCH)
+    assert sink.recording
+    sink.close()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_ring_across_two_epochs_brings_the_references_of_the_older_one(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "ring.mcap", ring=1.0)
+    for seq in range(30):
+        frame = Frame(
+            "main", seq, seq / FPS, image(seq), reference=seq in (0, 1, 25), epoch=1 if seq >= 25 else 0
+        )
+        sink.write(Tick(frame), None, None, None, None)
+    sink.start_recording()
+    sink.close()
+    source = open_source(str(tmp_path / "ring-001.mcap"))
+    assert isinstance(source, Recording)
+    stamps = [item[2] for item in iter(source.read_stamped, None)]
+    assert [stamp.seq for stamp in stamps] == [0, 1, *range(19, 30)]
+    assert [stamp.seq for stamp in stamps if stamp.reference] == [0, 1, 25]
+    assert [stamp.epoch for stamp in stamps] == [0] * 8 + [1] * 5
+    assert [stamp.seq for stamp in stamps if not stamp.paced] == [0, 1]
+
+
+def test_a_full_disk_is_a_clear_error_and_what_was_written_can_be_played(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    sink = opened(path)
+    limit = 60_000
+    with disk_full_after(limit), pytest.raises(StageError, match=r"can be played.*tactflow repair") as caught:
+        write(sink, range(10_000))
+    sink.close()
+    seqs = seqs_in(path)
+    assert seqs == list(range(len(seqs)))
+    assert f"the {len(seqs)} frames written before are complete" in str(caught.value)
+    # A frame takes under 2 kB, so the limit is reached within one frame's size.
+    assert path.stat().st_size > limit - 8000
+
+
+def test_a_disk_that_is_full_at_the_end_keeps_all_frames(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    sink = opened(path)
+    write(sink, range(5))
+    with disk_full_after(path.stat().st_size), pytest.raises(StageError, match="the 5 frames"):
+        sink.close()
+    assert seqs_in(path) == list(range(5))
+
+
+def test_without_the_extra_the_error_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *a: None if name == "mcap" else found(name, *a)
+    )
+    with pytest.raises(StageError, match=r"recordings need mcap: pip install 'tactflow\[record\]'"):
+        opened(tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize(
+    ("params", "words"),
+    [
+        ({"path": "a.avi"}, "pattern"),
+        ({"ring": 30, "trigger": "start"}, "set trigger to button or contact"),
+        ({"ring": 0}, "greater than 0"),
+    ],
+)
+def test_parameters_that_make_no_sense_are_refused(params: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        Record.Params(**params)
+
+
+def test_pictures_come_at_their_own_rate(tmp_path: Path) -> None:
+    for rate, count in ((0.0, 0), (2.0, 8), (10.0, 40), (240.0, 40)):
+        path = tmp_path / f"{rate}.mcap"
+        sink = opened(path, preview=rate)
+        write(sink, range(40))
+        sink.close()
+        with path.open("rb") as file:
+            assert len(list(make_reader(file).iter_messages("/main/image"))) == count
+
+
+def test_results_are_the_messages_that_other_sinks_publish(tmp_path: Path) -> None:
+    sink = opened(tmp_path / "a.mcap")
+    write(sink, range(2), TOUCH)
+    sink.close()
+    with (tmp_path / "a.mcap").open("rb") as file:
+        messages = [orjson.loads(m.data) for _, _, m in make_reader(file).iter_messages("/main/results")]
+    assert [message["seq"] for message in messages] == [0, 1]
+    assert messages[1]["contact"]["area"] == 4.0

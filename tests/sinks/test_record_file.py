@@ -1,0 +1,174 @@
+"""The recorded file, read by programs that are not ours: the mcap library, protobuf, JSON Schema."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jsonschema
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from tactflow.engine.config import load_pipeline
+from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.run import Runner
+from tactflow.message import message_schema
+from tactflow.recording.frames import FrameCoder, StoredFrame
+from tactflow.recording.protobuf import decode, encode, unzigzag, zigzag
+from tactflow.recording.schemas import plain_schema
+from tactflow.sinks.record import Record
+from tactflow.vision.types import Contact, Ellipse, Flow
+
+PIPELINE = """\
+sensor: left    # a comment
+stages:
+  capture: {source: "sim:press?frames=20"}
+sinks:
+  record: {path: PATH, preview: 30}
+"""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    file = folder / "pipeline.yaml"
+    file.write_text(PIPELINE.replace("PATH", str(folder / "a.mcap")))
+    pipeline = load_pipeline(file, overrides=["stages.capture.source=sim:press?frames=12"])
+    assert Runner(pipeline).run().exit_code == 0
+    return folder / "a.mcap"
+
+
+def test_pictures_are_foxglove_compressed_images(recording: Path) -> None:
+    with recording.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        found = list(reader.iter_decoded_messages("/left/image"))
+    assert len(found) >= 4
+    for schema, channel, message, picture in found:
+        assert schema is not None
+        assert (schema.name, schema.encoding) == ("foxglove.CompressedImage", "protobuf")
+        assert channel.message_encoding == "protobuf"
+        assert (picture.format, picture.frame_id) == ("jpeg", "left")
+        assert picture.timestamp.seconds * 10**9 + picture.timestamp.nanos == message.log_time
+        pixels = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
+        assert pixels is not None
+        assert pixels.shape == (600, 800, 3)
+
+
+def test_raw_frames_can_be_unpacked_by_anybody_from_the_schema_in_the_file(recording: Path) -> None:
+    zstandard = pytest.importorskip("zstandard")
+    ours = StoredFrame.parse
+    with recording.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = list(reader.iter_decoded_messages(["/left/frames", "/left/references"]))
+    assert [message.sequence for _, _, message, _ in found] == list(range(12))
+    for _, _, message, frame in found:
+        assert (frame.width, frame.height, frame.encoding, frame.codec) == (800, 600, "bgr8", "up+zstd")
+        assert frame.reference == (frame.seq == 0)
+        rows = np.frombuffer(zstandard.decompress(frame.data), np.uint8).reshape(600, 800, 3)
+        pixels = np.add.accumulate(rows, axis=0, dtype=np.uint8)
+        np.testing.assert_array_equal(pixels, ours(message.data).image())
+        assert ours(message.data).t == frame.t == frame.seq / 60
+
+
+def test_the_file_says_how_it_was_made(recording: Path, tmp_path: Path) -> None:
+    with recording.open("rb") as file:
+        reader = make_reader(file)
+        texts = {item.name: item.data.decode() for item in reader.iter_attachments()}
+        (facts,) = (item.metadata for item in reader.iter_metadata() if item.name == "tactflow")
+    assert {"tactflow", "numpy", "opencv", "python"} <= set(facts)
+    assert facts["opencv"] == cv2.__version__
+    assert "# a comment" in texts["pipeline.original.yaml"]
+    settings = yaml.safe_load(texts["pipeline.yaml"])
+    assert settings["stages"]["capture"]["source"] == "sim:press?frames=12"
+    assert settings["sensor"] == "left"
+    again = tmp_path / "again.yaml"
+    again.write_text(texts["pipeline.yaml"])
+    assert load_pipeline(again).sensor == "left"
+    assert json.loads(texts["message.schema.json"]) == message_schema()
+
+
+def test_results_are_valid_under_the_schema_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    sink = Record(Record.Params(path=str(path)))
+    sink.open()
+    contact = Contact(4.0, (1.0, 1.0), 10.0, -0.2, np.eye(3, 2), Ellipse((1.0, 1.0), (3.0, 2.0), 10.0), 0.5)
+    pixels = np.zeros((3, 4, 3), np.uint8)
+    sink.write(Tick(Frame("main", 0, 0.0, pixels)), None, contact, Flow((1.0, 2.0), 3), None)
+    sink.close()
+    with path.open("rb") as file:
+        ((schema, channel, message),) = make_reader(file).iter_messages("/main/results")
+    assert schema is not None
+    assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+    plain = json.loads(schema.data)
+    result = json.loads(message.data)
+    jsonschema.validate(result, message_schema())
+    # The schema for plotting programs does not know null: they look at fields that have a value.
+    jsonschema.validate(without_nulls(result), plain)
+
+
+def test_the_schema_for_plots_has_one_type_everywhere_and_no_references() -> None:
+    def check(part: dict[str, Any], path: str) -> None:
+        assert isinstance(part["type"], str), path
+        assert not {"$ref", "anyOf", "prefixItems", "const"} & set(part), path
+        for name, field in part.get("properties", {}).items():
+            check(field, f"{path}.{name}")
+        if part["type"] == "array":
+            check(part["items"], f"{path}[]")
+
+    plain = plain_schema(message_schema())
+    assert plain["type"] == "object"
+    check(plain, "")
+    assert plain["properties"]["contact"]["properties"]["area"]["type"] == "number"
+    assert plain["properties"]["markers"]["properties"]["position"]["items"]["items"]["type"] == "number"
+
+
+def without_nulls(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: without_nulls(item) for key, item in value.items() if item is not None}
+    return value
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1), (480, 640)])
+def test_pixels_come_back_whatever_the_size(shape: tuple[int, int]) -> None:
+    random = np.random.default_rng(0)
+    for pixels in (random.integers(0, 256, (*shape, 3), np.uint8), np.full((*shape, 3), 255, np.uint8)):
+        packed = FrameCoder().encode(Frame("main", 3, 0.1, pixels, epoch=2))
+        stored = StoredFrame.parse(packed)
+        np.testing.assert_array_equal(stored.image(), pixels)
+        assert (stored.seq, stored.t, stored.epoch, stored.reference) == (3, 0.1, 2, False)
+
+
+def test_a_view_of_an_image_is_recorded_as_it_looks() -> None:
+    whole = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    view = whole[::-2, 3:20:3]
+    stored = StoredFrame.parse(FrameCoder().encode(Frame("main", 0, 0.0, view)))
+    np.testing.assert_array_equal(stored.image(), view)
+
+
+@given(st.binary(max_size=200))
+def test_bytes_that_are_no_frame_are_refused(data: bytes) -> None:
+    with pytest.raises(ValueError):
+        StoredFrame.parse(data).image()
+
+
+def test_damaged_pixels_are_refused() -> None:
+    packed = FrameCoder().encode(Frame("main", 0, 0.0, np.full((9, 9, 3), 7, np.uint8)))
+    with pytest.raises(ValueError, match="damaged"):
+        StoredFrame.parse(packed[:-1] + b"x" if packed[-1:] != b"x" else packed[:-1] + b"y").image()
+
+
+@given(st.integers(-(2**62), 2**62))
+def test_signed_numbers_survive(number: int) -> None:
+    fields = decode(encode([(1, zigzag(number)), (2, 0.5), (3, b"ab")]))
+    value = fields[1]
+    assert isinstance(value, int)
+    assert unzigzag(value) == number
+    assert fields[2] == 0.5
+    assert fields[3] == b"ab"
