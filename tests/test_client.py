@@ -66,6 +66,16 @@ def test_every_message_arrives_as_a_dict(publisher: Publisher) -> None:
         assert (messages.received, messages.lost) == (3, 0)
 
 
+def test_statistics_that_somebody_else_asked_for_are_no_results(publisher: Publisher) -> None:
+    with Subscriber(publisher.endpoint, timeout=LONG) as messages:
+        publisher.wait()
+        assert publisher.sink._socket is not None
+        publisher.sink._socket.send(b'tactflow.stats {"frames": 7}')
+        publisher.send(5)
+        assert next(iter(messages))["seq"] == 5
+        assert messages.received == 1
+
+
 @pytest.mark.parametrize(
     ("seqs", "lost"),
     [

@@ -22,6 +22,10 @@ DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Where tactflow publishes unless its pipeline says otherwise."""
 
 
+STATISTICS = b"tactflow.stats"
+"""Topic of a run's statistics, which no sensor may be called after."""
+
+
 class Subscriber:
     """Receives result messages (`tactflow.frame/1`) as dicts; a context manager and an iterator.
 
@@ -100,9 +104,9 @@ class Subscriber:
             left = None if deadline is None else max(int((deadline - time.monotonic()) * 1000), 0)
             if not self._socket.poll(left):
                 raise TimeoutError(self._silence())
-            # Someone else's message that shares the beginning of our topic has no JSON in it.
-            _, _, body = self._socket.recv().partition(b" ")
-            if body.startswith(b"{"):
+            # Not every message that shares the beginning of our topic is a result: there are statistics too.
+            topic, _, body = self._socket.recv().partition(b" ")
+            if body.startswith(b"{") and topic != STATISTICS:
                 self.received += 1
                 return body
 

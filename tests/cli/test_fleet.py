@@ -162,6 +162,7 @@ def test_one_signal_ends_all_sensors_well(folder: Path) -> None:
         (GRAPH.replace("rotate: 0", "rotate: 7"), [], "pipeline.yaml:8:28"),
         (GRAPH.replace("  left: {stages:", "  left: {stagse:"), [], "did you mean stages?"),
         (GRAPH.replace("  left:", "  'le ft':"), [], "a name is a word"),
+        (GRAPH.replace("left:", "stats:"), [], "give the sensor another name"),
         (GRAPH + "sensor: main\n", [], "already; leave this one out"),
         (
             "sensors: []\n" + GRAPH[GRAPH.index('stages:\n  capture: {source: "sim:idle"}') :],

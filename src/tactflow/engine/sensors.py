@@ -11,6 +11,7 @@ parameter. `{sensor}` in any text of a sink stands for the sensor's name.
 from __future__ import annotations
 
 from tactflow.engine import envelope
+from tactflow.engine.graph import Mark
 from tactflow.engine.registry import did_you_mean
 from tactflow.engine.yamlmap import Entry, Item, Problems
 
@@ -18,6 +19,7 @@ CHANGEABLE = ("skipping", "opencv_threads", "stages", "sinks")
 """What a sensor may change."""
 
 PLACEHOLDER = "{sensor}"
+RESERVED = "stats"
 
 
 def names(root: Item) -> list[str]:
@@ -34,6 +36,7 @@ def select(root: Item, chosen: str | None, problems: Problems) -> tuple[Item, st
     entry = root.entries.get("sensors")
     if entry is None:
         own = envelope.word(root.entries, "sensor", "", problems) or "main"
+        _refuse_reserved(own, root.entries["sensor"].mark if own == RESERVED else root.mark, problems)
         if chosen is not None and chosen != own:
             problems.add(root.mark, f"there is no sensor {chosen!r}; the file's only sensor is {own}")
         return _named(root, own), own
@@ -46,6 +49,11 @@ def select(root: Item, chosen: str | None, problems: Problems) -> tuple[Item, st
     rest = Item({key: value for key, value in root.entries.items() if key != "sensors"}, root.mark)
     merged = _laid_over(rest, changes.item) if changes and changes.item.is_mapping else rest
     return _named(merged, name), name
+
+
+def _refuse_reserved(name: str, mark: Mark, problems: Problems) -> None:
+    if name == RESERVED:
+        problems.add(mark, f"{name} is the topic of a run's statistics; give the sensor another name")
 
 
 def _check(root: Item, entry: Entry, problems: Problems) -> None:
@@ -61,6 +69,7 @@ def _check(root: Item, entry: Entry, problems: Problems) -> None:
             f"sensor: the names stand under sensors ({entry.mark}) already; leave this one out",
         )
     for name, changes in entry.item.entries.items():
+        _refuse_reserved(name, changes.mark, problems)
         if not envelope.is_word(name):
             problems.add(changes.mark, f"sensors.{name}: a name is a word of letters, digits, _ and -")
         elif not changes.item.is_mapping:
