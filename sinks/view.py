@@ -19,7 +19,7 @@ from tactflow.engine.frame import Tick
 from tactflow.engine.stage import StageParams
 from tactflow.message import encode_message
 from tactflow.ports import Image
-from tactflow.view.address import address, bind, is_loopback
+from tactflow.view.address import Neighbours, address, bind, is_loopback
 from tactflow.vision.types import Contact, Flow, Markers
 
 if TYPE_CHECKING:
@@ -69,6 +69,11 @@ class View:
         max_size: int = Field(
             1280, ge=64, description="larger pictures are reduced to this length of their longer side, px"
         )
+        neighbours: str | None = Field(
+            None,
+            description="folder in which the views of a run of several sensors tell each other where they "
+            "are; such a run sets it by itself",
+        )
         open_browser: bool = Field(False, description="open the page in the desktop's browser")
 
         @model_validator(mode="after")
@@ -101,6 +106,7 @@ class View:
         self._control = control
         self._hub: Hub | None = None
         self._server: Server | None = None
+        self._neighbours = None if params.neighbours is None else Neighbours(Path(params.neighbours), sensor)
         self._interval = 1.0 / params.max_fps
         self._due = float("-inf")
         self._encoded = 0
@@ -121,13 +127,15 @@ class View:
             from tactflow.view.server import Server
 
             listener = bind(p.host, p.port)
+            if self._neighbours is not None:
+                self._neighbours.announce(listener.getsockname()[1])
         except (ImportError, OSError, UnicodeError) as error:
             log.warning("view: not shown, because %s:%d cannot be served: %s", p.host, p.port, error)
             return
         port = listener.getsockname()[1]
-        if p.port not in (0, port):
+        if p.port not in (0, port) and self._neighbours is None:
             log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
-        self._hub = Hub(self._control, self._sensor)
+        self._hub = Hub(self._control, self._sensor, self._neighbours or dict)
         self._server = Server(self._hub, listener, p.host, p.token)
         self._server.start()
         self.description = address(p.host, port)
@@ -183,5 +191,8 @@ class View:
     def close(self) -> None:
         """Tell the pages that the run has ended, and serve no more."""
         server, self._server = self._server, None
-        if server is not None:
-            server.close()
+        if server is None:
+            return
+        if self._neighbours is not None:
+            self._neighbours.leave()
+        server.close()

@@ -136,7 +136,9 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
     contexts: list[Any] = []
     complaints: list[str] = []
 
-    def open_(url: str, *, lost: bool = False, prepare: Any = None, **options: Any) -> Any:
+    def open_(
+        url: str, *, everywhere: bool = False, lost: bool = False, prepare: Any = None, **options: Any
+    ) -> Any:
         options = {"viewport": {"width": 1400, "height": 900}, "color_scheme": "dark"} | options
         context = browser.new_context(**options)
         contexts.append(context)
@@ -150,7 +152,8 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
                 complaints.append(message.text)
 
         def check_target(request: Any) -> None:
-            if not request.url.startswith(url):
+            origin = "http://127.0.0.1:" if everywhere else url
+            if not request.url.startswith(origin):
                 complaints.append(f"asked for {request.url}")
 
         page.on("console", complain)
@@ -395,6 +398,30 @@ def test_two_browsers_watch_one_run(run: Callable[..., Run], open_page: Callable
     status(other, "paused")
 
 
+def test_sensors_of_several_processes_share_their_tabs(
+    run: Callable[..., Run], open_page: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "pipeline.yaml").write_text(
+        "sensors:\n"
+        f"  left: {{stages: {{capture: {{source: '{ENDLESS}', realtime: true}}}}}}\n"
+        "  right: {stages: {capture: {source: 'sim:idle?frames=100000', realtime: true}}}\n"
+        f"stages:\n  capture: {{source: '{ENDLESS}'}}\n  preprocess: {{downsample: 2}}\n"
+        "sinks:\n  view: {}\n"
+    )
+    started = run(cwd=tmp_path)
+    page = open_page(started.url, everywhere=True, lost=True)
+    watch(page)
+    until(page, "() => document.getElementById('tabs').innerText.split(/\\s+/).join() === 'left,right'")
+    for sensor, source in (("right", "sim:idle"), ("left", "sim:twist")):
+        page.click(f"#tabs >> text={sensor}")
+        until(page, "s => document.querySelector('#tabs [aria-selected=true]')?.textContent === s", sensor)
+        watch(page)
+        assert page.inner_text("#source").startswith(source)
+    started.process.send_signal(signal.SIGTERM)
+    assert started.exit_code() == 0
+    status(page, "ended")
+
+
 def test_a_token_is_asked_for_and_leaves_the_address(
     run: Callable[..., Run], open_page: Callable[..., Any]
 ) -> None:
@@ -542,7 +569,7 @@ def state(sensor: str, **changes: Any) -> str:
     source = {"description": f"camera of {sensor}", "live": True, "total": None, "state": "connected"}
     whole = {
         **{"type": "state", "sensor": sensor, "paused": False, "recording": False, "end": None},
-        **{"source": source, "refused": dict.fromkeys(names)},
+        **{"neighbours": {}, "source": source, "refused": dict.fromkeys(names)},
     }
     return json.dumps(whole | changes)
 

@@ -11,7 +11,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,11 +44,14 @@ PATIENCE = 10.0
 class FakeRun:
     """A run that notes what it is asked to do."""
 
-    def __init__(self, *, live: bool = False, nodes: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, *, live: bool = False, recorder: Any = None) -> None:
         self.calls: list[Any] = []
         self.paused = False
         self.source = SimpleNamespace(live=live, total=600, description="a test", retake=lambda: None)
-        self.nodes = nodes or {}
+        self.sink = recorder
+
+    def recorder(self) -> Any:
+        return self.sink
 
     def stop(self, reason: str = "signal") -> None:
         self.calls.append(("stop", reason))
@@ -355,7 +358,7 @@ def test_a_record_sink_in_the_run_is_started_and_stopped(
     view: Callable[..., View], page: Callable[..., Page]
 ) -> None:
     recorder = FakeRecorder()
-    browser = page(view(FakeRun(nodes={"record": SimpleNamespace(instance=recorder)})))
+    browser = page(view(FakeRun(recorder=recorder)))
     assert browser.next("state")["refused"]["record"] is None
     browser.say(do="record", value=True)
     browser.until("state", lambda state: state["recording"])
@@ -372,7 +375,7 @@ def test_a_failing_recorder_is_reported_and_ends_nothing(
         def start_recording(self) -> None:
             raise OSError("no space left")
 
-    browser = page(view(FakeRun(nodes={"record": SimpleNamespace(instance=Full())})))
+    browser = page(view(FakeRun(recorder=Full())))
     browser.say(do="record", value=True)
     assert "no space left" in browser.next("note")["text"]
     assert "no space left" in caplog.text
@@ -642,6 +645,22 @@ def test_an_opened_view_closes_without_ever_having_had_a_page(view: Callable[...
     sink.close()
     sink.close()
     assert not any(thread.name == "tactflow-view-server" for thread in threading.enumerate())
+
+
+def test_views_of_several_sensors_know_of_each_other(
+    stack: ExitStack, page: Callable[..., Page], tmp_path: Path
+) -> None:
+    views = {}
+    for sensor in ("left", "right"):
+        views[sensor] = View(View.Params(port=0, neighbours=str(tmp_path)), sensor, control=FakeRun())
+        stack.callback(views[sensor].close)
+        views[sensor].open()
+    address = views["right"].description
+    assert address is not None
+    browser = page(views["left"])
+    assert browser.next("state")["neighbours"] == {"right": int(address.rstrip("/").rpartition(":")[2])}
+    views["right"].close()
+    browser.until("state", lambda state: state["neighbours"] == {})
 
 
 def test_too_many_pages_are_turned_away(view: Callable[..., View], page: Callable[..., Page]) -> None:

@@ -67,6 +67,12 @@ def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipe
                 for sensor, id_ in ids
                 if sensor == name
             ]
+            # Their pages show a tab for each other.
+            private += [
+                f"sinks.{node.id}.neighbours={scratch}"
+                for node in pipelines[name].sinks
+                if node.component.name == "view"
+            ]
             members.append(_Member(name, _command(args, file, name, private)))
         return _Supervisor(members).run()
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import ipaddress
 import socket
+from collections.abc import Mapping
+from pathlib import Path
 
 LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "[::1]"})
 """What a browser on this machine may call it."""
@@ -59,3 +61,36 @@ def bind(host: str, port: int, *, tries: int = 20) -> socket.socket:
         else:
             return listener
     raise AssertionError("port 0 either binds or raises")
+
+
+class Neighbours:
+    """How the views of a run of several sensors, one process each, find each other: a file each in a folder.
+
+    folder : shared by them and by nobody else. sensor : whose view this is.
+    """
+
+    def __init__(self, folder: Path, sensor: str) -> None:
+        self._folder = folder
+        self._own = folder / f"{sensor}.view"
+
+    def announce(self, port: int) -> None:
+        """Tell the others where this view is."""
+        draft = self._own.with_suffix(".draft")
+        draft.write_text(str(port))
+        draft.replace(self._own)
+
+    def leave(self) -> None:
+        """This view has ended."""
+        self._own.unlink(missing_ok=True)
+
+    def __call__(self) -> Mapping[str, int]:
+        """Sensor -> port of every other view that is there now."""
+        found: dict[str, int] = {}
+        for file in sorted(self._folder.glob("*.view")):
+            if file != self._own:
+                try:
+                    found[file.stem] = int(file.read_text())
+                except (OSError, ValueError):
+                    # It has ended in this moment.
+                    continue
+        return found

@@ -97,11 +97,18 @@ class Hub:
     ----------
     control : handle on the run; None shows frames without any control over it.
     sensor : name of the sensor this run serves.
+    neighbours : tells the ports of other sensors' pages by their names.
     """
 
-    def __init__(self, control: Control | None, sensor: str) -> None:
+    def __init__(
+        self,
+        control: Control | None,
+        sensor: str,
+        neighbours: Callable[[], Mapping[str, int]] = dict,
+    ) -> None:
         self.control = control
         self.sensor = sensor
+        self.neighbours = neighbours
         self.run_id = secrets.token_hex(8)
         self.wanted = False
         """Whether a page has credit."""
@@ -223,13 +230,14 @@ class Hub:
         """The message that says what the run is doing, and which buttons work (null) or why not."""
         control = self.control
         source = getattr(control, "source", None)
-        recorder = find_recorder(control)
+        recorder = None if control is None else control.recorder()
         return _text(
             type="state",
             sensor=self.sensor,
             paused=bool(control and control.paused),
             recording=bool(recorder is not None and recorder.recording),
             end=self._end,
+            neighbours=self.neighbours(),
             source={
                 "description": _words(source, "description"),
                 "live": bool(getattr(source, "live", False)),
@@ -328,7 +336,7 @@ class Hub:
             return None if control.paused else "pause first"
         if name == "reference" and not hasattr(source, "retake"):
             return "this source cannot take a new reference"
-        if name == "record" and find_recorder(control) is None:
+        if name == "record" and control.recorder() is None:
             return "no record sink in this pipeline"
         return None
 
@@ -346,7 +354,8 @@ class Hub:
         self.control.retake_reference()
 
     def _record(self, value: Any) -> None:
-        recorder = find_recorder(self.control)
+        assert self.control is not None
+        recorder = self.control.recorder()
         if recorder is not None:
             if value is True:
                 recorder.start_recording()
@@ -365,19 +374,6 @@ class Hub:
         except RuntimeError:
             # The run is still opening its sinks: its tables grew while they were read. The next one is whole.
             return {}
-
-
-def find_recorder(control: Control | None) -> Any:
-    """The sink of the run that can start and stop recording, or None.
-
-    It has the methods `start_recording` and `stop_recording` and the attribute `recording`.
-    """
-    wanted = ("start_recording", "stop_recording", "recording")
-    for node in list(getattr(control, "nodes", {}).values()):
-        instance = getattr(node, "instance", None)
-        if all(hasattr(instance, name) for name in wanted):
-            return instance
-    return None
 
 
 def _words(thing: Any, name: str) -> str | None:

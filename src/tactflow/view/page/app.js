@@ -55,7 +55,10 @@ const connection = new Connection({
     refresh();
   },
   state(message) {
-    sensor(message.sensor).state = message;
+    const s = sensor(message.sensor);
+    const changed = JSON.stringify(message.neighbours) !== JSON.stringify(s.state?.neighbours);
+    s.state = message;
+    if (changed) drawTabs();
     refresh();
   },
   stats(message) {
@@ -231,9 +234,18 @@ function skips(node) {
   return parts.join(", ") || "–";
 }
 
+// Sensors of this run, and those that other processes of a run of several serve on pages of their own.
+function tabs() {
+  const all = new Map([...sensors.keys()].map((name) => [name, null]));
+  for (const { state } of sensors.values()) {
+    for (const [name, port] of Object.entries(state?.neighbours ?? {})) if (!all.has(name)) all.set(name, port);
+  }
+  return new Map([...all].sort(([a], [b]) => (a < b ? -1 : 1)));
+}
+
 function drawTabs() {
   const focused = $("tabs").contains(document.activeElement);
-  $("tabs").replaceChildren(...[...sensors.keys()].map((name) => {
+  $("tabs").replaceChildren(...[...tabs().keys()].map((name) => {
     const tab = document.createElement("button");
     const chosen = name === current;
     Object.assign(tab, { type: "button", textContent: name, tabIndex: chosen ? 0 : -1 });
@@ -247,6 +259,12 @@ function drawTabs() {
 }
 
 function choose(name) {
+  const port = tabs().get(name);
+  if (port) {
+    const token = connection.token ? `?token=${encodeURIComponent(connection.token)}` : "";
+    location.assign(`${location.protocol}//${location.hostname}:${port}/${token}`);
+    return;
+  }
   current = name;
   drawTabs();
   const s = sensors.get(name);
@@ -385,7 +403,7 @@ keys.x = "magnify";
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, textarea, select")) return;
   if (event.target.matches('[role="tab"]') && ["ArrowLeft", "ArrowRight"].includes(event.key)) {
-    const names = [...sensors.keys()];
+    const names = [...tabs().keys()];
     const step = event.key === "ArrowRight" ? 1 : -1;
     choose(names[(names.indexOf(current) + step + names.length) % names.length]);
     return;
