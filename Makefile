@@ -15,7 +15,7 @@ run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
 
 test: lint types
-	$(PY) -m pytest
+	$(PY) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .
