@@ -114,5 +114,6 @@ def _smoothed(values: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     """Mean over the near cells, with a trace of the wide window's and of the whole frame's."""
     near = cv2.GaussianBlur(values, (3, 3), 0)
     mixed = cv2.scaleAdd(cv2.blur(values, (size, size)), _FAR, near)
-    everywhere = np.asarray(cv2.mean(values), np.float64) * _TRACE
-    return np.asarray(cv2.add(mixed, everywhere), np.float32)
+    everywhere = np.asarray(cv2.mean(values), np.float32) * np.float32(_TRACE)
+    # Not by cv2.add, which takes an array of four numbers for a colour.
+    return np.asarray(mixed + (everywhere[:3] if values.ndim == 3 else everywhere[0]), np.float32)

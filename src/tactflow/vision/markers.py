@@ -213,7 +213,8 @@ def neighbour_graph(centers: FloatArray, longest: float) -> NDArray[np.int64]:
     # A tenth more than a right angle's sum of squares still blocks: a skewed square has no diagonals then.
     blocked = squared[:, None, :] + between < 1.1 * squared[:, :, None]
     blocked &= ~np.eye(near.shape[1], dtype=bool)
-    keep = ~blocked.any(axis=2) & (distances <= longest)
+    # Of marks in one place, the nearest may be the mark itself.
+    keep = ~blocked.any(axis=2) & (distances <= longest) & (distances > 0)
     first = np.repeat(np.arange(count), keep.sum(axis=1))
     pairs = np.sort(np.column_stack([first, near[keep]]), axis=1)
     return np.unique(pairs, axis=0).astype(np.int64)
