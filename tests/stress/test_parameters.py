@@ -1,0 +1,167 @@
+"""What is no finite number is refused with words, by functions and in pipeline files alike."""
+
+from __future__ import annotations
+
+import math
+import re
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from tactflow.engine.config import load_pipeline
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.registry import names, resolve
+from tactflow.vision.change import ChangeProbe
+from tactflow.vision.contact import ContactDetector, chi_square_threshold
+from tactflow.vision.draw import Annotator
+from tactflow.vision.flow import flow_in_mask
+from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
+from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.inpaint import remove_markers
+from tactflow.vision.marker_mask import Dot, find_dot
+from tactflow.vision.markers import detect_markers
+from tactflow.vision.seed_tracker import SeedTracker
+from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
+from tactflow.vision.tracking import MarkerTracker
+from tactflow.vision.types import Markers
+from tests.stress.builders import gel
+
+UNUSABLE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+MASK = np.full((20, 30), 255, np.uint8)
+IMAGE = np.full((20, 30, 3), 100, np.uint8)
+NO_MARKERS = Markers(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.uint8), np.zeros(0))
+SQUARE = np.array([[0.0, 0], [29, 0], [0, 19], [29, 19]])
+CAMERA = np.array([[30.0, 0, 15], [0, 30, 10], [0, 0, 1]])
+
+
+def spoiled(points: Any, value: float) -> Any:
+    """The points with one coordinate replaced."""
+    copy = np.array(points, np.float64)
+    copy.flat[1] = value
+    return copy
+
+
+FUNCTIONS: dict[str, Callable[[float], Any]] = {
+    "contact_geometry.min_area": lambda v: contact_geometry(MASK, min_area=v),
+    "contact_geometry.min_confidence": lambda v: contact_geometry(MASK, min_confidence=v),
+    "regress_line.points": lambda v: regress_line(spoiled(SQUARE, v)),
+    "flow_in_mask.dilate": lambda v: flow_in_mask(NO_MARKERS, MASK, dilate=v),
+    "remove_markers.radius": lambda v: remove_markers(IMAGE, MASK // 255 * 0, radius=v),
+    "remove_markers.radius (telea)": lambda v: remove_markers(IMAGE, MASK, radius=v, method="telea"),
+    "remove_markers.radius (none)": lambda v: remove_markers(IMAGE, MASK, radius=v, method="none"),
+    "Dot.radius": lambda v: Dot(v),
+    "Dot.contrast": lambda v: Dot(3.0, "dark", v),
+    "find_dot.radius": lambda v: find_dot(IMAGE, radius=v),
+    "detect_markers.dot_radius": lambda v: detect_markers(IMAGE, dot_radius=v),
+    "MarkerTracker.max_displacement": lambda v: MarkerTracker(
+        gel().reference, detect_markers(gel().reference), max_displacement=v
+    ),
+    "SeedTracker.least_area": lambda v: SeedTracker(gel().reference, least_area=v),
+    "SeedTracker.most_area": lambda v: SeedTracker(gel().reference, most_area=v),
+    "chi_square_threshold": chi_square_threshold,
+    "ContactDetector.false_alarms": lambda v: ContactDetector(false_alarms=v),
+    "ContactDetector.repeatability": lambda v: ContactDetector(repeatability=v),
+    "ContactDetector.shift": lambda v: ContactDetector(shift=v),
+    "ContactDetector.relaxation": lambda v: ContactDetector(relaxation=v),
+    "ContactDetector.distance": lambda v: ContactDetector("colour", distance=v),
+    "ChangeProbe.false_alarms": lambda v: ChangeProbe(IMAGE, false_alarms=v),
+    "ChangeProbe.tile": lambda v: ChangeProbe(IMAGE, tile=v),  # type: ignore[arg-type]
+    "Annotator.arrow_scale": lambda v: Annotator(arrow_scale=v),
+    "Annotator.dilate": lambda v: Annotator(dilate=v),
+    "OneEuro.min_cutoff": lambda v: OneEuro(min_cutoff=v),
+    "OneEuro.speed_coefficient": lambda v: OneEuro(speed_coefficient=v),
+    "OneEuro.speed_cutoff": lambda v: OneEuro(speed_cutoff=v),
+    "OneEuro.period": lambda v: OneEuro(period=v),
+    "AlphaBeta.alpha": lambda v: AlphaBeta(alpha=v),
+    "AlphaBeta.beta": lambda v: AlphaBeta(beta=v),
+    "AlphaBeta.period": lambda v: AlphaBeta(period=v),
+    "ContactSmoother.min_cutoff": lambda v: ContactSmoother(min_cutoff=v),
+    "ContactSmoother.alpha": lambda v: ContactSmoother("alpha_beta", alpha=v),
+    "find_homography.source": lambda v: find_homography(spoiled(SQUARE, v), SQUARE),
+    "find_homography.destination": lambda v: find_homography(SQUARE, spoiled(SQUARE, v)),
+    "check_lens.camera_matrix": lambda v: check_lens(spoiled(CAMERA, v), [0, 0, 0, 0], False),
+    "check_lens.distortion": lambda v: check_lens(CAMERA, [0, v, 0, 0], False),
+    "Preprocessor.downsample": lambda v: Preprocessor((30, 20), downsample=v),  # type: ignore[arg-type]
+    "Preprocessor.rotate": lambda v: Preprocessor((30, 20), rotate=v),  # type: ignore[arg-type]
+    "Preprocessor.crop": lambda v: Preprocessor((30, 20), crop=(0, 0, v, 5)),  # type: ignore[arg-type]
+    "Preprocessor.homography size": lambda v: Preprocessor(
+        (30, 20),
+        homography=(SQUARE, SQUARE, (v, 5)),  # type: ignore[arg-type]
+    ),
+    "PixelMapping.to_processed": lambda v: PixelMapping.identity((30, 20)).to_processed([[1.0, v]]),
+    "PixelMapping.to_raw": lambda v: PixelMapping.identity((30, 20)).to_raw([[1.0, v]]),
+}
+
+
+@pytest.mark.parametrize("value", UNUSABLE)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_function_refuses_what_is_no_number_and_says_what_it_required(name: str, value: str) -> None:
+    with pytest.raises(ValueError, match="required") as caught:
+        FUNCTIONS[name](UNUSABLE[value])
+    # The value that came is named, or the kind of what came.
+    assert re.search(r"nan|inf|got", str(caught.value))
+
+
+def test_any_gap_may_be_bridged_but_not_an_unknown_one() -> None:
+    assert contact_geometry(MASK, max_gap=math.inf) is not None
+    for gap in (math.nan, -1.0, -math.inf):
+        with pytest.raises(ValueError, match="required max_gap"):
+            contact_geometry(MASK, max_gap=gap)
+
+
+# -- pipeline files ---------------------------------------------------------------------------------------
+
+
+def numbers_of(params: type[BaseModel], path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """The paths of all parameters that take a float, those of nested mappings included."""
+    found = []
+    for name, field in params.model_fields.items():
+        here = (*path, field.alias or name)
+        for annotation in _alternatives(field.annotation):
+            if annotation is float:
+                found.append(here)
+            elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
+                found += numbers_of(annotation, here)
+    return found
+
+
+def _alternatives(annotation: Any) -> list[Any]:
+    if get_origin(annotation) in (Union, types.UnionType):
+        return [inner for part in get_args(annotation) for inner in _alternatives(part)]
+    if get_origin(annotation) not in (None, Literal, list, dict, tuple) and get_args(annotation):
+        return _alternatives(get_args(annotation)[0])
+    return [annotation]
+
+
+COMPONENTS = [(section, name) for section in ("stages", "sinks") for name in names(section)]
+NUMBERS = [
+    pytest.param(section, name, path, id=f"{name}.{'.'.join(path)}")
+    for section, name in COMPONENTS
+    for path in numbers_of(resolve(section=section, use=name, directory=REPOSITORY).params)
+]
+
+
+@pytest.mark.parametrize("value", [".nan", ".inf", "-.inf"])
+@pytest.mark.parametrize(("section", "name", "path"), NUMBERS)
+def test_a_pipeline_file_refuses_what_is_no_number_with_its_place(
+    section: str, name: str, path: tuple[str, ...], value: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_pipeline(
+            REPOSITORY / "pipeline.yaml",
+            [f"{section}.{name}.use={name}", f"{section}.{name}.{'.'.join(path)}={value}"],
+        )
+    assert path[-1] in str(caught.value)
+    assert "Traceback" not in str(caught.value)
+
+
+def test_the_table_of_numbers_is_not_empty() -> None:
+    found = {parameter.id for parameter in NUMBERS}
+    assert {"hull.min_area", "tracker.dot", "smooth.alpha", "probe.false_alarms"} <= found

@@ -1,0 +1,306 @@
+"""Properties that hold whatever comes, searched for counter-examples by hypothesis.
+
+A failure prints the smallest example that was found, with a line (and in a random search the seed) that
+reproduces it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from numpy.typing import NDArray
+
+from tactflow.vision.contact import ContactDetector, chi_square_threshold
+from tactflow.vision.flow import flow_in_mask, inside_mask
+from tactflow.vision.geometry import Preprocessor, find_homography
+from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.inpaint import remove_markers
+from tactflow.vision.marker_matching import choose_spots
+from tactflow.vision.markers import detect_markers, neighbour_graph
+from tactflow.vision.smooth import AlphaBeta, OneEuro
+from tactflow.vision.types import Markers, MarkerStatus
+from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, INPAINTING, assert_defined, axis_difference
+
+# The same examples on every run, so that a change is judged by itself; TACTFLOW_STRESS=random searches anew.
+RANDOM = os.environ.get("TACTFLOW_STRESS") == "random"
+thorough = settings(
+    max_examples=60,
+    derandomize=not RANDOM,
+    deadline=None,
+    database=None,
+    print_blob=True,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+
+MASKS = arrays.arrays(
+    np.uint8, arrays.array_shapes(min_dims=2, max_dims=2, max_side=24), elements=st.sampled_from([0, 255])
+)
+PICTURES = arrays.arrays(
+    np.uint8, st.tuples(st.integers(1, 20), st.integers(1, 20), st.just(3)), elements=st.integers(0, 255)
+)
+COORDINATES = st.floats(-1e4, 1e4, allow_nan=False, width=32)
+
+
+def points(least: int = 1, most: int = 20) -> st.SearchStrategy[NDArray[Any]]:
+    return arrays.arrays(np.float64, st.tuples(st.integers(least, most), st.just(2)), elements=COORDINATES)
+
+
+@thorough
+@given(MASKS, st.sampled_from(HULLS), st.floats(0, 50), st.none() | st.floats(0, 50))
+def test_geometry_lies_within_its_mask(
+    mask: Any, method: Any, min_area: float, max_gap: float | None
+) -> None:
+    found = contact_geometry(mask, method=method, min_area=min_area, max_gap=max_gap)
+    assert_defined(found)
+    if found is None:
+        assert not mask.any() or method == "moments"
+        return
+    rows, columns = np.nonzero(mask)
+    assert found.hull[:, 0].min() >= columns.min()
+    assert found.hull[:, 1].max() <= rows.max()
+    if method == "moments":
+        assert found.region_area <= found.area
+        assert found.hull[:, 0].min() <= found.center[0] <= found.hull[:, 0].max()
+        assert found.hull[:, 1].min() <= found.center[1] <= found.hull[:, 1].max()
+        assert 0 <= found.confidence <= 1
+    if found.angle is not None:
+        assert -90 < found.angle <= 90
+
+
+@thorough
+@given(MASKS, st.integers(0, 3))
+def test_geometry_turns_with_its_mask(mask: Any, turns: int) -> None:
+    here, there = contact_geometry(mask), contact_geometry(np.ascontiguousarray(np.rot90(mask, turns)))
+    assert (here is None) == (there is None)
+    if here is None or there is None:
+        return
+    assert here.area == there.area
+    assert here.confidence == pytest.approx(there.confidence, abs=1e-12)
+    if here.angle is not None and there.angle is not None:
+        assert axis_difference(there.angle, here.angle + 90 * turns) < 1e-9
+
+
+@thorough
+@given(points(2), st.floats(-math.pi, math.pi), st.tuples(COORDINATES, COORDINATES))
+def test_a_line_moves_with_its_points(cloud: Any, turn: float, shift: Any) -> None:
+    line = regress_line(cloud)
+    assert_defined(line)
+    moved = regress_line(cloud + shift)
+    scale = float(np.abs(cloud).max() + np.abs(shift).max()) + 1
+    # The mean of up to 20 numbers: some ulps of the largest.
+    assert np.abs(np.subtract(moved.point, np.add(line.point, shift))).max() <= 1e-13 * scale
+    matrix = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    turned = regress_line(cloud @ matrix.T)
+    centred = cloud - cloud.mean(axis=0)
+    first, second = np.linalg.svd(centred, compute_uv=False)[:2]
+    if first > 0 and first - second > 1e-3 * scale:
+        assert line.angle is not None
+        assert turned.angle is not None
+        # Clockwise in y down is against the angle; rounding of 1e-16 * scale against a gap of 1e-3 * scale.
+        assert axis_difference(turned.angle, line.angle - math.degrees(turn)) < 1e-6
+
+
+@st.composite
+def marker_sets(draw: Any) -> Markers:
+    count = draw(st.integers(0, 15))
+    shape = (count, 2)
+    near = st.floats(-30, 50, allow_nan=False, width=32)
+    origin = draw(arrays.arrays(np.float64, shape, elements=near))
+    move = draw(arrays.arrays(np.float64, shape, elements=st.floats(-20, 20, width=32)))
+    status = draw(arrays.arrays(np.uint8, count, elements=st.integers(0, 2)))
+    return Markers(origin, origin + move, status, np.full(count, np.nan))
+
+
+@thorough
+@given(marker_sets(), MASKS, st.floats(0, 30), st.sampled_from(FLOWS), st.randoms(use_true_random=False))
+def test_the_flow_is_a_mean_of_displacements_in_any_order(
+    markers: Markers, mask: Any, dilate: float, method: Any, random: Any
+) -> None:
+    flow = flow_in_mask(markers, mask, dilate=dilate, method=method)
+    assert_defined(flow)
+    order = list(range(len(markers.status)))
+    random.shuffle(order)
+    other = Markers(
+        markers.origin[order], markers.position[order], markers.status[order], markers.stderr[order]
+    )
+    again = flow_in_mask(other, mask, dilate=dilate, method=method)
+    assert again.count == flow.count
+    if flow.mean is None:
+        assert flow.count == 0
+        return
+    moved = markers.displacement
+    np.testing.assert_allclose(again.mean, flow.mean, rtol=0, atol=1e-12)
+    assert (np.array(flow.mean) <= moved.max(axis=0) + 1e-12).all()
+    assert (np.array(flow.mean) >= moved.min(axis=0) - (1 if method == "seed" else 1e-12)).all()
+    if method == "mean":
+        assert flow.count <= np.count_nonzero(markers.status != MarkerStatus.LOST)
+
+
+@thorough
+@given(points(), MASKS, st.floats(0, 40), st.floats(0, 10))
+def test_more_dilation_never_takes_in_less(cloud: Any, mask: Any, dilate: float, more: float) -> None:
+    cloud = cloud % 40
+    few, many = inside_mask(cloud, mask, dilate), inside_mask(cloud, mask, dilate + more)
+    assert (few <= many).all()
+    rows, columns = np.nonzero(mask)
+    for point, inside in zip(np.rint(cloud), few, strict=True):
+        nearest = np.hypot(columns - point[0], rows - point[1]).min(initial=np.inf)
+        assert inside == (nearest <= dilate) or abs(nearest - dilate) < 1e-6
+
+
+@thorough
+@given(PICTURES, st.sampled_from(INPAINTING), st.floats(0.5, 30), st.data())
+def test_inpainting_touches_nothing_but_its_mask_and_invents_no_colours(
+    image: Any, method: Any, radius: float, data: Any
+) -> None:
+    mask = data.draw(arrays.arrays(np.uint8, image.shape[:2], elements=st.sampled_from([0, 255])))
+    filled = remove_markers(image, mask, method=method, radius=radius)
+    assert np.array_equal(filled[mask == 0], image[mask == 0])
+    if method == "normalized":
+        # A weighted mean lies between the pixels it is made of, to its rounding.
+        assert int(filled.max()) <= int(image.max()) + 1
+        assert int(filled.min()) >= int(image.min()) - 1
+
+
+@thorough
+@given(PICTURES, st.sampled_from(DIFFERENCES), st.data())
+def test_any_pair_of_pictures_has_a_mask(reference: Any, method: Any, data: Any) -> None:
+    image = data.draw(arrays.arrays(np.uint8, reference.shape, elements=st.integers(0, 255)))
+    detector = ContactDetector(method)
+    detector.add_reference(reference)
+    assert not detector.detect(reference).touching
+    result = detector.detect(image)
+    assert_defined(result.strength)
+    assert result.touching == bool(result.mask.any())
+    assert set(np.unique(result.mask).tolist()) <= {0, 255}
+
+
+@thorough
+@given(PICTURES)
+def test_any_picture_has_marks_within_it_or_none(image: Any) -> None:
+    try:
+        found = detect_markers(image)
+    except ValueError as error:
+        if "markers found" not in str(error):
+            raise
+        return
+    assert_defined(found.centers)
+    height, width = image.shape[:2]
+    assert (found.centers > -1).all()
+    assert (found.centers < (width, height)).all()
+
+
+@thorough
+@given(points(0, 25), st.floats(0.1, 2e4))
+def test_neighbours_are_pairs_of_different_marks_within_reach(cloud: Any, longest: float) -> None:
+    edges = neighbour_graph(cloud, longest)
+    assert (edges[:, 0] < edges[:, 1]).all()
+    assert len(np.unique(edges, axis=0)) == len(edges)
+    lengths = np.linalg.norm(cloud[edges[:, 0]] - cloud[edges[:, 1]], axis=1)
+    # Distances are float32 of coordinates up to 2e4 px.
+    assert (lengths <= longest + 1e-2).all()
+
+
+@thorough
+@given(points(2, 12), points(0, 15), st.floats(1, 100), st.data())
+def test_no_spot_is_given_to_two_marks(origin: Any, spots: Any, farthest: float, data: Any) -> None:
+    count = len(origin)
+    edges = neighbour_graph(origin, 1e5)
+    lengths = np.linalg.norm(origin[edges[:, 0]] - origin[edges[:, 1]], axis=1)
+    edges = edges[lengths > 1e-3]
+    settled = data.draw(arrays.arrays(np.bool_, count))
+    free = np.flatnonzero(~settled)
+    strength = data.draw(arrays.arrays(np.float64, len(spots), elements=st.floats(0, 3)))
+    chosen = choose_spots(
+        origin,
+        edges,
+        free,
+        settled,
+        np.zeros((count, 2)),
+        origin[free][None],
+        spots,
+        strength,
+        pitch=10.0,
+        farthest=farthest,
+    )
+    taken = chosen[chosen >= 0]
+    assert len(set(taken.tolist())) == len(taken)
+    away = np.linalg.norm(spots[taken] - origin[free[chosen >= 0]], axis=1)
+    assert (away <= farthest + 1e-6).all()
+
+
+@thorough
+@given(
+    st.integers(1, 60),
+    st.integers(1, 60),
+    st.sampled_from([0, 90, 180, 270]),
+    st.sampled_from([1, 2, 4, 8]),
+    st.sampled_from(["area", "pyramid"]),
+    points(1, 5),
+)
+def test_a_mapping_undoes_itself(
+    width: int, height: int, rotate: int, downsample: int, method: Any, cloud: Any
+) -> None:
+    if method == "area" and min(width, height) < downsample:
+        with pytest.raises(ValueError, match="required both sides"):
+            Preprocessor((width, height), rotate=rotate, downsample=downsample, method=method)
+        return
+    process = Preprocessor((width, height), rotate=rotate, downsample=downsample, method=method)
+    assert process(np.zeros((height, width, 3), np.uint8)).shape[1::-1] == process.mapping.size
+    back = process.mapping.to_raw(process.mapping.to_processed(cloud))
+    # Powers of two, whole shifts: some ulps of coordinates up to 1e4.
+    assert np.abs(back - cloud).max() <= 1e-10
+
+
+@thorough
+@given(arrays.arrays(np.float64, (2, 4, 2), elements=st.floats(-40, 40, width=32)))
+def test_a_homography_takes_its_corners_where_they_belong_or_refuses(moves: Any) -> None:
+    square = np.array([[0.0, 0], [100, 0], [0, 100], [100, 100]])
+    source, destination = square + moves
+    try:
+        matrix = find_homography(source, destination)
+    except ValueError as error:
+        if "required" not in str(error):
+            raise
+        return
+    homogeneous = np.column_stack([source, np.ones(4)]) @ matrix.T
+    there = homogeneous[:, :2] / homogeneous[:, 2:]
+    # Linear equations of a condition up to 1e9 or so (nearly collinear corners); measured 1e-7 px.
+    assert np.abs(there - destination).max() < 1e-5
+
+
+@thorough
+@given(
+    st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(1e-3, 10)), min_size=1, max_size=40),
+    st.floats(1e-3, 1e3),
+    st.floats(0, 1e3),
+)
+def test_a_one_euro_filter_stays_among_what_it_was_given(
+    steps: list[tuple[float, float]], cutoff: float, coefficient: float
+) -> None:
+    euro = OneEuro(cutoff, coefficient)
+    values = [value for value, _ in steps]
+    for value, dt in steps:
+        out = euro.update(value, dt)
+        assert min(values) - 1e-9 <= out <= max(values) + 1e-9
+
+
+@thorough
+@given(st.floats(0.01, 1), st.floats(-1e3, 1e3), st.integers(1, 60))
+def test_a_filter_of_a_constant_is_that_constant(alpha: float, value: float, count: int) -> None:
+    for smoother in (AlphaBeta(alpha), OneEuro()):
+        assert all(smoother.update(value, 0.01) == value for _ in range(count))
+
+
+@thorough
+@given(st.floats(1e-12, 0.999), st.floats(1e-12, 0.999))
+def test_a_rarer_event_needs_a_larger_value(first: float, second: float) -> None:
+    low, high = sorted((first, second))
+    assert chi_square_threshold(low) >= chi_square_threshold(high) >= 0
