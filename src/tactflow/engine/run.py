@@ -342,14 +342,18 @@ class Runner:
             return go and not self._stopping.is_set()
 
     def _demand(self, sinks: Sequence[RunningNode], frame: Frame) -> frozenset[str]:
-        """The sinks that want this frame; none wants a reference image that is not part of the source."""
-        if frame.seq < 0:
-            return frozenset()
-        return frozenset(
-            sink.id
-            for sink in sinks
-            if not sink.disabled and sink.due(frame) and (sink.wants is None or sink.wants())
-        )
+        """The sinks that want this frame.
+
+        One with `takes_references` gets all references; no other gets a reference image that is not part of
+        the source.
+        """
+        return frozenset(sink.id for sink in sinks if not sink.disabled and self._wanted(sink, frame))
+
+    @staticmethod
+    def _wanted(sink: RunningNode, frame: Frame) -> bool:
+        if frame.reference and getattr(sink.instance, "takes_references", False):
+            return True
+        return frame.seq >= 0 and sink.due(frame) and (sink.wants is None or sink.wants())
 
     # -- statistics ---------------------------------------------------------------------------------------
 

@@ -7,17 +7,29 @@ from __future__ import annotations
 
 import glob
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import Source, StampedSource
-from tactflow.sources.devices import Camera, CameraRequest, Stream
+from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream, public_address
 from tactflow.sources.files import open_recording
+from tactflow.sources.watch import LiveSource, Watch, Watched
 
-__all__ = ["KINDS", "CameraRequest", "Source", "StampedSource", "open_source"]
+__all__ = [
+    "KINDS",
+    "CameraRequest",
+    "LiveSource",
+    "Source",
+    "StampedSource",
+    "Watch",
+    "Watched",
+    "open_source",
+]
 
 KINDS = (
-    "sim:NAME (simulated sensor), a camera index or /dev/videoN, a video file, a folder or glob of images, "
+    "sim:NAME (simulated sensor), a camera index, /dev/videoN or /dev/v4l/by-id/NAME, a video file, a folder or glob of images, "
     "a .npy file, an .mcap recording of tactflow, an http://, rtsp:// or udp:// stream"
 )
 """What a source can be, for messages."""
@@ -31,16 +43,18 @@ def open_source(
     directory: Path | None = None,
     fps: float | None = None,
     camera: CameraRequest | None = None,
+    watch: Watch | None = None,
 ) -> Source:
     """Open a source of frames.
 
     Parameters
     ----------
-    spec : `sim:NAME?frames=300&seed=7`, a camera index, `/dev/videoN`, a video file, a folder or glob of
-        images, a `.npy` file, an `.mcap` recording, or an `http://`, `rtsp://`, `udp://` stream.
+    spec : `sim:NAME?frames=300&seed=7`, a camera index, `/dev/videoN` or `/dev/v4l/by-id/NAME`, a video
+        file, a folder or glob of images, a `.npy` file, an `.mcap` recording, or an `http://`, `rtsp://`, `udp://` stream.
     directory : where a relative path is looked for if it is not in the current directory.
     fps : rate of recordings that do not know their own (images, arrays), frames per second; 30 by default.
     camera : size, rate and format to ask a camera for.
+    watch : watch a camera or a stream, and open it anew after faults; without it, the first fault ends it.
 
     Raises
     ------
@@ -57,13 +71,18 @@ def open_source(
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]+)://", spec)
     if scheme is not None:
         if scheme[1].lower() in _STREAMS:
-            return Stream(spec)
+            return _live(partial(Stream, spec, ArrivalClock()), watch, public_address(spec))
         hint = f"; for a file, leave out {scheme[0]}" if scheme[1].lower() == "file" else ""
         raise SourceError(f"{spec}: unknown kind of source {scheme[0]}{hint}; required one of: {KINDS}")
     if spec.isdecimal() or spec.startswith(("/dev/video", "/dev/v4l/")):
-        return Camera(spec, camera)
+        return _live(partial(Camera, spec, camera, ArrivalClock()), watch, f"camera {spec}")
     if re.search(r"\.mcap($|\?)", spec, re.IGNORECASE) and not glob.has_magic(spec.partition("?")[0]):
         from tactflow.sources.mcap import Recording
 
         return Recording(spec, directory)
     return open_recording(spec, directory, fps)
+
+
+def _live(opener: Callable[[], Source], watch: Watch | None, name: str) -> Source:
+    """The source itself, or watched. One clock serves all connections, so that times never step back."""
+    return opener() if watch is None else Watched(opener, watch, name)

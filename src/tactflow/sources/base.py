@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import logging
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -159,11 +160,35 @@ def quiet_opencv() -> Iterator[None]:
     """Keep OpenCV's and FFmpeg's own messages off standard error: ours say the same more clearly."""
     # FFmpeg reads this once, when OpenCV opens the first file with it.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    _silence.begin()
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        _silence.end()
+
+
+class _Silence:
+    """OpenCV's one log level, silent while any thread wants it silent."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._wanted = 0
+        self._level = 0
+
+    def begin(self) -> None:
+        with self._lock:
+            if self._wanted == 0:
+                self._level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            self._wanted += 1
+
+    def end(self) -> None:
+        with self._lock:
+            self._wanted -= 1
+            if self._wanted == 0:
+                cv2.utils.logging.setLogLevel(self._level)
+
+
+_silence = _Silence()
 
 
 def find_path(spec: str, directory: Path | None) -> Path:

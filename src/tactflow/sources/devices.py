@@ -28,7 +28,7 @@ class CameraRequest:
     format: str | None = None
 
 
-class _ArrivalClock:
+class ArrivalClock:
     """Unix time that never steps back: the system's clock at the start plus a monotonic clock."""
 
     def __init__(self) -> None:
@@ -45,6 +45,7 @@ class Camera:
     ----------
     device : an index ("0") or a path ("/dev/video0", "/dev/v4l/by-id/...").
     request : size, rate and format to ask for. A camera may answer with something else; that is reported.
+    clock : stamps the frames; its own if not given.
 
     Raises
     ------
@@ -55,9 +56,16 @@ class Camera:
     live = True
     total: int | None = None
 
-    def __init__(self, device: str, request: CameraRequest | None = None) -> None:
+    READ_TIMEOUT = 2
+    """Seconds after which Linux's video driver gives up on a frame; OpenCV's own choice is 10."""
+
+    def __init__(
+        self, device: str, request: CameraRequest | None = None, clock: ArrivalClock | None = None
+    ) -> None:
         request = request or CameraRequest()
         self._name = f"camera {device}"
+        # OpenCV reads this once, at its first camera.
+        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(self.READ_TIMEOUT))
         backend = cv2.CAP_V4L2 if os.name == "posix" and os.uname().sysname == "Linux" else cv2.CAP_ANY
         with quiet_opencv():
             if device.isdecimal():
@@ -68,7 +76,7 @@ class Camera:
             raise SourceError(f"{self._name}: cannot be opened; {_camera_hint(device)}")
         self._ask(self._capture, request)
         self._normalise = Normaliser(self._name)
-        self._clock = _ArrivalClock()
+        self._clock = clock or ArrivalClock()
 
     def _ask(self, capture: cv2.VideoCapture, request: CameraRequest) -> None:
         # The format comes first: it decides which sizes and rates the driver offers.
@@ -156,6 +164,7 @@ class Stream:
     Parameters
     ----------
     url : what OpenCV's FFmpeg is to open.
+    clock : stamps the frames; its own if not given.
 
     Raises
     ------
@@ -168,12 +177,11 @@ class Stream:
     total: int | None = None
     OPEN_TIMEOUT = 10.0
     """Seconds to wait for the first answer."""
-    READ_TIMEOUT = 5.0
+    READ_TIMEOUT = 2.0
     """Seconds without a frame after which a stream counts as ended."""
 
-    def __init__(self, url: str) -> None:
-        # A password in the address must not end up in logs and error messages.
-        self._name = re.sub(r"(?<=//)[^/@]*@", "", url)
+    def __init__(self, url: str, clock: ArrivalClock | None = None) -> None:
+        self._name = public_address(url)
         with quiet_opencv():
             self._capture: cv2.VideoCapture | None = cv2.VideoCapture(
                 url,
@@ -188,7 +196,7 @@ class Stream:
         if not self._capture.isOpened():
             raise SourceError(f"{self._name}: no stream can be opened there; {_stream_hint(url)}")
         self._normalise = Normaliser(self._name)
-        self._clock = _ArrivalClock()
+        self._clock = clock or ArrivalClock()
         self._count = 0
         self.size: tuple[int, int] | None = (
             int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
@@ -206,7 +214,6 @@ class Stream:
         if not there:
             if self._count == 0:
                 raise SourceError(f"{self._name}: the stream was opened but delivers no frames")
-            log.warning("%s: the stream ended after %d frames", self._name, self._count)
             return None
         self._count += 1
         return self._normalise(image), t
@@ -216,6 +223,11 @@ class Stream:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+
+def public_address(url: str) -> str:
+    """The address without user and password, which must not end up in logs and error messages."""
+    return re.sub(r"(?<=//)[^/@]*@", "", url)
 
 
 def _stream_hint(url: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl
@@ -143,10 +144,15 @@ class Recording:
 
         contents, start = self._contents, self._start
         topics = {contents.frame_topic, contents.reference_topic}
+        played = messages(self._path, contents, topics, start=start)
         if start is not None:
+            first = next(played, None)
+            if first is None:
+                return
             before = messages(self._path, contents, {contents.reference_topic}, end=start)
             yield from ((frame, False) for frame in _in_force([StoredFrame.parse(m.data) for m in before]))
-        for message in messages(self._path, contents, topics, start=start):
+            played = chain([first], played)
+        for message in played:
             frame = StoredFrame.parse(message.data)
             # A recording begun late brings the references of before, at the time it began.
             late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)

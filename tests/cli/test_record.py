@@ -1,0 +1,208 @@
+"""`tactflow record`, its replay, and `tactflow repair`."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from tactflow.cli.main import main
+from tactflow.sim import open_scene
+from tactflow.sources import open_source
+from tests.cli.kill_me import image
+
+QUIET = ["--quiet", "--set", "sinks.zmq=null", "--set", "sinks.jsonl=null", "--set", "sinks.view=null"]
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def record_and_replay(folder: Path, *options: str, replay: tuple[str, ...] = ()) -> list[dict[str, Any]]:
+    """Run with a recording, play it, and compare every result, bit for bit; the results."""
+    live, again, out = folder / "live.jsonl", folder / "again.jsonl", folder / "a.mcap"
+    assert main(["record", *QUIET, *options, "--jsonl", str(live), "--out", str(out)]) == 0
+    kept = [option for option in options if option != "--realtime"]
+    del kept[kept.index("--source") : kept.index("--source") + 2]
+    command = ["run", *QUIET, *kept, *replay, "--source", str(out), "--jsonl", str(again)]
+    assert main(command) == 0
+    assert live.read_text() == again.read_text()
+    return lines(live)
+
+
+def test_replay_gives_the_very_same_results(tmp_path: Path) -> None:
+    results = record_and_replay(tmp_path, "--source", "sim:press?frames=60")
+    assert len(results) == 60
+    assert any(result["contact"] for result in results)
+    assert any(result["markers"] for result in results)
+
+
+def test_replay_is_equal_where_the_live_run_dropped_frames(tmp_path: Path) -> None:
+    # Frames that are there already come at 1000 a second, more than any machine works on.
+    scene = open_scene("press?frames=120")
+    np.save(tmp_path / "fast.npy", np.stack([scene.frame(i) for i in range(120)]))
+    source = ("--source", str(tmp_path / "fast.npy"), "--set", "stages.capture.fps=1000")
+    results = record_and_replay(tmp_path, *source, "--realtime")
+    seqs = [result["seq"] for result in results]
+    assert 1 < len(seqs) < 120
+    assert max(b - a for a, b in pairwise(seqs)) > 1
+
+
+def test_replay_is_equal_across_a_new_reference(tmp_path: Path) -> None:
+    sink = tmp_path / "again.py"
+    sink.write_text(
+        "from tactflow.engine.frame import Tick\n"
+        "class Again:\n"
+        "    def __init__(self, params, control=None):\n"
+        "        self.control = control\n"
+        "    def write(self, tick: Tick) -> None:\n"
+        "        if tick.frame.seq == 20:\n"
+        "            self.control.retake_reference()\n"
+    )
+    results = record_and_replay(
+        tmp_path,
+        *("--source", "sim:press?frames=40", "--set", "stages.capture.reference=3"),
+        *("--set", f"sinks.again={{use: '{sink}:Again'}}"),
+        replay=("--set", "sinks.again=null"),
+    )
+    assert len(results) == 40
+    epochs = {stamp.epoch for stamp in stamps(tmp_path / "a.mcap")}
+    assert epochs == {0, 1}
+
+
+def test_replay_is_equal_with_a_reference_from_an_image_file(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "gel.png"), open_scene("press?frames=2").frame(0))
+    reference = ("--set", f"stages.capture.reference={tmp_path / 'gel.png'}")
+    record_and_replay(tmp_path, "--source", "sim:press?frames=40", *reference)
+    assert [stamp.seq for stamp in stamps(tmp_path / "a.mcap")] == [-1, *range(40)]
+
+
+def stamps(path: Path) -> list[Any]:
+    source = open_source(str(path))
+    return [item[2] for item in iter(source.read_stamped, None)]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("out", "words"),
+    [
+        ("a.avi", "required a file whose name ends in .mcap"),
+        ("there.mcap", "is already there; give --overwrite"),
+    ],
+)
+def test_a_wrong_file_is_refused_before_anything_starts(
+    tmp_path: Path, out: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "there.mcap").write_bytes(b"precious")
+    assert main(["record", *QUIET, "--source", "sim:press?frames=3", "--out", str(tmp_path / out)]) == 2
+    assert words in capsys.readouterr().err
+    assert (tmp_path / "there.mcap").read_bytes() == b"precious"
+
+
+def test_overwrite_replaces_the_file(tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    out.write_bytes(b"old")
+    source = ["--source", "sim:press?frames=3"]
+    assert main(["record", *QUIET, *source, "--out", str(out), "--overwrite"]) == 0
+    assert len(stamps(out)) == 3
+
+
+def test_a_kill_at_any_moment_loses_no_frame_that_was_written(tmp_path: Path) -> None:
+    """20 processes are killed at random moments. Repaired, each file opens with the seeking reader."""
+    root = Path(__file__).resolve().parents[2]
+    moments = random.Random(6)
+    helper = subprocess.Popen(
+        [sys.executable, "-m", "tests.cli.kill_me"],
+        cwd=root,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert helper.stdin is not None
+    assert helper.stdout is not None
+    with helper:
+        for number in range(20):
+            path, counter = tmp_path / f"{number}.mcap", tmp_path / f"{number}.count"
+            print(path, counter, file=helper.stdin, flush=True)
+            child = int(helper.stdout.readline())
+            while not counter.exists() or not counter.stat().st_size:
+                time.sleep(0.001)
+            time.sleep(moments.uniform(0, 0.1))
+            os.kill(child, signal.SIGKILL)
+            assert int(helper.stdout.readline()) == path.stat().st_size
+            written = int.from_bytes(counter.read_bytes(), "little")
+            with path.open("rb") as file, pytest.raises((McapError, ValueError)):
+                list(make_reader(file).iter_messages())
+            found = pixels_are_right(path)
+            # The one frame more: killed between the last byte of the frame and the counter.
+            assert written <= found <= written + 1
+            assert main(["repair", str(path), "--quiet"]) == 0
+            with path.open("rb") as file:
+                again = list(make_reader(file, validate_crcs=True).iter_messages("/main/results"))
+            assert len(again) == found == pixels_are_right(path)
+        helper.stdin.close()
+    assert helper.returncode == 0
+
+
+def pixels_are_right(path: Path) -> int:
+    """Play a recording of `kill_me`; the number of frames."""
+    source = open_source(str(path))
+    count = 0
+    for pixels, _, stamp in iter(source.read_stamped, None):  # type: ignore[attr-defined]
+        assert stamp.seq == count
+        np.testing.assert_array_equal(pixels, image(stamp.seq))
+        count += 1
+    return count
+
+
+def test_repair_leaves_a_whole_file_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.mcap"
+    assert main(["record", *QUIET, "--source", "sim:press?frames=3", "--out", str(out)]) == 0
+    data = out.read_bytes()
+    capsys.readouterr()
+    assert main(["repair", str(out)]) == 0
+    assert "is whole already" in capsys.readouterr().err
+    assert out.read_bytes() == data
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_repair_can_write_elsewhere_and_replaces_nothing_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, copy = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    assert main(["record", *QUIET, "--source", "sim:press?frames=3", "--out", str(out)]) == 0
+    out.write_bytes(out.read_bytes()[:-200])
+    data = out.read_bytes()
+    copy.write_bytes(b"precious")
+    assert main(["repair", str(out), "--out", str(copy)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert copy.read_bytes() == b"precious"
+    assert main(["repair", str(out), "--out", str(copy), "--overwrite"]) == 0
+    assert out.read_bytes() == data
+    with copy.open("rb") as file:
+        assert make_reader(file).get_summary() is not None
+    assert len(stamps(copy)) == 3
+
+
+@pytest.mark.parametrize(("content", "words"), [(b"no", "is not an MCAP file"), (None, "no such file")])
+def test_repair_refuses_what_is_no_recording(
+    tmp_path: Path, content: bytes | None, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["repair", str(path)]) == 4
+    assert words in capsys.readouterr().err
+    assert len(list(tmp_path.iterdir())) == (content is not None)

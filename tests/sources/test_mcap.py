@@ -1,0 +1,269 @@
+"""Recordings as a source: what was captured comes back, also from the middle, and again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+from tactflow.engine.frame import Frame, Tick
+from tactflow.recording.repair import repair
+from tactflow.sinks.record import Record
+from tactflow.sources import StampedSource, open_source
+from tactflow.stages.capture import Capture
+
+FPS = 10.0
+UNIX = 1_700_000_000.123456789
+
+
+def image(seq: int) -> NDArray[np.uint8]:
+    return np.random.default_rng(seq + 1000).integers(0, 256, (12, 17, 3), np.uint8)
+
+
+def frames(seqs: Sequence[int], references: Sequence[int] = (0,), start: float = 0.0) -> list[Frame]:
+    """A new epoch begins at each reference that does not follow another one directly."""
+    made = []
+    epoch = 0
+    for seq in seqs:
+        if seq in references and seq > 0 and seq - 1 not in references:
+            epoch += 1
+        made.append(
+            Frame(
+                "main", seq, start + max(seq, 0) / FPS, image(seq), 0.0, seq in references or seq < 0, epoch
+            )
+        )
+    return made
+
+
+def record(path: Path, made: Sequence[Frame], *, cut: bool = False) -> Path:
+    sink = Record(Record.Params(path=str(path), preview=0))
+    sink.open()
+    for frame in made:
+        sink.write(Tick(frame), None, None, None, None)
+    if cut:
+        data = path.read_bytes()
+        sink.close()
+        path.write_bytes(data)
+    else:
+        sink.close()
+    return path
+
+
+def captured(spec: Path | str, **params: Any) -> list[Frame]:
+    capture = Capture(Capture.Params(source=str(spec), **params))
+    capture.open()
+    try:
+        return list(capture.frames())
+    finally:
+        capture.close()
+
+
+def facts(made: Sequence[Frame]) -> list[tuple[int, float, bool, int]]:
+    return [(frame.seq, frame.t, frame.reference, frame.epoch) for frame in made]
+
+
+def same(one: Sequence[Frame], other: Sequence[Frame]) -> None:
+    assert facts(one) == facts(other)
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.image, b.image)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("start", [0.0, UNIX])
+def test_frames_come_back_with_seq_time_and_flags_as_they_were(
+    tmp_path: Path, cut: bool, start: float
+) -> None:
+    made = frames([0, 1, 2, 5, 6, 9, 10, 11], references=(0, 1, 9, 10), start=start)
+    path = record(tmp_path / "a.mcap", made, cut=cut)
+    # What capture is told about references and frames to skip was true of the camera, not of this file.
+    same(captured(path, reference=4, skip=3), made)
+
+
+def test_a_reference_image_that_was_no_part_of_the_source_comes_first_again(tmp_path: Path) -> None:
+    made = frames([-1, 0, 1, 2], references=(-1,))
+    same(captured(record(tmp_path / "a.mcap", made)), made)
+
+
+def test_a_recording_says_how_long_and_how_fast_it_is(tmp_path: Path) -> None:
+    source = open_source(str(record(tmp_path / "a.mcap", frames(range(21)))))
+    assert isinstance(source, StampedSource)
+    assert (source.live, source.total, source.size) == (False, 21, (17, 12))
+    assert source.fps == pytest.approx(FPS, rel=1e-9)
+    assert "21 frames" in source.description
+
+
+def test_pixels_are_read_only_to_stages(tmp_path: Path) -> None:
+    assert not captured(record(tmp_path / "a.mcap", frames([0])))[0].image.flags.writeable
+
+
+def test_a_file_that_was_not_finished_is_played_with_a_note(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = frames(range(6))
+    path = record(tmp_path / "a.mcap", made, cut=True)
+    caplog.set_level("INFO")
+    same(captured(path), made)
+    assert "was not finished" in caplog.text
+    assert "tactflow repair" in caplog.text
+
+
+def test_wherever_a_file_is_cut_whole_frames_come_back(tmp_path: Path) -> None:
+    made = frames(range(5))
+    path = record(tmp_path / "a.mcap", made)
+    data = path.read_bytes()
+    cut, fixed = tmp_path / "cut.mcap", tmp_path / "fixed.mcap"
+    counts = []
+    for length in range(8, len(data), 97):
+        cut.write_bytes(data[:length])
+        result = repair(cut, fixed)
+        with fixed.open("rb") as file:
+            again = [m.data for _, _, m in make_reader(file, validate_crcs=True).iter_messages()]
+        assert len(again) == result.messages
+        assert not result.finished
+        # A frame and its message lie in one chunk.
+        count = len(again) // 2
+        assert len(again) == 2 * count
+        if count:
+            same(captured(cut), made[:count])
+            same(captured(fixed), made[:count])
+        else:
+            with pytest.raises(SourceError, match="no frame"):
+                captured(cut)
+        counts.append(count)
+    assert counts == sorted(counts)
+    assert set(counts) == set(range(6))
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_start_skips_ahead_but_shows_the_references_that_are_in_force(tmp_path: Path, cut: bool) -> None:
+    made = frames(range(40), references=(0, 1, 20, 21))
+    path = record(tmp_path / "a.mcap", made, cut=cut)
+    same(captured(f"{path}?start=1.0"), [*made[:2], *made[10:]])
+    same(captured(f"{path}?start=3"), [*made[20:22], *made[30:]])
+    # In the middle of the references: those before, then the others in their turn.
+    same(captured(f"{path}?start=2.1"), [made[20], *made[21:]])
+    with pytest.raises(SourceError, match="no frame after 4 s"):
+        captured(f"{path}?start=4")
+
+
+@pytest.mark.parametrize("query", ["loop=3", "loop=3&start=0.5"])
+def test_laps_repeat_the_frames_while_seq_and_time_grow(tmp_path: Path, query: str) -> None:
+    made = frames([0, 1, 4, 5, 6, 7, 8], references=(0, 6))
+    path = record(tmp_path / "a.mcap", made)
+    once = captured(f"{path}?{query.replace('loop=3', 'loop=1')}")
+    found = captured(f"{path}?{query}")
+    assert len(found) == 3 * len(once)
+    assert facts(found[: len(once)]) == facts(once)
+    for before, after in pairwise(found):
+        assert after.seq > before.seq
+        assert after.t >= before.t
+        assert after.epoch >= before.epoch
+    for lap in range(3):
+        part = found[lap * len(once) : (lap + 1) * len(once)]
+        for frame, first in zip(part, once, strict=True):
+            np.testing.assert_array_equal(frame.image, first.image)
+            assert (frame.reference, frame.epoch) == (first.reference, first.epoch + 2 * lap)
+        assert np.diff([f.t for f in part[-3:]]) == pytest.approx([0.1, 0.1])
+
+
+def test_a_loop_without_end_goes_on(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", frames(range(3)))
+    source = open_source(f"{path}?loop=0")
+    assert source.total is None
+    seqs = [stamp.seq for _, _, stamp in (source.read_stamped() for _ in range(20))]  # type: ignore[attr-defined]
+    assert seqs == list(range(20))
+    source.close()
+    assert source.read() is None
+
+
+def test_at_its_own_pace_references_of_before_are_not_waited_for(tmp_path: Path) -> None:
+    made = frames([0, *range(10_000, 10_003)])
+    sink = Record(Record.Params(path=str(tmp_path / "a.mcap"), trigger="button"))
+    sink.open()
+    sink.write(Tick(made[0]), None, None, None, None)
+    sink.start_recording()
+    for frame in made[1:]:
+        sink.write(Tick(frame), None, None, None, None)
+    sink.close()
+    # Waiting for frame 10 000 would take 1000 s, far beyond this test's time limit.
+    same(captured(tmp_path / "a-001.mcap", realtime=True), made)
+
+
+def test_a_new_reference_can_be_taken_during_replay(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", frames(range(8), references=(0, 5)))
+    capture = Capture(Capture.Params(source=str(path), reference=2))
+    capture.open()
+    found = []
+    for frame in capture.frames():
+        found.append((frame.seq, frame.reference, frame.epoch))
+        if frame.seq == 1:
+            capture.retake()
+    capture.close()
+    assert [seq for seq, reference, _ in found if reference] == [0, 2, 3, 5]
+    assert [epoch for _, _, epoch in found] == [0, 0, 1, 1, 1, 2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("start=-1", "start=-1: required start=SECONDS"),
+        ("start=soon", "required start=SECONDS"),
+        ("loop=1.5", "required .*loop=N"),
+        ("speed=2", "speed=2: required"),
+        ("start=nan", "required"),
+    ],
+)
+def test_a_wrong_option_is_a_clear_error(tmp_path: Path, query: str, words: str) -> None:
+    path = record(tmp_path / "a.mcap", frames(range(3)))
+    with pytest.raises(SourceError, match=words):
+        open_source(f"{path}?{query}")
+
+
+def test_a_question_mark_may_be_part_of_a_name(tmp_path: Path) -> None:
+    made = frames(range(3))
+    path = record(tmp_path / "what?.mcap", made)
+    same(captured(path), made)
+
+
+def test_files_of_others_are_refused_with_what_they_hold(tmp_path: Path) -> None:
+    foreign = tmp_path / "foreign.mcap"
+    writer = Writer(str(foreign))
+    writer.start()
+    schema = writer.register_schema("std_msgs/String", "ros1msg", b"string data")
+    channel = writer.register_channel("/chatter", "ros1", schema)
+    writer.add_message(channel, 0, b"\0\0\0\0", 0)
+    writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(SourceError, match=r"holds no frames that tactflow recorded \(it has /chatter\)"):
+        open_source(str(foreign))
+    text = tmp_path / "text.mcap"
+    for content in (b"", b"hello, I am no recording"):
+        text.write_bytes(content)
+        with pytest.raises(SourceError, match="is not an MCAP file"):
+            open_source(str(text))
+    with pytest.raises(SourceError, match=r"no such file.*did you mean .*foreign"):
+        open_source(str(tmp_path / "foreing.mcap"))
+    (tmp_path / "folder.mcap").mkdir()
+    with pytest.raises(SourceError, match="cannot be read"):
+        open_source(str(tmp_path / "folder.mcap"))
+
+
+def test_a_recording_without_a_frame_is_a_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="no frame in it"):
+        open_source(str(record(tmp_path / "a.mcap", [])))
+
+
+def test_damage_in_the_middle_of_a_whole_file_is_reported(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", frames(range(9)))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(SourceError, match=r"is damaged .*tactflow repair keeps what lies before"):
+        captured(path)
