@@ -1,13 +1,13 @@
 # make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
 # make test         lint, types, tests
-# make system-deps  what the tests need from the system: a browser (Debian; needs root)
+# make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 
 # Debian packages that tests use; without them those tests say that they were skipped.
-SYSTEM_DEPS := chromium
+SYSTEM_DEPS := chromium ffmpeg
 
 .PHONY: run test lint types system-deps clean
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from pydantic import Field, field_validator
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
-from tactflow.sources import CameraRequest, Source, StampedSource, open_source
+from tactflow.sources import CameraRequest, LiveSource, Source, StampedSource, Watch, open_source
 from tactflow.sources.files import load_image
 from tactflow.sources.pace import Pace
 
@@ -31,8 +32,8 @@ class Capture:
 
         source: str = Field(
             "sim:press",
-            description="sim:NAME?query, camera index or /dev/videoN, video file, folder or glob of images, "
-            ".npy file, .mcap recording, http:// rtsp:// udp:// stream",
+            description="sim:NAME?query, camera index, /dev/videoN or /dev/v4l/by-id/NAME, video file, "
+            "folder or glob of images, .npy file, .mcap recording, http:// rtsp:// udp:// stream",
         )
         realtime: bool = Field(
             False, description="play a recording at its own pace, with a live camera's drop policy"
@@ -60,6 +61,34 @@ class Capture:
             description="ask the camera for this pixel format, four characters: MJPG, YUYV, ...",
         )
 
+        reconnect: bool = Field(
+            True,
+            description="open a camera or stream anew when it is gone, frozen or black; if false, a camera "
+            "that stops is an error and a stream that ends is the end",
+        )
+        on_reconnect: Literal["keep", "retake"] = Field(
+            "keep",
+            description="after a reconnection, keep the reference, or retake it: the first frames then must "
+            "show the untouched gel",
+        )
+        no_frame_timeout: float | None = Field(
+            30.0,
+            ge=0,
+            description="a camera or stream without a good frame for so long ends the run with an error, s; "
+            "0 waits for ever",
+        )
+        frozen_after: float | None = Field(
+            3.0,
+            gt=0,
+            description="pictures of a camera or stream that are the same bit for bit for so long are a "
+            "fault, s; null never",
+        )
+        black_after: float | None = Field(
+            1.0,
+            gt=0,
+            description="black pictures of a camera or stream for so long are a fault, s; null never",
+        )
+
         @field_validator("source", mode="before")
         @classmethod
         def _index_is_text(cls, value: object) -> object:
@@ -74,13 +103,20 @@ class Capture:
                 raise ValueError(f"required at least 1 frame, got {value}")
             return value
 
-    def __init__(self, params: Params, sensor: str = "main", directory: Path | None = None) -> None:
+    def __init__(
+        self,
+        params: Params,
+        sensor: str = "main",
+        directory: Path | None = None,
+        opener: Callable[..., Source] = open_source,
+    ) -> None:
         """Prepare; nothing is opened yet.
 
         Parameters
         ----------
         sensor : name given to every frame.
         directory : where relative paths are looked for if they are not in the current directory.
+        opener : opens the source; called like `open_source`.
         """
         self.params = params
         self.live = params.realtime
@@ -88,6 +124,7 @@ class Capture:
         self.description = params.source
         self._sensor = sensor
         self._directory = directory
+        self._opener = opener
         self._source: Source | None = None
         self._reference_image: NDArray[np.uint8] | None = None
         self._stop = threading.Event()
@@ -105,7 +142,10 @@ class Capture:
         request = CameraRequest(p.width, p.height, p.fps, p.format)
         if isinstance(p.reference, str):
             self._reference_image = load_image(p.reference, self._directory)
-        self._source = open_source(p.source, directory=self._directory, fps=p.fps, camera=request)
+        watch = Watch(p.reconnect, p.no_frame_timeout, p.frozen_after, p.black_after)
+        self._source = self._opener(
+            p.source, directory=self._directory, fps=p.fps, camera=request, watch=watch
+        )
         self.live = self._source.live or p.realtime
         self.total = None if self._source.total is None else max(self._source.total - p.skip, 0)
         self.description = self._source.description
@@ -117,8 +157,15 @@ class Capture:
             self._source.close()
 
     def stop(self) -> None:
-        """End `frames()` soon; wakes it if it waits for the time of the next frame."""
+        """End `frames()` soon; wakes it if it waits for the next frame."""
         self._stop.set()
+        if isinstance(self._source, LiveSource):
+            self._source.stop()
+
+    @property
+    def state(self) -> str:
+        """How the source is: `running`, `waiting since ...` or `reconnecting since ...`."""
+        return self._source.state if isinstance(self._source, LiveSource) else "running"
 
     def retake(self) -> None:
         """Make the next frames the new reference, in a new epoch: as many as at the start."""
@@ -142,6 +189,9 @@ class Capture:
         pace = Pace(self._stop) if self.params.realtime and not source.live else None
         if isinstance(source, StampedSource):
             yield from self._replay(source, pace, count)
+            return
+        if isinstance(source, LiveSource):
+            yield from self._watch(source, count)
             return
         epoch = 0
         seq = -1
@@ -184,6 +234,35 @@ class Capture:
             references_left -= again
             reference, epoch = stamp.reference or again, stamp.epoch + retaken
             yield Frame(self._sensor, stamp.seq, t, _read_only(image), time.perf_counter(), reference, epoch)
+
+    def _watch(self, source: LiveSource, count: int) -> Iterator[Frame]:
+        """Frames of a source that numbers them where they arrive, and that may go and come back."""
+        p = self.params
+        references_left = count if self._reference_image is None else 0
+        shown = self._reference_image is None
+        epoch = 0
+        connection, begins = 0, p.skip
+        while not self._stop.is_set():
+            arrival = source.read_arrival()
+            if arrival is None:
+                return
+            if arrival.connection != connection:
+                connection, begins = arrival.connection, arrival.seq + p.skip
+                if p.on_reconnect == "retake":
+                    self._retake.set()
+            if arrival.seq < begins:
+                continue
+            image = _read_only(arrival.image)
+            if not shown:
+                shown = True
+                yield self._reference_frame(image, arrival.t)
+            if self._retake.is_set():
+                self._retake.clear()
+                epoch += 1
+                references_left = count
+            reference = references_left > 0
+            references_left -= reference
+            yield Frame(self._sensor, arrival.seq, arrival.t, image, arrival.captured, reference, epoch)
 
     def _reference_frame(self, first: NDArray[np.uint8], t: float) -> Frame:
         image = self._reference_image

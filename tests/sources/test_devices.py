@@ -151,9 +151,7 @@ def stream_server() -> Iterator[str]:
     server.server_close()
 
 
-def test_an_http_stream_gives_its_frames_stamped_on_arrival(
-    stream_server: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_http_stream_gives_its_frames_stamped_on_arrival(stream_server: str) -> None:
     source = open_source(f"http://{stream_server}/stream")
     assert source.live
     assert source.size == (64, 48)
@@ -169,7 +167,6 @@ def test_an_http_stream_gives_its_frames_stamped_on_arrival(
     assert times == sorted(times)
     # 60 s: only to tell Unix time from the stream's own time stamps.
     assert abs(times[0] - before) < 60
-    assert "ended after 5 frames" in caplog.text
 
 
 def test_an_address_without_a_stream_is_an_error_without_the_password(

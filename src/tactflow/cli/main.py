@@ -22,6 +22,7 @@ COMMANDS = {
     "bench": "measure run time against error, per method and for whole pipelines",
     "record": "run a pipeline and record its frames and results",
     "repair": "give a recording that was cut off its index",
+    "cameras": "list the cameras that are plugged in, with names that stay the same",
     "sim": "write a simulated recording and its ground truth",
     "schema": "print the JSON Schema of the result message or of a pipeline file",
 }

@@ -29,8 +29,9 @@ __all__ = [
 ]
 
 KINDS = (
-    "sim:NAME (simulated sensor), a camera index, /dev/videoN or /dev/v4l/by-id/NAME, a video file, a folder or glob of images, "
-    "a .npy file, an .mcap recording of tactflow, an http://, rtsp:// or udp:// stream"
+    "sim:NAME (simulated sensor), a camera index, /dev/videoN or /dev/v4l/by-id/NAME, a video file, "
+    "a folder or glob of images, a .npy file, an .mcap recording of tactflow, "
+    "an http://, rtsp:// or udp:// stream"
 )
 """What a source can be, for messages."""
 
@@ -50,7 +51,8 @@ def open_source(
     Parameters
     ----------
     spec : `sim:NAME?frames=300&seed=7`, a camera index, `/dev/videoN` or `/dev/v4l/by-id/NAME`, a video
-        file, a folder or glob of images, a `.npy` file, an `.mcap` recording, or an `http://`, `rtsp://`, `udp://` stream.
+        file, a folder or glob of images, a `.npy` file, an `.mcap` recording, or an `http://`, `rtsp://`,
+        `udp://` stream.
     directory : where a relative path is looked for if it is not in the current directory.
     fps : rate of recordings that do not know their own (images, arrays), frames per second; 30 by default.
     camera : size, rate and format to ask a camera for.
