@@ -76,7 +76,10 @@ class Record:
             "recording begins with them",
         )
         memory: int = Field(
-            1024, ge=16, description="most that the ring may take, MB; if it is less, the ring is shorter"
+            2048,
+            ge=16,
+            description="most that the ring may take, MB (30 s of 800 x 600 at 60 Hz take 1300); what does not "
+            "fit is left out, with a warning",
         )
         after: float = Field(1.0, ge=0, description="a contact's recording ends so long after the contact, s")
         preview: float = Field(
@@ -120,6 +123,7 @@ class Record:
         self._references: list[Entry] = []
         self._ring: deque[Entry] = deque()
         self._ring_bytes = 0
+        self._warned = False
         self._touching = False
         self._touched = 0.0
         self._preview_due = float("-inf")
@@ -159,6 +163,9 @@ class Record:
             if self._file is None and self._coder is not None:
                 self._begin_next()
                 self._ends = self.params.ring is not None
+                # While the run is paused no frame comes along that would take the ring with it.
+                if self._ends and self._control is not None and self._control.paused:
+                    self.stop_recording()
 
     def stop_recording(self) -> None:
         """Finish the file, with all that belongs to it. Nothing if not recording.
@@ -278,12 +285,24 @@ class Record:
             ring.append(entry)
             self._ring_bytes += entry.size
             limit = self.params.memory * 1_000_000
-            while ring and (ring[0].time < entry.time - seconds * 1e9 or self._ring_bytes > limit):
+            while ring and ring[0].time < entry.time - seconds * 1e9:
                 self._ring_bytes -= ring.popleft().size
+            while ring and self._ring_bytes > limit:
+                self._ring_bytes -= ring.popleft().size
+                self._warn_of_memory(ring[-1].time - ring[0].time if ring else 0)
         if entry.reference:
             self._references.append(entry)
         oldest = ring[0].epoch if ring else entry.epoch
         self._references = [reference for reference in self._references if reference.epoch >= oldest]
+
+    def _warn_of_memory(self, nanoseconds: int) -> None:
+        if not self._warned:
+            self._warned = True
+            log.warning(
+                "record: the ring holds only %.1f s, because memory is limited to %d MB; raise memory",
+                nanoseconds / 1e9,
+                self.params.memory,
+            )
 
     def _begin_next(self) -> None:
         while True:

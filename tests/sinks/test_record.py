@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.graph import Pipeline
 from tactflow.sinks.record import Record
 from tactflow.sources import open_source
 from tactflow.sources.mcap import Recording
@@ -166,13 +167,31 @@ def test_the_ring_is_saved_even_if_the_run_ends_at_once(tmp_path: Path) -> None:
     assert seqs_in(tmp_path / "ring-001.mcap") == [0, *range(29, 50)]
 
 
-def test_the_ring_never_takes_more_memory_than_allowed(tmp_path: Path) -> None:
+def test_the_ring_is_saved_at_once_while_the_run_is_paused(tmp_path: Path) -> None:
+    class Paused:
+        paused = True
+        source = None
+        pipeline = Pipeline("nowhere.yaml", tmp_path, "main", {})
+
+    sink = Record(Record.Params(path=str(tmp_path / "ring.mcap"), ring=2.0), control=Paused())  # type: ignore[arg-type]
+    sink.open()
+    write(sink, range(50))
+    sink.start_recording()
+    assert not sink.recording
+    assert seqs_in(tmp_path / "ring-001.mcap") == [0, *range(29, 50)]
+    sink.close()
+
+
+def test_the_ring_never_takes_more_memory_than_allowed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     noise = np.random.default_rng(1).integers(0, 256, (500, 700, 3), np.uint8)
     sink = opened(tmp_path / "ring.mcap", ring=1000.0, memory=16, preview=0)
     for seq in range(30):
         sink.write(Tick(Frame("main", seq, seq / FPS, noise)), None, None, None, None)
         assert sink.counters()["ring_bytes"] <= 16_000_000
     assert 10 <= sink.counters()["ring_frames"] < 30
+    assert caplog.text.count("because memory is limited to 16 MB") == 1
     sink.close()
 
 
