@@ -78,8 +78,8 @@ class Record:
         memory: int = Field(
             2048,
             ge=16,
-            description="most that the ring may take, MB (30 s of 800 x 600 at 60 Hz take 1300); what does not "
-            "fit is left out, with a warning",
+            description="most that the ring may take, MB (30 s of 800 x 600 at 60 Hz take 1300); what does "
+            "not fit is left out, with a warning",
         )
         after: float = Field(1.0, ge=0, description="a contact's recording ends so long after the contact, s")
         preview: float = Field(

@@ -94,6 +94,15 @@ def test_the_file_says_how_it_was_made(recording: Path, tmp_path: Path) -> None:
     assert json.loads(texts["message.schema.json"]) == message_schema()
 
 
+def test_the_run_knows_its_recorder(tmp_path: Path) -> None:
+    file = tmp_path / "pipeline.yaml"
+    file.write_text(PIPELINE.replace("PATH", str(tmp_path / "a.mcap")))
+    runner = Runner(load_pipeline(file, overrides=["stages.capture.source=sim:press?frames=2"]))
+    assert runner.recorder() is None
+    runner.run()
+    assert isinstance(runner.recorder(), Record)
+
+
 def test_results_are_valid_under_the_schema_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     sink = Record(Record.Params(path=str(path)))
