@@ -163,6 +163,25 @@ def test_single_precision_costs_the_contact_nothing(method: str) -> None:
     assert single.strength == pytest.approx(double.strength, rel=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["brightened", "tilted"])
+def test_single_precision_costs_the_outline_nothing(kind: str) -> None:
+    rows, columns = np.indices((64, 88)).astype(np.float64)
+    away = np.hypot(columns - 44, rows - 32)
+    if kind == "brightened":
+        answer = np.repeat(0.2 / (1 + np.exp(away - 18))[..., None], 3, axis=2)
+    else:
+        slope = away / 18 * (away < 18) * 0.2
+        turn = np.arctan2(rows - 32, columns - 44)
+        answer = np.stack([slope * np.cos(turn + phase) for phase in (0, 2.1, 4.2)], axis=-1)
+    answer += np.random.default_rng(0).normal(0, 0.003, answer.shape)
+    inside = (away < 26).astype(np.uint8)
+    single, double = both(lambda: imprint.imprint(answer.astype(imprint.np.float32), inside), imprint)
+    assert (single > 0).any()
+    assert double.dtype == np.float64
+    # The bound of the docstring.
+    assert np.abs(single - double).max() <= 1e-3
+
+
 def test_single_precision_costs_the_fit_of_the_light_nothing() -> None:
     cells = contact._cells(gel(dots=False).reference)[1], contact._cells(gel(dots=False).touched)[1]
 

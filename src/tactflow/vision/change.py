@@ -45,6 +45,8 @@ _FORGETTING = 0.05
 class ChangeProbe:
     """Tells whether a frame differs from the anchor by more than noise.
 
+    Computed in float32; the test values are those of float64 to 1e-5 of themselves.
+
     frame : (H, W, C) or (H, W) uint8, the first frame; it fixes the size and where to look.
     false_alarms : share of still frames that are called changed all the same, in (0, 0.5]. Each costs one
         frame's work; a smaller share lets larger changes pass unseen.
@@ -66,10 +68,9 @@ class ChangeProbe:
         step = max(1, frame.shape[0] // _LINES)
         self._lines = slice(step // 2, None, step)
         self._places, gradients, self._grid = _choose_places(frame, self._lines, tile)
-        strength = np.square(gradients).sum(axis=1)
-        self._strength = [
-            np.maximum([_neighbourhood(one, reach, self._grid) for one in strength], np.float32(1e-3))
-            for reach in _REACHES
+        strength = self._by_tile(np.square(gradients).sum(axis=1))
+        self._certainty = [
+            1 / np.sqrt(np.maximum(_neighbourhood(strength, reach), np.float32(1e-3))) for reach in _REACHES
         ]
         self._gradients = gradients
         _, tiles = self._places.shape
@@ -77,7 +78,8 @@ class ChangeProbe:
         self.bound = -NormalDist().inv_cdf(false_alarms / (2 * tests))
         """What the strongest test value must exceed, in standard deviations."""
         self.strongest = float("inf")
-        """The strongest test value of the last look, in standard deviations of noise."""
+        """The strongest test value of the last look, in standard deviations of noise; at least that, where
+        it is above the bound: what has changed for sure is not tested further."""
         self._anchor: NDArray[np.float32] | None = None
         self._last: NDArray[np.float32] | None = None
         self._variance: NDArray[np.float32] | None = None
@@ -101,7 +103,9 @@ class ChangeProbe:
             raise ValueError(f"required a frame of shape {self._shape}, got {frame.shape}")
         lines = frame[self._lines].copy()
         samples = lines.reshape(-1).take(self._places).astype(np.float32)
-        self._learn(samples)
+        last, self._last = self._last, samples
+        if last is not None:
+            self._learn(samples - last)
         if self._anchor is None or self._pairs < _WARM_UP:
             self.strongest = float("inf")
         else:
@@ -115,20 +119,16 @@ class ChangeProbe:
         """Make the frame of the last look the anchor: it is worked on, whatever the look said."""
         self._anchor = self._last
 
-    def _learn(self, samples: NDArray[np.float32]) -> None:
+    def _learn(self, step: NDArray[np.float32]) -> None:
         """Follow each tile's noise by the difference of frames in a row; a moving tile teaches nothing."""
-        last, self._last = self._last, samples
-        if last is None:
-            return
-        step = samples - last
         n, _ = step.shape
-        seen = np.maximum(_sums(step, step) / np.float32(2 * n), np.float32(_QUANTISATION))
+        seen = np.maximum(_sums(step * step) * np.float32(0.5 / n), np.float32(_QUANTISATION))
         self._pairs += 1
         if self._variance is None:
             self._variance = np.full_like(seen, np.median(seen))
             return
         # The mean of n squares scatters by sqrt(2 / n) of itself; six times that is motion, not noise.
-        quiet = seen < self._variance * np.float32(1 + 6 * np.sqrt(2 / n))
+        quiet = seen < self._variance * np.float32(1 + 6 * math.sqrt(2 / n))
         weight = np.float32(max(_FORGETTING, 1 / self._pairs))
         self._variance = np.where(quiet, self._variance + weight * (seen - self._variance), self._variance)
         if 2 * np.count_nonzero(quiet) < quiet.size:
@@ -136,44 +136,50 @@ class ChangeProbe:
             self._variance = np.where(quiet, self._variance, self._variance * np.float32(1.2))
 
     def _strongest(self, difference: NDArray[np.float32]) -> float:
-        """The largest of all tests' values, each a standard normal deviate under noise alone."""
+        """The largest of the tests' values, each a standard normal deviate under noise alone."""
         assert self._variance is not None
         n, tiles = difference.shape
-        scaled = (difference / np.sqrt(2 * self._variance)).astype(np.float32, copy=False)
-        light = scaled.sum(axis=0)
-        squares = _sums(scaled, scaled)
-        return max(
-            self._motion(scaled),
+        scale = 1 / np.sqrt(2 * self._variance)
+        light = _sums(difference) * scale
+        squares = _sums(difference * difference) * (scale * scale)
+        strongest = max(
             float(np.abs(light).max()) / math.sqrt(n),
             abs(float(light.sum())) / math.sqrt(n * tiles),
             _normal_deviate(float(squares.max()), n),
             _normal_deviate(float(squares.sum()), n * tiles),
         )
+        return strongest if strongest > self.bound else max(strongest, self._motion(difference, scale))
 
-    def _motion(self, scaled: NDArray[np.float32]) -> float:
+    def _motion(self, difference: NDArray[np.float32], scale: NDArray[np.float32]) -> float:
         """The strongest displacement of a tile, or of the tiles of a neighbourhood together."""
-        pulls = [_sums(scaled, gradients) for gradients in self._gradients]
-        squares = [
-            float((np.square(_neighbourhood(pull, reach, self._grid)) / strength).max())
-            for reach, strengths in zip(_REACHES, self._strength, strict=True)
-            for pull, strength in zip(pulls, strengths, strict=True)
-        ]
-        return math.sqrt(max(squares))
+        across, down = self._gradients
+        pulls = self._by_tile(
+            np.stack([_sums(difference * across) * scale, _sums(difference * down) * scale])
+        )
+        return max(
+            cv2.norm(_neighbourhood(pulls, reach) * certainty, cv2.NORM_INF)
+            for reach, certainty in zip(_REACHES, self._certainty, strict=True)
+        )
+
+    def _by_tile(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(2, tiles) as a picture of two channels, (rows, columns, 2)."""
+        return np.ascontiguousarray(values.T.reshape(*self._grid, 2))
 
 
-def _neighbourhood(values: NDArray[np.float32], reach: int, grid: tuple[int, int]) -> NDArray[np.float32]:
-    """Sum over each tile and its neighbours up to `reach` tiles away, (tiles,)."""
+def _neighbourhood(picture: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
+    """Sum over each tile and its neighbours up to `reach` tiles away, (rows, columns, 2)."""
     if reach == 0:
-        return values
+        return picture
     size = (2 * reach + 1, 2 * reach + 1)
-    total = cv2.boxFilter(values.reshape(grid), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return total.ravel().astype(np.float32, copy=False)
+    return np.asarray(
+        cv2.boxFilter(picture, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT), np.float32
+    )
 
 
-def _sums(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sum of products over the samples of each tile."""
-    result: NDArray[np.float32] = np.einsum("nt,nt->t", a, b)
-    return result
+def _sums(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sum over the samples of each tile."""
+    # A product with ones goes to BLAS, which is faster than a sum along the first axis.
+    return np.ones(len(values), np.float32) @ values
 
 
 def _normal_deviate(squares: float, degrees: int) -> float:

@@ -102,6 +102,8 @@ def chi_square_threshold(probability: float) -> float:
 class ContactDetector:
     """Finds where a gel is touched, by comparison with frames of the untouched gel.
 
+    Computed in float32; against float64 the outline moves by at most 1 px, the strength by 1e-5 of itself.
+
     Parameters
     ----------
     method : `noise` works for gels that answer with brightness or colour. `colour` is a plain distance of

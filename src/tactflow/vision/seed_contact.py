@@ -36,7 +36,8 @@ def seed_marker_mask(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
     Returns
     -------
-    mask : (H, W) uint8, 255 on markers, else 0.
+    mask : (H, W) uint8, 255 on markers, else 0. In float32, as the original; float64 would move its border by
+        at most 1 px.
 
     Raises
     ------
