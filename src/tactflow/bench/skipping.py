@@ -166,22 +166,50 @@ def _judge(result: Comparison, rows: Sequence[_Row]) -> None:
             result.noise[name] = float(np.sqrt(np.square(joined).mean())) / _SECOND_DIFFERENCE
 
 
-def compare_scenes(
-    pipelines: Mapping[str, Pipeline], frames: int, progress: Callable[[str, int, int], None]
-) -> Iterator[Comparison]:
-    """Compare on every simulated scene of `SCENES`.
+@dataclass(frozen=True, slots=True)
+class Pipelines:
+    """What to compare: on gels with markers, on gels without, and on recordings of the wedge sensor."""
 
-    pipelines : "default", and "markerless" for gels without markers. frames : length of each scene.
-    progress : called with the scene's name, scenes done, and scenes in all.
+    default: Pipeline
+    markerless: Pipeline
+    wedge: Pipeline
+
+
+def compare_all(
+    pipelines: Pipelines,
+    frames: int,
+    data: Path | None,
+    copies: CopyUnit,
+    progress: Callable[[str, int, int], None],
+) -> Iterator[Comparison]:
+    """Compare on every simulated scene of `SCENES`, and on the recordings in `data`.
+
+    frames : length of each scene. copies : measures the unit of time along the way.
+    progress : called with a name, the number done, and the number in all.
     """
+    real = [] if data is None else _recordings(pipelines, data)
+    count = len(SCENES) + len(real)
     for index, spec in enumerate(SCENES):
-        progress(spec, index, len(SCENES))
+        progress(spec, index, count)
+        copies.take(5)
         with tempfile.TemporaryDirectory() as folder:
             scratch = Path(folder)
             path = scratch / "scene.npy"
             write_frames(open_scene(spec + ("&" if "?" in spec else "?") + f"frames={frames}"), path)
-            pipeline = pipelines["markerless" if spec == "unmarked" else "default"]
+            pipeline = pipelines.markerless if spec == "unmarked" else pipelines.default
             yield compare(pipeline, path, spec, scratch)
+    for index, (name, pipeline, path) in enumerate(real, len(SCENES)):
+        progress(name, index, count)
+        copies.take(5)
+        with tempfile.TemporaryDirectory() as folder:
+            yield compare(pipeline, path, name, Path(folder))
+
+
+def _recordings(pipelines: Pipelines, data: Path) -> list[tuple[str, Pipeline, Path]]:
+    """Name, pipeline and source of each recording; the single presses count as one, in a row."""
+    found = [(name, pipelines.wedge, data / name) for name in ("wedge_roll", "wedge_ball")]
+    found += [(f.stem, pipelines.markerless, f) for f in sorted((data / "wedge_grasp").glob("*.avi"))]
+    return [item for item in found if item[2].exists()]
 
 
 def print_comparisons(comparisons: Sequence[Comparison], copies: CopyUnit, console: Console) -> None:

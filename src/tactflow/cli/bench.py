@@ -19,8 +19,10 @@ from tactflow.bench.methods import SEED
 from tactflow.bench.report import html
 from tactflow.bench.results import Result
 from tactflow.bench.run import DEFAULT, Plan, run_bench
+from tactflow.bench.skipping import Pipelines, compare_all, print_comparisons
 from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
+from tactflow.bench.timing import CopyUnit
 from tactflow.cli.pipelines import find_pipeline, packaged_pipelines
 from tactflow.engine.config import load_pipeline
 from tactflow.engine.errors import ConfigError
@@ -89,6 +91,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "exit code 3 if error, memory or time creep",
     )
 
+    parser.add_argument(
+        "--skipping",
+        nargs="?",
+        type=frame_count,
+        const=200,
+        metavar="FRAMES",
+        help="instead: compare the first PIPELINE with and without skipping, on 200 frames of each scene "
+        "unless told otherwise, and on the recordings of --data; exit code 3 if a number changes beyond its "
+        "noise",
+    )
+
 
 def frame_count(word: str) -> int:
     """A number of frames, >= 1, from the command line."""
@@ -101,6 +114,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure, print the table, write what was asked for; returns the exit code."""
     if args.stress is not None:
         return _stress(args.pipelines, args.stress)
+    if args.skipping is not None:
+        return _skipping(args.pipelines, args.skipping, args.data)
     if args.against is not None:
         load_comparable(args.against, args.quick)
     for path in (args.json, args.html, args.errors, args.markdown):
@@ -119,6 +134,23 @@ def run(args: argparse.Namespace) -> int:
     worse = against(result, args.against, plan.scenes) if args.against is not None else []
     _report(worse, args.against)
     return WORSE if worse else 0
+
+
+def _skipping(given: list[str], frames: int, data: Path | None) -> int:
+    """Compare with and without skipping, print both tables and what changed beyond noise."""
+    pipelines = Pipelines(
+        load_pipeline(find_pipeline(given[0] if given else f"pipelines/{DEFAULT}.yaml")),
+        load_pipeline(find_pipeline("pipelines/markerless.yaml")),
+        load_pipeline(find_pipeline("pipelines/wedge.yaml")),
+    )
+    copies = CopyUnit()
+    with _quiet_log(), _progress_bar() as progress:
+        found = list(compare_all(pipelines, frames, data, copies, progress))
+    print_comparisons(found, copies, Console(file=sys.stdout, highlight=False, width=200))
+    for one in found:
+        for fault in one.faults:
+            print(f"tactflow: {one.scene}: {fault}", file=sys.stderr)
+    return WORSE if any(one.faults for one in found) else 0
 
 
 def _stress(given: list[str], frames: int) -> int:
