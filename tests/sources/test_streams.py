@@ -1,0 +1,167 @@
+"""Real network streams that come and go: HTTP motion JPEG and MPEG-TS over UDP, served by ffmpeg."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from tactflow.engine.errors import SourceError
+from tactflow.engine.frame import Frame
+from tactflow.stages.capture import Capture
+from tests.sources.ffmpeg import DARKENS, FFMPEG, FREEZES, Server
+
+pytestmark = pytest.mark.skipif(
+    FFMPEG is None, reason="NO STREAM TESTS: ffmpeg is not installed (make system-deps installs it)"
+)
+
+PATIENCE = 40.0
+"""s; how long a test waits for what must happen. Nothing is asserted about the time it takes."""
+
+
+class Reading:
+    """A capture of a stream, read in a thread of its own."""
+
+    def __init__(self, server: Server, **params: object) -> None:
+        self.stage = Capture(Capture.Params.model_validate({"source": server.address, **params}))
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            try:
+                self.stage.open()
+                break
+            except SourceError:
+                # The server needs a moment until it listens.
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+        self.frames: list[Frame] = []
+        self.error: SourceError | None = None
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.frames.extend(self.stage.frames())
+        except SourceError as error:
+            self.error = error
+
+    def more(self, count: int = 10) -> None:
+        """Wait for so many more frames."""
+        wanted = len(self.frames) + count
+        self.until(lambda: len(self.frames) >= wanted)
+
+    def until(self, condition: object) -> None:
+        assert callable(condition)
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, f"{len(self.frames)} frames, {self.stage.state}, {self.error}"
+            time.sleep(0.01)
+
+    def ended(self) -> bool:
+        return not self._thread.is_alive()
+
+    def close(self) -> None:
+        self.stage.stop()
+        self._thread.join(PATIENCE)
+        self.stage.close()
+
+
+@pytest.fixture
+def servers() -> Iterator[list[Server]]:
+    started: list[Server] = []
+    yield started
+    for server in started:
+        server.kill()
+
+
+def serve(servers: list[Server], *args: str) -> Server:
+    servers.append(Server(*args))
+    servers[-1].start()
+    return servers[-1]
+
+
+def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+@pytest.mark.parametrize("kind", ["http", "udp"])
+def test_a_server_that_is_killed_and_started_again_gives_frames_again(
+    kind: str, servers: list[Server], caplog: pytest.LogCaptureFixture
+) -> None:
+    server = serve(servers, kind)
+    reading = Reading(server)
+    try:
+        reading.more()
+        server.kill()
+        reading.until(lambda: reading.stage.state.startswith("reconnecting since"))
+        server.start()
+        reading.until(lambda: reading.stage.state == "running")
+        reading.more()
+    finally:
+        reading.close()
+    assert [frame.seq for frame in reading.frames] == sorted({frame.seq for frame in reading.frames})
+    assert [frame.t for frame in reading.frames] == sorted({frame.t for frame in reading.frames})
+    assert [frame.reference for frame in reading.frames[:2]] == [True, False]
+    assert {frame.epoch for frame in reading.frames} == {0}
+    said = warnings_of(caplog)
+    assert "since" in said[0]
+    assert any("is back after" in text for text in said)
+
+
+def test_a_stream_that_is_interrupted_for_a_moment_is_reported_and_goes_on(
+    servers: list[Server], caplog: pytest.LogCaptureFixture
+) -> None:
+    server = serve(servers, "udp")
+    reading = Reading(server, on_reconnect="retake")
+    try:
+        reading.more()
+        server.halt()
+        reading.until(lambda: reading.stage.state != "running")
+        server.resume()
+        reading.until(lambda: reading.stage.state == "running")
+        reading.more()
+    finally:
+        reading.close()
+    assert "delivers no frames since" in warnings_of(caplog)[0]
+
+
+@pytest.mark.parametrize(("picture", "says"), [(FREEZES, "bit for bit"), (DARKENS, "only black pictures")])
+def test_a_picture_that_freezes_or_turns_black_is_reported_and_not_handed_over(
+    picture: str, says: str, servers: list[Server], caplog: pytest.LogCaptureFixture
+) -> None:
+    reading = Reading(serve(servers, "udp", picture), frozen_after=1.0, black_after=0.5)
+    try:
+        reading.until(lambda: any(says in text for text in warnings_of(caplog)))
+        reading.until(lambda: reading.stage.state == "running")
+        reading.more()
+    finally:
+        reading.close()
+    assert any("is back after" in text for text in warnings_of(caplog))
+
+
+def test_a_server_that_stays_away_ends_the_run_with_what_to_try(servers: list[Server]) -> None:
+    server = serve(servers, "http")
+    reading = Reading(server, no_frame_timeout=1.5)
+    try:
+        reading.more()
+        server.kill()
+        reading.until(reading.ended)
+    finally:
+        reading.close()
+    assert reading.error is not None
+    assert "no good frame for" in str(reading.error)
+    assert "no stream can be opened there" in str(reading.error)
+
+
+def test_without_reconnection_a_server_that_goes_away_is_the_end(servers: list[Server]) -> None:
+    server = serve(servers, "http")
+    reading = Reading(server, reconnect=False)
+    try:
+        reading.more()
+        server.kill()
+        reading.until(reading.ended)
+    finally:
+        reading.close()
+    assert reading.error is None
