@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
-import os
 import platform
-import re
 import threading
 from collections import deque
 from pathlib import Path
@@ -25,6 +23,7 @@ from tactflow.engine.stage import StageParams
 from tactflow.message import encode_message
 from tactflow.ports import Image
 from tactflow.recording import missing_packages
+from tactflow.recording.names import next_name
 from tactflow.vision.types import Contact, Flow, Markers
 
 if TYPE_CHECKING:
@@ -307,7 +306,7 @@ class Record:
     def _begin_next(self) -> None:
         while True:
             try:
-                self._begin(_next_name(self._path), overwrite=False)
+                self._begin(next_name(self._path), overwrite=False)
             except FileExistsError:
                 continue
             return
@@ -396,14 +395,3 @@ class Record:
             except (OSError, UnicodeDecodeError) as error:
                 log.debug("%s: not recorded: %s", pipeline.file, error)
         return About(self._sensor, facts, texts)
-
-
-def _next_name(path: Path) -> Path:
-    """The first numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ..."""
-    taken = 0
-    pattern = re.compile(re.escape(path.stem) + r"-(\d+)" + re.escape(path.suffix))
-    if path.parent.is_dir():
-        for name in os.listdir(path.parent):
-            found = pattern.fullmatch(name)
-            taken = max(taken, int(found[1]) if found else 0)
-    return path.with_name(f"{path.stem}-{taken + 1:03d}{path.suffix}")

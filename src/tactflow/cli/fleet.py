@@ -100,9 +100,15 @@ def _command(args: argparse.Namespace, file: Path, sensor: str, overrides: Seque
         command += ["--max-frames", str(args.max_frames)]
     if args.stats_every is not None:
         command += ["--stats-every", str(args.stats_every)]
-    flags = ("realtime", "quiet", "check", "overwrite")
+    flags = ("realtime", "quiet", "check", "overwrite", "number")
     command += [f"--{flag}" for flag in flags if getattr(args, flag, False)]
     return command
+
+
+def _again(command: Sequence[str]) -> list[str]:
+    """The command that starts a sensor after a failure: what it has recorded so far must stay."""
+    kept = [word for word in command if word not in ("--overwrite", "--number")]
+    return [*kept, "--number"] if "record" in command[:4] else list(command)
 
 
 def _refuse_clashes(args: argparse.Namespace, pipelines: Mapping[str, Pipeline]) -> None:
@@ -258,6 +264,7 @@ class _Supervisor:
             return
         pause = min(FIRST_PAUSE * 2 ** (member.failures - 1), LONGEST_PAUSE)
         member.start_at = time.monotonic() + pause
+        member.command = _again(member.command)
         self._say(member, f"failed (exit code {code}); starting again in {pause:g} s")
 
     def _start(self, member: _Member) -> None:
