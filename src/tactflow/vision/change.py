@@ -139,7 +139,7 @@ class ChangeProbe:
         """The largest of the tests' values, each a standard normal deviate under noise alone."""
         assert self._variance is not None
         n, tiles = difference.shape
-        scale = 1 / np.sqrt(2 * self._variance)
+        scale = np.asarray(1 / np.sqrt(2 * self._variance), np.float32)
         light = _sums(difference) * scale
         squares = _sums(difference * difference) * (scale * scale)
         strongest = max(
