@@ -27,6 +27,8 @@ OPENING_SECONDS = 15.0
 """Opening that takes longer hangs; more than what drivers and streams themselves allow."""
 MAX_ABANDONED = 4
 """No new attempt while so many threads hang in a driver."""
+SETTLE_SECONDS = 0.1
+"""Frames so soon after a silence are not passed on: a decoder that gives up lets go of old ones at once."""
 POLL_SECONDS = 0.1
 """How often a waiting reader looks for faults."""
 
@@ -93,6 +95,7 @@ class _Fault:
     clock: float
     attempts: int = 0
     detail: str = ""
+    resumed: float | None = None
 
 
 class Watched:
@@ -345,9 +348,14 @@ class Watched:
                 self._report(kind, what, since, now)
                 self._retry_at = now
             return self._fault is not None and self._watch.reconnect and now >= self._retry_at
-        self._good_at = now
         if self._fault is not None:
+            if self._fault.kind == "silent" and not self._fault.attempts:
+                if self._fault.resumed is None:
+                    self._fault.resumed = now
+                if now - self._fault.resumed < SETTLE_SECONDS:
+                    return False
             self._is_back(now)
+        self._good_at = now
         self._t = max(t, float(np.nextafter(self._t, np.inf)))
         self.missed += self._slot is not None
         self._slot = Arrival(image, self._t, self._seq, self._connection, now)
