@@ -184,7 +184,7 @@ class ContactDetector:
         half, cells = _cells(image)
         smooth = np.asarray(cv2.blur(cells, (3, 3)), np.float32)
         if self._mean is None or self._half is None or self._squares is None:
-            self._mean, self._half = smooth, half
+            self._mean, self._half = smooth, half.astype(np.float32)
             self._squares = np.zeros_like(smooth)
             self._noise = _spatial_noise(cells)
         else:
@@ -278,7 +278,7 @@ class ContactDetector:
             window = mask[
                 _CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop
             ]
-            window[large > 0] = 255
+            window |= 255 * (large > 0).view(np.uint8)
         mask = np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
         return ContactResult(mask, bool(mask.any()), math.sqrt(largest))
 
@@ -292,11 +292,16 @@ _Blob = tuple[slice, slice, NDArray[np.bool_]]
 
 
 def _level(
-    half: Float, found: Float, known: _Reference, rows: slice, columns: slice, inside: NDArray[np.bool_]
+    half: NDArray[np.uint8],
+    found: Float,
+    known: _Reference,
+    rows: slice,
+    columns: slice,
+    inside: NDArray[np.bool_],
 ) -> Float:
     """Level set of one contact's outline, at half resolution, over a window given in cells."""
     fine = slice(2 * rows.start, 2 * rows.stop), slice(2 * columns.start, 2 * columns.stop)
-    answer = half[fine] - known.half[fine]
+    answer = np.asarray(cv2.subtract(half[fine], known.half[fine], dtype=cv2.CV_32F), np.float32)
     answer -= light_change(found, known.half_shade, *fine)
     answer *= known.half_scale[fine]
     answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8), np.float32)
@@ -344,8 +349,8 @@ def _blobs(
     return blobs
 
 
-def _cells(image: NDArray[np.uint8]) -> tuple[Float, Float]:
-    """Means over 2 x 2 and over 4 x 4 px, float32; the border is repeated to make whole cells."""
+def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Float]:
+    """Means over 2 x 2 px, uint8, and over 4 x 4 px, float32; the border is repeated to make whole cells."""
     bottom, right = -image.shape[0] % _CELL, -image.shape[1] % _CELL
     padded = np.ascontiguousarray(image)
     if bottom or right:
@@ -353,7 +358,7 @@ def _cells(image: NDArray[np.uint8]) -> tuple[Float, Float]:
     height, width = padded.shape[:2]
     half = cv2.resize(padded, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
     cells = cv2.resize(half, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
-    return half.astype(np.float32), cells.astype(np.float32)
+    return np.asarray(half, np.uint8), cells.astype(np.float32)
 
 
 def _steepness(picture: Float) -> Float:

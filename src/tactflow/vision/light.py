@@ -51,6 +51,7 @@ class LightChange:
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._coarse(reference)
         self._limit: Float = np.float32(_CLIP) * np.sqrt(self._coarse(variance)).T[:, None, :]
+        self._lower: Float = -self._limit
 
     def shade(self, reference: Float) -> Float:
         """How the reference differs from its mean, relative: what a gain multiplies."""
@@ -66,9 +67,11 @@ class LightChange:
         found[..., 0] = np.sort(excess, axis=2)[..., excess.shape[2] // 2]
         for _ in range(_ROUNDS):
             residual = excess - found @ self._basis
-            step = np.clip(residual, -self._limit, self._limit) @ self._solve - found @ self._shrink
+            np.maximum(residual, self._lower, out=residual)
+            np.minimum(residual, self._limit, out=residual)
+            step = residual @ self._solve - found @ self._shrink
             found += step
-            if float(np.abs(step).max()) < _SETTLED:
+            if max(float(step.max()), -float(step.min())) < _SETTLED:
                 break
         return np.asarray(found[:, 0], np.float32)
 
@@ -85,12 +88,12 @@ def light_change(found: Float, shade: Float, rows: slice, columns: slice) -> Flo
     """
     height, width = shade.shape[:2]
     x, y = _positions(width)[columns], _positions(height)[rows]
-    along = (found[:, 0] + x[:, None] * found[:, 1]).ravel()
-    across = np.tile(found[:, 2], x.size)
-    change: Float = shade[rows, columns].reshape(y.size, -1) * np.tile(found[:, 3], x.size)
-    change += along
-    change += y[:, None] * across
-    return change.reshape(y.size, x.size, 3)
+    gain = np.hstack([np.diag(found[:, 3]), found[:, :1]])
+    change: Float = np.asarray(cv2.transform(shade[rows, columns], gain), np.float32)
+    flat = change.reshape(y.size, -1)
+    flat += (x[:, None] * found[:, 1]).ravel()
+    flat += y[:, None] * np.tile(found[:, 2], x.size)
+    return change
 
 
 @lru_cache(maxsize=16)
