@@ -226,8 +226,8 @@ class Watched:
         if fault and not fault.attempts and fault.detail:
             detail = f": {fault.detail}"
         return SourceError(
-            f"{self._name}: {what}, no good frame for {now - self._good_at:.1f} s{detail}. "
-            "Check its cable, power and light and what else may be using it; "
+            f"{self._name}: {what}, no good frame for {now - self._good_at:.1f} s{detail}; "
+            "check its cable, power and light and what else may be using it; "
             "no_frame_timeout says how long to wait (0: for ever)"
         )
 
