@@ -251,7 +251,7 @@ class ContactDetector:
         found = known.light.fit(smooth)
         expected = light_change(found, known.shade, slice(None), slice(None))
         expected += known.mean
-        return np.asarray(smooth - expected, np.float32), found
+        return np.subtract(smooth, expected, out=expected), found
 
     def _against_noise(self, image: NDArray[np.uint8]) -> ContactResult:
         known = self._reference()
@@ -302,9 +302,10 @@ def _level(
     """Level set of one contact's outline, at half resolution, over a window given in cells."""
     fine = slice(2 * rows.start, 2 * rows.stop), slice(2 * columns.start, 2 * columns.stop)
     answer = np.asarray(cv2.subtract(half[fine], known.half[fine], dtype=cv2.CV_32F), np.float32)
-    answer -= light_change(found, known.half_shade, *fine)
+    expected = light_change(found, known.half_shade, *fine)
+    answer -= expected
     answer *= known.half_scale[fine]
-    answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8), np.float32)
+    answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8, dst=expected), np.float32)
     size = (2 * inside.shape[1], 2 * inside.shape[0])
     belongs = cv2.resize(inside.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     return imprint(answer, np.asarray(belongs, np.uint8), _BRIDGE / 2)

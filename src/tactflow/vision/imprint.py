@@ -76,13 +76,14 @@ def imprint(change: Float, inside: Mask, bridge: float = 4.0) -> Float:
         it differs by at most 1e-3.
     """
     sums = np.array([[1, 1, 1]], np.float32)
-    mean = cv2.copyTo(cv2.transform(change, sums / 3), inside)
+    mean = np.asarray(cv2.copyTo(cv2.transform(change, sums / 3), inside), np.float32)
     strength = np.asarray(cv2.sqrt(cv2.copyTo(cv2.transform(change * change, sums), inside)), np.float32)
     typical = cv2.norm(strength, cv2.NORM_L2SQR) / max(cv2.norm(strength, cv2.NORM_L1), 1e-9)
     cap = max(GLOSS * typical, 1e-9)
-    strength = np.minimum(strength, np.float32(cap))
+    np.minimum(strength, np.float32(cap), out=strength)
     sign = -1 if cv2.sumElems(mean)[0] < 0 else 1
-    common: Float = np.asarray(np.minimum(sign * mean, cap / 3**0.5), np.float32)
+    mean *= np.float32(sign)
+    common: Float = np.minimum(mean, np.float32(cap / 3**0.5), out=mean)
     if 6 * cv2.norm(common, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
         return _brightened(common, _peak(common))
     return _tilted(strength, _peak(strength), bridge)

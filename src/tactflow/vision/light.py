@@ -88,11 +88,12 @@ def light_change(found: Float, shade: Float, rows: slice, columns: slice) -> Flo
     """
     height, width = shade.shape[:2]
     x, y = _positions(width)[columns], _positions(height)[rows]
-    gain = np.hstack([np.diag(found[:, 3]), found[:, :1]])
-    change: Float = np.asarray(cv2.transform(shade[rows, columns], gain), np.float32)
+    offset, along_x, along_y, gain = found.T
+    change: Float = np.asarray(cv2.transform(shade[rows, columns], np.diag(gain)), np.float32)
     flat = change.reshape(y.size, -1)
-    flat += (x[:, None] * found[:, 1]).ravel()
-    flat += y[:, None] * np.tile(found[:, 2], x.size)
+    across = np.stack([(x[:, None] * along_x + offset).ravel(), np.tile(along_y, x.size)])
+    # In place: memory for another picture costs more to get than to fill.
+    cv2.gemm(np.column_stack([np.ones_like(y), y]), across, 1.0, flat, 1.0, dst=flat)
     return change
 
 
