@@ -103,18 +103,23 @@ def test_all_sensors_publish_at_one_address(folder: Path) -> None:
 
 
 FLAKY = """
+from collections.abc import Iterator
 from pathlib import Path
+
+from tactflow.engine.frame import Frame
 from tactflow.stages.capture import Capture
 
 
 class Flaky(Capture):
-    def open(self):
+    def frames(self) -> Iterator[Frame]:
         trace = Path("attempts")
-        count = len(trace.read_text()) if trace.exists() else 0
-        trace.write_text("x" * (count + 1))
-        if count < 1:
-            raise OSError("the cable is loose")
-        super().open()
+        first = not trace.exists()
+        with trace.open("a") as file:
+            file.write("x")
+        for frame in super().frames():
+            if first and frame.seq == 10:
+                raise OSError("the cable is loose")
+            yield frame
 """
 
 
@@ -124,12 +129,13 @@ def test_a_sensor_that_fails_is_started_again_and_the_others_are_not_disturbed(f
         'capture: {source: "sim:press', "capture: {use: './flaky.py:Flaky', source: \"sim:press"
     )
     (folder / "pipeline.yaml").write_text(text)
-    done = run("--quiet", "--set", "sinks.jsonl.overwrite=true", cwd=folder)
+    done = run("--quiet", "--jsonl", "more.jsonl", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "left failed (exit code 4); starting again in 1 s" in done.stderr
     assert "the cable is loose" in done.stderr
     assert (folder / "attempts").read_text() == "xx"
-    assert len(rows(folder / "out-left.jsonl")) == 40
+    for file in ("out-left.jsonl", "more-left.jsonl"):
+        assert [row["seq"] for row in rows(folder / file)] == [*range(10), *range(40)], "nothing is lost"
     assert len(rows(folder / "out-right.jsonl")) == 30
     assert done.stderr.count("right failed") == 0
 

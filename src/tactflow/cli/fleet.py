@@ -9,6 +9,7 @@ the others go on.
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from typing import IO
 import zmq
 
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.run import INTERRUPTED
 from tactflow.engine.sensors import PLACEHOLDER
 
@@ -73,7 +74,9 @@ def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipe
                 for node in pipelines[name].sinks
                 if node.component.name == "view"
             ]
-            members.append(_Member(name, _command(args, file, name, private)))
+            private += _added_sinks(pipelines[name], name)
+            command = _command(args, file, name, private)
+            members.append(_Member(name, command, _again(command, pipelines[name])))
         return _Supervisor(members).run()
 
 
@@ -92,7 +95,7 @@ def _command(args: argparse.Namespace, file: Path, sensor: str, overrides: Seque
     command = [sys.executable, "-m", "tactflow", verb, str(file), "--sensor", sensor]
     for text in (*args.overrides, *overrides):
         command += ["--set", text]
-    for option in ("jsonl", "stats", "trace", "out"):
+    for option in ("stats", "trace", "out"):
         path = getattr(args, option, None)
         if path is not None:
             command += [f"--{option}", with_name(str(path), sensor)]
@@ -105,10 +108,31 @@ def _command(args: argparse.Namespace, file: Path, sensor: str, overrides: Seque
     return command
 
 
-def _again(command: Sequence[str]) -> list[str]:
-    """The command that starts a sensor after a failure: what it has recorded so far must stay."""
+def _lines(pipeline: Pipeline) -> Iterator[tuple[Node, str]]:
+    """The sinks that write JSON Lines, and where to."""
+    for node in pipeline.sinks:
+        if node.component.name == "jsonl":
+            yield node, str(getattr(node.params, "path", "-"))
+
+
+def _added_sinks(pipeline: Pipeline, sensor: str) -> list[str]:
+    """The sinks of `--jsonl` as overrides, so that a later override may change them."""
+    return [
+        f"sinks.{node.id}={{use: jsonl, path: {json.dumps(with_name(path, sensor))}}}"
+        for node, path in _lines(pipeline)
+        if str(node.mark).startswith("--jsonl")
+    ]
+
+
+def _again(command: Sequence[str], pipeline: Pipeline) -> list[str]:
+    """The command that starts a sensor after a failure: what it has written so far must stay."""
     kept = [word for word in command if word not in ("--overwrite", "--number")]
-    return [*kept, "--number"] if "record" in command[:4] else list(command)
+    if "record" in command[:4]:
+        kept.append("--number")
+    for node, path in _lines(pipeline):
+        if path != "-":
+            kept += ["--set", f"sinks.{node.id}.overwrite=false", "--set", f"sinks.{node.id}.append=true"]
+    return kept
 
 
 def _refuse_clashes(args: argparse.Namespace, pipelines: Mapping[str, Pipeline]) -> None:
@@ -207,6 +231,7 @@ class _Member:
 
     sensor: str
     command: list[str]
+    again: list[str]
     process: subprocess.Popen[str] | None = None
     started: float = 0.0
     start_at: float = 0.0
@@ -264,7 +289,7 @@ class _Supervisor:
             return
         pause = min(FIRST_PAUSE * 2 ** (member.failures - 1), LONGEST_PAUSE)
         member.start_at = time.monotonic() + pause
-        member.command = _again(member.command)
+        member.command = member.again
         self._say(member, f"failed (exit code {code}); starting again in {pause:g} s")
 
     def _start(self, member: _Member) -> None:
