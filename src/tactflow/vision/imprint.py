@@ -157,7 +157,7 @@ def fill(mask: Mask) -> Mask:
 
     mask : (h, w) uint8, 0 or 1. Returns the same, fresh.
     """
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     filled = np.zeros_like(mask)
     if not outlines:
         return filled

@@ -91,9 +91,13 @@ def light_change(found: Float, shade: Float, rows: slice, columns: slice) -> Flo
     offset, along_x, along_y, gain = found.T
     change: Float = np.asarray(cv2.transform(shade[rows, columns], np.diag(gain)), np.float32)
     flat = change.reshape(y.size, -1)
-    across = np.stack([(x[:, None] * along_x + offset).ravel(), np.tile(along_y, x.size)])
+    across = np.empty((2, x.size, 3), np.float32)
+    across[0] = x[:, None] * along_x + offset
+    across[1] = along_y
+    down = np.ones((y.size, 2), np.float32)
+    down[:, 1] = y
     # In place: memory for another picture costs more to get than to fill.
-    cv2.gemm(np.column_stack([np.ones_like(y), y]), across, 1.0, flat, 1.0, dst=flat)
+    cv2.gemm(down, across.reshape(2, -1), 1.0, flat, 1.0, dst=flat)
     return change
 
 
