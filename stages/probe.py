@@ -36,6 +36,12 @@ class Probe:
         tile: int = Field(
             40, ge=8, description="edge of the tiles that are tested on their own, px of the raw frame"
         )
+        hold: int = Field(
+            8,
+            ge=0,
+            description="frames for which a change keeps the stages at work: what moves slowly is rarely seen "
+            "to move in every frame",
+        )
         at_least_every: int = Field(
             30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"
         )
@@ -45,6 +51,7 @@ class Probe:
         self.params = params
         self._probe: ChangeProbe | None = None
         self._since = 0
+        self._hold = 0
 
     def reset(self) -> None:
         """A new reference follows: choose the places to look at anew."""
@@ -58,7 +65,8 @@ class Probe:
             )
         changed = self._probe.look(frame.image)
         self._since += 1
-        if changed or frame.reference or self._since >= self.params.at_least_every:
+        self._hold = self.params.hold if changed else max(self._hold - 1, -1)
+        if self._hold >= 0 or frame.reference or self._since >= self.params.at_least_every:
             self._since = 0
             self._probe.anchor_here()
             return ProbePorts(True)

@@ -15,10 +15,17 @@ def changes(probe: Probe, count: int, *, reference: bool = False) -> list[bool]:
 
 
 def test_a_still_scene_is_worked_on_at_least_every_so_many_frames() -> None:
-    probe = Probe(Probe.Params(at_least_every=5))
+    probe = Probe(Probe.Params(at_least_every=5, hold=0))
     found = changes(probe, 40)
     assert found[:6] == [True] * 6, "while the noise is not known"
     assert [i for i, c in enumerate(found) if c][6:] == [10, 15, 20, 25, 30, 35]
+
+
+def test_a_change_keeps_the_stages_at_work_for_a_while() -> None:
+    probe = Probe(Probe.Params(hold=3))
+    assert changes(probe, 20) == [True] * 9 + [False] * 11, "six frames to learn the noise, and three more"
+    brighter = Frame("s", 20, 20 / 60, np.clip(IMAGE.astype(np.int16) + 9, 0, 255).astype(np.uint8))
+    assert [probe.process(brighter).changed for _ in range(6)] == [True] * 4 + [False] * 2
 
 
 def test_a_reference_frame_is_always_worked_on() -> None:
@@ -27,7 +34,7 @@ def test_a_reference_frame_is_always_worked_on() -> None:
 
 
 def test_a_reset_starts_anew() -> None:
-    probe = Probe(Probe.Params())
+    probe = Probe(Probe.Params(hold=0))
     assert not changes(probe, 10)[-1]
     probe.reset()
     assert changes(probe, 6) == [True] * 6

@@ -40,6 +40,8 @@ ALLOWED = 3.0
 noise of two measurements, the rest is for what moved too little to be noticed."""
 
 _SECOND_DIFFERENCE = math.sqrt(6)
+_ENOUGH = 20
+"""Second differences from which a noise is told: it is then known to about a fifth."""
 
 
 @dataclass(slots=True)
@@ -161,8 +163,8 @@ def _judge(result: Comparison, rows: Sequence[_Row]) -> None:
             if before.repeated and now.repeated and after.repeated
             if all(name in row.off for row in (before, now, after))
         ]
-        if bends:
-            joined = np.concatenate(bends)
+        joined = np.concatenate(bends) if bends else np.empty(0)
+        if joined.size >= _ENOUGH:
             result.noise[name] = float(np.sqrt(np.square(joined).mean())) / _SECOND_DIFFERENCE
 
 
