@@ -39,8 +39,8 @@ class Probe:
         hold: int = Field(
             8,
             ge=0,
-            description="frames for which a change keeps the stages at work: what moves slowly is not seen to "
-            "move in every frame",
+            description="frames for which a change keeps the stages at work: what moves slowly is not seen "
+            "to move in every frame",
         )
         at_least_every: int = Field(
             30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"
