@@ -18,6 +18,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from tactflow.cli.fleet import run_fleet
+from tactflow.cli.options import add_pipeline
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.cli.story import share
 from tactflow.engine.config import load_pipeline, sensor_names
@@ -33,20 +34,10 @@ _COSTLIEST = 4
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `run`."""
-    parser.add_argument(
-        "pipeline", nargs="?", metavar="PIPELINE", help="default: ./pipeline.yaml, else the packaged one"
-    )
+    add_pipeline(parser)
     parser.add_argument("--source", metavar="SRC", help="replaces the source of the pipeline's capture stage")
     parser.add_argument(
         "--jsonl", metavar="PATH", help="also write one result message a frame ('-': standard output)"
-    )
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="a.b.c=VALUE",
-        help="override one value of the pipeline file; repeatable; null removes a whole stage or sink",
     )
     parser.add_argument("--max-frames", type=_positive, metavar="N", help="stop after N frames")
     parser.add_argument(
