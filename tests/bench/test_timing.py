@@ -6,11 +6,27 @@ import numpy as np
 from tactflow.bench import timing
 
 
-def test_alternatives_take_turns_frame_by_frame() -> None:
+def test_alternatives_take_turns_of_a_few_inputs_and_the_last_turn_may_be_shorter() -> None:
     calls: list[tuple[str, int]] = []
     alternatives = {name: (lambda value, name=name: calls.append((name, value))) for name in "ab"}
-    timing.interleaved(alternatives, [("x", 0), ("y", 1)])
-    assert calls == [("a", 0), ("b", 0), ("a", 1), ("b", 1)]
+    timing.interleaved(alternatives, [("x", 0), ("y", 1), ("x", 2)], block=2)
+    assert calls == [("a", 0), ("a", 1), ("b", 0), ("b", 1), ("a", 2), ("b", 2)]
+
+
+def test_a_method_is_not_disturbed_by_the_judging_of_its_results_within_a_turn() -> None:
+    events: list[tuple[str, int]] = []
+
+    def work(value: int) -> int:
+        events.append(("call", value))
+        return -value
+
+    def see(_name: str, _kind: object, value: int, result: int) -> None:
+        assert result == -value
+        events.append(("see", value))
+
+    timing.interleaved({"a": work}, [("k", 1), ("k", 2), ("k", 3)], block=2, see=see)
+    expected = [("call", 1), ("call", 2), ("see", 1), ("see", 2), ("call", 3), ("see", 3)]
+    assert events == expected
 
 
 def test_times_are_kept_apart_by_kind() -> None:
@@ -28,8 +44,16 @@ def test_results_are_seen_outside_the_timed_part() -> None:
 
 def test_a_method_that_uses_up_its_time_is_left_out() -> None:
     calls: list[int] = []
-    timing.interleaved({"slow": calls.append}, [("k", 1), ("k", 2)], give_up_after=0.0)
+    seen: list[int] = []
+    timing.interleaved(
+        {"slow": calls.append, "fast": lambda _: None},
+        [("k", 1), ("k", 2), ("k", 3)],
+        block=2,
+        give_up_after=0.0,
+        see=lambda name, _kind, value, _result: seen.append(value) if name == "slow" else None,
+    )
     assert calls == [1]
+    assert seen == [1]
 
 
 def test_measuring_uses_one_opencv_thread_and_restores_the_setting() -> None:
@@ -55,7 +79,8 @@ def test_the_unit_is_the_time_of_a_real_copy_and_a_real_pass() -> None:
     unit = timing.CopyUnit()
     before = [int(frame[0, 0, 0]) for frame in unit._pool]
     unit.take()
-    assert np.all(unit._pool[20] == before[0])
-    assert np.all(unit._pool[30] == 255 - before[10])
+    quarter = len(before) // 4
+    assert np.all(unit._pool[2 * quarter] == before[0])
+    assert np.all(unit._pool[3 * quarter] == 255 - before[quarter])
     assert unit.copy_ms > 0
     assert unit.touch_ms > 0

@@ -1,16 +1,17 @@
-"""Whole pipelines, taking turns frame by frame.
+"""Whole pipelines, taking turns.
 
 Each pipeline runs in the real engine with all its nodes in one segment, so in one thread that reads a frame,
 computes, writes its JSON line, and comes back for the next frame. Here that thread is held at the source
-until it is its turn. So pipelines can be compared frame by frame (A B A B ...) in one process, and the
-measured time is everything a frame costs, reading and writing included, and nothing else.
+until it is its turn, and then runs freely through as many frames as the turn has. So pipelines can be
+compared with each other (A B A B ...) in one process, and the measured time is everything a frame costs in a
+pipeline that streams, reading and writing included, and nothing else.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -62,31 +63,50 @@ class Collect:
 
 
 class _Turns:
-    """Hands one turn at a time to the pipeline's thread, and takes it back with the time it took."""
+    """Hands turns to the pipeline's thread, and takes them back with what it said and how long that took.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    keep : called in the pipeline's thread with a frame's CPU and wall time, s, between the timed parts.
+    """
+
+    def __init__(self, keep: Callable[[float, float], None]) -> None:
+        self._keep = keep
         self._go = threading.Semaphore(0)
         self._done = threading.Semaphore(0)
+        self._granted = 0
+        self._left = 0
+        self._finished = 0
         self._ended = False
-        self.cpu = 0.0
-        self.wall = 0.0
         self._start: tuple[float, float] | None = None
 
-    def take(self) -> bool:
-        """For the bench: let one frame through; False if there is none."""
+    def take(self, frames: int) -> bool:
+        """For the bench: let so many frames through, in one go; False if the recording ended before that."""
+        if self._ended:
+            return False
+        self._granted = frames
         self._go.release()
-        if not self._done.acquire(timeout=_PATIENCE):
-            raise TactflowError(f"one frame took more than {_PATIENCE:g} s")
+        finished = self._finished
+        while not self._done.acquire(timeout=_PATIENCE):
+            if self._finished == finished:
+                raise TactflowError(f"one frame took more than {_PATIENCE:g} s")
+            finished = self._finished
         return not self._ended
 
     def wait(self) -> bool:
         """For the pipeline's thread, in front of a frame: report the last one and wait. False to stop."""
         if self._start is not None:
-            self.cpu = time.thread_time() - self._start[0]
-            self.wall = time.perf_counter() - self._start[1]
+            cpu = time.thread_time() - self._start[0]
+            wall = time.perf_counter() - self._start[1]
             self._start = None
-            self._done.release()
-        self._go.acquire()
+            self._keep(cpu, wall)
+            self._finished += 1
+            self._left -= 1
+            if not self._left:
+                self._done.release()
+        if not self._left:
+            self._go.acquire()
+            self._left = self._granted
         if self._ended:
             return False
         self._start = (time.thread_time(), time.perf_counter())
@@ -100,7 +120,7 @@ class _Turns:
 
 
 class LockstepPipeline:
-    """One pipeline, run frame by frame.
+    """One pipeline, run a few frames at a time.
 
     Parameters
     ----------
@@ -109,7 +129,8 @@ class LockstepPipeline:
     """
 
     def __init__(self, pipeline: Pipeline, jsonl: Path | None) -> None:
-        self._turns = _Turns()
+        self._turns = _Turns(self._keep)
+        self._outcomes: list[Outcome] = []
         self._runner = Runner(_rewired(pipeline, jsonl, self._turns))
         self._result: RunResult | None = None
         self._thread = threading.Thread(target=self._run, name="tactflow-bench", daemon=True)
@@ -121,31 +142,57 @@ class LockstepPipeline:
         finally:
             self._turns.end()
 
+    def _keep(self, cpu: float, wall: float) -> None:
+        last = self._runner.nodes[_COLLECT].instance.last
+        self._outcomes.append(
+            Outcome(
+                frame=self._runner.source.last_frame,
+                contact=last.get("contact"),
+                flow=last.get("flow"),
+                markers=last.get("markers"),
+                contact_mask=last.get("contact_mask"),
+                mapping=last.get("mapping"),
+                image=last.get("image"),
+                cpu=cpu,
+                wall=wall,
+            )
+        )
+
+    def block(self, frames: int) -> list[Outcome]:
+        """Run the next frames without a pause between them.
+
+        Parameters
+        ----------
+        frames : how many, >= 1. What they say is kept until all are done, so this many results of the
+            pipeline must fit into memory.
+
+        Returns
+        -------
+        What was said about each. Fewer than asked for where the recording ends or the pipeline fails; the
+        call after that returns an empty list or raises.
+
+        Raises
+        ------
+        TactflowError
+            If the pipeline failed and there is nothing left to return.
+        """
+        complete = self._turns.take(frames)
+        outcomes, self._outcomes = self._outcomes, []
+        if not complete and not outcomes:
+            self._thread.join(_PATIENCE)
+            if self._result is not None and self._result.error is not None:
+                raise TactflowError(self._result.error)
+        return outcomes
+
     def step(self) -> Outcome | None:
-        """Run the next frame; None at the end of the recording.
+        """Run the next frame alone; None at the end of the recording.
 
         Raises
         ------
         TactflowError
             If the pipeline failed.
         """
-        if not self._turns.take():
-            self._thread.join(_PATIENCE)
-            if self._result is not None and self._result.error is not None:
-                raise TactflowError(self._result.error)
-            return None
-        last = self._runner.nodes[_COLLECT].instance.last
-        return Outcome(
-            frame=self._runner.source.last_frame,
-            contact=last.get("contact"),
-            flow=last.get("flow"),
-            markers=last.get("markers"),
-            contact_mask=last.get("contact_mask"),
-            mapping=last.get("mapping"),
-            image=last.get("image"),
-            cpu=self._turns.cpu,
-            wall=self._turns.wall,
-        )
+        return next(iter(self.block(1)), None)
 
     def stages_ms(self) -> dict[str, float]:
         """Stage or sink -> median time of a call so far, ms."""

@@ -19,7 +19,7 @@ from tactflow.bench.methods import SEED, fill_times
 from tactflow.bench.results import Measurement
 from tactflow.bench.scenes import Rendered
 from tactflow.bench.score import ContactScore, FlowScore, MarkerScore
-from tactflow.bench.timing import CopyUnit, Samples, quiet, timed
+from tactflow.bench.timing import BLOCK, CopyUnit, Samples, quiet, timed
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
@@ -166,15 +166,16 @@ def take_turns(
     unit: CopyUnit,
     see: Callable[[str, Outcome], str],
     step: Callable[[], None],
+    block: int = BLOCK,
 ) -> tuple[Times, dict[str, str]]:
-    """Run pipelines frame by frame, taking turns, until all recordings are over.
+    """Run pipelines in turns of a few frames until all recordings are over.
 
     Parameters
     ----------
     pipelines : name -> pipeline, each with its recording.
     folder : for the JSON lines.
-    see : called with (name, outcome) after each frame; returns the kind of frame its time belongs to.
-    step : called after each frame of all.
+    see : called with (name, outcome) for each frame, after its turn; returns the kind of frame its time
+        belongs to. step : called once per frame, when all have done it. block : frames in a turn.
 
     Returns
     -------
@@ -192,22 +193,25 @@ def take_turns(
                     failures[name] = str(error)
             active = list(running)
             while active:
-                unit.take()
+                unit.take(block)
+                longest = 0
                 for name in list(active):
                     try:
-                        outcome = running[name].step()
+                        outcomes = running[name].block(block)
                     except TactflowError as error:
                         failures[name] = str(error)
                         active.remove(name)
                         continue
-                    if outcome is None:
+                    if not outcomes:
                         active.remove(name)
-                        continue
-                    kind = see(name, outcome)
-                    if outcome.frame.reference:
-                        kind = "reference"
-                    times.samples[name].setdefault(kind, Samples()).add(outcome.cpu, outcome.wall)
-                step()
+                    longest = max(longest, len(outcomes))
+                    for outcome in outcomes:
+                        kind = see(name, outcome)
+                        if outcome.frame.reference:
+                            kind = "reference"
+                        times.samples[name].setdefault(kind, Samples()).add(outcome.cpu, outcome.wall)
+                for _ in range(longest):
+                    step()
             times.stages = {name: lockstep.stages_ms() for name, lockstep in running.items()}
         finally:
             for lockstep in running.values():
@@ -223,7 +227,7 @@ def measure_pipelines(
     step: Callable[[], None],
     worst: Callable[[str, Worst], None] = lambda *_: None,
 ) -> list[Measurement]:
-    """Every pipeline on one scene, frame by frame in turns.
+    """Every pipeline on one scene, in turns of a few frames.
 
     Parameters
     ----------

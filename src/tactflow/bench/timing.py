@@ -1,8 +1,9 @@
 """Time of alternatives, measured so that they can be compared.
 
-Two habits make ratios trustworthy on a machine that other programs share: alternatives take turns frame by
-frame (A B A B ...), so that a slow moment hits all of them alike; and the process's own CPU time is kept
-beside the wall time, which counts what others did.
+Two habits make ratios trustworthy on a machine that other programs share: alternatives take turns
+(A B A B ...), so that a slow moment hits all of them alike; and the process's own CPU time is kept beside the
+wall time, which counts what others did. A turn is `BLOCK` frames in a row: within it, an alternative streams
+as it does in use, with its code and buffers in the cache.
 
 The unit "copy" is the median time in which the same machine, in the same run, copies one raw frame of
 800 x 600 x 3 bytes. It carries results from one machine to another far better than milliseconds do.
@@ -15,10 +16,16 @@ import statistics
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import cv2
 import numpy as np
+
+BLOCK = 20
+"""Frames that an alternative gets in a turn. After the turns of others its first frame takes 1.5 to 2 times
+as long, its second 1.1 to 1.3 times, the later ones as long as in a run of its own: of 20 that leaves the
+median where it belongs (of 5 it did not), and a turn is still short beside a recording."""
 
 RAW_SHAPE = (600, 800, 3)
 """Shape of the raw frame whose copy is the unit of time."""
@@ -79,18 +86,20 @@ def interleaved(
     alternatives: Mapping[str, Callable[[Any], Any]],
     inputs: Iterable[tuple[Hashable, Any]],
     *,
+    block: int = BLOCK,
     give_up_after: float = float("inf"),
     see: Callable[[str, Hashable, Any, Any], None] | None = None,
 ) -> dict[str, dict[Hashable, Samples]]:
-    """Give every input to every alternative in turn and time each call.
+    """Give every input to every alternative, in turns of a few inputs, and time each call.
 
     Parameters
     ----------
     alternatives : name -> callable of one input.
     inputs : (kind, input) pairs; times are kept apart by kind (for instance with and without contact).
+    block : inputs in a turn; their results are kept until it ends.
     give_up_after : s. An alternative whose calls took longer than this in total is left out from then on, so
         that one slow method cannot use up the time of all others.
-    see : called outside the timed part with (name, kind, input, result).
+    see : called after each turn, outside the timed part, with (name, kind, input, result).
 
     Returns
     -------
@@ -98,16 +107,20 @@ def interleaved(
     """
     times: dict[str, dict[Hashable, Samples]] = {name: {} for name in alternatives}
     spent = dict.fromkeys(alternatives, 0.0)
+    waiting = iter(inputs)
     with quiet():
-        for kind, value in inputs:
+        while turn := list(islice(waiting, block)):
             for name, call in alternatives.items():
-                if spent[name] > give_up_after:
-                    continue
-                samples = times[name].setdefault(kind, Samples())
-                result = timed(lambda call=call, value=value: call(value), samples)  # type: ignore[misc]
-                spent[name] += samples.wall[-1]
+                results: list[Any] = []
+                for kind, value in turn:
+                    if spent[name] > give_up_after:
+                        break
+                    samples = times[name].setdefault(kind, Samples())
+                    results.append(timed(lambda call=call, value=value: call(value), samples))  # type: ignore[misc]
+                    spent[name] += samples.wall[-1]
                 if see is not None:
-                    see(name, kind, value, result)
+                    for (kind, value), result in zip(turn, results, strict=False):
+                        see(name, kind, value, result)
     return times
 
 
@@ -116,11 +129,14 @@ class CopyUnit:
 
     `take` measures one copy of a raw frame and one pass that reads and writes every byte once (the least
     that any method which looks at the whole frame can cost); `copy_ms` and `touch_ms` are the medians.
-    Source and destination come from a pool that is larger than any cache nearby, since a camera's frame is
-    in memory too, and not in the cache, when it arrives.
+    Source and destination come from a pool several times as large as any cache nearby, because a camera's
+    frame is in memory too, and not in the cache, when it arrives; page size, alignment, and whether the pages
+    belong to a file in the page cache make no difference. Take many in a row, as pipelines are given many
+    frames in a row: the first copy after other work takes a fifth to a half longer than the next ones, and
+    the median of single ones changes with whatever that work was.
     """
 
-    _POOL = 40
+    _POOL = 120
 
     def __init__(self) -> None:
         self._pool = [np.full(RAW_SHAPE, value, dtype=np.uint8) for value in range(self._POOL)]
