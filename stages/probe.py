@@ -37,37 +37,49 @@ class Probe:
             40, ge=8, description="edge of the tiles that are tested on their own, px of the raw frame"
         )
         hold: int = Field(
-            8,
+            4,
             ge=0,
-            description="frames for which a change keeps the stages at work: what moves slowly is not seen "
-            "to move in every frame",
+            description="frames for which a change keeps the stages at work; they are all compared with the "
+            "one that changed, so that what moves too slowly for one frame adds up",
         )
         at_least_every: int = Field(
             30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"
         )
 
-    def __init__(self, params: Params) -> None:
-        """Prepare; the first frame says where to look."""
+    def __init__(self, params: Params, skipping: bool = True) -> None:
+        """Prepare; the first frame says where to look. Where nothing is skipped, nothing is looked at."""
         self.params = params
+        self._skipping = skipping
         self._probe: ChangeProbe | None = None
         self._since = 0
-        self._hold = 0
+        self._left = 0
 
     def reset(self) -> None:
         """A new reference follows: choose the places to look at anew."""
         self._probe = None
 
     def process(self, frame: Frame) -> ProbePorts:
-        """Compare with the last frame that was called changed. A reference frame always is."""
+        """Compare with the last frame that was worked on. A reference frame always is."""
+        if not self._skipping:
+            return ProbePorts(True)
         if self._probe is None:
             self._probe = ChangeProbe(
                 frame.image, false_alarms=self.params.false_alarms, tile=self.params.tile
             )
-        changed = self._probe.look(frame.image)
+        probe = self._probe
+        changed = probe.look(frame.image)
         self._since += 1
-        self._hold = self.params.hold if changed else max(self._hold - 1, -1)
-        if self._hold >= 0 or frame.reference or self._since >= self.params.at_least_every:
-            self._since = 0
-            self._probe.anchor_here()
-            return ProbePorts(True)
-        return ProbePorts(False)
+        if changed or (self._left == 1 and not probe.calm):
+            # Rest begins with a calm frame only: what is in doubt is taken for a change.
+            self._left = self.params.hold
+            probe.anchor_here()
+        elif self._left > 0:
+            self._left -= 1
+            if self._left == 0:
+                probe.anchor_here()
+        elif frame.reference or self._since >= self.params.at_least_every:
+            probe.anchor_here()
+        else:
+            return ProbePorts(False)
+        self._since = 0
+        return ProbePorts(True)

@@ -66,6 +66,17 @@ def test_false_alarms_keep_to_the_share_that_was_asked_for() -> None:
             gel() + 30 * cv2.circle(np.zeros((240, 320, 3), np.float32), (100, 90), 8, (1, 1, 1), -1),
         ),
         ("one row of tiles darkens", gel() - 2.0 * (np.arange(240) < 40)[:, None, None]),
+        # In a window of 3 x 3 tiles: 8 lines x 120 px, so 0.3 levels are 0.3 / (2 sqrt(2 / 960)) = 3.3 of its
+        # standard deviations in each channel, and 7.7 in the window of 7 x 7 that holds all of it.
+        (
+            "a soft shadow of 0.3 grey levels over a third of the frame",
+            gel() - 0.3 * (np.arange(320) < 120)[None, :, None],
+        ),
+        ("colour changes, brightness does not", gel() + np.array([1.0, -0.5, -0.5], np.float32)),
+        (
+            "one dot jumps by half a pitch",
+            np.concatenate([gel()[:, :60], gel(shift=12)[:, 60:84], gel()[:, 84:]], axis=1),
+        ),
     ],
 )
 def test_a_change_is_seen(what: str, image: NDArray[np.float32]) -> None:
@@ -93,6 +104,48 @@ def test_repeated_frames_are_unchanged_and_the_next_real_one_is_found() -> None:
     probe = ChangeProbe(image)
     assert [probe.look(image) for _ in range(20)] == [True] * 6 + [False] * 14
     assert probe.look(noisy(gel(), 2)), "new noise on a source that was frozen is a change"
+
+
+def test_a_flickering_light_is_never_taken_for_noise() -> None:
+    """All frames differ by whole grey levels that all tiles share; also after seconds of it."""
+    probe = ChangeProbe(noisy(gel(), 0))
+    levels = np.random.default_rng(5).normal(0, 3, 300)
+    changed = [probe.look(noisy(gel() + level, 100 + i)) for i, level in enumerate(levels)]
+    # Two levels in a row that differ by less than 0.1 are nearly the same light: 2 % of them; 6 % may be.
+    assert np.count_nonzero(changed) >= 282
+
+
+def test_noise_that_neighbouring_pixels_share_is_learned() -> None:
+    """A camera that smooths or compresses: sums over tiles scatter more than independent pixels would."""
+    smooth = [
+        cv2.GaussianBlur(np.random.default_rng(i).normal(0, 12, (240, 320, 3)), (0, 0), 2.0)
+        for i in range(150)
+    ]
+    probe = ChangeProbe(noisy(gel(), 0))
+    changed = [probe.look(noisy(gel() + extra, 200 + i, 0.5)) for i, extra in enumerate(smooth)]
+    # One in a thousand is asked for; while six pairs of frames are all that is known, more.
+    assert np.count_nonzero(changed[6:]) <= 4
+    assert probe.look(noisy(gel(shift=0.5), 999, 0.5))
+
+
+def test_noise_learned_while_everything_moved_is_learned_anew() -> None:
+    random = np.random.default_rng(3)
+    probe = ChangeProbe(noisy(gel(), 0))
+    for i in range(40):
+        probe.look(noisy(gel(shift=float(random.uniform(-4, 4))), i))
+    for i in range(160):
+        probe.look(noisy(gel(), 100 + i))
+    # As in a scene that never moved; the noise of a median of tiles is known to 6 %, see above.
+    assert probe.noise == pytest.approx(np.hypot(2.0, np.sqrt(1 / 12)), rel=0.06)
+    assert probe.look(noisy(gel(shift=0.1), 999))
+
+
+def test_what_is_calm_is_rarer_than_what_is_unchanged() -> None:
+    """One still frame in ten may be not calm (Bonferroni: fewer): 30 of 300, and 5 deviations are 26."""
+    probe = warmed_up(gel(), frames=40)
+    looks = [(probe.look(noisy(gel(), 1000 + i)), probe.calm) for i in range(300)]
+    assert not any(changed and calm for changed, calm in looks)
+    assert 0 < sum(not calm for _, calm in looks) < 30 + 26
 
 
 def test_noise_learned_from_frozen_frames_recovers() -> None:

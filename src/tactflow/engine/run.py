@@ -210,7 +210,13 @@ class Runner:
 
     def _build(self, node: Node, kind: type[TactflowError]) -> Any:
         """Construct a node's class with what its constructor asks for, and open it."""
-        offered = {"sensor": self.pipeline.sensor, "directory": self.pipeline.directory, "control": self}
+        pipeline = self.pipeline
+        offered = {
+            "sensor": pipeline.sensor,
+            "directory": pipeline.directory,
+            "skipping": pipeline.skipping,
+            "control": self,
+        }
         try:
             wanted = inspect.signature(node.component.cls).parameters
             extra = {name: value for name, value in offered.items() if name in wanted}

@@ -1,45 +1,56 @@
 """Has anything changed? A cheap look at a raw frame.
 
-The frame is sampled at about 9 000 fixed places instead of being read whole: in each tile, those with the
-steepest gradients (edges of dots, where motion shows most) and some spread evenly (where a contact
-shows). The difference to the samples of the *anchor*, the last frame that was worked on, is tested tile by
-tile against the sensor's own noise:
+About forty lines of the frame are read, spread evenly, and compared with those of the *anchor*, the last
+frame that was worked on. First the sum of squared differences over all of them: where that exceeds what noise
+makes, the frame has changed and nothing else is looked at. If it does not, sums over tiles are tested:
 
-- motion: the projection on the gel's gradients, which is the least-squares estimate of a displacement
-  (Lucas and Kanade, 1981) in units of its standard error, also of neighbouring tiles together;
-- light: the mean;
-- anything else: the sum of squares (chi-squared; Wilson and Hilferty's cube root turns it into a normal
-  deviate, 1931).
+- light: the sum of each channel, which shows a brightness that changes little but over an area;
+- motion: the projection on the gel's gradients at its steepest edges, which is the least-squares estimate of
+  a displacement (Lucas and Kanade, 1981);
+- marks: the sum over those edges, which shows a dot that went further than its own size.
 
-All are compared with one bound, set from the share of still frames that may be taken for changed
-(Bonferroni over all tests). Comparing with the anchor, not with the frame before, means that a slow drift
-adds up until it is seen.
+Each is tested in every tile and in windows of tiles (a contact shades and drags its surroundings along, and
+together they show what none of them shows alone), in units of the noise that such sums have on this sensor.
+That noise is learned from frames in a row, tile by tile. It is what neighbouring tiles do not share: light
+that flickers is never taken for noise. All tests have one bound, set from the share of still frames that may
+be taken for changed (Bonferroni over all tests).
+
+Comparing with the anchor, not with the frame before, means that a slow drift adds up until it is seen.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from statistics import NormalDist
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+_LINES = 40
+"""Lines of the frame that are read, about; each costs a trip to memory."""
 _EDGES = 24
 """Samples of a tile on its steepest edges."""
-_SPREAD = 8
-"""Samples of a tile spread at random."""
-_LINES = 150
-"""Lines of the frame that are read, spread evenly."""
+_WINDOWS = (1, 3, 7)
+"""Widths and heights of the windows that are tested, tiles; also all tiles."""
 _WARM_UP = 6
 """Pairs of frames from which the noise is learned before any frame is called unchanged."""
-_REACHES = (0, 1, 3)
-"""Motion is tested in a tile and in its neighbourhoods up to so many tiles away: a contact drags its
-surroundings along, and together they show a displacement that none of them shows alone."""
+_CALM = 0.1
+"""Share of still frames that are not calm."""
+_EVERY = 16
+"""Noise is learned in every so many frames: it changes slowly, and learning costs as much as a look."""
+_FORGETTING = 0.05
+"""Weight of a new pair of frames in the running noise."""
+_QUIET = 9.0
+"""A tile whose squared difference is so many times what noise makes (three standard deviations) moves."""
+_LOWER = 0.9
+"""Two frames that differ by less than this share of what noise is thought to make show that it makes less:
+a sum over a hundred thousand pixels is known to a percent."""
+_MEDIAN = 0.455
+"""Median of the square of a standard normal deviate."""
 _QUANTISATION = 1 / 12
 """Variance of rounding to whole grey levels: noise below it cannot be seen."""
-_FORGETTING = 0.05
-"""Weight of a new frame in the running noise."""
 
 
 class ChangeProbe:
@@ -64,31 +75,36 @@ class ChangeProbe:
         if not (tile >= 8 and math.isfinite(tile)):
             raise ValueError(f"required a tile of at least 8 px, got {tile}")
         self._shape = _checked(frame).shape
-        # Whole lines are read in one sweep; scattered reads of a frame that is not in the cache cost more.
-        step = max(1, frame.shape[0] // _LINES)
-        self._lines = slice(step // 2, None, step)
-        self._places, gradients, self._grid = _choose_places(frame, self._lines, tile)
-        strength = self._by_tile(np.square(gradients).sum(axis=1))
-        self._certainty = [
-            1 / np.sqrt(np.maximum(_neighbourhood(strength, reach), np.float32(1e-3))) for reach in _REACHES
-        ]
-        self._gradients = gradients
-        _, tiles = self._places.shape
-        tests = (2 + 2 * len(_REACHES)) * tiles + 2
-        self.bound = -NormalDist().inv_cdf(false_alarms / (2 * tests))
+        self._tiling = tiling = _Tiling(frame, tile)
+        noise = self._noise = _Noise(tiling)
+        self.bound, self._calm = (
+            -NormalDist().inv_cdf(share / (2 * (noise.tests + 1)))
+            for share in (false_alarms, max(false_alarms, _CALM))
+        )
         """What the strongest test value must exceed, in standard deviations."""
         self.strongest = float("inf")
         """The strongest test value of the last look, in standard deviations of noise; at least that, where
         it is above the bound: what has changed for sure is not tested further."""
-        self._anchor: NDArray[np.float32] | None = None
-        self._last: NDArray[np.float32] | None = None
-        self._variance: NDArray[np.float32] | None = None
-        self._pairs = 0
+        self._anchor: _Sample | None = None
+        self._last: _Sample | None = None
+        # The anchor, the last frame and this one.
+        self._spare = [_Sample(tiling) for _ in range(3)]
+        self._looks = 0
 
     @property
     def noise(self) -> float | None:
-        """Standard deviation of the noise in the median tile, grey levels; None before it is known."""
-        return None if self._variance is None else float(np.sqrt(np.median(self._variance)))
+        """Standard deviation of a pixel's noise, grey levels, over the frame; None before it is known."""
+        if self._noise.pairs == 0:
+            return None
+        return math.sqrt(max(self._noise.energy / (2 * self._tiling.count), _QUANTISATION))
+
+    @property
+    def calm(self) -> bool:
+        """Whether the last look saw nothing that nine of ten still frames do not show as well.
+
+        A change that is too small to be told from noise for sure mostly is not calm either.
+        """
+        return self.strongest <= self._calm
 
     def look(self, frame: NDArray[np.uint8]) -> bool:
         """Compare a frame with the anchor; one that has changed becomes the anchor.
@@ -101,122 +117,260 @@ class ChangeProbe:
         """
         if _checked(frame).shape != self._shape:
             raise ValueError(f"required a frame of shape {self._shape}, got {frame.shape}")
-        lines = frame[self._lines].copy()
-        samples = lines.reshape(-1).take(self._places).astype(np.float32)
-        last, self._last = self._last, samples
-        if last is not None:
-            self._learn(samples - last)
-        if self._anchor is None or self._pairs < _WARM_UP:
+        now, last = self._spare.pop(), self._last
+        now.take(frame)
+        noise = self._noise
+        warming_up = noise.pairs < _WARM_UP
+        if last is not None and warming_up:
+            noise.learn(now, last, self.bound)
+        if self._anchor is None or noise.pairs < _WARM_UP:
             self.strongest = float("inf")
         else:
-            self.strongest = self._strongest(samples - self._anchor)
+            self.strongest = self._compare(now, self._anchor)
         changed = self.strongest > self.bound
+        self._looks += 1
+        if last is not None:
+            if not warming_up and self._looks % _EVERY == 0:
+                noise.learn(now, last, self.bound)
+            if last is not self._anchor:
+                self._spare.append(last)
+        self._last = now
         if changed:
-            self._anchor = samples
+            self.anchor_here()
         return changed
 
     def anchor_here(self) -> None:
         """Make the frame of the last look the anchor: it is worked on, whatever the look said."""
+        if self._anchor is not None and self._anchor is not self._last:
+            self._spare.append(self._anchor)
         self._anchor = self._last
 
-    def _learn(self, step: NDArray[np.float32]) -> None:
-        """Follow each tile's noise by the difference of frames in a row; a moving tile teaches nothing."""
-        n, _ = step.shape
-        seen = np.maximum(_sums(step * step) * np.float32(0.5 / n), np.float32(_QUANTISATION))
-        self._pairs += 1
-        if self._variance is None:
-            self._variance = np.full_like(seen, np.median(seen))
-            return
-        # The mean of n squares scatters by sqrt(2 / n) of itself; six times that is motion, not noise.
-        quiet = seen < self._variance * np.float32(1 + 6 * math.sqrt(2 / n))
-        weight = np.float32(max(_FORGETTING, 1 / self._pairs))
-        self._variance = np.where(quiet, self._variance + weight * (seen - self._variance), self._variance)
-        if 2 * np.count_nonzero(quiet) < quiet.size:
-            # Most of the frame moves, or the noise was learned from frames that were repeated: creep up.
-            self._variance = np.where(quiet, self._variance, self._variance * np.float32(1.2))
-
-    def _strongest(self, difference: NDArray[np.float32]) -> float:
+    def _compare(self, now: _Sample, then: _Sample) -> float:
         """The largest of the tests' values, each a standard normal deviate under noise alone."""
-        assert self._variance is not None
-        n, tiles = difference.shape
-        scale = np.asarray(1 / np.sqrt(2 * self._variance), np.float32)
-        light = _sums(difference) * scale
-        squares = _sums(difference * difference) * (scale * scale)
-        strongest = max(
-            float(np.abs(light).max()) / math.sqrt(n),
-            abs(float(light.sum())) / math.sqrt(n * tiles),
-            _normal_deviate(float(squares.max()), n),
-            _normal_deviate(float(squares.sum()), n * tiles),
-        )
-        return strongest if strongest > self.bound else max(strongest, self._motion(difference, scale))
+        strongest = self._noise.excess(now.energy(then))
+        if strongest > self.bound:
+            return strongest
+        return max(strongest, self._noise.strongest(now.sums() - then.sums()))
 
-    def _motion(self, difference: NDArray[np.float32], scale: NDArray[np.float32]) -> float:
-        """The strongest displacement of a tile, or of the tiles of a neighbourhood together."""
-        across, down = self._gradients
-        pulls = self._by_tile(
-            np.stack([_sums(difference * across) * scale, _sums(difference * down) * scale])
-        )
-        return max(
-            cv2.norm(_neighbourhood(pulls, reach) * certainty, cv2.NORM_INF)
-            for reach, certainty in zip(_REACHES, self._certainty, strict=True)
-        )
+
+class _Tiling:
+    """Where to look: which lines, how they are cut into tiles, and where the steepest edges of a tile are.
+
+    Samples are laid out (lines, channels, pixels), with zeros added so that all tiles are equally large; sums
+    (rows of tiles, kinds, tiles in a row), the kinds being light of each channel, marks, and motion in x, y.
+    """
+
+    def __init__(self, frame: NDArray[np.uint8], tile: int) -> None:
+        frame = np.atleast_3d(frame)
+        height, width, self.channels = frame.shape
+        step = max(1, min(height // _LINES, tile))
+        self.slice = slice(step // 2, None, step)
+        lines = len(range(*self.slice.indices(height)))
+        thick = max(1, min(lines, round(tile / step)))
+        self.width = math.ceil(width / max(1, round(width / tile)))
+        self.grid = rows, columns = math.ceil(lines / thick), math.ceil(width / self.width)
+        self.size = rows * thick, self.channels, columns * self.width
+        self.used = lines, width
+        self.count = lines * width * self.channels
+        self.collect = np.kron(np.eye(rows, dtype=np.float32), np.ones((1, thick), np.float32))
+        self._choose_edges(frame)
+        pixels = np.zeros(self.size, np.float32)
+        pixels[:lines, :, :width] = 1
+        unit = np.empty((rows, self.channels + 3, columns), np.float32)
+        unit[:, : self.channels] = self._by_tile(pixels).sum(axis=-1)
+        at_edges = np.square(self.weights).sum(axis=1)
+        unit[:, self.channels :] = at_edges.reshape(-1, rows, columns).swapaxes(0, 1)
+        # A tile without any gradient shows no motion, and no noise of it either.
+        self.unit = np.maximum(unit, np.float32(1e-3))
+        """Variance of each sum for noise of variance 1 that is independent from pixel to pixel."""
+
+    def _choose_edges(self, frame: NDArray[np.uint8]) -> None:
+        """Flat indices (samples, tiles) of the steepest edges, and their weights in the sums there."""
+        lines, width = self.used
+        smooth = cv2.GaussianBlur(frame.astype(np.float32), (5, 5), 0)
+        gradients = np.zeros((2, *self.size), np.float32)
+        for gradient, (x, y) in zip(gradients, ((1, 0), (0, 1)), strict=True):
+            slope = np.atleast_3d(cv2.Sobel(smooth, cv2.CV_32F, x, y))[self.slice]
+            gradient[:lines, :, :width] = slope.transpose(0, 2, 1)
+        steepness = np.full(self.size, -1, np.float32)
+        steepness[:lines, :, :width] = np.hypot(*gradients)[:lines, :, :width]
+        tiles = steepness.size // math.prod(self.grid)
+        steepness = self._by_tile(steepness).swapaxes(1, 2).reshape(-1, tiles)
+        index = self._by_tile(np.arange(steepness.size).reshape(self.size)).swapaxes(1, 2).reshape(-1, tiles)
+        order = np.argsort(-steepness, axis=1, kind="stable")
+        # A tile with too few pixels gives some of them several times.
+        inside = np.count_nonzero(steepness >= 0, axis=1)[:, None]
+        order = np.take_along_axis(order, np.arange(_EDGES) % np.minimum(inside, _EDGES), axis=1)
+        places = np.take_along_axis(index, order, axis=1)
+        self.places = np.ascontiguousarray(places.T, dtype=np.intp)
+        slopes = gradients.reshape(2, -1)[:, self.places]
+        self.weights = np.ascontiguousarray(np.concatenate([np.ones_like(slopes[:1]), slopes]))
+        resting = np.zeros(self.size, np.uint8)
+        resting[:lines, :, :width] = frame[self.slice].transpose(0, 2, 1)
+        # Sums of differences to this are small numbers, which single precision adds without loss.
+        self.resting = resting.reshape(-1)[self.places].astype(np.float32)
+        self.ones = np.ones(_EDGES, np.float32)
 
     def _by_tile(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(2, tiles) as a picture of two channels, (rows, columns, 2)."""
-        return np.ascontiguousarray(values.T.reshape(*self._grid, 2))
+        """(lines, channels, pixels) as (rows, channels, columns, values of a tile)."""
+        rows, columns = self.grid
+        cut = values.reshape(rows, -1, self.channels, columns, self.width)
+        return cut.transpose(0, 2, 3, 1, 4).reshape(rows, self.channels, columns, -1)
 
 
-def _neighbourhood(picture: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
-    """Sum over each tile and its neighbours up to `reach` tiles away, (rows, columns, 2)."""
-    if reach == 0:
-        return picture
-    size = (2 * reach + 1, 2 * reach + 1)
-    return np.asarray(
-        cv2.boxFilter(picture, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT), np.float32
-    )
+class _Sample:
+    """The lines of one frame, and the sums over its tiles once they are asked for."""
+
+    def __init__(self, tiling: _Tiling) -> None:
+        self._tiling = tiling
+        self._planes = np.zeros(tiling.size, np.uint8)
+        lines, width = tiling.used
+        self._into = [self._planes[:lines, channel, :width] for channel in range(tiling.channels)]
+        self._sums: NDArray[np.float32] | None = None
+
+    def take(self, frame: NDArray[np.uint8]) -> None:
+        """Read the lines of a frame."""
+        self._sums = None
+        lines = frame[self._tiling.slice]
+        if len(self._into) == 1:
+            self._into[0][...] = lines.reshape(self._into[0].shape)
+        else:
+            cv2.split(lines, self._into)
+
+    def energy(self, other: _Sample) -> float:
+        """Sum of squared differences over all samples."""
+        return cv2.norm(self._planes, other._planes, cv2.NORM_L2SQR)
+
+    def sums(self) -> NDArray[np.float32]:
+        """Sums over tiles, (rows, kinds, columns)."""
+        if self._sums is None:
+            tiling = self._tiling
+            rows, columns = tiling.grid
+            channels = tiling.channels
+            sums = np.empty(tiling.unit.shape, np.float32)
+            light = cv2.reduce(
+                self._planes.reshape(-1, tiling.width), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S
+            ).astype(np.float32)
+            light = tiling.collect @ light.reshape(-1, channels * columns)
+            sums[:, :channels] = light.reshape(rows, channels, columns)
+            edges = self._planes.reshape(-1).take(tiling.places).astype(np.float32) - tiling.resting
+            # A product with ones goes to BLAS, which is faster than a sum along an axis.
+            at_edges = tiling.ones @ (edges * tiling.weights)
+            sums[:, channels:] = at_edges.reshape(-1, rows, columns).swapaxes(0, 1)
+            self._sums = sums
+        return self._sums
 
 
-def _sums(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sum over the samples of each tile."""
-    # A product with ones goes to BLAS, which is faster than a sum along the first axis.
-    return np.ones(len(values), np.float32) @ values
+class _Noise:
+    """What differences noise alone makes, learned from frames in a row.
 
-
-def _normal_deviate(squares: float, degrees: int) -> float:
-    """A chi-squared value as a standard normal deviate (Wilson and Hilferty)."""
-    spread = 2 / (9 * degrees)
-    return (math.cbrt(squares / degrees) - (1 - spread)) / math.sqrt(spread)
-
-
-def _choose_places(
-    frame: NDArray[np.uint8], lines: slice, tile: int
-) -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, int]]:
-    """Where to sample.
-
-    Returns flat indices (samples, tiles) into the frame's lines, the x and y gradients there (2, samples,
-    tiles), and the rows and columns of tiles.
+    pairs : pairs of frames seen. energy : sum of squared differences of two frames. tests : how many values
+    are compared with the bound in `strongest`.
     """
-    image = np.atleast_3d(frame).astype(np.float32)
-    height, width, channels = image.shape
-    smooth = np.atleast_3d(cv2.GaussianBlur(image, (5, 5), 0))
-    across = np.atleast_3d(cv2.Sobel(smooth, cv2.CV_32F, 1, 0))[lines]
-    down = np.atleast_3d(cv2.Sobel(smooth, cv2.CV_32F, 0, 1))[lines]
-    steepness = np.hypot(across, down)
-    best = steepness.argmax(axis=2)
-    random = np.random.default_rng(0)
-    chosen = []
-    bands = max(1, min(len(steepness), round(height / tile)))
-    across_tiles = max(1, round(width / tile))
-    for rows in np.array_split(np.arange(len(steepness)), bands):
-        for columns in np.array_split(np.arange(width), across_tiles):
-            pixels = (rows[:, None] * width + columns).ravel()
-            places = pixels * channels + best.ravel()[pixels]
-            order = np.argsort(steepness.ravel()[places], kind="stable")[::-1]
-            edges = np.resize(places[order[:_EDGES]], _EDGES)
-            spread = random.choice(pixels, _SPREAD) * channels + random.integers(0, channels, _SPREAD)
-            chosen.append(np.concatenate([edges, spread]))
-    index = np.ascontiguousarray(np.array(chosen, dtype=np.intp).T)
-    return index, np.stack([across.ravel()[index], down.ravel()[index]]), (bands, across_tiles)
+
+    def __init__(self, tiling: _Tiling) -> None:
+        rows, columns = tiling.grid
+        self._unit = tiling.unit
+        self._light = tiling.channels
+        self._windows = _windows(rows), np.ascontiguousarray(_windows(columns).T)
+        self._near = _neighbours(rows), np.ascontiguousarray(_neighbours(columns).T)
+        self.tests = len(self._windows[0]) * self._unit.shape[1] * self._windows[1].shape[1]
+        self.pairs = 0
+        self.energy = 0.0
+        self._spread = 0.0
+        self._least = 2 * _QUANTISATION * tiling.count
+        self._count = tiling.count
+        self._taught = 0
+        # Of each sum, for one frame: as seen in its tile, and as used.
+        self._seen = np.zeros_like(self._unit)
+        self._variance = np.zeros_like(self._unit)
+        self._settle()
+
+    def excess(self, energy: float) -> float:
+        """How far a sum of squared differences is above what noise makes, in its standard deviations."""
+        return (energy - self.energy) * self._energy_scale
+
+    def strongest(self, difference: NDArray[np.float32]) -> float:
+        """The largest deviation of a difference of sums in any window, in its standard deviations."""
+        return cv2.norm(_product(self._windows, difference) * self._scale, cv2.NORM_INF)
+
+    def learn(self, now: _Sample, last: _Sample, bound: float) -> None:
+        """Take in two frames in a row; a tile that moves teaches nothing, nor does a repeated frame."""
+        self.pairs += 1
+        energy = now.energy(last)
+        if energy == 0:
+            return
+        difference = now.sums() - last.sums()
+        own = difference.copy()
+        # What neighbours share is light that changes, and not noise.
+        own[:, : self._light] -= self._smooth(difference)[:, : self._light]
+        seen = np.square(own) * np.float32(0.5)
+        self._taught += 1
+        weight = max(_FORGETTING, 1 / self._taught)
+        if self._taught == 1:
+            level = np.median(seen / self._unit, axis=(0, 2), keepdims=True) / _MEDIAN
+            self._seen = np.asarray(level * self._unit, np.float32)
+            self.energy = energy
+        else:
+            ratio = np.asarray(seen / self._variance, np.float32)
+            typical = float(np.median(ratio))
+            quiet = ratio < _QUIET
+            self._seen += np.where(quiet, np.float32(weight) * (seen - self._seen), np.float32(0))
+            # If most of the frame moves, the noise may have been learned too low, and if most of it is much
+            # quieter than noise, it was learned while something moved: go there in steps.
+            moves = typical > _QUIET
+            if moves or typical < _MEDIAN / 4:
+                self._seen *= np.float32(1.25 if moves else 0.5)
+            if energy < _LOWER * self.energy:
+                self.energy, self._spread = energy, 0.0
+            elif moves or self._taught <= _WARM_UP or self.strongest(difference) <= bound:
+                beyond = energy - self.energy
+                self.energy += weight * beyond
+                self._spread += weight * (beyond * beyond - self._spread)
+        self._settle()
+
+    def _settle(self) -> None:
+        """From the variances of single tiles to the scales of all tests."""
+        own = np.asarray(self._seen / self._unit, np.float32)
+        # One tile's variance comes from few values, and its neighbours have nearly the same; only one that is
+        # clearly louder is louder.
+        level = np.maximum(np.maximum(self._smooth(own), own / 2), np.float32(_QUANTISATION))
+        self._variance = np.asarray(level * self._unit, np.float32)
+        # What is known from few pairs only is allowed to be wrong.
+        doubt = 1 / max(self._taught, 1)
+        windows = _product(self._windows, self._variance) * np.float32(2 * (1 + doubt))
+        self._scale = np.asarray(1 / np.sqrt(windows), np.float32)
+        spread = max(self._spread, 2 * max(self.energy, self._least) ** 2 / self._count)
+        self._energy_scale = 1 / math.sqrt(spread * (1 + _WARM_UP * doubt))
+
+    def _smooth(self, sums: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Mean over each tile and its neighbours, of each kind."""
+        return _product(self._near, sums).reshape(sums.shape)
+
+
+def _product(factors: Sequence[NDArray[np.float32]], sums: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sums (rows, kinds, columns) times a matrix from the left and one from the right, (n * kinds, m)."""
+    rows, _, columns = sums.shape
+    left, right = factors
+    return np.asarray((left @ sums.reshape(rows, -1)).reshape(-1, columns) @ right, np.float32)
+
+
+def _windows(count: int) -> NDArray[np.float32]:
+    """(n, count): ones where a window lies, for windows of all widths, each half overlapping the next."""
+    found = []
+    for width in {min(width, count) for width in (*_WINDOWS, count)}:
+        last = count - width
+        for start in {*range(0, last, (width + 1) // 2), last}:
+            found.append(np.arange(count) - start)
+            found[-1] = (found[-1] >= 0) & (found[-1] < width)
+    return np.array(found, dtype=np.float32)
+
+
+def _neighbours(count: int, reach: int = 2) -> NDArray[np.float32]:
+    """(count, count): the mean over those up to `reach` away."""
+    index = np.arange(count)
+    near = (np.abs(index[:, None] - index) <= reach).astype(np.float32)
+    return np.asarray(near / near.sum(axis=1, keepdims=True), np.float32)
 
 
 def _checked(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
