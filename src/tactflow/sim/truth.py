@@ -172,12 +172,20 @@ def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
     """The image in processed pixels: the mean of 2 x 2 bilinear samples of each processed pixel."""
     width, height = mapping.size
     total = np.zeros((height, width, 3), np.float32)
+    for x, y in _sample_places(mapping):
+        total += cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.rint(total / 4.0).astype(np.uint8)
+
+
+@lru_cache(maxsize=8)
+def _sample_places(mapping: Any) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Raw coordinates (H, W) of the four samples of each processed pixel."""
+    width, height = mapping.size
     grid = (
         np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
     )
+    places = []
     for shift in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         raw = np.asarray(mapping.to_raw(grid + shift), dtype=np.float32).reshape(height, width, 2)
-        x, y = np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])
-        sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        total += sampled
-    return np.rint(total / 4.0).astype(np.uint8)
+        places.append((np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])))
+    return places
