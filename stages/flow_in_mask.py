@@ -21,11 +21,11 @@ class FlowInMask:
         """Which markers count as inside, and how they are averaged."""
 
         dilate: float = Field(
-            2.0,
+            0.5,
             ge=0,
             le=1000,
-            description="markers up to this far outside the contact count too, px; more markers make the "
-            "mean steadier and mix in gel that moves less",
+            description="markers whose centre is up to this far outside the contact's outline count too, px; "
+            "more markers make the mean steadier and mix in gel that moves less",
         )
         method: Literal["mean", "seed"] = Field(
             "mean", description="seed: the original's whole-pixel displacements and square dilation"

@@ -9,12 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.outline import inside_outline
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 Method = Literal["mean", "seed"]
 
 # Markers whose scatter across a line is below this share of that along it do not span a plane.
 _FLAT: Final = 1e-3
+# How far from a mark's rim the region's outline is still bent by it, px: by what its mask takes more than the
+# mark, and by the smoothing after that.
+_HIDDEN: Final = 2.5
 _TRACKED: Final = int(MarkerStatus.TRACKED)
 _LOST: Final = int(MarkerStatus.LOST)
 
@@ -26,9 +30,11 @@ def flow_in_mask(
 
     markers : as the tracker gives them, processed pixels.
     mask : (H, W) uint8, non-zero inside the contact.
-    dilate : px; a marker is inside if a pixel of the mask is at most this far from the pixel that its
-        *current* position falls on. More takes in more markers (a steadier mean), also such as move less
-        because they lie outside the contact.
+    dilate : px; a marker is inside if its *current* centre lies at most this far outside of the region. More
+        takes in more markers (a steadier mean), also such as move less because they lie outside the contact.
+        Where the markers' radius is known, the region's outline is bridged below each of them
+        (`tactflow.vision.outline`) and the distance counts to a fraction of a pixel; otherwise it is that
+        between the pixel that a centre falls on and the nearest pixel of the mask.
     method : "mean" uses tracked and inferred markers with equal weight, since the mean is one over the
         contact's area and not over how well each marker is seen; lost ones count nowhere. "seed" is the
         original: every marker, position and displacement cut to whole pixels, a square of side
@@ -53,7 +59,11 @@ def flow_in_mask(
     if method == "seed":
         return _seed_flow(markers, mask, round(dilate))
     chosen = np.flatnonzero(markers.status != _LOST)
-    chosen = chosen[inside_mask(markers.position[chosen], mask, dilate)]
+    position = markers.position[chosen]
+    if markers.radius is None:
+        chosen = chosen[inside_mask(position, mask, dilate)]
+    else:
+        chosen = chosen[inside_outline(position, mask, markers.radius + _HIDDEN, dilate)]
     count = len(chosen)
     if count == 0:
         return Flow(None, 0)

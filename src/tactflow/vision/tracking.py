@@ -201,7 +201,7 @@ class MarkerTracker:
             stderr[~seen] = np.nan
             self._infer(position, seen, status)
         self._position, self._seen = position, seen
-        return Markers(self._origin.copy(), position.copy(), status, stderr)
+        return Markers(self._origin.copy(), position.copy(), status, stderr, self._radius)
 
     def _stretch(self, position: FloatArray) -> FloatArray:
         """By how much the displacements of neighbours differ, as a fraction of their distance: (E,)."""

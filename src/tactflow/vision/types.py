@@ -72,12 +72,14 @@ class Markers:
     position : (N, 2) float64, position in this frame, px. Finite for every status.
     status : (N,) uint8, values of `MarkerStatus`.
     stderr : (N,) float64, standard error of each coordinate of `position`, px; NaN where unknown.
+    radius : of a mark in the reference frame, px; None where the method does not know it.
     """
 
     origin: NDArray[np.float64]
     position: NDArray[np.float64]
     status: NDArray[np.uint8]
     stderr: NDArray[np.float64]
+    radius: float | None = None
 
     @property
     def displacement(self) -> NDArray[np.float64]:
