@@ -8,7 +8,7 @@ from pydantic import Field
 
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
-from tactflow.ports import ContactMask, Touching, Unmarked
+from tactflow.ports import ContactMask, MarkerMask, Touching, Unmarked
 from tactflow.vision.contact import ContactDetector
 
 
@@ -67,9 +67,11 @@ class Difference:
         """Forget the reference; a new one follows."""
         self._detector.reset()
 
-    def process(self, unmarked: Unmarked, frame: Frame) -> ContactPorts:
-        """The contact mask of this frame."""
+    def process(
+        self, unmarked: Unmarked, frame: Frame, marker_mask: MarkerMask | None = None
+    ) -> ContactPorts:
+        """The contact mask of this frame; below markers its outline is continued from what is seen."""
         if frame.reference or not self._detector.has_reference:
             self._detector.add_reference(unmarked)
-        result = self._detector.detect(unmarked)
+        result = self._detector.detect(unmarked, marker_mask)
         return ContactPorts(result.mask, result.touching)

@@ -197,13 +197,20 @@ class ContactDetector:
         self._last = image
         self._known = None
 
-    def detect(self, image: NDArray[np.uint8]) -> ContactResult:
+    def detect(self, image: NDArray[np.uint8], hidden: NDArray[np.uint8] | None = None) -> ContactResult:
         """Compare a frame with the untouched gel.
 
         image : (H, W, 3) uint8, BGR grey levels, without markers, of the reference's size.
-        Raises ValueError if it is not, or without a reference.
+        hidden : (H, W) uint8, not 0 where a marker was removed (`noise` only). There the outline follows what
+            is seen to both sides. None: what was painted there is taken for seen.
+        Raises ValueError if they are not of that kind, or without a reference.
         """
         self._check(image)
+        if hidden is not None and (hidden.shape != image.shape[:2] or hidden.dtype != np.uint8):
+            raise ValueError(
+                f"required a uint8 mask of shape {image.shape[:2]}, got shape {hidden.shape}, "
+                f"dtype {hidden.dtype}"
+            )
         if self._last is None:
             raise ValueError("required a reference frame first: call add_reference")
         if self._method == "seed":
@@ -211,7 +218,7 @@ class ContactDetector:
             return ContactResult(mask, bool(mask.any()))
         if self._method == "colour":
             return _colour_distance(image, self._last, self._distance)
-        return self._against_noise(image)
+        return self._against_noise(image, hidden)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
@@ -253,7 +260,7 @@ class ContactDetector:
         expected += known.mean
         return np.subtract(smooth, expected, out=expected), found
 
-    def _against_noise(self, image: NDArray[np.uint8]) -> ContactResult:
+    def _against_noise(self, image: NDArray[np.uint8], hidden: NDArray[np.uint8] | None) -> ContactResult:
         known = self._reference()
         half, cells = _cells(image)
         change, found = self._change(np.asarray(cv2.blur(cells, (3, 3)), np.float32), known)
@@ -273,7 +280,7 @@ class ContactDetector:
         mask = np.zeros((cells.shape[0] * _CELL, cells.shape[1] * _CELL), np.uint8)
         for rows, columns, inside in blobs:
             self._before[rows, columns] |= inside
-            level = _level(half, found, known, rows, columns, inside)
+            level = _level(half, found, known, rows, columns, inside, hidden)
             large = cv2.resize(level, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
             window = mask[
                 _CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop
@@ -298,6 +305,7 @@ def _level(
     rows: slice,
     columns: slice,
     inside: NDArray[np.bool_],
+    hidden: NDArray[np.uint8] | None,
 ) -> Float:
     """Level set of one contact's outline, at half resolution, over a window given in cells."""
     fine = slice(2 * rows.start, 2 * rows.stop), slice(2 * columns.start, 2 * columns.stop)
@@ -308,7 +316,18 @@ def _level(
     answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8, dst=expected), np.float32)
     size = (2 * inside.shape[1], 2 * inside.shape[0])
     belongs = cv2.resize(inside.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    return imprint(answer, np.asarray(belongs, np.uint8), _BRIDGE / 2)
+    below = None if hidden is None else _halved_mask(hidden, rows, columns)
+    return imprint(answer, np.asarray(belongs, np.uint8), _BRIDGE / 2, below)
+
+
+def _halved_mask(mask: NDArray[np.uint8], rows: slice, columns: slice) -> NDArray[np.uint8]:
+    """A window, given in cells, of a mask at half resolution: 1 where any pixel is not 0, else 0."""
+    part = mask[_CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop]
+    high, wide = 2 * (rows.stop - rows.start), 2 * (columns.stop - columns.start)
+    padded = np.zeros((2 * high, 2 * wide), np.uint8)
+    padded[: part.shape[0], : part.shape[1]] = part
+    pairs = cv2.max(padded[::2], padded[1::2])
+    return (np.maximum(pairs[:, ::2], pairs[:, 1::2]) > 0).view(np.uint8)
 
 
 def _squared_length(vectors: Float) -> Float:

@@ -11,6 +11,9 @@ the change is not: averaged along the whole outline, the profile of the change a
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +25,12 @@ OUTER = 0.4
 """Fraction of its peak at which a change of slope is cut. Lower takes in more of the surroundings of a
 contact and of gel that wrinkles; higher opens the ring where the light is faint."""
 
-RIDGE = 0.9
-"""The rim is where the mean profile reaches this fraction of its peak: the peak itself is flat on a knife
-edge, whose flanks have the same slope all the way in."""
+RIDGE = 0.87
+"""The rim is where the mean profile reaches this fraction of its peak: outside a contact the slope is about
+0.6 of that inside, and half way between the two, blurred, is the rim of a small contact's narrow ridge."""
+
+TOP = 0.9
+"""Fraction of its peak up to which the width of the profile's skirt is measured."""
 
 GLOSS = 2.0
 """A change of more than so many times its typical value (the mean weighted by the change itself) is a mirror
@@ -34,15 +40,15 @@ SKIRT = 0.6
 """Fraction of its peak to which the mean profile has fallen in the surroundings of the contact."""
 
 SHARP_SKIRT = 0.11
-"""Distance from there to the rim where the slope breaks at the rim, as on a half-space (Hertz), in half
+"""Distance from there to the top where the slope breaks at the rim, as on a half-space (Hertz), in half
 widths of the contact."""
 
 BLUR = 0.6
 """What smoothing adds to that distance, pixels at half resolution."""
 
-SOFTNESS = 1.0
+SOFTNESS = 1.75
 """Where the distance is larger, the gel is coated or soft and the slope has no break: the peak of the profile
-is as blunt as its skirt is wide, and `RIDGE` is reached too early by this part of the excess."""
+is as blunt as its skirt is wide, and `RIDGE` is reached too early by so many times the excess."""
 
 DEEPEST = 0.5
 """The rim is sought no further in than this part of the way to the middle: where the contact's own relief has
@@ -55,13 +61,22 @@ make the peak a little more."""
 SOLID = 0.96
 """Part of its convex hull that a region fills at least, if no gap is to be looked for."""
 
+TANGENT = 4
+"""Points of an outline over which its direction beside a marker is measured."""
+
 _PROFILE_STEP = 0.5
 _FEW = 8
 _ENOUGH = 8000
 """Pixels that are enough for the profile: of a window of n times as many, every n-th row is taken."""
+_FIXED = 4
+"""Bits behind the point of an outline's coordinates."""
+_POCKET = 0.8
+"""Part of an area between a region and the frame's border that the region's hull covers if it belongs."""
+
+Outlines = list[NDArray[np.int32]]
 
 
-def imprint(change: Float, inside: Mask, bridge: float = 4.0) -> Float:
+def imprint(change: Float, inside: Mask, bridge: float = 4.0, hidden: Mask | None = None) -> Float:
     """Level set of one contact's outline.
 
     Parameters
@@ -69,6 +84,9 @@ def imprint(change: Float, inside: Mask, bridge: float = 4.0) -> Float:
     change : (h, w, 3) float32, relative change of each channel, the light's own change taken out.
     inside : (h, w) uint8, not 0 where the change belongs to this contact.
     bridge : half the width of gaps that are closed in any case, px: what a removed marker can leave.
+    hidden : (h, w) uint8, 1 where a marker was removed, else 0; None where that is not known. What was
+        painted there smears the rim outwards and leaves gaps in it; the outline is continued below a marker
+        as a cubic curve from what is seen on both sides.
 
     Returns
     -------
@@ -84,9 +102,13 @@ def imprint(change: Float, inside: Mask, bridge: float = 4.0) -> Float:
     sign = -1 if cv2.sumElems(mean)[0] < 0 else 1
     mean *= np.float32(sign)
     common: Float = np.minimum(mean, np.float32(cap / 3**0.5), out=mean)
+    if hidden is not None:
+        hidden = np.asarray(cv2.bitwise_and(hidden, hidden, mask=inside), np.uint8)
+        if not cv2.countNonZero(hidden):
+            hidden = None
     if 6 * cv2.norm(common, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
-        return _brightened(common, _peak(common))
-    return _tilted(strength, _peak(strength), bridge)
+        return _brightened(common, _peak(common), hidden)
+    return _tilted(strength, _peak(strength), bridge, hidden)
 
 
 def _peak(values: Float) -> float:
@@ -94,33 +116,38 @@ def _peak(values: Float) -> float:
     return float(cv2.minMaxLoc(cv2.blur(values, (3, 3)))[1])
 
 
-def _brightened(mean: Float, peak: float) -> Float:
-    level = mean / np.float32(peak) - np.float32(HALF)
-    filled = fill((level > 0).astype(np.uint8))
-    level[(filled > 0) & (level <= 0)] = HALF
+def _brightened(mean: Float, peak: float, hidden: Mask | None) -> Float:
+    level = mean * np.float32(1 / peak) - np.float32(HALF)
+    filled = _pockets(*_outlined((level > 0).view(np.uint8), hidden))
+    wrong = (level > 0).view(np.uint8) != filled
+    level[wrong] = np.where(filled[wrong], np.float32(HALF), np.float32(-HALF))
     return np.asarray(np.minimum(level, np.float32(HALF)) * np.float32(8), np.float32)
 
 
-def _tilted(strength: Float, peak: float, bridge: float) -> Float:
-    changed = (strength > OUTER * peak).astype(np.uint8)
-    filled = fill(changed)
-    if _solidity(filled) < SOLID:
-        filled = fill(_without_gaps(changed, bridge))
+def _tilted(strength: Float, peak: float, bridge: float, hidden: Mask | None) -> Float:
+    changed = (strength > OUTER * peak).view(np.uint8)
+    filled, outlines = _outlined(changed, hidden)
+    if _solidity(outlines) < SOLID:
+        ring = changed if hidden is None else np.asarray(cv2.bitwise_and(changed | hidden, filled), np.uint8)
+        filled, outlines = _outlined(_without_gaps(ring, bridge) | filled, None)
+    filled = _pockets(filled, outlines)
     if filled.all():
         return np.ones_like(strength)
-    depth = cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5)
+    depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
     rows = slice(None, None, max(1, filled.size // _ENOUGH))
-    bins = (depth[rows] * np.float32(1 / _PROFILE_STEP)).astype(np.intp).ravel()
-    count = np.bincount(bins)[1:]
-    total = np.bincount(bins, weights=strength[rows].ravel())[1:]
+    bins = (depth[rows] * np.float32(1 / _PROFILE_STEP)).astype(np.intp)
+    if hidden is not None:
+        bins[hidden[rows] > 0] = 0
+    count = np.bincount(bins.ravel())[1:]
+    total = np.bincount(bins.ravel(), weights=strength[rows].ravel())[1:]
     known = np.flatnonzero(count >= _FEW)
     if known.size < 2:
         return np.asarray(depth - np.float32(0.5), np.float32)
     profile = np.asarray(total[known] / count[known], np.float64)
     at = np.asarray((known + 1.5) * _PROFILE_STEP, np.float64)
-    rim, skirt = (_crossing(profile, at, part) for part in (RIDGE, SKIRT))
+    rim, top, skirt = (_crossing(profile, at, part) for part in (RIDGE, TOP, SKIRT))
     middle = float(depth.max())
-    soft = rim - skirt - SHARP_SKIRT * (middle - rim) - BLUR
+    soft = top - skirt - SHARP_SKIRT * (middle - top) - BLUR
     return np.asarray(depth - np.float32(min(rim + SOFTNESS * max(soft, 0.0), DEEPEST * middle)), np.float32)
 
 
@@ -133,12 +160,79 @@ def _crossing(profile: NDArray[np.float64], at: NDArray[np.float64], part: float
     return float(np.interp(wanted, profile[first - 1 : first + 1], at[first - 1 : first + 1]))
 
 
-def _solidity(mask: Mask) -> float:
+def _outlined(mask: Mask, hidden: Mask | None) -> tuple[Mask, Outlines]:
+    """The parts of a region with their holes filled, and their outlines in fixed point.
+
+    mask : (h, w) uint8, 0 or 1. hidden : the same: what is not known of the mask.
+    """
+    known = mask if hidden is None else np.asarray(cv2.bitwise_or(mask, hidden), np.uint8)
+    found, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if hidden is None:
+        outlines = [np.asarray(outline[:, 0], np.int32) << _FIXED for outline in found]
+    else:
+        # Smoothing has carried what was painted one pixel further.
+        grown = np.asarray(cv2.dilate(hidden, np.ones((3, 3), np.uint8)), np.uint8)
+        outlines = [
+            outline
+            for outline in (_continued(np.asarray(outline[:, 0]), grown) for outline in found)
+            if outline is not None
+        ]
+    filled = np.zeros_like(mask)
+    if outlines:
+        cv2.fillPoly(filled, outlines, (1.0,), cv2.LINE_8, _FIXED)
+    return filled, outlines
+
+
+def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | None:
+    """An outline, (n, 2) px, its hidden parts replaced by cubics, in fixed point; None if all is hidden.
+
+    Between the last point before a marker and the first behind it runs the cubic that has the outline's
+    direction at both (Hermite); where the outline turns back, which no cubic should guess, a straight line.
+    """
+    below = hidden[outline[:, 1], outline[:, 0]] > 0
+    if not below.any():
+        return np.asarray(outline << _FIXED, np.int32)
+    if below.all():
+        return None
+    start = int(np.argmin(below))
+    points = np.roll(outline, -start, axis=0).astype(np.float32)
+    below = np.roll(below, -start)
+    count = len(points)
+    # Alternately where a hidden part begins and where it ends; the start is seen.
+    change = [*(np.flatnonzero(np.diff(below)) + 1).tolist(), *([count] if below[-1] else [])]
+    pieces, last = [points[: change[0]]], 0
+    for index in range(0, len(change), 2):
+        first, behind = change[index], change[index + 1]
+        following = change[index + 2] if index + 2 < len(change) else count + change[0]
+        before, after = points[first - 1], points[behind % count]
+        chord = after - before
+        length = math.hypot(*chord)
+        here = before - points[max(first - 1 - TANGENT, last)]
+        there = points[min(behind + TANGENT, following - 1) % count] - after
+        here *= np.float32(length / max(math.hypot(*here), 1e-9))
+        there *= np.float32(length / max(math.hypot(*there), 1e-9))
+        if length > 1 and 2 * min(here @ chord, there @ chord) > length * length:
+            pieces.append(_cubics(math.ceil(length)) @ np.stack([before, here, after, there]))
+        pieces.append(points[behind : min(following, count)])
+        last = behind
+    return np.rint(np.concatenate(pieces) * (1 << _FIXED)).astype(np.int32)
+
+
+@lru_cache(maxsize=64)
+def _cubics(steps: int) -> Float:
+    """(steps - 1, 4) float32: Hermite's cubics between start and end, both left out."""
+    t = np.arange(1, steps, dtype=np.float32) / np.float32(steps)
+    back = 1 - t
+    cubics = np.stack([(1 + 2 * t) * back**2, t * back**2, t**2 * (3 - 2 * t), -(t**2) * back], axis=1)
+    cubics.setflags(write=False)
+    return np.asarray(cubics, np.float32)
+
+
+def _solidity(outlines: Outlines) -> float:
     """Part of its convex hull that a region fills; 1 for an empty one."""
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     if not outlines:
         return 1.0
-    around = cv2.contourArea(cv2.convexHull(np.vstack(outlines)))
+    around = cv2.contourArea(cv2.convexHull(np.concatenate(outlines)))
     return sum(cv2.contourArea(outline) for outline in outlines) / max(around, 1.0)
 
 
@@ -152,24 +246,43 @@ def _without_gaps(mask: Mask, bridge: float) -> Mask:
     return np.asarray(mask | (inner > reach).view(np.uint8), np.uint8)
 
 
+def _pockets(filled: Mask, outlines: Outlines) -> Mask:
+    """Fill, in place, what a region encloses together with the border of the frame."""
+    rim = np.concatenate([filled[0], filled[1:, -1], filled[-1, -2::-1], filled[-2:0:-1, 0]])
+    starts = np.flatnonzero(rim < np.roll(rim, 1))
+    if len(starts) < 2:
+        return filled
+    height, width = filled.shape
+    hull = np.zeros_like(filled)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), (1.0,), cv2.LINE_8, _FIXED)
+    for start in starts:
+        seed = _on_rim(int(start), width, height)
+        if filled[seed[1], seed[0]] or not hull[seed[1], seed[0]]:
+            continue
+        other = filled.copy()
+        area, *_ = cv2.floodFill(other, None, seed, (2.0,))
+        pocket = (other == 2).view(np.uint8)
+        if cv2.countNonZero(cv2.bitwise_and(pocket, hull)) > _POCKET * area:
+            filled |= pocket
+    return filled
+
+
+def _on_rim(index: int, width: int, height: int) -> tuple[int, int]:
+    """(x, y) of a pixel on the border, counted clockwise from the top left corner."""
+    if index < width:
+        return index, 0
+    index -= width - 1
+    if index < height:
+        return width - 1, index
+    index -= height - 1
+    if index < width:
+        return width - 1 - index, height - 1
+    return 0, height - 1 - (index - width + 1)
+
+
 def fill(mask: Mask) -> Mask:
     """Fill what a region encloses, alone or together with the border of the frame.
 
     mask : (h, w) uint8, 0 or 1. Returns the same, fresh.
     """
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    filled = np.zeros_like(mask)
-    if not outlines:
-        return filled
-    cv2.drawContours(filled, outlines, -1, (1.0,), cv2.FILLED)
-    outside, labels = cv2.connectedComponents(1 - filled, connectivity=4, ltype=cv2.CV_16U)
-    if outside > 2:
-        hull = np.zeros_like(mask)
-        cv2.fillConvexPoly(hull, cv2.convexHull(np.vstack(outlines)), (1.0,))
-        size, covered = (
-            np.ravel(cv2.calcHist([labels], [0], where, [outside], [0, outside])) for where in (None, hull)
-        )
-        for index in range(1, outside):
-            if covered[index] > 0.8 * size[index]:
-                filled[labels == index] = 1
-    return filled
+    return _pockets(*_outlined(mask, None))
