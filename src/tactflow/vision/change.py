@@ -1,8 +1,9 @@
 """Has anything changed? A cheap look at a raw frame.
 
-About forty lines of the frame are read, spread evenly, and compared with those of the *anchor*, the last
-frame that was worked on. First the sum of squared differences over all of them: where that exceeds what noise
-makes, the frame has changed and nothing else is looked at. If it does not, sums over tiles are tested:
+A few lines of the frame are read, spread evenly, and compared with those of the *anchor*, the last frame
+that was worked on: where the sum of squared differences exceeds what noise makes, the frame has changed and
+nothing else is looked at. If it does not, the same is done with four times as many lines, and then sums over
+tiles are tested:
 
 - light: the sum of each channel, which shows a brightness that changes little but over an area;
 - motion: the projection on the gel's gradients at its steepest edges, which is the least-squares estimate of
@@ -30,6 +31,8 @@ from numpy.typing import NDArray
 
 _LINES = 40
 """Lines of the frame that are read, about; each costs a trip to memory."""
+_GLANCE = 4
+"""Every so manieth of these lines is read first; a contact that moves mostly shows in them."""
 _EDGES = 24
 """Samples of a tile on its steepest edges."""
 _WINDOWS = (1, 3, 7)
@@ -78,7 +81,7 @@ class ChangeProbe:
         self._tiling = tiling = _Tiling(frame, tile)
         noise = self._noise = _Noise(tiling)
         self.bound, self._calm = (
-            -NormalDist().inv_cdf(share / (2 * (noise.tests + 1)))
+            -NormalDist().inv_cdf(share / (2 * (noise.tests + 2)))
             for share in (false_alarms, max(false_alarms, _CALM))
         )
         """What the strongest test value must exceed, in standard deviations."""
@@ -96,7 +99,7 @@ class ChangeProbe:
         """Standard deviation of a pixel's noise, grey levels, over the frame; None before it is known."""
         if self._noise.pairs == 0:
             return None
-        return math.sqrt(max(self._noise.energy / (2 * self._tiling.count), _QUANTISATION))
+        return math.sqrt(max(self._noise.energy.mean / (2 * self._tiling.count), _QUANTISATION))
 
     @property
     def calm(self) -> bool:
@@ -109,7 +112,8 @@ class ChangeProbe:
     def look(self, frame: NDArray[np.uint8]) -> bool:
         """Compare a frame with the anchor; one that has changed becomes the anchor.
 
-        frame : same shape and dtype as the first.
+        frame : same shape and dtype as the first. It is kept while it is the anchor or the last one, and must
+            not be written to meanwhile.
 
         Returns
         -------
@@ -147,10 +151,13 @@ class ChangeProbe:
 
     def _compare(self, now: _Sample, then: _Sample) -> float:
         """The largest of the tests' values, each a standard normal deviate under noise alone."""
-        strongest = self._noise.excess(now.energy(then))
+        noise = self._noise
+        strongest = noise.glance.excess(now.glance(then))
+        if strongest <= self.bound:
+            strongest = max(strongest, noise.energy.excess(now.energy(then)))
         if strongest > self.bound:
             return strongest
-        return max(strongest, self._noise.strongest(now.sums() - then.sums()))
+        return max(strongest, noise.strongest(now.sums() - then.sums()))
 
 
 class _Tiling:
@@ -172,6 +179,8 @@ class _Tiling:
         self.size = rows * thick, self.channels, columns * self.width
         self.used = lines, width
         self.count = lines * width * self.channels
+        self.glance = slice(step // 2, None, _GLANCE * step)
+        self.glance_shape = frame[self.glance].shape
         self.collect = np.kron(np.eye(rows, dtype=np.float32), np.ones((1, thick), np.float32))
         self._choose_edges(frame)
         pixels = np.zeros(self.size, np.float32)
@@ -219,27 +228,41 @@ class _Tiling:
 
 
 class _Sample:
-    """The lines of one frame, and the sums over its tiles once they are asked for."""
+    """The lines of one frame: few of them at once, all and the sums over tiles once they are asked for."""
 
     def __init__(self, tiling: _Tiling) -> None:
         self._tiling = tiling
+        self._frame: NDArray[np.uint8] | None = None
+        self._few = np.empty(tiling.glance_shape, np.uint8)
         self._planes = np.zeros(tiling.size, np.uint8)
         lines, width = tiling.used
         self._into = [self._planes[:lines, channel, :width] for channel in range(tiling.channels)]
         self._sums: NDArray[np.float32] | None = None
 
     def take(self, frame: NDArray[np.uint8]) -> None:
-        """Read the lines of a frame."""
+        """Begin with another frame."""
         self._sums = None
-        lines = frame[self._tiling.slice]
-        if len(self._into) == 1:
-            self._into[0][...] = lines.reshape(self._into[0].shape)
-        else:
-            cv2.split(lines, self._into)
+        self._frame = frame
+        self._few[...] = frame[self._tiling.glance].reshape(self._few.shape)
+
+    def planes(self) -> NDArray[np.uint8]:
+        """All lines, (lines, channels, pixels)."""
+        if self._frame is not None:
+            lines = self._frame[self._tiling.slice]
+            if len(self._into) == 1:
+                self._into[0][...] = lines.reshape(self._into[0].shape)
+            else:
+                cv2.split(lines, self._into)
+            self._frame = None
+        return self._planes
+
+    def glance(self, other: _Sample) -> float:
+        """Sum of squared differences over a few lines."""
+        return cv2.norm(self._few, other._few, cv2.NORM_L2SQR)
 
     def energy(self, other: _Sample) -> float:
-        """Sum of squared differences over all samples."""
-        return cv2.norm(self._planes, other._planes, cv2.NORM_L2SQR)
+        """Sum of squared differences over all lines."""
+        return cv2.norm(self.planes(), other.planes(), cv2.NORM_L2SQR)
 
     def sums(self) -> NDArray[np.float32]:
         """Sums over tiles, (rows, kinds, columns)."""
@@ -247,13 +270,12 @@ class _Sample:
             tiling = self._tiling
             rows, columns = tiling.grid
             channels = tiling.channels
+            planes = self.planes()
             sums = np.empty(tiling.unit.shape, np.float32)
-            light = cv2.reduce(
-                self._planes.reshape(-1, tiling.width), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S
-            ).astype(np.float32)
-            light = tiling.collect @ light.reshape(-1, channels * columns)
+            cells = cv2.reduce(planes.reshape(-1, tiling.width), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S)
+            light = tiling.collect @ cells.reshape(-1, channels * columns).astype(np.float32)
             sums[:, :channels] = light.reshape(rows, channels, columns)
-            edges = self._planes.reshape(-1).take(tiling.places).astype(np.float32) - tiling.resting
+            edges = planes.reshape(-1).take(tiling.places).astype(np.float32) - tiling.resting
             # A product with ones goes to BLAS, which is faster than a sum along an axis.
             at_edges = tiling.ones @ (edges * tiling.weights)
             sums[:, channels:] = at_edges.reshape(-1, rows, columns).swapaxes(0, 1)
@@ -261,11 +283,43 @@ class _Sample:
         return self._sums
 
 
+class _Energy:
+    """What a sum of squared differences of two frames is under noise alone.
+
+    count : how many differences are summed.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.mean = 0.0
+        self._spread = 0.0
+        self._count = count
+        self.settle(1.0)
+
+    def excess(self, energy: float) -> float:
+        """How far a sum is above what noise makes, in its standard deviations."""
+        return (energy - self.mean) * self._scale
+
+    def learn(self, energy: float, weight: float) -> None:
+        """Take in the sum for two frames that show the same."""
+        beyond = energy - self.mean
+        if beyond < (_LOWER - 1) * self.mean:
+            self.mean, self._spread = energy, 0.0
+        else:
+            self.mean += weight * beyond
+            # What the first one is away from nothing says nothing.
+            self._spread += weight * (beyond * beyond * (weight < 1) - self._spread)
+
+    def settle(self, doubt: float) -> None:
+        """Make ready for `excess`. doubt : 1 / (number of sums that were learned)."""
+        least = 2 * max(self.mean, 2 * _QUANTISATION * self._count) ** 2 / self._count
+        self._scale = 1 / math.sqrt(max(self._spread, least) * (1 + _WARM_UP * doubt))
+
+
 class _Noise:
     """What differences noise alone makes, learned from frames in a row.
 
-    pairs : pairs of frames seen. energy : sum of squared differences of two frames. tests : how many values
-    are compared with the bound in `strongest`.
+    pairs : pairs of frames seen. energy, glance : of all lines, of a few. tests : how many values are
+    compared with the bound in `strongest`.
     """
 
     def __init__(self, tiling: _Tiling) -> None:
@@ -276,19 +330,13 @@ class _Noise:
         self._near = _neighbours(rows), np.ascontiguousarray(_neighbours(columns).T)
         self.tests = len(self._windows[0]) * self._unit.shape[1] * self._windows[1].shape[1]
         self.pairs = 0
-        self.energy = 0.0
-        self._spread = 0.0
-        self._least = 2 * _QUANTISATION * tiling.count
-        self._count = tiling.count
+        self.energy = _Energy(tiling.count)
+        self.glance = _Energy(math.prod(tiling.glance_shape))
         self._taught = 0
         # Of each sum, for one frame: as seen in its tile, and as used.
         self._seen = np.zeros_like(self._unit)
         self._variance = np.zeros_like(self._unit)
         self._settle()
-
-    def excess(self, energy: float) -> float:
-        """How far a sum of squared differences is above what noise makes, in its standard deviations."""
-        return (energy - self.energy) * self._energy_scale
 
     def strongest(self, difference: NDArray[np.float32]) -> float:
         """The largest deviation of a difference of sums in any window, in its standard deviations."""
@@ -307,10 +355,10 @@ class _Noise:
         seen = np.square(own) * np.float32(0.5)
         self._taught += 1
         weight = max(_FORGETTING, 1 / self._taught)
+        calm = self._taught <= _WARM_UP
         if self._taught == 1:
             level = np.median(seen / self._unit, axis=(0, 2), keepdims=True) / _MEDIAN
             self._seen = np.asarray(level * self._unit, np.float32)
-            self.energy = energy
         else:
             ratio = np.asarray(seen / self._variance, np.float32)
             typical = float(np.median(ratio))
@@ -321,12 +369,10 @@ class _Noise:
             moves = typical > _QUIET
             if moves or typical < _MEDIAN / 4:
                 self._seen *= np.float32(1.25 if moves else 0.5)
-            if energy < _LOWER * self.energy:
-                self.energy, self._spread = energy, 0.0
-            elif moves or self._taught <= _WARM_UP or self.strongest(difference) <= bound:
-                beyond = energy - self.energy
-                self.energy += weight * beyond
-                self._spread += weight * (beyond * beyond - self._spread)
+            calm = calm or moves or self.strongest(difference) <= bound
+        if calm or energy < _LOWER * self.energy.mean:
+            self.energy.learn(energy, weight)
+            self.glance.learn(now.glance(last), weight)
         self._settle()
 
     def _settle(self) -> None:
@@ -340,8 +386,8 @@ class _Noise:
         doubt = 1 / max(self._taught, 1)
         windows = _product(self._windows, self._variance) * np.float32(2 * (1 + doubt))
         self._scale = np.asarray(1 / np.sqrt(windows), np.float32)
-        spread = max(self._spread, 2 * max(self.energy, self._least) ** 2 / self._count)
-        self._energy_scale = 1 / math.sqrt(spread * (1 + _WARM_UP * doubt))
+        for energy in (self.energy, self.glance):
+            energy.settle(doubt)
 
     def _smooth(self, sums: NDArray[np.float32]) -> NDArray[np.float32]:
         """Mean over each tile and its neighbours, of each kind."""
