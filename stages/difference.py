@@ -42,14 +42,26 @@ class Difference:
         repeatability: float = Field(
             0.025, ge=0, le=1, description="noise: how far the light of the gel itself varies, relative"
         )
+        tint: float = Field(
+            0.01,
+            ge=0,
+            le=1,
+            description="noise: how far the colour of that light varies, relative to its brightness",
+        )
         shift: float = Field(
             1.0, ge=0, le=100, description="noise: how far the untouched gel moves against the camera, px"
         )
         relaxation: float = Field(
-            0.16,
+            0.2,
             ge=0,
             lt=1,
             description="noise: what a released gel still shows, relative to the strongest change",
+        )
+        creep: float = Field(
+            0.1,
+            ge=0,
+            le=1,
+            description="noise: how much of its change a released gel loses from frame to frame at most",
         )
         distance: float = Field(24.0, gt=0, le=441, description="colour: change that is contact, grey levels")
 
@@ -58,8 +70,10 @@ class Difference:
             params.method,
             false_alarms=params.false_alarms,
             repeatability=params.repeatability,
+            tint=params.tint,
             shift=params.shift,
             relaxation=params.relaxation,
+            creep=params.creep,
             distance=params.distance,
         )
 

@@ -84,7 +84,16 @@ def test_the_same_frames_give_the_same_masks() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"false_alarms": 0}, {"repeatability": 2}, {"relaxation": 1}, {"method": "magic"}, {"edge": 1}]
+    "wrong",
+    [
+        {"false_alarms": 0},
+        {"repeatability": 2},
+        {"relaxation": 1},
+        {"tint": 2},
+        {"creep": -1},
+        {"method": "magic"},
+        {"edge": 1},
+    ],
 )
 def test_values_out_of_range_and_unknown_ones_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):

@@ -185,6 +185,110 @@ def test_a_gel_that_creeps_back_is_not_contact() -> None:
     assert [none.detect(frame).touching for frame in frames] == [True, True]
 
 
+def _lit(gel: NDArray[np.float64], part: NDArray[np.bool_], change: list[float]) -> NDArray[np.float64]:
+    """A gel of which a part, blurred at its border, changes by parts of its brightness, per channel."""
+    soft = cv2.GaussianBlur(part.astype(float), (0, 0), 2)[..., None]
+    return np.asarray(gel * (1 + soft * np.array(change)))
+
+
+def _limit(gel: NDArray[np.float64], false_alarms: float = 1e-6) -> float:
+    return math.sqrt(chi_square_threshold(false_alarms / (gel.shape[0] // 4 * (gel.shape[1] // 4))))
+
+
+@pytest.mark.parametrize(
+    ("change", "radius", "seen"),
+    [
+        ([0.045, 0.0, -0.045], 22, True),
+        ([0.07, 0.07, 0.07], 22, False),
+        ([-0.07, -0.07, -0.07], 22, False),
+        ([0.07, 0.0, -0.07], 5, False),
+        ([0.02, 0.0, -0.02], 22, False),
+    ],
+    ids=["wide colour", "brighter", "darker", "a spot of colour", "too faint"],
+)
+def test_a_faint_change_is_contact_if_it_is_one_of_colour_and_wide(
+    change: list[float], radius: float, seen: bool
+) -> None:
+    gel = _gel()
+    detector = _detector(_noisy(gel, 1))
+    lit = _lit(gel, _disc(gel.shape[:2], (61, 83), radius), change)
+    found = [detector.detect(_noisy(lit, seed)) for seed in range(2, 6)]
+    assert [result.touching for result in found[1:]] == [seen] * 3
+    if not seen:
+        return
+    # Its size alone would not do, neither of the change in any cell, nor beside a light of changing colour.
+    assert max(result.strength for result in found) < _limit(gel)
+    unsteady = _detector(_noisy(gel, 1), tint=0.025)
+    assert not any(unsteady.detect(_noisy(lit, seed)).touching for seed in range(2, 6))
+    y, x = np.nonzero(found[-1].mask)
+    assert math.hypot(x.mean() - 61, y.mean() - 83) < 2  # measured 0.3 to 0.7
+
+
+def test_a_faint_change_in_a_single_frame_is_not_contact() -> None:
+    gel = _gel()
+    detector = _detector(_noisy(gel, 1))
+    lit = _lit(gel, _disc(gel.shape[:2], (61, 83), 22), [0.07, 0.0, -0.07])
+    frames = [gel, lit, gel, gel, lit, gel]
+    assert not any(detector.detect(_noisy(frame, seed)).touching for seed, frame in enumerate(frames, 2))
+
+
+def test_blocks_of_heavy_compression_are_not_contact() -> None:
+    gel = _gel((400, 300))
+
+    def compressed(seed: int) -> Image:
+        drawn = cv2.resize(_noisy(gel, seed, 4.0), (600, 800), interpolation=cv2.INTER_NEAREST)
+        coded = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 15])[1]
+        decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+        assert decoded is not None
+        return np.asarray(cv2.resize(decoded, (300, 400), interpolation=cv2.INTER_AREA), np.uint8)
+
+    detector = _detector(compressed(0))
+    found = [detector.detect(compressed(seed)) for seed in range(1, 25)]
+    assert not any(result.touching for result in found)
+    # They do change colour by more than a cell of noise may: the test is about their extent.
+    assert max(result.strength for result in found) > _limit(gel)
+
+
+def test_a_contact_lasts_while_it_is_lifted_and_ends_when_the_rest_only_creeps() -> None:
+    gel = _gel()
+    reference = _noisy(gel, 0)
+    lifted = [0.9, 0.6, 0.4, 0.26, 0.17, 0.13]
+    quick, slow = _detector(reference, repeatability=0.01), _detector(reference, repeatability=0.01)
+    found = [quick.detect(_noisy(_pressed(gel, (61, 83), 20, part), 3)).touching for part in lifted]
+    assert all(found)
+    assert not quick.detect(_noisy(_pressed(gel, (61, 83), 20, 0.13), 4)).touching
+    # The same change without the way there: less than a gel may keep.
+    slow.detect(_noisy(_pressed(gel, (61, 83), 20, 0.9), 3))
+    assert not slow.detect(_noisy(_pressed(gel, (61, 83), 20, 0.13), 3)).touching
+
+
+def test_a_gel_that_creeps_back_for_seconds_does_not_become_contact_again() -> None:
+    gel = _gel()
+    detector = _detector(_noisy(gel, 0))
+    for seed in range(12):
+        assert detector.detect(_noisy(_pressed(gel, (61, 83), 30, 0.9), seed)).touching
+    rest = [0.9 * 0.15 * math.exp(-age / 40) for age in range(150)]
+    found = [
+        detector.detect(_noisy(_pressed(gel, (61, 83), 30, part), 20 + age)).touching
+        for age, part in enumerate(rest)
+    ]
+    assert not any(found)
+
+
+def test_the_outline_of_a_contact_that_fades_is_kept_but_not_shared() -> None:
+    gel = _gel()
+    truth = _disc(gel.shape[:2], (61, 83), 22)
+    detector = _detector(_noisy(gel, 1))
+    kept = []
+    for seed, part in enumerate((0.3, 0.22, 0.13, 0.1, 0.075), 2):
+        kept.append(detector.detect(_noisy(_lit(gel, truth, [part, 0.0, -part]), seed)))
+    same = [index for index in range(1, 5) if np.array_equal(kept[index].mask, kept[index - 1].mask)]
+    assert same
+    assert all(result.touching for result in kept)
+    for index in same:
+        assert not np.shares_memory(kept[index].mask, kept[index - 1].mask)
+
+
 def _mirrored(image: Image) -> Image:
     return np.ascontiguousarray(image[:, ::-1])
 
@@ -318,8 +422,10 @@ def test_misuse_is_refused_with_what_came() -> None:
     for settings in (
         {"false_alarms": 0},
         {"repeatability": -1},
+        {"tint": -0.1},
         {"shift": -1},
         {"relaxation": 1},
+        {"creep": 1.1},
         {"distance": 0},
         {"method": "magic"},
     ):
@@ -414,3 +520,25 @@ def test_real_presses_of_a_ball_are_all_found_where_the_labels_say(shared_data: 
     assert np.median(distance) < 2.6
     assert np.percentile(distance, 95) < 6.5
     assert abs(np.median(growth)) < 5
+
+
+def test_real_grasps_agree_with_the_force_of_the_grip(shared_data: Path) -> None:
+    right = frames = 0
+    for path in sorted((shared_data / "wedge_grasp").glob("*.csv")):
+        with path.open() as file:
+            force = [float(row["force_n"]) for row in csv.DictReader(file)]
+        video = cv2.VideoCapture(str(path.with_suffix(".avi")))
+        preprocess = Preprocessor((640, 480), rotate=90, downsample=2)
+        detector = ContactDetector(shift=0.5)
+        found = []
+        for _ in force:
+            image = preprocess(np.asarray(video.read()[1], np.uint8))
+            if not detector.has_reference:
+                detector.add_reference(image)
+            found.append(detector.detect(image).touching)
+        assert not found[1]
+        assert not found[-1]
+        right += sum(seen == (newton >= 0.75) for seen, newton in zip(found, force, strict=True))
+        frames += len(force)
+    # Measured 94.1 %: docs/contact-limits.md says which 19 frames are missing, and why.
+    assert right / frames > 0.93

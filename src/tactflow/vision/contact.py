@@ -7,12 +7,18 @@ alarms, and then *where*, by a rule that does not depend on the noise:
 2. A change of the light that is smooth over the whole frame is fitted robustly and taken out.
 3. What is left, divided by its standard deviation, is chi-square distributed with three degrees of freedom
    where nothing touches. One threshold, corrected for the number of cells, says whether anything does.
-4. Each connected change around such a place is looked at again at half resolution; `imprint` finds its rim.
+4. Beside that, changes of colour alone: lamps flicker and shadows fall in brightness, hardly in colour. A
+   fainter change of colour is contact if it is wide, which neither noise nor compressed blocks are.
+5. Contact ends at the noise, or at a part of the strongest recent change, since a released gel creeps back;
+   but not while it fades faster than by creeping: then it is still being unloaded.
+6. Each connected change around such a place is looked at again at half resolution; `imprint` finds its rim.
 
 References
 ----------
 T. Aach, A. Kaup, R. Mester, "Statistical model-based change detection in moving video", Signal Processing 31
-(1993), for the test; `light` and `imprint` name the sources of theirs. Seed function `difference`.
+(1993), for the test; K. Friston et al., "Assessing the significance of focal activations using their spatial
+extent", Human Brain Mapping 1 (1994), for the test by extent. `light` and `imprint` name the sources of
+theirs. Seed function `difference`.
 """
 
 from __future__ import annotations
@@ -57,6 +63,18 @@ _LEAST = 8
 """Cells that must change together; 128 px^2 is the halo of a ball's first touch."""
 _FADE = 0.96
 """How fast the strongest recent change is forgotten, per frame: half in 17 frames."""
+_SLOW_FADE = 0.98
+"""The same for wide, faint changes, which a gel that creeps back shows longest."""
+_TINTED = 12.0
+"""Squared deviation of the colour from which a cell counts as part of a wide change: 1 of 400 by chance."""
+_WIDE = 0.01
+"""Part of the picture that a wide change covers at least: more than the noise of compression, which comes in
+blocks of 16 px of the camera."""
+_CLUSTER = 0.7
+"""Cells by which a wide change must be larger for each factor of e in the rate of false alarms: measured on
+white noise, smoothed as the cells are."""
+_GONE = 0.5
+"""A faint change of which less is left after a frame has no longer the outline that it had, and is gone."""
 _BRIDGE = 8.0
 """Radius of the gaps in an outline that a removed marker may have left, px."""
 
@@ -81,6 +99,8 @@ class _Reference:
     mean: Float
     shade: Float
     weight: Float
+    sharper: Float
+    grey: Float
     light: LightChange
     half: Float
     half_shade: Float
@@ -112,10 +132,15 @@ class ContactDetector:
         (0, 1). Lower misses lighter contacts.
     repeatability : part of the brightness by which the light of the untouched gel may vary from place to
         place, as well as noise, 0..1. Higher misses lighter contacts.
+    tint : the same for the colour of the light, if smaller than `repeatability`, 0..1: part of the brightness
+        by which the channels may vary against each other. Higher finds soft contacts later on gels that
+        answer with colour; lower sees blocks of compression.
     shift : distance by which the untouched gel may move against the camera, px. It makes sharp edges in the
         picture count less.
     relaxation : part of the strongest recent change that a gel may still show after it was released, in
         [0, 1): soft gels creep back within a second or so. Higher ends a contact earlier while it is lifted.
+    creep : part of its change, 0..1, that a released gel loses from one frame to the next at most. What fades
+        faster, but not to `relaxation` at once, is still being lifted. Higher ends a contact earlier.
     distance : for `colour`: change of colour that is contact, grey levels.
 
     Raises
@@ -129,8 +154,10 @@ class ContactDetector:
         *,
         false_alarms: float = 1e-6,
         repeatability: float = 0.025,
+        tint: float = 0.01,
         shift: float = 1.0,
-        relaxation: float = 0.16,
+        relaxation: float = 0.2,
+        creep: float = 0.1,
         distance: float = 24.0,
     ) -> None:
         if method not in ("noise", "colour", "seed"):
@@ -139,17 +166,23 @@ class ContactDetector:
             raise ValueError(f"false_alarms: required in (0, 1), got {false_alarms}")
         if not 0 <= repeatability <= 1:
             raise ValueError(f"repeatability: required in [0, 1], got {repeatability}")
+        if not 0 <= tint <= 1:
+            raise ValueError(f"tint: required in [0, 1], got {tint}")
         if not (shift >= 0 and math.isfinite(shift)):
             raise ValueError(f"shift: required >= 0 px, got {shift}")
         if not 0 <= relaxation < 1:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
+        if not 0 <= creep <= 1:
+            raise ValueError(f"creep: required in [0, 1], got {creep}")
         if not (distance > 0 and math.isfinite(distance)):
             raise ValueError(f"distance: required > 0 grey levels, got {distance}")
         self._method = method
         self._false_alarms = false_alarms
         self._repeatability = repeatability
+        self._tint = min(tint, repeatability)
         self._shift = shift
         self._relaxation = relaxation
+        self._creep = creep
         self._distance = distance
         self.reset()
 
@@ -164,7 +197,10 @@ class ContactDetector:
         self._known: _Reference | None = None
         self._before: NDArray[np.bool_] | None = None
         self._limits: dict[int, float] = {}
-        self._strongest = 0.0
+        self._strongest = self._strongest_wide = 0.0
+        self._evidence: Float | None = None
+        self._suspected: NDArray[np.bool_] | None = None
+        self._outline: NDArray[np.uint8] | None = None
 
     @property
     def has_reference(self) -> bool:
@@ -237,15 +273,22 @@ class ContactDetector:
         assert self._noise is not None
         mean, count = self._mean, self._count
         variance = (_PRIOR * self._noise**2 + self._squares) / (_PRIOR + count - 1)
-        variance = variance * (1 + 1 / count) + (self._repeatability * mean) ** 2
-        variance += (self._shift / _CELL * _steepness(mean)) ** 2
+        steady = variance * (1 + 1 / count) + (self._shift / _CELL * _steepness(mean)) ** 2
+        variance = steady + (self._repeatability * mean) ** 2
         light = LightChange(mean, np.asarray(variance, np.float32))
+        weight = 1 / np.sqrt(variance)
+        # One factor for all channels, so that a change in proportion to the brightness is none of colour.
+        sharper = (variance / (steady + (self._tint * mean) ** 2)).min(axis=2)
+        grey = mean * weight
+        grey /= np.linalg.norm(grey, axis=2, keepdims=True) + np.float32(1e-6)
         dark = _DARK * self._half.mean(axis=(0, 1)) + 1
         edge = self._shift / 2 * _steepness(self._half) / (_SHARP * (self._half + dark))
         self._known = _Reference(
             mean=mean,
             shade=light.shade(mean),
-            weight=np.asarray(1 / np.sqrt(variance), np.float32),
+            weight=np.asarray(weight, np.float32),
+            sharper=np.asarray(sharper, np.float32),
+            grey=np.asarray(grey * weight * np.sqrt(sharper)[..., None], np.float32),
             light=light,
             half=self._half,
             half_shade=light.shade(self._half),
@@ -265,21 +308,29 @@ class ContactDetector:
         half, cells = _cells(image)
         change, found = self._change(np.asarray(cv2.blur(cells, (3, 3)), np.float32), known)
         square = _squared_length(change * known.weight)
-        largest = float(cv2.minMaxLoc(square)[1])
+        colour = _colour_change(change, square, known)
+        evidence = np.maximum(square, colour)
+        largest, largest_colour = cv2.minMaxLoc(square)[1], cv2.minMaxLoc(colour)[1]
+        strength = math.sqrt(max(largest, largest_colour))
         before, self._before = self._before, None
-        remembered = self._relaxation**2 * self._strongest
-        limit = self._limit(square.size)
-        start, stay = max(limit, remembered), max(limit * _LEAVE**2, remembered)
-        blobs: list[_Blob] = []
-        if largest >= (start if before is None else stay):
-            blobs = _blobs(square, limit / 4, start, stay, before)
+        left = 1.0 if before is None else self._left(evidence, before)
+        self._evidence = evidence
+        blobs = self._clear(square, largest, before, left)
+        clear = bool(blobs)
+        if clear:
+            self._suspected = None
+        else:
+            blobs = self._faint(colour, evidence, before, left)
         self._strongest = max(self._strongest * _FADE, largest if blobs else 0.0)
+        self._strongest_wide = max(self._strongest_wide * _SLOW_FADE, largest_colour if blobs else 0.0)
         if not blobs:
-            return ContactResult(np.zeros(image.shape[:2], np.uint8), False, math.sqrt(largest))
-        self._before = np.zeros(square.shape, np.bool_)
+            self._outline = None
+            return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
+        self._before = _union(blobs, square.shape)
+        if not clear and left < 1 - self._creep and self._outline is not None:
+            return ContactResult(self._outline.copy(), True, strength)
         mask = np.zeros((cells.shape[0] * _CELL, cells.shape[1] * _CELL), np.uint8)
         for rows, columns, inside in blobs:
-            self._before[rows, columns] |= inside
             level = _level(half, found, known, rows, columns, inside, hidden)
             large = cv2.resize(level, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
             window = mask[
@@ -287,7 +338,62 @@ class ContactDetector:
             ]
             window |= 255 * (large > 0).view(np.uint8)
         mask = np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
-        return ContactResult(mask, bool(mask.any()), math.sqrt(largest))
+        self._outline = mask if mask.any() else None
+        return ContactResult(mask, self._outline is not None, strength)
+
+    def _clear(
+        self, square: Float, largest: float, before: NDArray[np.bool_] | None, left: float
+    ) -> list[_Blob]:
+        """Contact by the size of the change, so that its outline can be seen.
+
+        largest : value of `square`. before : cells in contact in the frame before. left : part of the change
+        there that is left.
+        """
+        limit, remembered = self._limit(square.size), self._relaxation**2 * self._strongest
+        start, stay = max(limit, remembered), limit * _LEAVE**2
+        if not self._relaxation < left < 1 - self._creep:
+            stay = max(stay, remembered)
+        if largest < (start if before is None else stay):
+            return []
+        return _blobs(square, limit / 4, start, stay, before)
+
+    def _faint(
+        self, colour: Float, evidence: Float, before: NDArray[np.bool_] | None, left: float
+    ) -> list[_Blob]:
+        """Contact by the extent of a change of colour, in two frames; or one that fades while it is lifted.
+
+        before, left : as for `_clear`.
+        """
+        suspected, self._suspected = self._suspected, None
+        if left <= _GONE:
+            return []
+        fading = left < 1 - self._creep
+        belongs = _wide_change(colour, self._extent(colour.size))
+        if belongs is not None:
+            if not fading and colour[belongs].max() < self._relaxation**2 * self._strongest_wide:
+                belongs = None
+            self._suspected = belongs
+        if before is None:
+            # One frame may be a flash, a cable's shadow, a damaged picture.
+            if belongs is None or suspected is None or not (belongs & suspected).any():
+                return []
+        elif fading and evidence[before].max() >= self._limit(colour.size) * _LEAVE**2:
+            belongs = before if belongs is None else before | belongs
+        if belongs is None:
+            return []
+        return _blobs(evidence, self._limit(colour.size) / 4, math.inf, 0.0, belongs)
+
+    def _left(self, evidence: Float, before: NDArray[np.bool_]) -> float:
+        """Part of the change of the frame before that is left where that showed contact."""
+        if self._evidence is None:
+            return 1.0
+        inside = before.astype(np.float32).ravel()
+        now, then = float(inside @ evidence.ravel()), float(inside @ self._evidence.ravel())
+        return math.sqrt(now / then) if then > 0 else 1.0
+
+    def _extent(self, cells: int) -> float:
+        """Cells that a change of colour covers which is contact for its extent."""
+        return max(_WIDE * cells, _CLUSTER * math.log(cells / self._false_alarms))
 
     def _limit(self, cells: int) -> float:
         if cells not in self._limits:
@@ -331,8 +437,39 @@ def _halved_mask(mask: NDArray[np.uint8], rows: slice, columns: slice) -> NDArra
 
 
 def _squared_length(vectors: Float) -> Float:
-    """(h, w) float32: sum over the three channels of the squares of (h, w, 3) float32."""
-    return np.asarray(cv2.transform(vectors * vectors, np.ones((1, 3), np.float32)), np.float32)
+    """(h, w) float32: sum over the three channels of the squares of (h, w, 3) float32, which are lost."""
+    vectors *= vectors
+    return np.asarray(cv2.transform(vectors, np.ones((1, 3), np.float32)), np.float32)
+
+
+def _union(blobs: list[_Blob], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """(h, w) bool: cells of all blobs."""
+    cells = np.zeros(shape, np.bool_)
+    for rows, columns, inside in blobs:
+        cells[rows, columns] |= inside
+    return cells
+
+
+def _colour_change(change: Float, square: Float, known: _Reference) -> Float:
+    """(h, w) float32: squared deviation of the colour, chi-square with two degrees of freedom: without the
+    part of the change in which all channels go along with the brightness.
+
+    change : (h, w, 3) float32, grey levels. square : (h, w) float32, its squared deviation.
+    """
+    along = np.asarray(cv2.transform(change * known.grey, np.ones((1, 3), np.float32)), np.float32)
+    along *= along
+    return np.asarray(cv2.subtract(square * known.sharper, along, dst=along), np.float32)
+
+
+def _wide_change(colour: Float, extent: float) -> NDArray[np.bool_] | None:
+    """(h, w) bool: cells of connected changes of colour that cover `extent` cells at least; None: no such."""
+    changed = (colour > _TINTED).view(np.uint8)
+    if cv2.countNonZero(changed) < extent:
+        return None
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
+    wide = stats[:, cv2.CC_STAT_AREA] >= extent
+    wide[0] = False
+    return np.asarray(wide[labels], np.bool_) if wide.any() else None
 
 
 def _blobs(
