@@ -230,6 +230,21 @@ def test_gain_and_offset_of_the_light_do_not_move_marks() -> None:
     assert np.sqrt(np.mean((one.position - other.position) ** 2)) < 0.015
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.9, 2.4, 4.1])
+def test_a_steep_slope_of_the_light_does_not_pull_dark_marks(angle: float) -> None:
+    now = dragged((8.0, 5.0))
+    rows, columns = np.mgrid[0:400, 0:300]
+    for steepness in (0.02, 0.04):
+        # Waves of light across the picture: their flanks change by 2 or 4 % a pixel, as a contact's rim does.
+        phase = (np.cos(angle) * columns + np.sin(angle) * rows) / 12.0
+        light = 1 + 12.0 * steepness * np.sin(phase)
+        lit = np.clip(np.rint(picture(now, noise=0.0) * light[..., None]), 0, 255).astype(np.uint8)
+        error = errors(tracker(picture(TRUTH, noise=0.0)).track(lit), now)
+        # What is left is the light's bend, which the model has not, and rounding: measured 0.0085 and 0.012 px
+        # RMS at most; with a plane that is added to the mark 0.04 and 0.09 px.
+        assert np.sqrt(np.mean(error**2)) < 0.02
+
+
 def test_a_mirrored_recording_has_mirrored_displacements() -> None:
     now = dragged((16.0, 9.0))
     reference, image = picture(TRUTH, seed=1), picture(now, seed=2)

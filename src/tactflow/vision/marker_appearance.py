@@ -27,13 +27,20 @@ _SAMPLING: Final = 0.004
 class MarkerAppearance:
     """Measures marks against their own look in the reference, by least squares in the image as it is.
 
-    A patch of the frame is modelled as gain * reference mark, shifted, + a plane (Lucas and Kanade 1981 with
-    the illumination model of Hager and Belhumeur 1998, in the inverse form of Baker and Matthews 2004: all
-    that is costly is done once for the reference). The frame is only ever read at whole pixels; it is the
-    noise-free side, the reference, that is interpolated.
+    A patch of the frame is modelled as light * reference mark, shifted, + a constant, where the light is a
+    plane: at the edge of a contact it has a slope, and a dark mark dims this slope as it dims all light, so
+    that a plane that is *added* to the mark pulls it, by up to 0.2 px. To a bright mark, whose level is its
+    own, the slope is added. (Lucas and Kanade 1981 with the illumination model of Hager and Belhumeur 1998,
+    in the inverse form of Baker and Matthews 2004: all that is costly is done once for the reference.) The
+    frame is only ever read at whole pixels; it is the noise-free side, the reference, that is interpolated.
+
+    reference : (H, W) float32, grey levels. origin : (N, 2) float64, px. radius : of a mark, px.
+    dark : whether marks are darker than the gel.
     """
 
-    def __init__(self, reference: NDArray[np.float32], origin: FloatArray, radius: float) -> None:
+    def __init__(
+        self, reference: NDArray[np.float32], origin: FloatArray, radius: float, dark: bool = True
+    ) -> None:
         self.radius = radius
         reach = int(np.ceil(1.55 * radius + 1.2))
         self.pad = reach + 1
@@ -46,14 +53,12 @@ class MarkerAppearance:
         self._first = self.pad * (width + 1)
         self._offsets = (grid_y[disc] * width + grid_x[disc]).astype(np.int64)
         self.pixels = int(disc.sum())
-        x, y = grid_x[disc].astype(np.float64), grid_y[disc].astype(np.float64)
-        plane, _ = np.linalg.qr(np.column_stack([np.ones_like(x), x, y]))
-        self._plane = plane.astype(np.float32)
+        x, y = grid_x[disc] / radius, grid_y[disc] / radius
 
         count = len(origin)
         self._rows = np.arange(count)
         steps = (np.arange(_PHASES) + 0.5) / _PHASES - 0.5
-        pinv = np.empty((_PHASES, _PHASES, count, 3, self.pixels), np.float32)
+        weights = np.empty((_PHASES, _PHASES, count, 6, self.pixels), np.float32)
         gram = np.empty((_PHASES, _PHASES, count, 3, 3), np.float32)
         spread = np.empty((_PHASES, _PHASES, count), np.float32)
         half = 0.25
@@ -68,16 +73,20 @@ class MarkerAppearance:
                 mark = look(0, 0)
                 slope_x = (look(half, 0) - look(-half, 0)) / (2 * half)
                 slope_y = (look(0, half) - look(0, -half)) / (2 * half)
+                lit = mark if dark else np.ones_like(mark)
+                plane, _ = np.linalg.qr(np.stack([np.ones_like(lit), lit * x, lit * y], axis=2))
                 basis = np.stack([mark, slope_x, slope_y], axis=1)
-                basis -= (basis @ plane) @ plane.T
+                basis -= (basis @ plane) @ plane.transpose(0, 2, 1)
                 products = basis @ basis.transpose(0, 2, 1)
                 # A trace of ridge keeps marks without contrast solvable; they are never trusted anyway.
                 ridge = 1e-6 * np.trace(products, axis1=1, axis2=2) + 1e-6
                 inverse = np.linalg.inv(products + ridge[:, None, None] * np.eye(3))
-                pinv[row, column] = inverse @ basis
+                weights[row, column, :, :3] = inverse @ basis
+                weights[row, column, :, 3:] = plane.transpose(0, 2, 1)
                 gram[row, column] = products
                 spread[row, column] = 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
-        self._pinv = pinv.reshape(_PHASES * _PHASES * count, 3, self.pixels)
+        # Of each mark at each phase: what gives gain and shift, and the light's plane, orthonormal.
+        self._weights = weights.reshape(_PHASES * _PHASES * count, 6, self.pixels)
         self._gram = gram.reshape(_PHASES * _PHASES * count, 3, 3)
         self._spread = spread.reshape(_PHASES * _PHASES * count) / np.float32(max(self.pixels - 6, 1))
         self._phase_strides = np.array([count, _PHASES * count])
@@ -124,14 +133,14 @@ class MarkerAppearance:
         patch = flat.take(index[:, None] + self._offsets).astype(np.float32)
         # Far from zero, sums of squares would lose digits.
         patch -= np.float32(128)
-        theta = np.matmul(self._pinv.take(which, axis=0), patch[:, :, None])
+        sums = np.matmul(self._weights.take(which, axis=0), patch[:, :, None])
+        theta, level = sums[:, :3], sums[:, 3:, 0]
         seen = np.vecdot(np.matmul(self._gram.take(which, axis=0), theta)[:, :, 0], theta[:, :, 0])
         gain = theta[:, 0, 0]
         safe = np.maximum(gain, np.float32(0.15))
         step = theta[:, 1:, 0] / safe[:, None]
         np.minimum(np.maximum(step, -self.radius, out=step), self.radius, out=step)
         position = (quarter + 0.5) / _PHASES - 0.5 + step
-        level = patch @ self._plane
         contrast = np.vecdot(patch, patch) - np.vecdot(level, level)
         rest = np.maximum(contrast - seen, np.float32(1e-3))
         stderr = np.sqrt(rest * self._spread.take(which) / (safe * safe) + np.float32(_SAMPLING**2))

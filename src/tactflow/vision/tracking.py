@@ -150,7 +150,9 @@ class MarkerTracker:
         self._pitch = detection.pitch
         self._radius = detection.dot_radius
         self._farthest = max_displacement or 1.3 * detection.pitch
-        self._appearance = MarkerAppearance(mean, self._origin, detection.dot_radius)
+        self._appearance = MarkerAppearance(
+            mean, self._origin, detection.dot_radius, detection.polarity == "dark"
+        )
         self._spots = _Spots(np.rint(mean).astype(np.uint8), detection)
         self._edges = detection.edges
         self._edge_length = np.linalg.norm(
