@@ -11,9 +11,6 @@ the change is not: averaged along the whole outline, the profile of the change a
 
 from __future__ import annotations
 
-import math
-from functools import lru_cache
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +56,8 @@ HALF = 0.45
 make the peak a little more."""
 
 SOLID = 0.96
-"""Part of its convex hull that a region fills at least, if no gap is to be looked for."""
+"""Part of its convex hull that a region fills at least, if no gap is to be looked for: one in a ring that is
+narrower than the ring is thick, or than a marker."""
 
 TANGENT = 4
 """Points of an outline over which its direction beside a marker is measured."""
@@ -70,6 +68,8 @@ _ENOUGH = 8000
 """Pixels that are enough for the profile: of a window of n times as many, every n-th row is taken."""
 _FIXED = 4
 """Bits behind the point of an outline's coordinates."""
+_STAIRS = 0.75
+"""Part of a pixel by which an outline of whole pixels stays behind its convex hull, all along."""
 _POCKET = 0.8
 """Part of an area between a region and the frame's border that the region's hull covers if it belongs."""
 
@@ -127,10 +127,11 @@ def _brightened(mean: Float, peak: float, hidden: Mask | None) -> Float:
 def _tilted(strength: Float, peak: float, bridge: float, hidden: Mask | None) -> Float:
     changed = (strength > OUTER * peak).view(np.uint8)
     filled, outlines = _outlined(changed, hidden)
-    if _solidity(outlines) < SOLID:
-        ring = changed if hidden is None else np.asarray(cv2.bitwise_and(changed | hidden, filled), np.uint8)
-        filled, outlines = _outlined(_without_gaps(ring, bridge) | filled, None)
     filled = _pockets(filled, outlines)
+    if not _solid(outlines, cv2.countNonZero(filled)):
+        ring = changed if hidden is None else np.asarray(cv2.bitwise_and(changed | hidden, filled), np.uint8)
+        reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
+        filled = fill(_closed(ring, reach) | filled)
     if filled.all():
         return np.ones_like(strength)
     depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
@@ -195,68 +196,79 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     if below.all():
         return None
     start = int(np.argmin(below))
-    points = np.roll(outline, -start, axis=0).astype(np.float32)
-    below = np.roll(below, -start)
+    below = np.concatenate([below[start:], below[:start], below[start : start + 1]])
+    points = np.concatenate([outline[start:], outline[:start]]).astype(np.float32)
     count = len(points)
-    # Alternately where a hidden part begins and where it ends; the start is seen.
-    change = [*(np.flatnonzero(np.diff(below)) + 1).tolist(), *([count] if below[-1] else [])]
-    pieces, last = [points[: change[0]]], 0
-    for index in range(0, len(change), 2):
-        first, behind = change[index], change[index + 1]
-        following = change[index + 2] if index + 2 < len(change) else count + change[0]
-        before, after = points[first - 1], points[behind % count]
-        chord = after - before
-        length = math.hypot(*chord)
-        here = before - points[max(first - 1 - TANGENT, last)]
-        there = points[min(behind + TANGENT, following - 1) % count] - after
-        here *= np.float32(length / max(math.hypot(*here), 1e-9))
-        there *= np.float32(length / max(math.hypot(*there), 1e-9))
-        if length > 1 and 2 * min(here @ chord, there @ chord) > length * length:
-            pieces.append(_cubics(math.ceil(length)) @ np.stack([before, here, after, there]))
-        pieces.append(points[behind : min(following, count)])
-        last = behind
+    # The first point is seen, so a change is in turn the first hidden one of a part and the first behind it.
+    change = np.flatnonzero(below[1:] != below[:-1]) + 1
+    first, behind = change[::2], change[1::2]
+    since = np.maximum(first - 1 - TANGENT, np.concatenate([[0], behind[:-1]]))
+    until = np.minimum(behind + TANGENT, np.concatenate([first[1:], [count + first[0]]]) - 1)
+    before, after = points[first - 1], points[behind % count]
+    chord, here, there = after - before, before - points[since], points[until % count] - after
+    square = (chord * chord).sum(axis=1)
+    for direction in (here, there):
+        direction *= np.sqrt(square / np.maximum((direction * direction).sum(axis=1), 1e-9))[:, None]
+    ahead = 2 * np.minimum((here * chord).sum(axis=1), (there * chord).sum(axis=1)) > square
+    curves = _CUBICS @ np.stack([before, here, after, there], axis=1)
+    pieces, last = [], 0
+    for curve, smooth, left, back in zip(curves, ahead, first.tolist(), behind.tolist(), strict=True):
+        pieces.append(points[last:left])
+        if smooth:
+            pieces.append(curve)
+        last = back
+    pieces.append(points[last:])
     return np.rint(np.concatenate(pieces) * (1 << _FIXED)).astype(np.int32)
 
 
-@lru_cache(maxsize=64)
 def _cubics(steps: int) -> Float:
     """(steps - 1, 4) float32: Hermite's cubics between start and end, both left out."""
-    t = np.arange(1, steps, dtype=np.float32) / np.float32(steps)
+    t = np.arange(1, steps) / steps
     back = 1 - t
     cubics = np.stack([(1 + 2 * t) * back**2, t * back**2, t**2 * (3 - 2 * t), -(t**2) * back], axis=1)
-    cubics.setflags(write=False)
-    return np.asarray(cubics, np.float32)
+    return cubics.astype(np.float32)
 
 
-def _solidity(outlines: Outlines) -> float:
-    """Part of its convex hull that a region fills; 1 for an empty one."""
+_CUBICS = _cubics(8)
+
+
+def _solid(outlines: Outlines, area: int) -> bool:
+    """Whether a region fills its convex hull.
+
+    outlines : of its parts, in fixed point. area : px, of the region with all that it encloses.
+    """
     if not outlines:
-        return 1.0
-    around = cv2.contourArea(cv2.convexHull(np.concatenate(outlines)))
-    return sum(cv2.contourArea(outline) for outline in outlines) / max(around, 1.0)
+        return True
+    hull = cv2.convexHull(np.concatenate(outlines)).astype(np.float32) / (1 << _FIXED)
+    # A pixel reaches half a pixel beyond its centre.
+    around = cv2.arcLength(hull, closed=True)
+    return cv2.contourArea(hull) + around / 2 - area < max((1 - SOLID) * area, _STAIRS * around)
 
 
-def _without_gaps(mask: Mask, bridge: float) -> Mask:
-    """Close gaps that are narrower than the ring itself is thick, or than a marker."""
-    reach = max(float(cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
+def _closed(mask: Mask, reach: float) -> Mask:
+    """Morphological closing of a mask, 0 or 1, by a disc with a radius of `reach` px, by distances."""
     margin = int(reach) + 2
     away = cv2.copyMakeBorder(1 - mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(1.0,))
     grown = (cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_3) <= reach).view(np.uint8)
     inner = cv2.distanceTransform(grown, cv2.DIST_L2, cv2.DIST_MASK_3)[margin:-margin, margin:-margin]
-    return np.asarray(mask | (inner > reach).view(np.uint8), np.uint8)
+    return (inner > reach).view(np.uint8)
 
 
 def _pockets(filled: Mask, outlines: Outlines) -> Mask:
-    """Fill, in place, what a region encloses together with the border of the frame."""
+    """Fill, perhaps in place, what a region encloses together with the border of the frame."""
     rim = np.concatenate([filled[0], filled[1:, -1], filled[-1, -2::-1], filled[-2:0:-1, 0]])
-    starts = np.flatnonzero(rim < np.roll(rim, 1))
+    starts = np.flatnonzero(rim < np.roll(rim, 1)).tolist()
     if len(starts) < 2:
         return filled
+    ends = np.flatnonzero(rim > np.roll(rim, 1)).tolist()
+    if ends[0] < starts[0]:
+        ends = [*ends[1:], ends[0] + len(rim)]
     height, width = filled.shape
     hull = np.zeros_like(filled)
     cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), (1.0,), cv2.LINE_8, _FIXED)
-    for start in starts:
-        seed = _on_rim(int(start), width, height)
+    closed = False
+    for start, end in zip(starts, ends, strict=True):
+        seed = _on_rim((start + end) // 2 % len(rim), width, height)
         if filled[seed[1], seed[0]] or not hull[seed[1], seed[0]]:
             continue
         other = filled.copy()
@@ -264,7 +276,9 @@ def _pockets(filled: Mask, outlines: Outlines) -> Mask:
         pocket = (other == 2).view(np.uint8)
         if cv2.countNonZero(cv2.bitwise_and(pocket, hull)) > _POCKET * area:
             filled |= pocket
-    return filled
+            closed = True
+    # What was open to both sides of a pocket is now a hole.
+    return _outlined(filled, None)[0] if closed else filled
 
 
 def _on_rim(index: int, width: int, height: int) -> tuple[int, int]:
