@@ -240,8 +240,8 @@ def test_a_steep_slope_of_the_light_does_not_pull_dark_marks(angle: float) -> No
         light = 1 + 12.0 * steepness * np.sin(phase)
         lit = np.clip(np.rint(picture(now, noise=0.0) * light[..., None]), 0, 255).astype(np.uint8)
         error = errors(tracker(picture(TRUTH, noise=0.0)).track(lit), now)
-        # What is left is the light's bend, which the model has not, and rounding: measured 0.0085 and 0.012 px
-        # RMS at most; with a plane that is added to the mark 0.04 and 0.09 px.
+        # What is left is the light's bend, which the model has not, and rounding: measured 0.0085 and 0.012
+        # px RMS at most; with a plane that is added to the mark 0.04 and 0.09 px.
         assert np.sqrt(np.mean(error**2)) < 0.02
 
 
