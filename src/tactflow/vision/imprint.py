@@ -239,10 +239,11 @@ def _solid(outlines: Outlines, area: int) -> bool:
     """
     if not outlines:
         return True
-    hull = cv2.convexHull(np.concatenate(outlines)).astype(np.float32) / (1 << _FIXED)
+    hull = cv2.convexHull(np.concatenate(outlines))
+    around = cv2.arcLength(hull, closed=True) / (1 << _FIXED)
     # A pixel reaches half a pixel beyond its centre.
-    around = cv2.arcLength(hull, closed=True)
-    return cv2.contourArea(hull) + around / 2 - area < max((1 - SOLID) * area, _STAIRS * around)
+    missing = cv2.contourArea(hull) / (1 << 2 * _FIXED) + around / 2 - area
+    return missing < max((1 - SOLID) * area, _STAIRS * around)
 
 
 def _closed(mask: Mask, reach: float) -> Mask:
