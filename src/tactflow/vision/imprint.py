@@ -55,9 +55,9 @@ HALF = 0.45
 """Fraction of the peak at which a brightened contact ends: half of the plateau, of which noise and shading
 make the peak a little more."""
 
-SOLID = 0.96
-"""Part of its convex hull that a region fills at least, if no gap is to be looked for: one in a ring that is
-narrower than the ring is thick, or than a marker."""
+BAY = 2.5
+"""A region with a bay that is deeper, px at half resolution, may be a ring with a gap. A gap that is
+narrower than the ring is thick, or than a marker, is closed."""
 
 TANGENT = 4
 """Points of an outline over which its direction beside a marker is measured."""
@@ -68,8 +68,6 @@ _ENOUGH = 8000
 """Pixels that are enough for the profile: of a window of n times as many, every n-th row is taken."""
 _FIXED = 4
 """Bits behind the point of an outline's coordinates."""
-_STAIRS = 0.75
-"""Part of a pixel by which an outline of whole pixels stays behind its convex hull, all along."""
 _POCKET = 0.8
 """Part of an area between a region and the frame's border that the region's hull covers if it belongs."""
 
@@ -128,7 +126,7 @@ def _tilted(strength: Float, peak: float, bridge: float, hidden: Mask | None) ->
     changed = (strength > OUTER * peak).view(np.uint8)
     filled, outlines = _outlined(changed, hidden)
     filled = _pockets(filled, outlines)
-    if not _solid(outlines, cv2.countNonZero(filled)):
+    if not _solid(filled):
         ring = changed if hidden is None else np.asarray(cv2.bitwise_and(changed | hidden, filled), np.uint8)
         reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
         filled = fill(_closed(ring, reach) | filled)
@@ -232,18 +230,15 @@ def _cubics(steps: int) -> Float:
 _CUBICS = _cubics(8)
 
 
-def _solid(outlines: Outlines, area: int) -> bool:
-    """Whether a region fills its convex hull.
-
-    outlines : of its parts, in fixed point. area : px, of the region with all that it encloses.
-    """
-    if not outlines:
-        return True
-    hull = cv2.convexHull(np.concatenate(outlines))
-    around = cv2.arcLength(hull, closed=True) / (1 << _FIXED)
-    # A pixel reaches half a pixel beyond its centre.
-    missing = cv2.contourArea(hull) / (1 << 2 * _FIXED) + around / 2 - area
-    return missing < max((1 - SOLID) * area, _STAIRS * around)
+def _solid(filled: Mask) -> bool:
+    """Whether a region, (h, w) uint8, 0 or 1, is one piece without bays."""
+    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    outlines = [outline for outline in outlines if len(outline) > 3]
+    if len(outlines) != 1:
+        return not outlines
+    bays = cv2.convexityDefects(outlines[0], cv2.convexHull(outlines[0], returnPoints=False))
+    # Depths come in 256ths of a pixel.
+    return bays is None or bool(bays.reshape(-1, 4)[:, 3].max() <= BAY * 256)
 
 
 def _closed(mask: Mask, reach: float) -> Mask:
