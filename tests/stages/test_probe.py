@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from tactflow.engine.config import load_pipeline
 from tactflow.engine.frame import Frame
+from tactflow.engine.run import Runner
 from tactflow.stages.probe import Probe
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
@@ -52,6 +57,16 @@ def test_where_nothing_is_skipped_nothing_is_looked_at() -> None:
     probe = Probe(Probe.Params(), skipping=False)
     assert all(changes(probe, 40))
     assert probe._probe is None
+
+
+@pytest.mark.parametrize("skipping", [True, False])
+def test_the_probe_of_a_pipeline_knows_whether_it_skips(skipping: bool) -> None:
+    root = Path(__file__).resolve().parents[2]
+    without = ["sinks.zmq=null", "sinks.view=null", "sinks.jsonl.path=/dev/null"]
+    pipeline = load_pipeline(root / "pipeline.yaml", [f"skipping={str(skipping).lower()}", *without])
+    runner = Runner(pipeline, max_frames=3)
+    assert runner.run().exit_code == 0
+    assert (runner.nodes["probe"].instance._probe is not None) == skipping
 
 
 def test_a_reference_frame_is_always_worked_on() -> None:
