@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tactflow.sim import open_scene
 from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
 from tactflow.vision.geometry import Preprocessor
+from tactflow.vision.imprint import _solid
 from tactflow.vision.inpaint import remove_markers
 from tactflow.vision.marker_mask import find_dot, marker_mask
 
@@ -520,6 +521,12 @@ def test_real_presses_of_a_ball_are_all_found_where_the_labels_say(shared_data: 
     assert np.median(distance) < 2.6
     assert np.percentile(distance, 95) < 6.5
     assert abs(np.median(growth)) < 5
+
+
+def test_a_region_with_a_neck_of_one_pixel_is_not_solid() -> None:
+    region = np.array([[0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1], [0, 0, 1, 1]], np.uint8)
+    assert not _solid(region)
+    assert _solid(np.ones((4, 4), np.uint8))
 
 
 def test_real_grasps_agree_with_the_force_of_the_grip(shared_data: Path) -> None:

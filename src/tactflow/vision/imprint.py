@@ -236,7 +236,11 @@ def _solid(filled: Mask) -> bool:
     outlines = [outline for outline in outlines if len(outline) > 3]
     if len(outlines) != 1:
         return not outlines
-    bays = cv2.convexityDefects(outlines[0], cv2.convexHull(outlines[0], returnPoints=False))
+    try:
+        bays = cv2.convexityDefects(outlines[0], cv2.convexHull(outlines[0], returnPoints=False))
+    except cv2.error:
+        # OpenCV refuses an outline that touches itself, at a neck of one pixel.
+        return False
     # Depths come in 256ths of a pixel.
     return bays is None or bool(bays.reshape(-1, 4)[:, 3].max() <= BAY * 256)
 
