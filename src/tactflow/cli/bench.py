@@ -146,7 +146,7 @@ def _skipping(given: list[str], frames: int, data: Path | None) -> int:
     copies = CopyUnit()
     with _quiet_log(), _progress_bar() as progress:
         found = list(compare_all(pipelines, frames, data, copies, progress))
-    print_comparisons(found, copies, Console(file=sys.stdout, highlight=False, width=200))
+    print_comparisons(found, copies, Console(file=sys.stdout, highlight=False, width=240))
     for one in found:
         for fault in one.faults:
             print(f"tactflow: {one.scene}: {fault}", file=sys.stderr)
