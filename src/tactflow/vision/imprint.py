@@ -29,9 +29,12 @@ RIDGE = 0.87
 TOP = 0.9
 """Fraction of its peak up to which the width of the profile's skirt is measured."""
 
+UNEVEN = 1.6
+"""Where the peak is more than so many times the change's typical value (the mean weighted by the change
+itself), the light comes mostly from one side, and `OUTER` refers to that instead: else the dim side is cut."""
+
 GLOSS = 2.0
-"""A change of more than so many times its typical value (the mean weighted by the change itself) is a mirror
-image of a lamp, and is cut back to that."""
+"""A change of more than so many times its typical value is a mirror image of a lamp, and is cut back to that."""
 
 SKIRT = 0.6
 """Fraction of its peak to which the mean profile has fallen in the surroundings of the contact."""
@@ -106,7 +109,7 @@ def imprint(change: Float, inside: Mask, bridge: float = 4.0, hidden: Mask | Non
             hidden = None
     if 6 * cv2.norm(common, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
         return _brightened(common, _peak(common), hidden)
-    return _tilted(strength, _peak(strength), bridge, hidden)
+    return _tilted(strength, min(_peak(strength), UNEVEN * typical), bridge, hidden)
 
 
 def _peak(values: Float) -> float:
