@@ -18,7 +18,7 @@ Method = Literal["mean", "seed"]
 _FLAT: Final = 1e-3
 # How far from a mark's rim the region's outline is still bent by it, px: by what its mask takes more than the
 # mark, and by the smoothing after that.
-_HIDDEN: Final = 2.5
+HIDDEN: Final = 2.5
 _TRACKED: Final = int(MarkerStatus.TRACKED)
 _LOST: Final = int(MarkerStatus.LOST)
 
@@ -63,7 +63,7 @@ def flow_in_mask(
     if markers.radius is None:
         chosen = chosen[inside_mask(position, mask, dilate)]
     else:
-        chosen = chosen[inside_outline(position, mask, markers.radius + _HIDDEN, dilate)]
+        chosen = chosen[inside_outline(position, mask, markers.radius + HIDDEN, dilate)]
     count = len(chosen)
     if count == 0:
         return Flow(None, 0)

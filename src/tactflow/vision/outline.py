@@ -57,21 +57,29 @@ def inside_outline(
     for name, value in (("hidden", hidden), ("dilate", dilate)):
         if not (value >= 0 and math.isfinite(value)):
             raise ValueError(f"required {name} >= 0 px, got {value}")
-    inside = np.zeros(len(points), np.bool_)
+    return outline_depth(points, mask, hidden, max(dilate, hidden) + 1) >= -dilate
+
+
+def outline_depth(
+    points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, reach: float
+) -> FloatArray:
+    """How deep marks lie inside a region: their distance (N,) from its outline, px, negative outside.
+
+    points, mask, hidden : as `inside_outline` takes them. reach : px, >= hidden; marks further than this from
+        the region's bounding box are told -inf.
+    """
+    depth = np.full(len(points), -np.inf)
     if len(points) == 0 or mask.size == 0:
-        return inside
+        return depth
     left, top, width, height = cv2.boundingRect(mask)
-    if width == 0:
-        return inside
-    reach = max(dilate, hidden) + 1
     near = np.flatnonzero(
         (points[:, 0] > left - reach)
         & (points[:, 0] < left + width - 1 + reach)
         & (points[:, 1] > top - reach)
         & (points[:, 1] < top + height - 1 + reach)
     )
-    if len(near) == 0:
-        return inside
+    if width == 0 or len(near) == 0:
+        return depth
     region = mask[top : top + height, left : left + width]
     marks = np.asarray(points[near] - (left, top), np.float64)
     column, row = np.rint(marks).astype(np.intp).T
@@ -95,9 +103,9 @@ def inside_outline(
                 if abs(value) < abs(bridged[mark]):
                     bridged[mark] = value
     distance = np.sqrt(squared)
-    depth = np.where(on, distance + 0.5, 0.5 - distance)
-    inside[near] = np.where(np.isfinite(bridged), bridged + 0.5, depth) >= -dilate
-    return inside
+    plain = np.where(on, distance + 0.5, 0.5 - distance)
+    depth[near] = np.where(np.isfinite(bridged), bridged + 0.5, plain)
+    return depth
 
 
 def _gaps(seen: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
