@@ -235,7 +235,7 @@ def picture(grasps: list[Grasp], said: tuple[Bools, ...]) -> str:
         '<text x="376" y="17">change of the picture, 1 to 300 grey levels</text>'
         '<rect x="622" y="9" width="14" height="7" fill="#4a7a3f"/><text x="640" y="17">called contact</text>'
         '<rect x="736" y="11" width="14" height="4" fill="#d9a300"/>'
-        '<text x="754" y="17">disagrees (log scales)</text>'
+        '<text x="754" y="17">disagrees</text>'
     )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {top + 28:.0f}" '
