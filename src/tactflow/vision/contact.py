@@ -429,11 +429,15 @@ def _level(
 def _halved_mask(mask: NDArray[np.uint8], rows: slice, columns: slice) -> NDArray[np.uint8]:
     """A window, given in cells, of a mask at half resolution: 1 where any pixel is not 0, else 0."""
     part = mask[_CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop]
-    high, wide = 2 * (rows.stop - rows.start), 2 * (columns.stop - columns.start)
-    padded = np.zeros((2 * high, 2 * wide), np.uint8)
-    padded[: part.shape[0], : part.shape[1]] = part
-    pairs = cv2.max(padded[::2], padded[1::2])
-    return (np.maximum(pairs[:, ::2], pairs[:, 1::2]) > 0).view(np.uint8)
+    high, wide = _CELL * (rows.stop - rows.start), _CELL * (columns.stop - columns.start)
+    if part.shape != (high, wide):
+        below, beside = high - part.shape[0], wide - part.shape[1]
+        part = np.asarray(cv2.copyMakeBorder(part, 0, below, 0, beside, cv2.BORDER_CONSTANT), np.uint8)
+    # A pixel of 255 in four leaves 63, and one of 1 none: so the mask is spread to 0 and 255 first.
+    full = cv2.compare(part, np.zeros(1), cv2.CMP_GT)
+    return (np.asarray(cv2.resize(full, (wide // 2, high // 2), interpolation=cv2.INTER_AREA)) > 0).view(
+        np.uint8
+    )
 
 
 def _squared_length(vectors: Float) -> Float:
@@ -480,30 +484,33 @@ def _blobs(
     square : (h, w) float32, squared deviations. weak : belongs to a contact if connected to it. start : makes
     a new contact. stay : keeps one. before : the cells that were in contact in the frame before.
     """
-    changed = cv2.morphologyEx((square > weak).view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
+    changed = np.asarray(
+        cv2.morphologyEx((square > weak).view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8
+    )
+    outlines, _ = cv2.findContours(changed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     height, width = square.shape
-    found = []
-    for index in range(1, count):
-        left, top, wide, high, area = (int(value) for value in stats[index])
-        if area < min(_LEAST, square.size // 4):
+    least = min(_LEAST, square.size // 4)
+    found: list[tuple[float, _Blob]] = []
+    for outline in outlines:
+        left, top, wide, high = cv2.boundingRect(outline)
+        if wide * high < least:
             continue
-        window = slice(top, top + high), slice(left, left + wide)
-        inside = labels[window] == index
-        values = square[window][inside]
-        peak = float(values.max())
-        stays = before is not None and peak >= stay and bool(before[window][inside].any())
+        rows = slice(max(top - 1, 0), min(top + high + 1, height))
+        columns = slice(max(left - 1, 0), min(left + wide + 1, width))
+        inside = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
+        cv2.drawContours(inside, [outline], 0, 1, cv2.FILLED, offset=(-columns.start, -rows.start))
+        inside &= changed[rows, columns]
+        area = cv2.countNonZero(inside)
+        if area < least:
+            continue
+        belongs = inside.view(np.bool_)
+        peak = cv2.minMaxLoc(square[rows, columns], inside)[1]
+        stays = before is not None and peak >= stay and bool((before[rows, columns] & belongs).any())
         if peak >= start or stays:
-            found.append((float(values.sum()), index, window))
+            energy = cv2.mean(square[rows, columns], inside)[0] * area
+            found.append((energy, (rows, columns, belongs)))
     found.sort(key=lambda entry: -entry[0])
-    blobs = []
-    for energy, index, (high_rows, wide_columns) in found[:_BLOBS]:
-        if energy < _WEAK * found[0][0]:
-            break
-        rows = slice(max(high_rows.start - 1, 0), min(high_rows.stop + 1, height))
-        columns = slice(max(wide_columns.start - 1, 0), min(wide_columns.stop + 1, width))
-        blobs.append((rows, columns, labels[rows, columns] == index))
-    return blobs
+    return [blob for energy, blob in found[:_BLOBS] if energy >= _WEAK * found[0][0]]
 
 
 def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Float]:

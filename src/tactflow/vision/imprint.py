@@ -31,10 +31,10 @@ TOP = 0.9
 
 UNEVEN = 1.6
 """Where the peak is more than so many times the change's typical value (the mean weighted by the change
-itself), the light comes mostly from one side, and `OUTER` refers to that instead: else the dim side is cut."""
+itself), the light comes mostly from one side, and `OUTER` refers to that instead: the dim side is not cut."""
 
 GLOSS = 2.0
-"""A change of more than so many times its typical value is a mirror image of a lamp, and is cut back to that."""
+"""A change of more than so many times its typical value is a mirror image of a lamp, and is cut to that."""
 
 SKIRT = 0.6
 """Fraction of its peak to which the mean profile has fallen in the surroundings of the contact."""
@@ -133,15 +133,16 @@ def _tilted(strength: Float, peak: float, bridge: float, hidden: Mask | None) ->
         ring = changed if hidden is None else np.asarray(cv2.bitwise_and(changed | hidden, filled), np.uint8)
         reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
         filled = fill(_closed(ring, reach) | filled)
-    if filled.all():
+    if cv2.countNonZero(filled) == filled.size:
         return np.ones_like(strength)
     depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
     rows = slice(None, None, max(1, filled.size // _ENOUGH))
-    bins = (depth[rows] * np.float32(1 / _PROFILE_STEP)).astype(np.intp)
+    seen = depth[rows]
     if hidden is not None:
-        bins[hidden[rows] > 0] = 0
-    count = np.bincount(bins.ravel())[1:]
-    total = np.bincount(bins.ravel(), weights=strength[rows].ravel())[1:]
+        seen = np.asarray(cv2.copyTo(seen, 1 - hidden[rows]), np.float32)
+    bins = (seen * np.float32(1 / _PROFILE_STEP)).astype(np.intp).ravel()
+    count = np.bincount(bins)[1:]
+    total = np.bincount(bins, weights=strength[rows].ravel())[1:]
     known = np.flatnonzero(count >= _FEW)
     if known.size < 2:
         return np.asarray(depth - np.float32(0.5), np.float32)
@@ -260,10 +261,11 @@ def _closed(mask: Mask, reach: float) -> Mask:
 def _pockets(filled: Mask, outlines: Outlines) -> Mask:
     """Fill, perhaps in place, what a region encloses together with the border of the frame."""
     rim = np.concatenate([filled[0], filled[1:, -1], filled[-1, -2::-1], filled[-2:0:-1, 0]])
-    starts = np.flatnonzero(rim < np.roll(rim, 1)).tolist()
+    before = np.concatenate([rim[-1:], rim[:-1]])
+    starts = np.flatnonzero(rim < before).tolist()
     if len(starts) < 2:
         return filled
-    ends = np.flatnonzero(rim > np.roll(rim, 1)).tolist()
+    ends = np.flatnonzero(rim > before).tolist()
     if ends[0] < starts[0]:
         ends = [*ends[1:], ends[0] + len(rim)]
     height, width = filled.shape
