@@ -333,6 +333,24 @@ def test_centre_and_area_are_those_of_the_pixels(mask: Mask) -> None:
     assert contact.area == inside
 
 
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.98, 1.0])
+def test_a_large_mask_is_summed_exactly_too(share: float) -> None:
+    rng = np.random.default_rng(11)
+    mask = (rng.random((210, 190)) < share).astype(np.uint8) * 7
+    # Whole rows and corners: where a run of pixels meets the next line.
+    mask[[0, 1, -1]] = 7
+    contact = described(mask)
+    y, x = np.nonzero(mask)
+    assert contact.region_area == len(x)
+    assert contact.center == (int(x.sum()) / len(x), int(y.sum()) / len(y))
+    xx, yy, xy = np.var(x), np.var(y), np.mean((x - x.mean()) * (y - y.mean()))
+    spread = math.hypot(xx - yy, 2 * xy)
+    # Rounding of the reference in float64; the sums themselves are whole numbers.
+    assert contact.confidence == pytest.approx(spread / (xx + yy), rel=1e-9)
+    assert contact.ellipse is not None
+    assert contact.ellipse.axes[0] == pytest.approx(4 * math.sqrt((xx + yy + spread) / 2), rel=1e-9)
+
+
 def test_specks_below_min_area_do_not_count() -> None:
     mask = ellipse_mask((60, 50), (50, 20), 30)
     alone = described(mask)

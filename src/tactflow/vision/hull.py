@@ -23,6 +23,8 @@ FALSE_DIRECTION: Final = 1e-3
 _GRID_NOISE: Final = 0.122
 # Outline harmonics that measure how rough the outline is; 0 to 2 are size, place and elongation themselves.
 _HARMONICS: Final = range(3, 10)
+# Pixels from which on a region is summed by runs.
+_LARGE: Final = 20_000
 # Up to here (axis ratio 2) elongation is proportional to the outline's second harmonic.
 _LINEAR_LIMIT: Final = 0.6
 
@@ -114,12 +116,9 @@ def contact_geometry(
         roi = cv2.bitwise_and(roi, roi, mask=filled)
     outline = kept[0] if len(kept) == 1 else np.concatenate(kept)
     polygon = cv2.convexHull(outline)
-    moments = cv2.moments(roi, binaryImage=True)
     # Sums over pixels in whole numbers: no cancellation, a vertical bar is exactly vertical.
-    count, sx, sy = round(moments["m00"]), round(moments["m10"]), round(moments["m01"])
-    xx = count * round(moments["m20"]) - sx * sx
-    yy = count * round(moments["m02"]) - sy * sy
-    xy = count * round(moments["m11"]) - sx * sy
+    count, sx, sy, sxx, sxy, syy = _pixel_sums(roi)
+    xx, xy, yy = count * sxx - sx * sx, count * sxy - sx * sy, count * syy - sy * sy
     spread = math.hypot(xx - yy, 2 * xy)
     square = float(count) * count
     major = (xx + yy + spread) / (2 * square)
@@ -199,6 +198,38 @@ def _direction(theta: float) -> tuple[float, float | None]:
     return angle + 0.0, slope
 
 
+def _pixel_sums(roi: NDArray[Any]) -> tuple[int, int, int, int, int, int]:
+    """Over the non-zero pixels: their number and the sums of x, y, x^2, x y and y^2; exact."""
+    if roi.size < _LARGE:
+        moments = cv2.moments(roi, binaryImage=True)
+        m00, m10, m01 = round(moments["m00"]), round(moments["m10"]), round(moments["m01"])
+        return m00, m10, m01, round(moments["m20"]), round(moments["m11"]), round(moments["m02"])
+    # By runs of pixels, of which a large region has few. Each line starts with a pixel outside.
+    width = roi.shape[1] + 1
+    inside = np.zeros((len(roi), width), np.bool_)
+    np.not_equal(roi, 0, out=inside[:, 1:])
+    flat = inside.ravel()
+    ends = np.flatnonzero(flat[1:] != flat[:-1])
+    if flat[-1]:
+        ends = np.append(ends, flat.size - 1)
+    before, last = ends[::2], ends[1::2]
+    y = before // width
+    first, length = before - y * width, last - before
+    after = first + length
+    x = (first + after - 1) * length // 2
+    # The sum of the squares below n is (n - 1) n (2 n - 1) / 6.
+    squares = ((after - 1) * after * (2 * after - 1) - (first - 1) * first * (2 * first - 1)) // 6
+    lines = y * length
+    return (
+        int(length.sum()),
+        int(x.sum()),
+        int(lines.sum()),
+        int(squares.sum()),
+        int((y * x).sum()),
+        int((y * lines).sum()),
+    )
+
+
 def _filled_area(contour: NDArray[Any]) -> float:
     """Pixels of a blob from its outline of pixel centres, holes filled (Pick's theorem)."""
     return cv2.contourArea(contour) + len(contour) / 2 + 1 if len(contour) > 1 else 1.0
@@ -206,7 +237,7 @@ def _filled_area(contour: NDArray[Any]) -> float:
 
 def _pixels_in_hull(polygon: NDArray[Any]) -> float:
     vertices = polygon.reshape(-1, 2)
-    edges = vertices - np.roll(vertices, 1, axis=0)
+    edges = np.diff(vertices, axis=0, prepend=vertices[-1:])
     on_border = int(np.gcd(edges[:, 0], edges[:, 1]).sum())
     return cv2.contourArea(polygon) + on_border / 2 + 1
 
