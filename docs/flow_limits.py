@@ -38,6 +38,8 @@ SIGMA = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5)
 DRAWS = 400
 NEAR = 3.0
 """Marks nearer than this to the true outline tell how well it is known at marks, px."""
+UNDECIDED = 0.25
+"""Marks nearer than this to the true outline are in or out by chance, px."""
 COLOURS = (
     "#1f4e79", "#c0392b", "#4a7a3f", "#d9a300", "#7d3c98", "#16a085",
     "#d35400", "#2c3e50", "#8e6e53", "#c2185b", "#00838f",
@@ -49,12 +51,14 @@ class Curve:
     """One scene.
 
     expected : (S,) px, mean error for each of `SIGMA`. measured : px, of the default pipeline.
+    decided : px, the same over the frames in which no marker is `UNDECIDED` or nearer to the true outline.
     sigma : px, standard deviation of its outline at the markers; None where there are too few.
     """
 
     name: str
     expected: Values
     measured: float | None
+    decided: float | None
     sigma: float | None
 
 
@@ -105,7 +109,7 @@ def curves(say: Callable[[str], None]) -> list[Curve]:
     with tempfile.TemporaryDirectory() as folder:
         for rendered in render_all(cases, Path(folder)):
             pipeline = LockstepPipeline(on_recording(load_pipeline(PIPELINE), rendered.path), None)
-            score, off, index = FlowScore(), [], None
+            score, decided, off, index = FlowScore(), FlowScore(), [], None
             depths, moves = [], []
             for outcome in iter(pipeline.step, None):
                 number, mapping, markers = outcome.frame.seq, outcome.mapping, outcome.markers
@@ -118,6 +122,8 @@ def curves(say: Callable[[str], None]) -> list[Curve]:
                 depth = true_depth(rendered.scene, number)
                 if not (depth[truth.visible] > 0).any():
                     continue
+                if (np.abs(depth[truth.visible]) > UNDECIDED).all():
+                    decided.add(outcome.flow, truth)
                 depths.append(depth[truth.visible])
                 moves.append((truth.position - truth.origin)[truth.visible])
                 mask = outcome.contact_mask
@@ -128,9 +134,9 @@ def curves(say: Callable[[str], None]) -> list[Curve]:
                     off.extend((seen - depth)[near].tolist())
             if not depths:
                 continue
-            measured = score.errors().get("flow_error")
+            measured, certain = (each.errors().get("flow_error") for each in (score, decided))
             sigma = float(np.std(off)) if len(off) >= 20 else None
-            curve = Curve(rendered.case.label, expected_errors(depths, moves, rng), measured, sigma)
+            curve = Curve(rendered.case.label, expected_errors(depths, moves, rng), measured, certain, sigma)
             found.append(curve)
             say(row(curve, float(np.mean(off)) if off else math.nan))
     return found
@@ -141,8 +147,8 @@ def row(curve: Curve, bias: float) -> str:
     cells = [f"{curve.expected[SIGMA.index(sigma)]:.3f}" for sigma in (0.2, 0.5, 1.0)]
     enough = [sigma for sigma, error in zip(SIGMA, curve.expected, strict=True) if error <= TARGET]
     spread = "-" if curve.sigma is None else f"{curve.sigma:.2f} ({bias:+.2f})"
-    measured = "-" if curve.measured is None else f"{curve.measured:.3f}"
-    return f"| {curve.name} | " + " | ".join([*cells, f"{max(enough):g}", spread, measured]) + " |"
+    measured = ["-" if error is None else f"{error:.3f}" for error in (curve.measured, curve.decided)]
+    return f"| {curve.name} | " + " | ".join([*cells, f"{max(enough):g}", spread, *measured]) + " |"
 
 
 def picture(found: list[Curve]) -> str:

@@ -22,11 +22,17 @@ IntArray = NDArray[np.intp]
 # pixels' stairs tilt it; more: it cuts corners), and how many points of that.
 _SIDE: Final = 1.5
 _POINTS: Final = 12
+# For each point to the sides of a gap: whether it belongs to the first end or to the second, to which side
+# that is, and how far out it lies.
+_WHICH: Final = np.repeat([0, 1], _POINTS)
+_SIGN: Final = np.repeat([-1.0, 1.0], _POINTS)
+_OUTWARD: Final = _SIGN * np.tile(np.linspace(0, 1, _POINTS), 2)
 # Where along a gap its bridge is evaluated, in half widths from the middle.
 _STEPS: Final = np.linspace(-1, 1, 9)
 _BRIDGE: Final = np.stack([_STEPS**0, _STEPS, _STEPS**2], axis=1)
 _TANGENT: Final = np.stack([0 * _STEPS, _STEPS**0, 2 * _STEPS], axis=1)
 _MANY: Final = 400
+_NOBODY: Final = np.zeros(0, np.intp)
 # Weight of outline that other marks hide, against what is seen: it decides only where there is no other.
 _ELSEWHERE: Final = 0.02
 # A trace of ridge keeps a side of a few points solvable.
@@ -60,9 +66,7 @@ def inside_outline(
     return outline_depth(points, mask, hidden, max(dilate, hidden) + 1) >= -dilate
 
 
-def outline_depth(
-    points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, reach: float
-) -> FloatArray:
+def outline_depth(points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, reach: float) -> FloatArray:
     """How deep marks lie inside a region: their distance (N,) from its outline, px, negative outside.
 
     points, mask, hidden : as `inside_outline` takes them. reach : px, >= hidden; marks further than this from
@@ -95,9 +99,9 @@ def outline_depth(
         lengths = away[0] * away[0] + away[1] * away[1]
         np.minimum(squared, lengths.min(axis=1), out=squared)
         seen = lengths > hidden * hidden
-        which, before, after = _gaps(seen)
+        everywhere = np.asarray(seen.all(axis=0), np.bool_)
+        which, before, after = (_NOBODY,) * 3 if everywhere.all() else _gaps(seen)
         if len(which):
-            everywhere = np.asarray(seen.all(axis=0), np.bool_)
             found = _beyond(marks[which], corners, everywhere, before, after, hidden / spacing)
             for mark, value in zip(which.tolist(), found.tolist(), strict=True):
                 if abs(value) < abs(bridged[mark]):
@@ -138,18 +142,18 @@ def _beyond(
     """
     count = len(outline)
     side = min(_SIDE * half_width, count / 2 - 1)
-    sides = np.rint(np.arange(_POINTS) * (side / (_POINTS - 1))).astype(np.intp)
-    ends = np.concatenate([before[:, None] - sides, after[:, None] + sides], axis=1) % count
-    known = outline[ends]
-    weight = np.maximum(seen[ends], _ELSEWHERE)
-    first, second = known[:, :1], known[:, _POINTS : _POINTS + 1]
-    chord = second - first
-    half = np.maximum(0.5 * np.sqrt((chord * chord).sum(axis=2)), 0.5)
-    away = np.concatenate([known[:, :_POINTS] - first, known[:, _POINTS:] - second], axis=1)
-    place = 1 + np.sqrt((away * away).sum(axis=2)) / half
-    place[:, :_POINTS] *= -1
-    powers = np.stack([np.ones_like(place), place, place * place], axis=1)
-    weighted = powers * weight[:, None]
+    borders = np.stack([before, after], axis=1)
+    ends = (borders.take(_WHICH, axis=1) + np.rint(_OUTWARD * side).astype(np.intp)) % count
+    known = outline.take(ends, axis=0)
+    corners = outline.take(borders, axis=0)
+    chord = corners[:, 1] - corners[:, 0]
+    half = np.maximum(0.5 * np.sqrt((chord * chord).sum(axis=1)), 0.5)
+    away = known - corners.take(_WHICH, axis=1)
+    place = _SIGN * (1 + np.sqrt((away * away).sum(axis=2)) / half[:, None])
+    powers = np.empty((len(marks), 3, len(_WHICH)))
+    powers[:, 0], powers[:, 1] = 1, place
+    np.multiply(place, place, out=powers[:, 2])
+    weighted = powers * np.maximum(seen.take(ends), _ELSEWHERE)[:, None]
     fit = np.linalg.solve(weighted @ powers.transpose(0, 2, 1) + _RIDGE, weighted @ known)
     offset = marks[:, None] - _BRIDGE @ fit
     tangent = _TANGENT @ fit
