@@ -163,8 +163,8 @@ def _propagate(unary: FloatArray, first: IntArray, second: IntArray, pair: NDArr
     source = np.concatenate([first, second])
     links = len(first)
     reverse = np.concatenate([np.arange(links) + links, np.arange(links)])
-    # One layout for the minimum over the sender's label: axis 1 is the receiver's, axis 2 the sender's.
-    cost = np.concatenate([pair.transpose(0, 2, 1), pair])
+    # Axes: the sender's label, the link, the receiver's label. A minimum over the first axis goes by long rows.
+    cost = np.concatenate([pair.transpose(1, 0, 2), pair.transpose(2, 0, 1)], axis=1)
     collect = np.zeros((len(unary), 2 * links))
     collect[source[reverse], np.arange(2 * links)] = 1.0
     message = np.zeros((2 * links, unary.shape[1]))
@@ -173,7 +173,7 @@ def _propagate(unary: FloatArray, first: IntArray, second: IntArray, pair: NDArr
     unchanged = 0
     for _ in range(24):
         outgoing = belief[source] - message[reverse]
-        fresh = (outgoing[:, None, :] + cost).min(axis=2)
+        fresh = (outgoing.T[:, :, None] + cost).min(axis=0)
         fresh -= fresh.min(axis=1, keepdims=True)
         # Damping keeps messages around loops from oscillating.
         message = 0.7 * fresh + 0.3 * message
