@@ -53,6 +53,8 @@ class Probe:
         self._probe: ChangeProbe | None = None
         self._since = 0
         self._left = 0
+        self._span = params.hold
+        self._rest = 0
 
     def reset(self) -> None:
         """A new reference follows: choose the places to look at anew."""
@@ -71,7 +73,8 @@ class Probe:
         self._since += 1
         if changed or (self._left == 1 and not probe.calm):
             # Rest begins with a calm frame only: what is in doubt is taken for a change.
-            self._left = self.params.hold
+            self._span = self._held_for(probe.strongest <= 2 * probe.bound)
+            self._left, self._rest = self._span, 0
             probe.anchor_here()
         elif self._left > 0:
             self._left -= 1
@@ -80,6 +83,18 @@ class Probe:
         elif frame.reference or self._since >= self.params.at_least_every:
             probe.anchor_here()
         else:
+            self._rest += 1
             return ProbePorts(False)
         self._since = 0
         return ProbePorts(True)
+
+    def _held_for(self, faint: bool) -> int:
+        """For how many frames a change is held.
+
+        One that is faint and ends a short rest is a slow motion: it is held for twice as long as the last
+        one, to see more of it.
+        """
+        hold = self.params.hold
+        if not faint or self._rest >= 2 * self._span:
+            return hold
+        return self._span if self._rest == 0 else min(2 * self._span, max(hold, self.params.at_least_every))

@@ -27,7 +27,7 @@ MARKERLESS = ROOT / "pipelines" / "markerless.yaml"
         ("hold", 0.3),
         ("creep", 0.0),
         ("drift", 0.0),
-        ("drift?drift=0.02", 0.1),
+        ("drift?drift=0.01", 0.1),
         ("flicker", 0.0),
         ("tap", 0.3),
         ("spike", 0.2),

@@ -53,6 +53,23 @@ def test_frames_that_are_held_are_compared_with_the_one_that_changed() -> None:
     assert share(hold=0) < 0.7
 
 
+def test_a_slow_motion_is_held_for_longer_each_time() -> None:
+    """Light that grows too slowly for four held frames is seen over eight."""
+    random = np.random.default_rng(1)
+    probe = Probe(Probe.Params(hold=4))
+    found = []
+    for i in range(260):
+        # 40 lines x 320 px x 3 channels: 2 sqrt(2 / 38400) = 0.0144 levels are one deviation of a difference
+        # of two frames, so 0.013 levels a frame are 3.6 of them after four frames and 7.2 after eight.
+        level = 0.013 * max(0, min(i, 160) - 60)
+        rough = 120 + level + random.normal(0, 2, (240, 320, 3))
+        image = np.clip(np.rint(rough), 0, 255).astype(np.uint8)
+        found.append(probe.process(Frame("s", i, i / 60, image)).changed)
+    assert np.mean(found[10:60]) < 0.3, "still"
+    assert np.mean(found[110:160]) > 0.8, "moving"
+    assert np.mean(found[210:260]) < 0.3, "still again"
+
+
 def test_where_nothing_is_skipped_nothing_is_looked_at() -> None:
     probe = Probe(Probe.Params(), skipping=False)
     assert all(changes(probe, 40))

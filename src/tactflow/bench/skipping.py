@@ -37,7 +37,7 @@ SCENES = (*scene_names(), "hold?markers=none")
 
 ADVERSARIES: Mapping[str, str] = {
     "drift": "light that grows by 18 % with a time constant of 5 s",
-    "drift?drift=0.02": "light that grows by 2 % with a time constant of 5 s",
+    "drift?drift=0.01": "light that grows by 1 % with a time constant of 5 s",
     "creep": "a contact that drags the gel by 0.02 px a frame",
     "flicker": "light that flickers by 6 %, with bands of gain of 3 %",
     "tap": "contacts of one frame",
@@ -67,7 +67,7 @@ _MEDIAN_DEVIATION = 0.6745
 """Median of the absolute value of a standard normal deviate."""
 _OUTLIER = 5.0
 _ENOUGH = 20
-"""Second differences from which a noise is told: it is then known to about a fifth."""
+"""Differences from which a noise or an RMS is told: it is then known to about a fifth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +88,9 @@ class Comparison:
     repeated : frames whose result was repeated. rest : the longest run of such frames. decisions : frames in
     which the two disagree about contact. missed : the longest run of such frames. late : frames in which some
     number is stale, further from the fresh one than noise takes it. stale : the longest run of such frames.
-    worst, rms : number -> difference over the repeated frames. noise : number -> its noise; where hardly
-    three repeated frames follow each other it comes from all frames. times : "on" and "off" -> times of a
-    frame.
+    worst, rms, values : number -> difference over the repeated frames, and how many. noise : number -> its
+    noise; where hardly three repeated frames follow each other it comes from all frames. times : "on" and
+    "off" -> times of a frame.
     """
 
     scene: str
@@ -103,6 +103,7 @@ class Comparison:
     stale: int = 0
     worst: dict[str, float] = field(default_factory=dict[str, float])
     rms: dict[str, float] = field(default_factory=dict[str, float])
+    values: dict[str, int] = field(default_factory=dict[str, int])
     noise: dict[str, Noise] = field(default_factory=dict[str, Noise])
     times: dict[str, Samples] = field(default_factory=lambda: {"on": Samples(), "off": Samples()})
 
@@ -111,7 +112,8 @@ class Comparison:
         """What skipping changed beyond noise; empty if nothing."""
         found = [f"{self.decisions} contact decisions differ"] if self.decisions else []
         for name, rms in self.rms.items():
-            if name in self.noise and rms > ALLOWED * self.noise[name].rms:
+            enough = self.values[name] >= _ENOUGH
+            if enough and name in self.noise and rms > ALLOWED * self.noise[name].rms:
                 found.append(f"{name}: RMS difference {rms:.3g} with a noise of {self.noise[name].rms:.3g}")
         if self.stale > STALE:
             found.append(f"a number is stale for {self.stale} frames")
@@ -211,6 +213,7 @@ def _judge(result: Comparison, rows: Sequence[_Row]) -> None:
         if not differences:
             continue
         joined = np.concatenate(list(differences.values()))
+        result.values[name] = joined.size
         result.worst[name] = float(np.abs(joined).max())
         result.rms[name] = float(np.sqrt(np.square(joined).mean()))
         if noise is not None:
@@ -329,8 +332,8 @@ def print_comparisons(comparisons: Sequence[Comparison], copies: CopyUnit, conso
             cells.append(f"{one.rms[name]:.2g} / {one.worst[name]:.2g} ({own})")
         changed.add_row(*cells, "; ".join(one.faults) or "nothing")
     changed.caption = (
-        f"beyond noise: RMS above {ALLOWED:g} x noise, a contact decision that differs, or a number stale "
-        f"for more than {STALE} frame"
+        f"beyond noise: RMS of at least {_ENOUGH} values above {ALLOWED:g} x noise, a contact decision that "
+        f"differs, or a number stale for more than {STALE} frame"
     )
     changed.caption_justify = "left"
     console.print(changed)

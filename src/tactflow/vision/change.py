@@ -5,7 +5,7 @@ that was worked on: where the sum of squared differences exceeds what noise make
 nothing else is looked at. If it does not, the same is done with four times as many lines, and then sums over
 tiles are tested:
 
-- light: the sum of each channel, which shows a brightness that changes little but over an area;
+- light: the sums of each channel and of all, which show a light that changes little but over an area;
 - motion: the projection on the gel's gradients at its steepest edges, which is the least-squares estimate of
   a displacement (Lucas and Kanade, 1981);
 - marks: the sum over those edges, which shows a dot that went further than its own size.
@@ -37,6 +37,8 @@ _EDGES = 24
 """Samples of a tile on its steepest edges."""
 _WINDOWS = (1, 3, 7)
 """Widths and heights of the windows that are tested, tiles; also all tiles."""
+_MEAN = 4
+"""The anchor's sums are the mean of so many frames without a change, where there were any before it."""
 _WARM_UP = 6
 """Pairs of frames from which the noise is learned before any frame is called unchanged."""
 _CALM = 0.1
@@ -90,6 +92,10 @@ class ChangeProbe:
         it is above the bound: what has changed for sure is not tested further."""
         self._anchor: _Sample | None = None
         self._last: _Sample | None = None
+        # Mean of the sums over the first unchanged frames, and of how many; the same of the anchor.
+        self._mean: NDArray[np.float32] | None = None
+        self._anchor_mean: NDArray[np.float32] | None = None
+        self._frames = self._anchor_frames = 0
         # The anchor, the last frame and this one.
         self._spare = [_Sample(tiling) for _ in range(3)]
         self._looks = 0
@@ -132,6 +138,7 @@ class ChangeProbe:
         else:
             self.strongest = self._compare(now, self._anchor)
         changed = self.strongest > self.bound
+        self._follow(now, changed)
         self._looks += 1
         if last is not None:
             if not warming_up and self._looks % _EVERY == 0:
@@ -148,6 +155,17 @@ class ChangeProbe:
         if self._anchor is not None and self._anchor is not self._last:
             self._spare.append(self._anchor)
         self._anchor = self._last
+        self._anchor_mean, self._anchor_frames = self._mean, self._frames
+
+    def _follow(self, now: _Sample, changed: bool) -> None:
+        """Take a frame into the mean of the first ones that are unchanged."""
+        if changed:
+            self._mean, self._frames = None, 0
+        elif self._frames < _MEAN:
+            self._frames += 1
+            sums = now.sums()
+            mean = sums if self._mean is None else self._mean
+            self._mean = mean + (sums - mean) / np.float32(self._frames)
 
     def _compare(self, now: _Sample, then: _Sample) -> float:
         """The largest of the tests' values, each a standard normal deviate under noise alone."""
@@ -157,14 +175,19 @@ class ChangeProbe:
             strongest = max(strongest, noise.energy.excess(now.energy(then)))
         if strongest > self.bound:
             return strongest
-        return max(strongest, noise.strongest(now.sums() - then.sums()))
+        mean, frames = self._anchor_mean, self._anchor_frames
+        if mean is None:
+            mean, frames = then.sums(), 1
+        # Scaled for the noise of two frames; that of a mean is less.
+        return max(strongest, noise.strongest(now.sums() - mean) * math.sqrt(2 / (1 + 1 / frames)))
 
 
 class _Tiling:
     """Where to look: which lines, how they are cut into tiles, and where the steepest edges of a tile are.
 
     Samples are laid out (lines, channels, pixels), with zeros added so that all tiles are equally large; sums
-    (rows of tiles, kinds, tiles in a row), the kinds being light of each channel, marks, and motion in x, y.
+    (rows of tiles, kinds, tiles in a row), the kinds being light of each channel and of all, marks, and
+    motion in x and y.
     """
 
     def __init__(self, frame: NDArray[np.uint8], tile: int) -> None:
@@ -179,16 +202,19 @@ class _Tiling:
         self.size = rows * thick, self.channels, columns * self.width
         self.used = lines, width
         self.count = lines * width * self.channels
+        self.lights = self.channels + (self.channels > 1)
+        self.together = np.tile(np.eye(columns, dtype=np.float32), (self.channels, 1))
         self.glance = slice(step // 2, None, _GLANCE * step)
         self.glance_shape = frame[self.glance].shape
         self.collect = np.kron(np.eye(rows, dtype=np.float32), np.ones((1, thick), np.float32))
         self._choose_edges(frame)
         pixels = np.zeros(self.size, np.float32)
         pixels[:lines, :, :width] = 1
-        unit = np.empty((rows, self.channels + 3, columns), np.float32)
+        unit = np.empty((rows, self.lights + 3, columns), np.float32)
         unit[:, : self.channels] = self._by_tile(pixels).sum(axis=-1)
+        unit[:, self.lights - 1] = unit[:, : self.channels].sum(axis=1)
         at_edges = np.square(self.weights).sum(axis=1)
-        unit[:, self.channels :] = at_edges.reshape(-1, rows, columns).swapaxes(0, 1)
+        unit[:, self.lights :] = at_edges.reshape(-1, rows, columns).swapaxes(0, 1)
         # A tile without any gradient shows no motion, and no noise of it either.
         self.unit = np.maximum(unit, np.float32(1e-3))
         """Variance of each sum for noise of variance 1 that is independent from pixel to pixel."""
@@ -275,10 +301,12 @@ class _Sample:
             cells = cv2.reduce(planes.reshape(-1, tiling.width), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S)
             light = tiling.collect @ cells.reshape(-1, channels * columns).astype(np.float32)
             sums[:, :channels] = light.reshape(rows, channels, columns)
+            if channels > 1:
+                sums[:, channels] = light @ tiling.together
             edges = planes.reshape(-1).take(tiling.places).astype(np.float32) - tiling.resting
             # A product with ones goes to BLAS, which is faster than a sum along an axis.
             at_edges = tiling.ones @ (edges * tiling.weights)
-            sums[:, channels:] = at_edges.reshape(-1, rows, columns).swapaxes(0, 1)
+            sums[:, tiling.lights :] = at_edges.reshape(-1, rows, columns).swapaxes(0, 1)
             self._sums = sums
         return self._sums
 
@@ -325,7 +353,7 @@ class _Noise:
     def __init__(self, tiling: _Tiling) -> None:
         rows, columns = tiling.grid
         self._unit = tiling.unit
-        self._light = tiling.channels
+        self._light = tiling.lights
         self._windows = _windows(rows), np.ascontiguousarray(_windows(columns).T)
         self._near = _neighbours(rows), np.ascontiguousarray(_neighbours(columns).T)
         self.tests = len(self._windows[0]) * self._unit.shape[1] * self._windows[1].shape[1]
