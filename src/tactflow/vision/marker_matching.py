@@ -163,7 +163,7 @@ def _propagate(unary: FloatArray, first: IntArray, second: IntArray, pair: NDArr
     source = np.concatenate([first, second])
     links = len(first)
     reverse = np.concatenate([np.arange(links) + links, np.arange(links)])
-    # Axes: the sender's label, the link, the receiver's label. A minimum over the first axis goes by long rows.
+    # Axes: the label of the sender, the link, the label of the receiver: a minimum over the first is fastest.
     cost = np.concatenate([pair.transpose(1, 0, 2), pair.transpose(2, 0, 1)], axis=1)
     collect = np.zeros((len(unary), 2 * links))
     collect[source[reverse], np.arange(2 * links)] = 1.0
