@@ -140,27 +140,30 @@ def _tilted(strength: Float, peak: float, bridge: float, hidden: Mask | None) ->
     seen = depth[rows]
     if hidden is not None:
         seen = np.asarray(cv2.copyTo(seen, 1 - hidden[rows]), np.float32)
-    bins = (seen * np.float32(1 / _PROFILE_STEP)).astype(np.intp).ravel()
+    flat = seen.ravel()
+    within = np.flatnonzero(flat)
+    bins = (flat[within] * np.float32(1 / _PROFILE_STEP)).astype(np.intp)
     count = np.bincount(bins)[1:]
-    total = np.bincount(bins, weights=strength[rows].ravel())[1:]
+    total = np.bincount(bins, weights=strength[rows].ravel()[within])[1:]
     known = np.flatnonzero(count >= _FEW)
     if known.size < 2:
         return np.asarray(depth - np.float32(0.5), np.float32)
-    profile = np.asarray(total[known] / count[known], np.float64)
-    at = np.asarray((known + 1.5) * _PROFILE_STEP, np.float64)
+    profile = (total[known] / count[known]).tolist()
+    at = ((known + 1.5) * _PROFILE_STEP).tolist()
     rim, top, skirt = (_crossing(profile, at, part) for part in (RIDGE, TOP, SKIRT))
     middle = float(depth.max())
     soft = top - skirt - SHARP_SKIRT * (middle - top) - BLUR
     return np.asarray(depth - np.float32(min(rim + SOFTNESS * max(soft, 0.0), DEEPEST * middle)), np.float32)
 
 
-def _crossing(profile: NDArray[np.float64], at: NDArray[np.float64], part: float) -> float:
+def _crossing(profile: list[float], at: list[float], part: float) -> float:
     """Where, coming from outside, a profile first reaches a part of its peak."""
-    wanted = part * float(profile.max())
-    first = int(np.argmax(profile >= wanted))
+    wanted = part * max(profile)
+    first = next(index for index, value in enumerate(profile) if value >= wanted)
     if first == 0:
-        return float(at[0])
-    return float(np.interp(wanted, profile[first - 1 : first + 1], at[first - 1 : first + 1]))
+        return at[0]
+    share = (wanted - profile[first - 1]) / (profile[first] - profile[first - 1])
+    return at[first - 1] + share * (at[first] - at[first - 1])
 
 
 def _outlined(mask: Mask, hidden: Mask | None) -> tuple[Mask, Outlines]:
@@ -207,12 +210,13 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     since = np.maximum(first - 1 - TANGENT, np.concatenate([[0], behind[:-1]]))
     until = np.minimum(behind + TANGENT, np.concatenate([first[1:], [count + first[0]]]) - 1)
     before, after = points[first - 1], points[behind % count]
-    chord, here, there = after - before, before - points[since], points[until % count] - after
-    square = (chord * chord).sum(axis=1)
-    for direction in (here, there):
-        direction *= np.sqrt(square / np.maximum((direction * direction).sum(axis=1), 1e-9))[:, None]
-    ahead = 2 * np.minimum((here * chord).sum(axis=1), (there * chord).sum(axis=1)) > square
-    curves = _CUBICS @ np.stack([before, here, after, there], axis=1)
+    chord = after - before
+    square = np.einsum("ij,ij->i", chord, chord)
+    # Directions at both ends, as long as the chord.
+    ways = np.stack([before - points[since], points[until % count] - after])
+    ways *= np.sqrt(square / np.maximum(np.einsum("kij,kij->ki", ways, ways), 1e-9))[..., None]
+    ahead = 2 * np.einsum("kij,ij->ki", ways, chord).min(axis=0) > square
+    curves = _CUBICS @ np.stack([before, ways[0], after, ways[1]], axis=1)
     pieces, last = [], 0
     for curve, smooth, left, back in zip(curves, ahead, first.tolist(), behind.tolist(), strict=True):
         pieces.append(points[last:left])
