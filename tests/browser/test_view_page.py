@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,12 @@ import pytest
 sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: playwright is not installed")
 pytest.importorskip("uvicorn", reason="NO BROWSER TESTS: the extra tactflow[view] is not installed")
 
+from websockets.http11 import Request, Response  # noqa: E402
+from websockets.sync.server import ServerConnection  # noqa: E402
+from websockets.sync.server import serve as websockets_serve  # noqa: E402
+
 REPOSITORY = Path(__file__).resolve().parents[2]
+PAGE = REPOSITORY / "src" / "tactflow" / "view" / "page"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 PATIENCE = 30_000
 """ms; how long a test waits for what must happen. Nothing is asserted about the time it takes."""
@@ -136,9 +142,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
     contexts: list[Any] = []
     complaints: list[str] = []
 
-    def open_(
-        url: str, *, everywhere: bool = False, lost: bool = False, prepare: Any = None, **options: Any
-    ) -> Any:
+    def open_(url: str, *, everywhere: bool = False, lost: bool = False, **options: Any) -> Any:
         options = {"viewport": {"width": 1400, "height": 900}, "color_scheme": "dark"} | options
         context = browser.new_context(**options)
         contexts.append(context)
@@ -159,8 +163,6 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
         page.on("console", complain)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("request", check_target)
-        if prepare is not None:
-            prepare(page)
         page.goto(url)
         return page
 
@@ -194,9 +196,27 @@ def seq(page: Any) -> int:
     return int(page.get_attribute("#picture", "data-seq"))
 
 
-def pixels(page: Any, canvas: str) -> str:
-    """What a canvas shows."""
-    return str(page.evaluate("id => document.getElementById(id).toDataURL()", canvas))
+def pixels(page: Any, canvas: str) -> bytes:
+    """What a canvas shows. A worker draws it, so a screenshot is the only way to see it."""
+    return bytes(page.locator(f"#{canvas}").screenshot())
+
+
+def shows(page: Any, canvas: str, condition: Callable[[bytes], bool]) -> bool:
+    """Whether a canvas comes to show what is wanted: drawing takes the worker a moment."""
+    deadline = time.monotonic() + PATIENCE / 1000
+    while not condition(pixels(page, canvas)):
+        if time.monotonic() > deadline:
+            return False
+    return True
+
+
+def steady(page: Any, canvas: str) -> bytes:
+    """What a canvas shows once it no longer changes."""
+    before = b""
+    while before != (now := pixels(page, canvas)):
+        before = now
+        page.wait_for_timeout(100)
+    return now
 
 
 def advance(page: Any, frames: int = 1) -> None:
@@ -522,6 +542,65 @@ def test_the_page_fits_its_window(
 # -- a server of the test's own -----------------------------------------------------------------------------
 
 
+class Stage:
+    """Serves the page's files, and plays the run: what it says and hears is up to the test.
+
+    greet : what to send a page that connects.
+    """
+
+    def __init__(self, *greet: str | bytes) -> None:
+        self.greet = greet
+        self.heard: list[Any] = []
+        self.page: ServerConnection | None = None
+        self._server = websockets_serve(
+            self._play, "127.0.0.1", 0, process_request=self._file, compression=None
+        )
+        self.url = f"http://127.0.0.1:{self._server.socket.getsockname()[1]}/"
+        self._thread = threading.Thread(target=self._server.serve_forever)
+        self._thread.start()
+
+    def _file(self, connection: ServerConnection, request: Request) -> Response | None:
+        name = request.path.strip("/") or "index.html"
+        if name == "live":
+            return None
+        kinds = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+        response = connection.respond(HTTPStatus.OK, (PAGE / name).read_text())
+        del response.headers["Content-Type"]
+        response.headers["Content-Type"] = kinds[name.rpartition(".")[2]]
+        return response
+
+    def _play(self, connection: ServerConnection) -> None:
+        for message in self.greet:
+            connection.send(message)
+        self.page = connection
+        for text in connection:
+            self.heard.append(json.loads(text))
+
+    def send(self, message: str | bytes) -> None:
+        assert self.page is not None
+        self.page.send(message)
+
+    def close(self) -> None:
+        if self.page is not None:
+            self.page.close()
+        self._server.shutdown()
+        self._thread.join()
+
+
+@pytest.fixture
+def staged() -> Iterator[Callable[..., Stage]]:
+    """Opens servers of the test's own."""
+    stages: list[Stage] = []
+
+    def open_(*greet: str | bytes) -> Stage:
+        stages.append(Stage(*greet))
+        return stages[-1]
+
+    yield open_
+    for stage in stages:
+        stage.close()
+
+
 def frame(sensor: str, number: int, colour: int, *, contact: bool = False, directed: bool = False) -> bytes:
     """A frame as the view sends it."""
     image = np.full((40, 60, 3), colour, np.uint8)
@@ -535,12 +614,13 @@ def frame(sensor: str, number: int, colour: int, *, contact: bool = False, direc
         "size": [60, 40],
         "contact": None,
         "flow": None,
-        "markers": {
-            "origin": points,
-            "position": [[x + 3, y + 2] for x, y in points],
-            "status": ["tracked", "inferred", "lost"],
-        },
+        "markers": None,
         "skipped": {},
+    }
+    markers = {
+        "origin": [round(10 * value) for point in points for value in point],
+        "position": [round(10 * value) for x, y in points for value in (x + 3, y + 2)],
+        "status": "til",
     }
     if contact:
         message["contact"] = {
@@ -559,7 +639,8 @@ def frame(sensor: str, number: int, colour: int, *, contact: bool = False, direc
             "ellipse": {"center": [30.0, 20.0], "axes": [30.0, 12.0], "angle": -30.0},
         }
         message["flow"] = {"mean": [4.0, -2.0], "count": 3, "rotation": None}
-    header = json.dumps({"latency_ms": 3.0, "epoch": 0, "message": message, "number": number}).encode()
+    described = {"latency_ms": 3.0, "epoch": 0, "message": message, "markers": markers, "number": number}
+    header = json.dumps(described).encode()
     return struct.pack("<I", len(header)) + header + jpeg
 
 
@@ -574,76 +655,69 @@ def state(sensor: str, **changes: Any) -> str:
     return json.dumps(whole | changes)
 
 
-def test_each_layer_is_drawn_and_can_be_hidden(watched: Run, open_page: Callable[..., Any]) -> None:
-    def serve(wire: Any) -> None:
-        wire.on_message(json.loads)
-        wire.send(json.dumps({"type": "hello", "run": "1", "sensors": ["main"]}))
-        wire.send(state("main"))
-        wire.send(frame("main", 1, 120, contact=True, directed=True))
+def hello(*sensors: str) -> str:
+    """How a run greets a page."""
+    return json.dumps({"type": "hello", "run": "1", "sensors": sensors})
 
-    page = open_page(watched.url, prepare=lambda p: p.route_web_socket("**/live", serve))
+
+def test_each_layer_is_drawn_and_can_be_hidden(
+    staged: Callable[..., Stage], open_page: Callable[..., Any]
+) -> None:
+    stage = staged(hello("main"), state("main"), frame("main", 1, 120, contact=True, directed=True))
+    page = open_page(stage.url)
     watch(page)
     until(page, "() => document.getElementById('value-angle').textContent === '−30.0°'")
     assert page.get_attribute("#layer-ellipse", "aria-pressed") == "false"
+    without = steady(page, "picture")
     page.click("#layer-ellipse")
-    whole = pixels(page, "picture")
+    assert shows(page, "picture", lambda seen: seen != without)
+    whole = steady(page, "picture")
     for key, layer in enumerate(("image", "arrows", "hull", "axis", "ellipse", "mean"), start=1):
         page.click(f"#layer-{layer}")
         assert page.get_attribute(f"#layer-{layer}", "aria-pressed") == "false"
-        assert pixels(page, "picture") != whole, layer
+        assert shows(page, "picture", lambda seen: seen != whole), layer
         page.keyboard.press(str(key))
         assert page.get_attribute(f"#layer-{layer}", "aria-pressed") == "true"
-        assert pixels(page, "picture") == whole, layer
+        assert shows(page, "picture", lambda seen: seen == whole), layer
     page.keyboard.press("x")
     assert page.inner_text("#magnify span") == "Arrows × 5"
-    assert pixels(page, "picture") != whole
+    assert shows(page, "picture", lambda seen: seen != whole)
 
 
-def test_a_tab_per_sensor_and_honest_empty_states(watched: Run, open_page: Callable[..., Any]) -> None:
-    wires: list[Any] = []
-    acks: list[int] = []
-
-    def hear(text: str) -> None:
-        message = json.loads(text)
-        if "ack" in message:
-            acks.append(message["ack"])
-
-    def serve(wire: Any) -> None:
-        wires.append(wire)
-        wire.on_message(hear)
-        wire.send(json.dumps({"type": "hello", "run": "1", "sensors": ["left", "right"]}))
-
-    page = open_page(watched.url, prepare=lambda p: p.route_web_socket("**/live", serve))
+def test_a_tab_per_sensor_and_honest_empty_states(
+    staged: Callable[..., Stage], open_page: Callable[..., Any]
+) -> None:
+    stage = staged(hello("left", "right"))
+    page = open_page(stage.url)
     status(page, "waiting")
     assert page.inner_text("#empty-title") == "Waiting for frames"
     assert page.inner_text("#tabs").split() == ["left", "right"]
-    wire = wires[0]
     for sensor in ("left", "right"):
-        wire.send(state(sensor))
-    wire.send(frame("left", 1, 200))
+        stage.send(state(sensor))
+    stage.send(frame("left", 1, 200))
     watch(page)
-    wire.send(frame("right", 2, 90, contact=True))
+    stage.send(frame("right", 2, 90, contact=True))
     until(page, "() => document.getElementById('count-lost').textContent === '1'")
-    left = pixels(page, "picture")
+    left = steady(page, "picture")
     assert page.inner_text("#unit-area") == "no contact"
     page.click("#tabs button:nth-child(2)")
     assert page.get_attribute("#tabs button:nth-child(2)", "aria-selected") == "true"
-    assert pixels(page, "picture") != left
+    assert shows(page, "picture", lambda seen: seen != left)
     until(page, "() => document.getElementById('unit-angle').textContent === 'no direction'")
     assert page.inner_text("#unit-flow") == "no marker inside"
     assert page.inner_text("#source") == "camera of right"
     assert page.inner_text("#source-state").endswith("connected")
     page.keyboard.press("ArrowLeft")
     assert page.get_attribute("#tabs button:nth-child(1)", "aria-selected") == "true"
-    assert pixels(page, "picture") == left
+    assert shows(page, "picture", lambda seen: seen == left)
     status(page, "stalled")
     assert re.match(r"no frames for \d+ s", page.inner_text("#status-text"))
-    wire.send(frame("left", 3, 100))
+    stage.send(frame("left", 3, 100))
     status(page, "live")
     deadline = time.monotonic() + PATIENCE / 1000
-    while acks != [1, 2, 3] and time.monotonic() < deadline:
+    while len(stage.heard) < 3 and time.monotonic() < deadline:
         page.wait_for_timeout(20)
-    assert acks == [1, 2, 3]
-    wire.send(state("left", end="eos"))
+    assert [message.get("ack") for message in stage.heard] == [1, 2, 3]
+    stage.send(state("left", end="eos"))
     status(page, "ended")
     assert "The source has ended." in page.inner_text("#empty-text")

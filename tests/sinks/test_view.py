@@ -30,6 +30,7 @@ from tactflow.engine.run import Runner
 from tactflow.message import build_message
 from tactflow.sinks.view import View
 from tactflow.view.address import address, bind, is_loopback
+from tactflow.vision.types import Contact, Markers
 
 pytest.importorskip("uvicorn", reason="the extra tactflow[view] is not installed")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -405,6 +406,58 @@ def test_an_answer_for_another_frame_counts_for_nothing(
     browser.say(do="nothing")
     browser.next("note")
     assert not sink.wants()
+
+
+def test_a_page_on_a_full_machine_rests_before_its_next_frame(
+    view: Callable[..., View], page: Callable[..., Page], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.view.hub.REST_MS", 3_600_000)
+    sink = view()
+    browser = page(sink)
+    write(sink, 0)
+    number = browser.next("frame")[0]["number"]
+    browser.say(ack=number, rest=3_600_000)
+    # Saying it twice does not shorten the rest.
+    browser.say(ack=number, rest=0)
+    browser.say(do="nothing")
+    browser.next("note")
+    assert not sink.wants()
+    # A frame for another page is no frame for this one.
+    other = page(sink)
+    other.say(ack=other.next("frame")[0]["number"])
+    write(sink, 1)
+    assert other.next("frame")[0]["message"]["seq"] == 1
+
+
+def test_a_rest_is_never_long(view: Callable[..., View], page: Callable[..., Page]) -> None:
+    sink = view()
+    browser = page(sink)
+    write(sink, 0)
+    browser.say(ack=browser.next("frame")[0]["number"], rest=3_600_000)
+    write(sink, 1)
+    assert browser.next("frame")[0]["message"]["seq"] == 1
+
+
+def test_what_is_only_drawn_is_sent_in_tenths_of_a_pixel(
+    view: Callable[..., View], page: Callable[..., Page]
+) -> None:
+    sink = view()
+    browser = page(sink)
+    hull = np.array([[10.04, 20.06], [30.0, 20.0], [30.0, 40.0]])
+    contact = Contact(200.123456, (23.3, 26.7), None, None, hull, None)
+    origin = np.array([[1.04, 2.06], [-3.14159, 40.0], [5.0, 6.0]])
+    markers = Markers(origin, origin + 0.5, np.array([0, 1, 2], np.uint8), np.full(3, np.nan))
+    wait_for(sink.wants)
+    sink.write(tick(), picture(), contact, None, markers)
+    header, _ = browser.next("frame")
+    assert header["markers"] == {
+        "origin": [10, 21, -31, 400, 50, 60],
+        "position": [15, 26, -26, 405, 55, 65],
+        "status": "til",
+    }
+    assert header["message"]["contact"]["hull"] == [[10.0, 20.1], [30.0, 20.0], [30.0, 40.0]]
+    assert header["message"]["contact"]["area"] == 200.123456
+    assert hull[0, 0] == 10.04
 
 
 # -- who is let in ------------------------------------------------------------------------------------------

@@ -29,6 +29,9 @@ STATS_SECONDS = 0.5
 STALE_SECONDS = 1.0
 """A picture older than this is not shown to a page that has just opened, unless the run is paused."""
 
+REST_MS = 250
+"""A page whose machine is full may ask for at most this long until its next frame."""
+
 MAX_PAGES = 16
 """More pages than this at a time are turned away."""
 
@@ -69,6 +72,7 @@ class Page:
         self.wire = wire
         self.credit = True
         self.sent = 0
+        self.answered = 0
         self.captured = 0.0
         self.sent_at = 0.0
         self.screen_s: deque[float] = deque(maxlen=64)
@@ -297,13 +301,22 @@ class Hub:
                 await self._command(page, message)
 
     def _acknowledged(self, page: Page, message: Mapping[str, Any]) -> None:
-        if message["ack"] != page.sent or page.credit:
+        if message["ack"] != page.sent or page.sent == page.answered:
             return
+        page.answered = page.sent
         # A hidden page draws nothing until it is looked at again: that is no delay.
         if message.get("late") is not True and page.captured > 0:
             delay = time.perf_counter() - page.captured
             page.screen_s.append(delay)
             self._screen.add(delay)
+        rest = message.get("rest")
+        # The machine that is full may be the one that runs the pipeline: let it have half of the time.
+        if isinstance(rest, int) and rest > 0:
+            asyncio.get_running_loop().call_later(min(rest, REST_MS) / 1000, self._ready, page)
+        else:
+            self._ready(page)
+
+    def _ready(self, page: Page) -> None:
         page.credit = True
         self._recount()
         page.wake.set()

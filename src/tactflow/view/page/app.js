@@ -1,33 +1,33 @@
-// The page: one tab per sensor, its picture, plots and statistics, and the buttons that steer the run.
-
-import { Connection } from "./connection.js";
-import { LAYERS, Picture } from "./picture.js";
-import { Plot, SECONDS, onPaletteChange } from "./plot.js";
+// The page: one tab per sensor, its numbers and statistics, and the buttons that steer the run. The picture and
+// the plots are drawn by a worker, which also talks to the run.
 
 const $ = (id) => document.getElementById(id);
 const MINUS = "−";
 const STALL_SECONDS = 2;
-const PLOT_MS = 80;
 const MAGNIFICATIONS = [1, 3, 5, 10];
-
-const picture = new Picture($("picture"));
-const plots = [
-  new Plot($("plot-area"), { series: [(p) => p.area], range: "positive", minimum: 100 }),
-  new Plot($("plot-angle"), { series: [(p) => p.angle], range: [-90, 90], jump: 90, format: (v) => `${v}°`.replace("-", MINUS) }),
-  new Plot($("plot-flow"), { series: [(p) => p.dx, (p) => p.dy], range: "symmetric", minimum: 1 }),
-  new Plot($("plot-latency"), { series: [(p) => p.latency], range: "positive", minimum: 4 }),
+const CANVASES = ["picture", "plot-area", "plot-angle", "plot-flow", "plot-latency"];
+const COLOURS = ["tracked", "inferred", "lost", "hull", "axis", "ellipse", "mean", "series-a", "series-b", "grid", "quiet", "panel"];
+const LAYERS = [
+  { id: "image", label: "Image", key: "1", colour: "var(--quiet)" },
+  { id: "arrows", label: "Arrows", key: "2", colour: "var(--tracked)" },
+  { id: "hull", label: "Hull", key: "3", colour: "var(--hull)" },
+  { id: "axis", label: "Line and angle", key: "4", colour: "var(--axis)" },
+  { id: "ellipse", label: "Ellipse", key: "5", colour: "var(--ellipse)", off: true },
+  { id: "mean", label: "Mean flow", key: "6", colour: "var(--mean)" },
 ];
+
 const sensors = new Map();
+const layers = Object.fromEntries(LAYERS.map((layer) => [layer.id, !layer.off]));
+let magnification = 3;
 let current = null;
 let run = null;
 let link = "connecting";  // connecting, open, lost, token
 let nextAttempt = 0;
 let lastFrame = 0;
-let hiddenSince = 0;
 
 function sensor(name) {
   if (!sensors.has(name)) {
-    sensors.set(name, { name, points: [], message: null, bitmap: null, header: null, state: null, stats: null, rate: null, shown: [], epoch: null });
+    sensors.set(name, { name, last: null, state: null, stats: null, rate: null });
     current ??= name;
     drawTabs();
   }
@@ -36,32 +36,35 @@ function sensor(name) {
 
 // -- what comes from the run ------------------------------------------------------------------------------
 
-const connection = new Connection({
+const painter = new Worker("painter.js", { type: "module" });
+const order = (name, content = {}, transfer = []) => painter.postMessage({ order: name, ...content }, transfer);
+const command = (name, value = null) => order("send", { message: { do: name, value } });
+
+const news = {
   open() {
     link = "open";
     lastFrame = performance.now();
     refresh();
   },
-  hello(message) {
+  hello({ message }) {
     // Another run behind the same address: what is on the screen is not its own.
     if (run !== null && run !== message.run) {
       sensors.clear();
       current = null;
-      picture.show(null, null);
     }
     run = message.run;
     message.sensors.forEach(sensor);
-    schedule();
+    drawValues(sensors.get(current));
     refresh();
   },
-  state(message) {
+  state({ message }) {
     const s = sensor(message.sensor);
     const changed = JSON.stringify(message.neighbours) !== JSON.stringify(s.state?.neighbours);
     s.state = message;
     if (changed) drawTabs();
     refresh();
   },
-  stats(message) {
+  stats({ message }) {
     const s = sensor(message.sensor);
     const stats = message.run;
     if (!stats.stages) return;
@@ -73,9 +76,18 @@ const connection = new Connection({
     if (s.name === current) drawStats(s);
     refresh();
   },
-  note: (message) => note(message.text),
-  frame: showFrame,
-  lost(seconds) {
+  frames({ sensor: name, summary }) {
+    const s = sensor(name);
+    s.last = summary;
+    lastFrame = performance.now();
+    if (s.name === current) {
+      drawAspect(s);
+      drawValues(s);
+    }
+    if (shownStatus !== status()) refresh();
+  },
+  note: ({ text, message }) => note(text ?? message.text),
+  lost({ seconds }) {
     link = "lost";
     nextAttempt = performance.now() + seconds * 1000;
     refresh();
@@ -85,79 +97,19 @@ const connection = new Connection({
     refresh();
     $("token").focus();
   },
-});
-
-async function showFrame(header, blob) {
-  const received = performance.now();
-  const s = sensor(header.message.sensor);
-  try {
-    const bitmap = await createImageBitmap(blob);
-    s.bitmap?.close();
-    s.bitmap = bitmap;
-  } catch {
-    note("a picture could not be decoded");
-  }
-  requestAnimationFrame(() => {
-    addFrame(s, header);
-    // The run sends the next frame only now: a slow page gets fewer of them, never old ones.
-    connection.send({ ack: header.number, late: hiddenSince > received || document.hidden });
-  });
-}
-
-function addFrame(s, header) {
-  const message = header.message;
-  const flow = message.flow?.mean ?? null;
-  const last = s.points[s.points.length - 1];
-  if (last && message.t < last.t) s.points.length = 0;
-  s.points.push({
-    t: message.t,
-    area: message.contact?.area ?? null,
-    angle: message.contact?.angle ?? null,
-    dx: flow && flow[0],
-    dy: flow && flow[1],
-    latency: header.latency_ms < 0 ? null : header.latency_ms,
-  });
-  const first = s.points.findIndex((point) => point.t >= message.t - SECONDS);
-  if (first > 0) s.points.splice(0, first);
-  if (s.epoch !== null && header.epoch !== s.epoch) note(`new reference taken at frame ${message.seq}`);
-  s.epoch = header.epoch;
-  s.header = header;
-  s.message = message;
-  lastFrame = performance.now();
-  s.shown.push(lastFrame);
-  while (lastFrame - s.shown[0] > 1000) s.shown.shift();
-  if (s.name === current) {
-    const aspect = message.size[0] / message.size[1];
-    if (s.aspect !== aspect) {
-      s.aspect = aspect;
-      document.documentElement.style.setProperty("--aspect", aspect.toFixed(4));
-    }
-    picture.show(s.bitmap, message);
-    $("picture").dataset.seq = message.seq;
-    schedule();
-  }
-  if (shownStatus !== status()) refresh();
-}
+};
+painter.onmessage = ({ data }) => news[data.type]?.(data);
 
 // -- drawing ----------------------------------------------------------------------------------------------
 
-let planned = 0;
-let lastPlot = 0;
-
-// Plots and numbers need not change at every frame.
-function schedule() {
-  if (planned) return;
-  planned = setTimeout(() => {
-    planned = 0;
-    lastPlot = performance.now();
-    const s = sensors.get(current);
-    plots.forEach((plot) => plot.draw(s?.points ?? []));
-    drawValues(s);
-  }, Math.max(0, PLOT_MS - (performance.now() - lastPlot)));
+function drawAspect({ last }) {
+  const value = last.aspect.toFixed(4);
+  const style = document.documentElement.style;
+  if (style.getPropertyValue("--aspect") !== value) style.setProperty("--aspect", value);
 }
 
 function drawValues(s) {
-  const message = s?.message;
+  const message = s?.last;
   const contact = message?.contact;
   const flow = message?.flow;
   set("value-area", contact ? grouped(contact.area) : "–");
@@ -167,18 +119,18 @@ function drawValues(s) {
   set("value-flow", flow?.mean ? fixed(Math.hypot(...flow.mean), 2) : "–");
   const twist = flow?.rotation == null ? "" : `, twist ${fixed(flow.rotation, 1)}°`;
   set("unit-flow", flow?.mean ? `px, ${flow.count} ${flow.count === 1 ? "marker" : "markers"}${twist}` : flow ? "no marker inside" : "");
-  const latency = s?.header?.latency_ms ?? -1;
+  const latency = message?.latency ?? -1;
   set("value-latency", latency < 0 ? "–" : fixed(latency, 1));
-    const counts = { tracked: 0, inferred: 0, lost: 0 };
-  message?.markers?.status.forEach((status) => counts[status]++);
-  for (const [name, count] of Object.entries(counts)) set(`count-${name}`, message?.markers ? count : "–");
+  for (const name of ["tracked", "inferred", "lost"]) set(`count-${name}`, message?.counts?.[name] ?? "–");
   const total = s?.state?.source.total;
   set("frame-number", message ? (total ? `${message.seq + 1} of ${total}` : message.seq) : "–");
   set("frame-time", message ? clock(message.t) : "–");
-  set("shown", s ? `${s.shown.length}/s` : "–");
+  set("shown", message ? `${message.shown}/s` : "–");
   const bar = $("progress");
-  bar.hidden = !total;
-  if (total) bar.value = message ? (message.seq + 1) / total : 0;
+  put(bar, "hidden", !total);
+  if (total) put(bar, "value", message ? (message.seq + 1) / total : 0);
+  if (message) $("picture").dataset.seq = message.seq;
+  for (const id of CANVASES.slice(1)) $(id).dataset.points = message?.points ?? 0;
 }
 
 function drawStats(s) {
@@ -188,7 +140,7 @@ function drawStats(s) {
   set("dropped", stats ? grouped(stats.dropped) : "–");
   const body = $("stage-rows");
   if (!stats) {
-    body.replaceChildren(row("quiet", [["no statistics yet", { colSpan: 5, className: "quiet" }]]));
+    if (!body.querySelector("td[colspan]")) body.innerHTML = '<tr><td colspan="5" class="quiet">no statistics yet</td></tr>';
     set("links", "");
     return;
   }
@@ -197,33 +149,30 @@ function drawStats(s) {
     ...Object.entries(stats.stages).map(([id, node], index) => ({ id, node, kind: index ? "stage" : "source" })),
     ...Object.entries(stats.sinks).map(([id, node]) => ({ id, node, kind: "sink" })),
   ];
+  if (entries.map(({ id }) => id).join() !== [...body.rows].map((row) => row.cells[0].textContent).join()) {
+    body.replaceChildren(...entries.map(newRow));
+  }
   const busiest = Math.max(1e-9, ...entries.filter((e) => e.kind !== "source").map(({ node }) => node.p50_ms ?? 0));
-  body.replaceChildren(...entries.map(({ id, node, kind }) => {
-    const bar = document.createElement("span");
-    bar.hidden = kind === "source";
-    bar.style.width = `${(100 * (node.p50_ms ?? 0)) / busiest}%`;
-    return row(kind, [
-      [id],
-      [bar, { className: "bar" }],
-      [milliseconds(node.p50_ms)],
-      [milliseconds(node.p99_ms)],
-      [skips(node), { className: "skips", title: `ran ${node.runs} times` }],
-    ]);
-  }));
+  entries.forEach(({ node }, index) => {
+    const [, bar, p50, p99, skipped] = body.rows[index].cells;
+    put(bar.firstChild.style, "width", `${Math.round((100 * (node.p50_ms ?? 0)) / busiest)}%`);
+    put(p50, "textContent", milliseconds(node.p50_ms));
+    put(p99, "textContent", milliseconds(node.p99_ms));
+    put(skipped, "textContent", skips(node));
+    put(skipped, "title", `ran ${node.runs} times`);
+  });
   set("links", Object.entries(stats.links)
     .map(([id, l]) => `${id.replace("->", " → ")}: ${l.drops ? `${grouped(l.drops)} of ${grouped(l.offered)} dropped` : "none dropped"} (${l.policy})`)
     .join(" · "));
 }
 
-function row(className, cells) {
-  const tr = document.createElement("tr");
-  tr.className = className;
-  for (const [content, properties] of cells) {
-    const td = Object.assign(document.createElement("td"), properties);
-    td.append(content);
-    tr.append(td);
-  }
-  return tr;
+function newRow({ id, kind }) {
+  const row = document.createElement("tr");
+  row.className = kind;
+  row.innerHTML = '<td></td><td class="bar"><span></span></td><td></td><td></td><td class="skips"></td>';
+  row.cells[0].textContent = id;
+  row.querySelector("span").hidden = kind === "source";
+  return row;
 }
 
 function skips(node) {
@@ -261,17 +210,17 @@ function drawTabs() {
 function choose(name) {
   const port = tabs().get(name);
   if (port) {
-    const token = connection.token ? `?token=${encodeURIComponent(connection.token)}` : "";
-    location.assign(`${location.protocol}//${location.hostname}:${port}/${token}`);
+    const query = token ? `?token=${encodeURIComponent(token)}` : "";
+    location.assign(`${location.protocol}//${location.hostname}:${port}/${query}`);
     return;
   }
   current = name;
   drawTabs();
   const s = sensors.get(name);
-  if (s.aspect) document.documentElement.style.setProperty("--aspect", s.aspect.toFixed(4));
-  picture.show(s.bitmap, s.message);
+  order("choose", { name });
+  if (s.last) drawAspect(s);
+  drawValues(s);
   drawStats(s);
-  schedule();
   refresh();
 }
 
@@ -285,7 +234,7 @@ function status() {
   if (s?.state?.end) return "ended";
   if (link !== "open") return link === "lost" ? "disconnected" : "connecting";
   if (s?.state?.paused) return "paused";
-  if (!s?.message) return "waiting";
+  if (!s?.last) return "waiting";
   return performance.now() - lastFrame > STALL_SECONDS * 1000 && !document.hidden ? "stalled" : "live";
 }
 
@@ -301,7 +250,7 @@ function refresh() {
   const state = s?.state;
   const wait = Math.max(0, Math.ceil((nextAttempt - performance.now()) / 1000));
   shownStatus = now;
-  document.body.dataset.status = now;
+  put(document.body.dataset, "status", now);
   const silent = Math.round((performance.now() - lastFrame) / 1000);
   const texts = {
     connecting: ["Connecting", "Looking for the run."],
@@ -318,30 +267,28 @@ function refresh() {
   const [title, text] = texts[now];
   set("empty-title", title);
   set("empty-text", text);
-  const hasPicture = Boolean(s?.message);
+  const hasPicture = Boolean(s?.last);
   const show = !["live", "stalled"].includes(now) && !(now === "paused" && hasPicture);
-  if (show) document.body.dataset.empty = hasPicture ? "veil" : "blank";
-  else delete document.body.dataset.empty;
-  $("token-form").hidden = now !== "token";
-  $("retry").hidden = now !== "disconnected";
-  document.title = s && now === "live" ? `${s.name} – tactflow` : `${words[now] ?? now} – tactflow`;
+  put(document.body.dataset, "empty", show ? (hasPicture ? "veil" : "blank") : "no");
+  put($("token-form"), "hidden", now !== "token");
+  put($("retry"), "hidden", now !== "disconnected");
+  put(document, "title", s && now === "live" ? `${s.name} – tactflow` : `${words[now] ?? now} – tactflow`);
 
   set("source", state?.source.description ?? "–");
   set("source-state", state ? [state.source.live ? "live" : "recording", state.source.state ?? words[now] ?? (now === "live" ? "delivering frames" : now)].join(", ") : "");
   const open = link === "open" && state;
   for (const name of ["pause", "step", "reference", "record", "stop"]) {
     const reason = open ? state.refused[name] : "not connected";
-    $(name).disabled = reason !== null;
-    $(name).title = reason ?? "";
+    put($(name), "disabled", reason !== null);
+    put($(name), "title", reason ?? "");
   }
   press("pause", Boolean(state?.paused), "Resume", "Pause");
   press("record", Boolean(state?.recording), "Stop recording", "Record");
 }
 
 function press(id, pressed, on, off) {
-  $(id).setAttribute("aria-pressed", String(pressed));
-  const label = $(id).querySelector(".label");
-  if (label.textContent !== (pressed ? on : off)) label.textContent = pressed ? on : off;
+  put($(id), "ariaPressed", String(pressed));
+  put($(id).querySelector(".label"), "textContent", pressed ? on : off);
 }
 
 let noteTimer = 0;
@@ -357,12 +304,15 @@ function note(text) {
 // -- buttons and keys -------------------------------------------------------------------------------------
 
 const actions = {
-  pause: () => connection.command("pause", !sensors.get(current)?.state?.paused),
-  step: () => connection.command("step"),
-  reference: () => { connection.command("reference"); note("the next frames become the reference"); },
-  record: () => connection.command("record", !sensors.get(current)?.state?.recording),
-  stop: () => connection.command("stop"),
+  pause: () => command("pause", !sensors.get(current)?.state?.paused),
+  step: () => command("step"),
+  reference: () => { command("reference"); note("the next frames become the reference"); },
+  record: () => command("record", !sensors.get(current)?.state?.recording),
+  stop: () => command("stop"),
 };
+function orderLayers() {
+  order("layers", { layers, magnify: magnification });
+}
 const keys = { " ": "pause", s: "step", n: "reference", r: "record", q: "stop" };
 for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
 
@@ -375,11 +325,11 @@ for (const layer of LAYERS) {
   button.children[1].textContent = layer.label;
   button.lastChild.textContent = layer.key;
   button.setAttribute("aria-keyshortcuts", layer.key);
-  button.setAttribute("aria-pressed", String(picture.layers[layer.id]));
+  button.setAttribute("aria-pressed", String(layers[layer.id]));
   button.addEventListener("click", () => {
-    picture.layers[layer.id] = !picture.layers[layer.id];
-    button.setAttribute("aria-pressed", String(picture.layers[layer.id]));
-    picture.draw();
+    layers[layer.id] = !layers[layer.id];
+    button.setAttribute("aria-pressed", String(layers[layer.id]));
+    orderLayers();
   });
   $("layers").append(button);
   keys[layer.key] = button.id;
@@ -389,12 +339,12 @@ Object.assign(magnify, { type: "button", id: "magnify", title: "How much longer 
 magnify.setAttribute("aria-keyshortcuts", "x");
 const drawMagnify = () => {
   magnify.innerHTML = "<span></span><kbd aria-hidden=\"true\">x</kbd>";
-  magnify.firstChild.textContent = `Arrows × ${picture.magnify}`;
+  magnify.firstChild.textContent = `Arrows × ${magnification}`;
 };
 magnify.addEventListener("click", () => {
-  picture.magnify = MAGNIFICATIONS[(MAGNIFICATIONS.indexOf(picture.magnify) + 1) % MAGNIFICATIONS.length];
+  magnification = MAGNIFICATIONS[(MAGNIFICATIONS.indexOf(magnification) + 1) % MAGNIFICATIONS.length];
   drawMagnify();
-  picture.draw();
+  orderLayers();
 });
 drawMagnify();
 $("layers").append(magnify);
@@ -418,25 +368,64 @@ document.addEventListener("keydown", (event) => {
   else button.click();
 });
 
-$("retry").addEventListener("click", () => connection.retryNow());
+$("retry").addEventListener("click", () => order("retry"));
 $("token-form").addEventListener("submit", (event) => {
   event.preventDefault();
   link = "connecting";
-  connection.useToken($("token").value.trim());
+  token = $("token").value.trim();
+  sessionStorage.setItem("tactflow-token", token);
+  order("token", { token });
   refresh();
 });
-document.addEventListener("visibilitychange", () => { if (document.hidden) hiddenSince = performance.now(); });
-onPaletteChange(() => plots.forEach((plot) => plot.draw()));
+
+// -- the worker's side of it ------------------------------------------------------------------------------
+
+// A token in the address is kept for this tab only, and leaves the address bar.
+function takeToken() {
+  const url = new URL(location.href);
+  const shown = url.searchParams.get("token");
+  if (shown) {
+    sessionStorage.setItem("tactflow-token", shown);
+    url.searchParams.delete("token");
+    history.replaceState(null, "", url);
+  }
+  return shown ?? sessionStorage.getItem("tactflow-token");
+}
+
+function orderColours() {
+  const style = getComputedStyle(document.documentElement);
+  order("colours", { colours: Object.fromEntries(COLOURS.map((name) => [name, style.getPropertyValue(`--${name}`).trim()])) });
+}
+
+function orderSizes(ids) {
+  const ratio = Math.min(window.devicePixelRatio || 1, 2);
+  for (const id of ids) {
+    const [width, height] = [$(id).clientWidth, $(id).clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    order("resize", { index: CANVASES.indexOf(id), width, height, ratio });
+  }
+}
+
+let token = takeToken();
+const canvases = Object.fromEntries(CANVASES.map((id) => [id, $(id).transferControlToOffscreen()]));
+order("begin", { canvases, token, hidden: document.hidden }, Object.values(canvases));
+orderColours();
+orderLayers();
+const sizes = new ResizeObserver((entries) => orderSizes(entries.map((entry) => entry.target.id)));
+CANVASES.forEach((id) => sizes.observe($(id)));
+document.addEventListener("visibilitychange", () => order("hide", { hidden: document.hidden }));
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", orderColours);
 setInterval(refresh, 500);
-schedule();
+drawValues(null);
 refresh();
 
 // -- words ------------------------------------------------------------------------------------------------
 
+// Writing what is there already would have the browser lay the page out again.
+function put(thing, property, value) {
+  if (thing[property] !== value) thing[property] = value;
+}
 function set(id, text) {
-  const element = $(id);
-  text = String(text);
-  if (element.textContent !== text) element.textContent = text;
+  put($(id), "textContent", String(text));
 }
 const fixed = (value, digits) => value.toFixed(digits).replace("-", MINUS);
 const grouped = (value) => Math.round(value).toLocaleString("en").replaceAll(",", "\u202f");

@@ -1,16 +1,15 @@
-// The WebSocket to the run: decodes what comes, answers for each frame, and finds the run again when it is lost.
+// The WebSocket to the run: decodes what comes, and finds the run again when it is lost.
 
 const DELAYS = [0.3, 0.7, 1.5, 3, 5];  // s between attempts; the last one repeats
 const WRONG_TOKEN = 4401;
 
 export class Connection {
-  // on: { hello, state, stats, note, frame(header, blob), open, lost(secondsToNextAttempt), refused(reason) }
-  constructor(on) {
+  // on: { open, text(message), frame(header, blob), lost(secondsToNextAttempt), refused }
+  constructor(token, on) {
     this.on = on;
     this.attempt = 0;
-    this.token = takeToken();
+    this.token = token;
     this.connect();
-    document.addEventListener("visibilitychange", () => document.hidden || this.retryNow());
   }
 
   connect() {
@@ -26,7 +25,7 @@ export class Connection {
           this.attempt = 0;
           this.on.open();
         }
-        this.on[message.type]?.(message);
+        this.on.text(message);
       } else {
         this.on.frame(...decode(event.data));
       }
@@ -35,11 +34,11 @@ export class Connection {
       if (this.socket !== socket) return;
       this.socket = null;
       if (event.code === WRONG_TOKEN) {
-        this.on.refused("token");
+        this.on.refused();
       } else {
         const delay = DELAYS[Math.min(this.attempt++, DELAYS.length - 1)];
         this.timer = setTimeout(() => this.connect(), delay * 1000);
-        this.on.lost(delay, event.reason);
+        this.on.lost(delay);
       }
     };
     this.socket = socket;
@@ -52,29 +51,12 @@ export class Connection {
 
   useToken(token) {
     this.token = token;
-    sessionStorage.setItem("tactflow-token", token);
     this.retryNow();
   }
 
   send(message) {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
-
-  command(name, value = null) {
-    this.send({ do: name, value });
-  }
-}
-
-// A token in the address is kept for this tab only, and leaves the address bar.
-function takeToken() {
-  const url = new URL(location.href);
-  const token = url.searchParams.get("token");
-  if (token) {
-    sessionStorage.setItem("tactflow-token", token);
-    url.searchParams.delete("token");
-    history.replaceState(null, "", url);
-  }
-  return token ?? sessionStorage.getItem("tactflow-token");
 }
 
 // A little-endian length, a JSON header of that length, a JPEG picture.

@@ -3,53 +3,61 @@
 
 const DARK = "rgb(0 0 0 / .65)";
 
-export const LAYERS = [
-  { id: "image", label: "Image", key: "1", colour: "var(--quiet)" },
-  { id: "arrows", label: "Arrows", key: "2", colour: "var(--tracked)" },
-  { id: "hull", label: "Hull", key: "3", colour: "var(--hull)" },
-  { id: "axis", label: "Line and angle", key: "4", colour: "var(--axis)" },
-  { id: "ellipse", label: "Ellipse", key: "5", colour: "var(--ellipse)", off: true },
-  { id: "mean", label: "Mean flow", key: "6", colour: "var(--mean)" },
-];
-
 export class Picture {
   constructor(canvas) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d", { alpha: false });
-    this.colours = readColours();
-    this.layers = Object.fromEntries(LAYERS.map((layer) => [layer.id, !layer.off]));
-    this.magnify = 3;
+    this.colours = null;
+    this.layers = null;
+    this.magnify = 1;
+    this.ratio = 0;
     this.bitmap = null;
-    this.message = null;
-    new ResizeObserver(() => this.draw()).observe(canvas);
+    this.header = null;
   }
 
-  show(bitmap, message) {
+  resize(width, height, ratio) {
+    this.ratio = ratio;
+    Object.assign(this.canvas, { width, height });
+    this.draw();
+  }
+
+  recolour(colours) {
+    this.colours = colours;
+    this.draw();
+  }
+
+  // layers: whether each is shown, by its name. magnify: how much longer arrows are than what they show.
+  choose(layers, magnify) {
+    this.layers = layers;
+    this.magnify = magnify;
+    this.draw();
+  }
+
+  // header: what came with the picture.
+  show(bitmap, header) {
     this.bitmap = bitmap;
-    this.message = message;
+    this.header = header;
     this.draw();
   }
 
   draw() {
-    const { canvas, context: c, message, layers } = this;
-    const ratio = Math.min(window.devicePixelRatio || 1, 2);
-    const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
-    const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    c.setTransform(1, 0, 0, 1, 0, 0);
-    c.fillStyle = layers.image ? "#0a0d10" : "#14181d";
-    c.fillRect(0, 0, width, height);
-    if (!message) return;
+    const { canvas, context: c, layers, ratio } = this;
+    if (!layers || !this.colours || !ratio) return;
+    const { width, height } = canvas;
     if (layers.image && this.bitmap) {
-      c.imageSmoothingQuality = "medium";
       c.drawImage(this.bitmap, 0, 0, width, height);
+    } else {
+      c.fillStyle = layers.image ? "#0a0d10" : "#14181d";
+      c.fillRect(0, 0, width, height);
     }
+    if (!this.header) return;
+    const { message, markers } = this.header;
     const sx = width / message.size[0];
     const sy = height / message.size[1];
     this.at = ([x, y]) => [(x + 0.5) * sx, (y + 0.5) * sy];
     this.unit = ratio * Math.max(1, Math.min(width, height) / ratio / 480);
     c.lineJoin = c.lineCap = "round";
-    if (layers.arrows && message.markers) this.drawMarkers(message.markers);
+    if (layers.arrows && markers) this.drawMarkers(markers);
     if (message.contact) {
       if (layers.hull) this.drawHull(message.contact.hull);
       if (layers.ellipse && message.contact.ellipse) this.drawEllipse(message.contact.ellipse);
@@ -73,43 +81,57 @@ export class Picture {
     c.setLineDash([]);
   }
 
+  // Seen markers are many and in every frame. Filling a polygon costs far less than stroking lines, so their
+  // arrows are filled twice: a little larger for the rim, then in their colour.
   drawMarkers({ origin, position, status }) {
-    const lines = { tracked: new Path2D(), inferred: new Path2D(), lost: new Path2D() };
-    const heads = { tracked: new Path2D(), inferred: new Path2D() };
+    const seen = { rim: new Path2D(), body: new Path2D() };
+    const placed = { line: new Path2D(), head: new Path2D() };
+    const lost = new Path2D();
     const c = this.context;
     const u = this.unit;
-    for (let i = 0; i < position.length; i++) {
-      const kind = status[i];
-      if (kind === "lost") {
-        const [x, y] = this.at(position[i]);
+    const point = (points, i) => this.at([points[2 * i] / 10, points[2 * i + 1] / 10]);
+    for (let i = 0; i < status.length; i++) {
+      const [xp, yp] = point(position, i);
+      if (status[i] === "l") {
         const r = 3 * u;
-        lines.lost.moveTo(x - r, y - r);
-        lines.lost.lineTo(x + r, y + r);
-        lines.lost.moveTo(x - r, y + r);
-        lines.lost.lineTo(x + r, y - r);
+        lost.moveTo(xp - r, yp - r);
+        lost.lineTo(xp + r, yp + r);
+        lost.moveTo(xp - r, yp + r);
+        lost.lineTo(xp + r, yp - r);
         continue;
       }
-      const [x0, y0] = this.at(origin[i]);
-      const [xp, yp] = this.at(position[i]);
+      const tracked = status[i] === "t";
+      const [x0, y0] = point(origin, i);
       const dx = (xp - x0) * this.magnify;
       const dy = (yp - y0) * this.magnify;
       const length = Math.hypot(dx, dy);
+      const size = Math.min(6 * u, Math.max(3.5 * u, length * 0.35));
       if (length < 3 * u) {
-        heads[kind].moveTo(x0 + 1.8 * u, y0);
-        heads[kind].arc(x0, y0, 1.8 * u, 0, 2 * Math.PI);
-        continue;
+        if (tracked) {
+          octagon(seen.rim, x0, y0, 3.2 * u);
+          octagon(seen.body, x0, y0, 2.2 * u);
+        } else {
+          placed.head.moveTo(x0 + 1.8 * u, y0);
+          placed.head.arc(x0, y0, 1.8 * u, 0, 2 * Math.PI);
+        }
+      } else if (tracked) {
+        solidArrow(seen.rim, x0, y0, dx / length, dy / length, length, size, 1.8 * u, 1.4 * u);
+        solidArrow(seen.body, x0, y0, dx / length, dy / length, length, size, 0.8 * u, 0.4 * u);
+      } else {
+        arrow(placed.line, placed.head, x0, y0, dx, dy, length, size);
       }
-      arrow(lines[kind], heads[kind], x0, y0, dx, dy, length, Math.min(6 * u, Math.max(3.5 * u, length * 0.35)));
     }
-    this.stroke(lines.tracked, this.colours.tracked, 1.6);
-    this.stroke(lines.inferred, this.colours.inferred, 1.6, [4, 3]);
-    c.globalAlpha = 0.55;
-    this.stroke(lines.lost, this.colours.lost, 1.4);
-    c.globalAlpha = 1;
-    this.stroke(heads.tracked, this.colours.tracked, 0.8);
+    if (status.includes("i")) this.stroke(placed.line, this.colours.inferred, 1.6, [4, 3]);
+    if (status.includes("l")) {
+      c.globalAlpha = 0.55;
+      this.stroke(lost, this.colours.lost, 1.4);
+      c.globalAlpha = 1;
+    }
+    c.fillStyle = DARK;
+    c.fill(seen.rim);
     c.fillStyle = this.colours.tracked;
-    c.fill(heads.tracked);
-    this.stroke(heads.inferred, this.colours.inferred, 1.2);
+    c.fill(seen.body);
+    if (status.includes("i")) this.stroke(placed.head, this.colours.inferred, 1.2);
   }
 
   drawHull(hull) {
@@ -197,10 +219,33 @@ function arrow(line, head, x, y, dx, dy, length, size) {
   head.closePath();
 }
 
-const radians = (degrees) => (degrees * Math.PI) / 180;
-
-function readColours() {
-  const style = getComputedStyle(document.documentElement);
-  const names = ["tracked", "inferred", "lost", "hull", "axis", "ellipse", "mean"];
-  return Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
+// One outline of shaft and head. half: half the width of the shaft. more: by how much the head is larger.
+function solidArrow(path, x, y, ux, uy, length, size, half, more) {
+  const wide = size * 0.5 + 1.2 * more;
+  const neck = length - size - more;
+  const to = (along, across) => path.lineTo(x + along * ux - across * uy, y + along * uy + across * ux);
+  path.moveTo(x - half * ux - half * uy, y - half * uy + half * ux);
+  to(neck, half);
+  to(neck, wide);
+  to(length + 1.3 * more, 0);
+  to(neck, -wide);
+  to(neck, -half);
+  to(-half, -half);
+  path.closePath();
 }
+
+function octagon(path, x, y, radius) {
+  const a = radius;
+  const b = radius * Math.SQRT1_2;
+  path.moveTo(x + a, y);
+  path.lineTo(x + b, y + b);
+  path.lineTo(x, y + a);
+  path.lineTo(x - b, y + b);
+  path.lineTo(x - a, y);
+  path.lineTo(x - b, y - b);
+  path.lineTo(x, y - a);
+  path.lineTo(x + b, y - b);
+  path.closePath();
+}
+
+const radians = (degrees) => (degrees * Math.PI) / 180;

@@ -2,64 +2,53 @@
 
 export const SECONDS = 10;
 const GAP = 0.6;  // s; points further apart are not joined
+const LEFT = 34;
+const TOP = 6;
 
 export class Plot {
   // series: one function (point) -> number or null each. range: [low, high], or "positive", or "symmetric".
   constructor(canvas, { series, range, jump = Infinity, minimum = 1, format = short }) {
     Object.assign(this, { canvas, series, range, jump, minimum, format });
-    this.context = canvas.getContext("2d");
+    this.context = canvas.getContext("2d", { alpha: false });
+    this.ground = new OffscreenCanvas(1, 1);
+    this.colours = null;
+    this.ratio = 0;
     this.points = [];
-    new ResizeObserver(() => this.draw()).observe(canvas);
+  }
+
+  resize(width, height, ratio) {
+    this.ratio = ratio;
+    for (const canvas of [this.canvas, this.ground]) Object.assign(canvas, { width, height });
+    this.drawn = null;
+    this.draw();
+  }
+
+  recolour(colours) {
+    this.colours = colours;
+    this.drawn = null;
+    this.draw();
   }
 
   draw(points = this.points) {
     this.points = points;
-    const { canvas, context: c } = this;
-    const ratio = Math.min(window.devicePixelRatio || 1, 2);
-    const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
-    const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    c.setTransform(ratio, 0, 0, ratio, 0, 0);
-    const w = width / ratio;
-    const h = height / ratio;
-    c.clearRect(0, 0, w, h);
-    const colours = palette();
+    if (!this.colours || !this.ratio) return;
+    const { canvas, context: c, ratio, colours } = this;
+    const w = canvas.width / ratio;
+    const h = canvas.height / ratio;
     const [low, high] = this.limits(points);
-    const left = 34;
-    const top = 6;
     const bottom = h - 14;
     const end = points.length ? points[points.length - 1].t : 0;
-    const x = (t) => w - 2 + ((t - end) / SECONDS) * (w - 2 - left);
-    const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
-
-    c.font = '10px system-ui, "DejaVu Sans", sans-serif';
-    c.textAlign = "right";
-    c.textBaseline = "middle";
-    c.lineWidth = 1;
-    for (const value of [low, (low + high) / 2, high]) {
-      const line = Math.round(y(value)) + 0.5;
-      c.strokeStyle = colours.grid;
-      c.beginPath();
-      c.moveTo(left, line);
-      c.lineTo(w, line);
-      c.stroke();
-      c.fillStyle = colours.quiet;
-      c.fillText(this.format(value), left - 5, Math.min(Math.max(line, 5), h - 5));
-    }
-    c.textBaseline = "alphabetic";
-    for (const seconds of [10, 5, 0]) {
-      c.textAlign = seconds === 0 ? "right" : seconds === 10 ? "left" : "center";
-      c.fillText(seconds === 0 ? "now" : `−${seconds} s`, x(end - seconds), h - 2);
-    }
-
-    c.save();
-    c.beginPath();
-    c.rect(left, 0, w - left, h);
-    c.clip();
+    const x = (t) => w - 2 + ((t - end) / SECONDS) * (w - 2 - LEFT);
+    const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - TOP);
+    if (this.drawn !== high) this.drawGround(w, h, [low, (low + high) / 2, high], y);
+    this.drawn = high;
+    c.setTransform(1, 0, 0, 1, 0, 0);
+    c.drawImage(this.ground, 0, 0);
+    c.setTransform(ratio, 0, 0, ratio, 0, 0);
     c.lineWidth = 1.8;
     c.lineJoin = "round";
     this.series.forEach((pick, index) => {
-      c.strokeStyle = c.fillStyle = index ? colours.b : colours.a;
+      c.strokeStyle = c.fillStyle = index ? colours["series-b"] : colours["series-a"];
       c.setLineDash(index ? [5, 3] : []);
       c.beginPath();
       let last = null;
@@ -81,8 +70,34 @@ export class Plot {
         c.fill();
       }
     });
-    c.restore();
-    canvas.dataset.points = String(points.length);
+  }
+
+  // Lines and numbers change rarely; they are drawn once and copied.
+  drawGround(w, h, values, y) {
+    const { colours, ratio } = this;
+    const c = this.ground.getContext("2d", { alpha: false });
+    c.setTransform(ratio, 0, 0, ratio, 0, 0);
+    c.fillStyle = colours.panel;
+    c.fillRect(0, 0, w, h);
+    c.font = '10px system-ui, "DejaVu Sans", sans-serif';
+    c.textAlign = "right";
+    c.textBaseline = "middle";
+    c.lineWidth = 1;
+    for (const value of values) {
+      const line = Math.round(y(value)) + 0.5;
+      c.strokeStyle = colours.grid;
+      c.beginPath();
+      c.moveTo(LEFT, line);
+      c.lineTo(w, line);
+      c.stroke();
+      c.fillStyle = colours.quiet;
+      c.fillText(this.format(value), LEFT - 5, Math.min(Math.max(line, 5), h - 5));
+    }
+    c.textBaseline = "alphabetic";
+    for (const [seconds, align] of [[10, "left"], [5, "center"], [0, "right"]]) {
+      c.textAlign = align;
+      c.fillText(seconds ? `−${seconds} s` : "now", w - 2 - (seconds / SECONDS) * (w - 2 - LEFT), h - 2);
+    }
   }
 
   limits(points) {
@@ -105,28 +120,10 @@ function nice(value) {
   return [1, 2, 4, 6, 8, 10].find((step) => step * power >= value * 0.999) * power;
 }
 
-export function short(value) {
+function short(value) {
   const size = Math.abs(value);
   const text = size >= 1e6 ? `${trim(value / 1e6)}M` : size >= 1e4 ? `${trim(value / 1e3)}k` : trim(value);
   return text.replace("-", "−");
 }
 
 const trim = (value) => String(Number(value.toPrecision(3)));
-
-let colours = null;
-
-function palette() {
-  if (colours === null) {
-    const style = getComputedStyle(document.documentElement);
-    const of = (name) => style.getPropertyValue(name).trim();
-    colours = { a: of("--series-a"), b: of("--series-b"), grid: of("--grid"), quiet: of("--quiet") };
-  }
-  return colours;
-}
-
-export function onPaletteChange(redraw) {
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-    colours = null;
-    redraw();
-  });
-}
