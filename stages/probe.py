@@ -11,6 +11,9 @@ from tactflow.engine.stage import StageParams
 from tactflow.ports import Changed
 from tactflow.vision.change import ChangeProbe
 
+_SETTLING = 3
+"""The last held frames, which are looked at; those before are worked on anyway, whatever a look would say."""
+
 
 class ProbePorts(NamedTuple):
     """What the probe tells."""
@@ -37,10 +40,10 @@ class Probe:
             40, ge=8, description="edge of the tiles that are tested on their own, px of the raw frame"
         )
         hold: int = Field(
-            4,
+            5,
             ge=0,
-            description="frames for which a change keeps the stages at work; they are all compared with the "
-            "one that changed, so that what moves too slowly for one frame adds up",
+            description="frames for which a change keeps the stages at work; the last of them are compared "
+            "with the one that changed, so that what moves too slowly for one frame adds up",
         )
         at_least_every: int = Field(
             30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"
@@ -69,6 +72,9 @@ class Probe:
                 frame.image, false_alarms=self.params.false_alarms, tile=self.params.tile
             )
         probe = self._probe
+        if self._left > _SETTLING and probe.ready:
+            self._left -= 1
+            return ProbePorts(True)
         changed = probe.look(frame.image)
         self._since += 1
         if changed or (self._left == 1 and not probe.calm):

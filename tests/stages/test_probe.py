@@ -53,6 +53,20 @@ def test_frames_that_are_held_are_compared_with_the_one_that_changed() -> None:
     assert share(hold=0) < 0.7
 
 
+def test_only_the_last_held_frames_are_looked_at() -> None:
+    """The others are worked on anyway: of a contact that moves, the first of three held frames is."""
+    probe = Probe(Probe.Params(hold=5))
+    changes(probe, 20)
+    assert probe._probe is not None
+    looked = []
+    for i in range(31):
+        before = probe._probe._looks
+        image = np.roll(IMAGE, i + 1, axis=1)
+        assert probe.process(Frame("s", 20 + i, (20 + i) / 60, image)).changed
+        looked.append(probe._probe._looks > before)
+    assert looked == [True] + 10 * [False, False, True]
+
+
 def test_a_slow_motion_is_held_for_longer_each_time() -> None:
     """Light that grows too slowly for four held frames is seen over eight."""
     random = np.random.default_rng(1)

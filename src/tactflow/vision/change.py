@@ -108,6 +108,11 @@ class ChangeProbe:
         return math.sqrt(max(self._noise.energy.mean / (2 * self._tiling.count), _QUANTISATION))
 
     @property
+    def ready(self) -> bool:
+        """Whether the noise is known, so that a look can tell what is unchanged."""
+        return self._noise.pairs >= _WARM_UP
+
+    @property
     def calm(self) -> bool:
         """Whether the last look saw nothing that nine of ten still frames do not show as well.
 
@@ -130,10 +135,10 @@ class ChangeProbe:
         now, last = self._spare.pop(), self._last
         now.take(frame)
         noise = self._noise
-        warming_up = noise.pairs < _WARM_UP
+        warming_up = not self.ready
         if last is not None and warming_up:
             noise.learn(now, last, self.bound)
-        if self._anchor is None or noise.pairs < _WARM_UP:
+        if self._anchor is None or not self.ready:
             self.strongest = float("inf")
         else:
             self.strongest = self._compare(now, self._anchor)
