@@ -7,6 +7,7 @@ import logging
 import platform
 import threading
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -91,6 +92,10 @@ class Record:
             if self.ring is not None and self.trigger == "start":
                 raise ValueError("ring keeps what came before a trigger: set trigger to button or contact")
             return self
+
+        def needed_inputs(self) -> Mapping[str, str]:
+            """A contact must be seen to begin a recording."""
+            return {"contact": "trigger"} if self.trigger == "contact" else {}
 
     def __init__(
         self,

@@ -167,6 +167,11 @@ class Capture:
         """How the source is: `running`, `waiting since ...` or `reconnecting since ...`."""
         return self._source.state if isinstance(self._source, LiveSource) else "running"
 
+    @property
+    def missed(self) -> int:
+        """Frames of a live source that a newer one overtook before they were taken: gaps in `seq`."""
+        return self._source.missed if isinstance(self._source, LiveSource) else 0
+
     def retake(self) -> None:
         """Make the next frames the new reference, in a new epoch: as many as at the start."""
         self._retake.set()

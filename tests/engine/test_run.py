@@ -373,6 +373,13 @@ def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
 # -- live -------------------------------------------------------------------------------------------------
 
 
+def test_frames_that_were_overtaken_inside_the_source_count_as_dropped(toy_runner: MakeRunner) -> None:
+    runner = toy_runner({"capture": {"overtaken": 7}}, sinks={"out": {"use": "Collect"}})
+    result = ran(runner)
+    assert (result.stats["frames"], result.stats["dropped"]) == (20, 7)
+    assert (runner.progress().frames, runner.progress().dropped) == (20, 7)
+
+
 def test_a_live_source_drops_rather_than_lags_and_counts_it(toy_runner: MakeRunner) -> None:
     runner = toy_runner(
         {

@@ -35,10 +35,12 @@ class Ramp:
         pause: float = 0.0
         retake_at: int = -1
         preroll: bool = False
+        overtaken: int = 0
 
     def __init__(self, params: Params, sensor: str) -> None:
         self.params, self.sensor = params, sensor
         self.live = params.realtime
+        self.missed = params.overtaken
         self.stopped = threading.Event()
         self.closed = 0
 

@@ -16,7 +16,8 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from tactflow.engine.errors import StageError
+from tactflow.engine.config import load_pipeline
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.graph import Pipeline
 from tactflow.sinks.record import Record
@@ -297,6 +298,23 @@ def test_without_the_extra_the_error_says_what_to_install(
 def test_parameters_that_make_no_sense_are_refused(params: dict[str, Any], words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         Record.Params(**params)
+
+
+@pytest.mark.parametrize("kind", ["named", "wired to nothing"])
+def test_a_contact_that_no_stage_gives_cannot_begin_a_recording(tmp_path: Path, kind: str) -> None:
+    file = tmp_path / "pipeline.yaml"
+    wire = "" if kind == "named" else "    in: {contact: null}\n"
+    stages = "stages:\n  capture: {source: 'sim:press'}\n  preprocess: {}\n"
+    if kind != "named":
+        stages += "  marker_mask: {}\n  inpaint: {}\n  difference: {}\n  hull: {}\n"
+    file.write_text(f"{stages}sinks:\n  record:\n    path: a.mcap\n{wire}    trigger: contact\n")
+    line = 1 + file.read_text().splitlines().index("    trigger: contact")
+    with pytest.raises(
+        ConfigError, match=rf"pipeline.yaml:{line}:\d+  sinks.record.trigger: contact needs contact"
+    ):
+        load_pipeline(file)
+    file.write_text(file.read_text().replace("trigger: contact", "trigger: button"))
+    load_pipeline(file)
 
 
 def test_pictures_come_at_their_own_rate(tmp_path: Path) -> None:

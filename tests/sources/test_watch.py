@@ -163,6 +163,24 @@ def test_a_reader_that_is_slow_gets_the_newest_frame_and_a_gap_in_seq(
     assert second.seq - first.seq >= 6
 
 
+def test_capture_tells_how_many_frames_nobody_took(device: Flaky) -> None:
+    capture = Capture(
+        Capture.Params(source="0"), opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky")
+    )
+    capture.open()
+    frames = capture.frames()
+    seqs = [next(frames).seq]
+    for wanted in (3, 6, 9):
+        while capture.missed < wanted:
+            time.sleep(0.01)
+        before = capture.missed
+        seqs.append(next(frames).seq)
+        # Of the frames up to this one, those that were not taken are gaps; more may have come meanwhile.
+        assert before <= seqs[-1] + 1 - len(seqs) <= capture.missed
+    capture.stop()
+    capture.close()
+
+
 @pytest.mark.parametrize("does", ["gone", "hangs", "frozen", "black", "other_size"])
 def test_without_a_good_frame_for_too_long_the_error_says_what_to_try(
     does: str, device: Flaky, watched: Callable[..., Watched]

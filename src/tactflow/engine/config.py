@@ -292,6 +292,14 @@ def _node(draft: Draft, params: StageParams | None, problems: Problems) -> Node 
     max_rate = _max_rate(entries, path, problems) if draft.section == "sinks" else None
     if draft.component is None or params is None:
         return None
+    # Another mistake may be why an input is not connected.
+    for port, name in {} if problems.found else params.needed_inputs().items():
+        if draft.inputs.get(port) is None:
+            mark = entries[name].item.mark if name in entries else draft.mark
+            value = getattr(params, name)
+            problems.add(
+                mark, f"{path}.{name}: {value} needs {port}, which no stage gives; add a stage that does"
+            )
     return Node(
         id=draft.id,
         component=draft.component,

@@ -189,7 +189,8 @@ class Runner:
 
     def progress(self) -> Progress:
         """How far the run is."""
-        return Progress(self._frames, self._dropped(), time.perf_counter() - self._began)
+        dropped = self._dropped() + self._missed()
+        return Progress(self._frames, dropped, time.perf_counter() - self._began)
 
     def _open(self) -> None:
         """Build and open the source first, then stages, then sinks: a missing recording truncates no file."""
@@ -371,6 +372,10 @@ class Runner:
             (link.stats().drops for link, only_sinks in source.outputs if only_sinks is None), default=0
         )
 
+    def _missed(self) -> int:
+        """Frames of a live source that were overtaken before they could be taken."""
+        return int(getattr(self._source, "missed", 0))
+
     def _stats(self, wall_s: float) -> dict[str, Any]:
         stages: dict[str, Any] = {self.pipeline.source.id: _node_stats(self._source_stats)}
         sinks: dict[str, Any] = {}
@@ -400,7 +405,7 @@ class Runner:
         dropped = self._dropped()
         return {
             "frames": self._frames - dropped,
-            "dropped": dropped,
+            "dropped": dropped + self._missed(),
             "wall_s": round(wall_s, 6),
             "end": self._end or "eos",
             "stages": stages,

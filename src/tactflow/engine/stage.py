@@ -30,7 +30,7 @@ from __future__ import annotations
 import inspect
 import re
 import types
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -47,6 +47,10 @@ class StageParams(BaseModel):
     """Base of every stage's and sink's parameters: frozen, unknown keys refused, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+    def needed_inputs(self) -> Mapping[str, str]:
+        """Optional inputs that these settings cannot do without: port -> the parameter that needs it."""
+        return {}
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,6 +80,10 @@ class LiveSource(Protocol):
     def state(self) -> str:
         """`running`, `waiting since ...` or `reconnecting since ...`."""
 
+    @property
+    def missed(self) -> int:
+        """Good frames that a newer one replaced before they were read."""
+
     def read_arrival(self) -> Arrival | None:
         """Wait for the newest frame that was not read yet; None at the end and after `stop`."""
 
