@@ -316,6 +316,21 @@ def test_a_page_that_comes_late_to_a_paused_run_sees_the_last_picture(
 # -- what pages may ask for ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("state", ["running", "waiting since 12:00:00 (no frames)", None])
+def test_a_source_that_is_held_is_not_said_to_run(
+    state: str | None, view: Callable[..., View], page: Callable[..., Page]
+) -> None:
+    run = FakeRun()
+    run.source.state = state
+    browser = page(view(run))
+    assert browser.next("state")["source"]["state"] == state
+    browser.say(do="pause", value=True)
+    held = browser.until("state", lambda told: told["paused"])["source"]["state"]
+    assert held == ("paused" if state == "running" else state), "a fault is told even then"
+    browser.say(do="pause", value=False)
+    assert browser.until("state", lambda told: not told["paused"])["source"]["state"] == state
+
+
 def test_buttons_reach_the_run_and_every_page_learns_of_it(
     view: Callable[..., View], page: Callable[..., Page]
 ) -> None:

@@ -234,11 +234,13 @@ class Hub:
         """The message that says what the run is doing, and which buttons work (null) or why not."""
         control = self.control
         source = getattr(control, "source", None)
+        paused = bool(control and control.paused)
+        condition = _words(source, "state")
         recorder = None if control is None else control.recorder()
         return _text(
             type="state",
             sensor=self.sensor,
-            paused=bool(control and control.paused),
+            paused=paused,
             recording=bool(recorder is not None and recorder.recording),
             end=self._end,
             neighbours=self.neighbours(),
@@ -246,7 +248,7 @@ class Hub:
                 "description": _words(source, "description"),
                 "live": bool(getattr(source, "live", False)),
                 "total": getattr(source, "total", None),
-                "state": _words(source, "state"),
+                "state": "paused" if paused and condition == "running" else condition,
             },
             refused={name: self._refusal(name) for name in self._commands},
         )
