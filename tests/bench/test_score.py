@@ -169,7 +169,18 @@ def test_flow_is_compared_where_both_know_it(truth: Truth) -> None:
     score.add(Flow((x + 0.3, y + 0.4), 5), truth)
     score.add(Flow(None, 0), truth)
     score.add(None, truth)
-    assert score.errors() == {"flow_error": pytest.approx(0.5)}
+    assert not truth.at_rim.any()
+    assert score.errors() == {"flow_error": pytest.approx(0.5), "flow_decided": pytest.approx(0.5)}
+
+
+def test_flow_beside_a_marker_at_the_rim_is_a_matter_of_chance(truth: Truth) -> None:
+    assert truth.mean_flow is not None
+    x, y = truth.mean_flow
+    at_rim = np.zeros_like(truth.at_rim)
+    at_rim[0] = True
+    score = FlowScore()
+    score.add(Flow((x + 3, y), 5), replace(truth, at_rim=at_rim))
+    assert score.errors() == {"flow_error": pytest.approx(3)}
 
 
 def test_detected_dots_are_compared_with_visible_ones(truth: Truth) -> None:

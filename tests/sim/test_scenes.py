@@ -11,6 +11,7 @@ import pytest
 
 from tactflow.sim import KEYS, Scene, open_scene, scene_descriptions, scene_names
 from tactflow.sim import gel as gel_model
+from tactflow.sim.truth import measure
 from tactflow.vision.geometry import Preprocessor
 
 SCENES = scene_names()
@@ -104,15 +105,39 @@ def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
         assert np.isfinite(truth.position).all()
         assert np.isfinite(truth.origin).all()
         assert truth.depth > gel_model.TOUCH_DEPTH
-        if truth.mean_flow is not None:
-            assert all(math.isfinite(value) for value in truth.mean_flow)
-            inside = [
-                i
-                for i, (x, y) in enumerate(truth.position)
-                if truth.visible[i] and truth.contact_mask[round(y), round(x)]
-            ]
-            moved = (truth.position - truth.origin)[inside].mean(axis=0)
+        # The mask knows the contact at the pixels' centres; next to its outline a marker's centre decides.
+        height, width = truth.contact_mask.shape
+        for i in np.flatnonzero(truth.visible):
+            x, y = round(truth.position[i, 0]), round(truth.position[i, 1])
+            around = truth.contact_mask[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            if around.all() or not around.any():
+                assert truth.inside[i] == around.any()
+                assert not (truth.at_rim[i] and 1 < x < width - 2 and 1 < y < height - 2)
+        assert not (truth.inside & ~truth.visible).any()
+        if truth.mean_flow is None:
+            assert not truth.inside.any()
+        else:
+            moved = (truth.position - truth.origin)[truth.inside].mean(axis=0)
             np.testing.assert_allclose(truth.mean_flow, moved, atol=1e-9)
+
+
+def test_a_marker_at_the_outline_of_the_contact_is_told_apart_from_one_inside() -> None:
+    scene = open_scene("press?frames=150")
+    press = scene.presses(40)
+    assert scene.camera.identity
+    x, y = press[0].x, press[0].y
+    inner, outer = 0.0, 200.0
+    while outer - inner > 1e-4:
+        middle = (inner + outer) / 2
+        reached = gel_model.in_contact(press, np.array([x + middle], np.float32), np.array([y], np.float32))[
+            0
+        ]
+        inner, outer = (middle, outer) if reached else (inner, middle)
+    places = np.array([(x + inner + away, y) for away in (-2.0, -0.5, -0.1, 0.1, 0.5)])
+    shown = np.ones(5, np.bool_)
+    truth = measure(press, scene.camera, places, places, shown, scene.size, None, lambda: scene.clean(40))
+    assert truth.inside.tolist() == [True, True, True, False, False]
+    assert truth.at_rim.tolist() == [False, False, True, True, False]
 
 
 def test_index_i_is_the_same_marker_in_every_frame() -> None:

@@ -59,6 +59,12 @@ _ALL = [
     Quantity("angle_missing", "frames with a direction where none was given", "%", slack=4.0),
     Quantity("angle_invented", "round contacts that were given a direction", "%", slack=4.0),
     Quantity("flow_error", "mean-flow error inside the contact, mean", "px", slack=0.02),
+    Quantity(
+        "flow_decided",
+        "mean-flow error inside the contact, mean, no marker within 0.25 px of the outline",
+        "px",
+        slack=0.02,
+    ),
     Quantity("false_contacts", "idle frames called contact", "%", slack=0.0),
     Quantity("missed_contacts", "frames with contact missed", "%", slack=4.0),
     Quantity("missed_half_depth", "contact at half depth or more missed", "%", slack=0.0),

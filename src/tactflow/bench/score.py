@@ -229,18 +229,22 @@ class FlowScore:
     """Is the mean flow inside the contact right?"""
 
     error: list[float] = field(default_factory=list[float])
+    decided: list[float] = field(default_factory=list[float])
 
     def add(self, flow: Flow | None, truth: Truth) -> None:
         """Compare one frame, if both know a mean flow."""
         if flow is None or flow.mean is None or truth.mean_flow is None:
             return
-        self.error.append(
-            float(np.hypot(flow.mean[0] - truth.mean_flow[0], flow.mean[1] - truth.mean_flow[1]))
-        )
+        error = float(np.hypot(flow.mean[0] - truth.mean_flow[0], flow.mean[1] - truth.mean_flow[1]))
+        self.error.append(error)
+        if not truth.at_rim.any():
+            self.decided.append(error)
 
     def errors(self) -> dict[str, float]:
         """Quantity -> value."""
-        return _drop_unknown({"flow_error": metrics.mean(self.error)})
+        return _drop_unknown(
+            {"flow_error": metrics.mean(self.error), "flow_decided": metrics.mean(self.decided)}
+        )
 
 
 @dataclass(slots=True)

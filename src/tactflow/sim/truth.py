@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from tactflow.sim.camera import Camera
 from tactflow.sim.gel import Press, in_contact
 
+AT_RIM = 0.25
+"""Distance to the outline of the contact, px, at which no method can tell whether a marker is inside."""
+
 NO_DIRECTION = 0.02
 """Anisotropy (difference over sum of the principal second moments) below which a region has no direction."""
 
@@ -33,8 +36,9 @@ class Truth:
     origin : (N, 2) float64, markers on the untouched gel. position : (N, 2) float64, now. Markers that were
         never printed are not listed.
     visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, and not vanished.
-    mean_flow : (dx, dy), mean displacement of the visible markers whose position lies in the contact, px;
-        None where there are none.
+    inside : (N,) bool, whether a marker is visible and its centre lies in the contact.
+    at_rim : (N,) bool, whether a marker is visible and the outline passes its centre at `AT_RIM` or less.
+    mean_flow : (dx, dy), mean displacement of the markers inside, px; None where there are none.
     """
 
     touching: bool
@@ -46,6 +50,8 @@ class Truth:
     origin: NDArray[np.float64]
     position: NDArray[np.float64]
     visible: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+    at_rim: NDArray[np.bool_]
     mean_flow: tuple[float, float] | None
     depth: float
     _render: Callable[[], NDArray[np.uint8]] = field(repr=False)
@@ -141,17 +147,19 @@ def measure(
         points = np.stack([columns, rows], axis=1).astype(np.int32)
         hull = cv2.convexHull(points).reshape(-1, 2).astype(np.float64)
         area = float(cv2.contourArea(hull.astype(np.float32)))
+    places = _around(position, to)
     if to is not None:
         origin = np.asarray(to.to_processed(origin), dtype=np.float64)
         position = np.asarray(to.to_processed(position), dtype=np.float64)
     nearest = np.rint(position).astype(np.int64)
-    inside = (nearest[:, 0] >= 0) & (nearest[:, 1] >= 0) & (nearest[:, 0] < width) & (nearest[:, 1] < height)
-    visible = shown & inside
+    visible = shown & np.all((nearest >= 0) & (nearest < (width, height)), axis=1)
+    gel = camera.to_gel(places.reshape(-1, 2)).astype(np.float32)
+    reached = in_contact(pressed, gel[:, 0], gel[:, 1]).reshape(places.shape[:2])
+    inside = visible & reached[0]
+    at_rim = visible & (reached.any(axis=0) != reached.all(axis=0))
     mean_flow = None
-    touched = np.zeros(len(position), dtype=np.bool_)
-    touched[visible] = mask[nearest[visible, 1], nearest[visible, 0]]
-    if touched.any():
-        moved = (position - origin)[touched].mean(axis=0)
+    if inside.any():
+        moved = (position - origin)[inside].mean(axis=0)
         mean_flow = (float(moved[0]), float(moved[1]))
 
     def render() -> NDArray[np.uint8]:
@@ -164,8 +172,33 @@ def measure(
 
     depth = max((press.depth for press in pressed), default=0.0) if touching else 0.0
     return Truth(
-        touching, mask, center, angle, hull, area, origin, position, visible, mean_flow, depth, render
+        touching,
+        mask,
+        center,
+        angle,
+        hull,
+        area,
+        origin,
+        position,
+        visible,
+        inside,
+        at_rim,
+        mean_flow,
+        depth,
+        render,
     )
+
+
+def _around(position: NDArray[np.float64], to: Any) -> NDArray[np.float64]:
+    """(9, N, 2) raw px: points (N, 2), raw px, and eight places `AT_RIM` processed px from each."""
+    turn = np.arange(8) * (np.pi / 4)
+    steps = AT_RIM * np.concatenate([[[0.0, 0.0]], np.stack([np.cos(turn), np.sin(turn)], axis=1)])
+    if to is None:
+        return position + steps[:, None]
+    around = np.asarray(to.to_processed(position), dtype=np.float64) + steps[:, None]
+    raw = np.asarray(to.to_raw(around.reshape(-1, 2)), dtype=np.float64).reshape(around.shape)
+    raw[0] = position
+    return raw
 
 
 def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
