@@ -62,6 +62,10 @@ BAY = 2.5
 """A region with a bay that is deeper, px at half resolution, may be a ring with a gap. A gap that is
 narrower than the ring is thick, or than a marker, is closed."""
 
+TURN = 0.2
+"""Least cosine of the angle between an outline beside a marker and the chord below it: where the outline turns
+back further, no curve is laid below the marker but the chord itself."""
+
 TANGENT = 4
 """Points of an outline over which its direction beside a marker is measured."""
 
@@ -119,6 +123,9 @@ def _peak(values: Float) -> float:
 
 def _brightened(mean: Float, peak: float, hidden: Mask | None) -> Float:
     level = mean * np.float32(1 / peak) - np.float32(HALF)
+    if hidden is not None:
+        # The change is smooth here: what is painted next to what is seen is nearly right.
+        hidden = np.asarray(cv2.erode(hidden, np.ones((3, 3), np.uint8)), np.uint8)
     filled = _pockets(*_outlined((level > 0).view(np.uint8), hidden))
     wrong = (level > 0).view(np.uint8) != filled
     level[wrong] = np.where(filled[wrong], np.float32(HALF), np.float32(-HALF))
@@ -196,9 +203,10 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     direction at both (Hermite); where the outline turns back, which no cubic should guess, a straight line.
     """
     below = hidden[outline[:, 1], outline[:, 0]] > 0
-    if not below.any():
+    unseen = np.count_nonzero(below)
+    if unseen == 0:
         return np.asarray(outline << _FIXED, np.int32)
-    if below.all():
+    if unseen == len(below):
         return None
     start = int(np.argmin(below))
     below = np.concatenate([below[start:], below[:start], below[start : start + 1]])
@@ -212,10 +220,13 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     before, after = points[first - 1], points[behind % count]
     chord = after - before
     square = np.einsum("ij,ij->i", chord, chord)
-    # Directions at both ends, as long as the chord.
+    # Directions at both ends, as long as the chord, and the cosines of their angles to it.
     ways = np.stack([before - points[since], points[until % count] - after])
     ways *= np.sqrt(square / np.maximum(np.einsum("kij,kij->ki", ways, ways), 1e-9))[..., None]
-    ahead = 2 * np.einsum("kij,ij->ki", ways, chord).min(axis=0) > square
+    along = np.einsum("kij,ij->ki", ways, chord) / np.maximum(square, 1e-9)
+    ahead = along.min(axis=0) > TURN
+    # With tangents of this length, equal angles at both ends make a curve as high as the circle's arc.
+    ways *= (4 / np.maximum(2 + along.sum(axis=0), 1))[:, None]
     curves = _CUBICS @ np.stack([before, ways[0], after, ways[1]], axis=1)
     pieces, last = [], 0
     for curve, smooth, left, back in zip(curves, ahead, first.tolist(), behind.tolist(), strict=True):
