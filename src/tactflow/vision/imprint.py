@@ -63,8 +63,8 @@ BAY = 2.5
 narrower than the ring is thick, or than a marker, is closed."""
 
 TURN = 0.2
-"""Least cosine of the angle between an outline beside a marker and the chord below it: where the outline turns
-back further, no curve is laid below the marker but the chord itself."""
+"""Least cosine of the angle between an outline beside a marker and the chord below it: where the outline
+turns back further, no curve is laid below the marker but the chord itself."""
 
 TANGENT = 4
 """Points of an outline over which its direction beside a marker is measured."""
