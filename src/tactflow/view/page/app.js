@@ -275,7 +275,7 @@ function refresh() {
   put(document, "title", s && now === "live" ? `${s.name} – tactflow` : `${words[now] ?? now} – tactflow`);
 
   set("source", state?.source.description ?? "–");
-  set("source-state", state ? [state.source.live ? "live" : "recording", state.source.state ?? words[now] ?? (now === "live" ? "delivering frames" : now)].join(", ") : "");
+  set("source-state", state ? [state.source.live ? "live" : "recording", (link === "open" && !state.end && state.source.state) || words[now] || (now === "live" ? "delivering frames" : now)].join(", ") : "");
   const open = link === "open" && state;
   for (const name of ["pause", "step", "reference", "record", "stop"]) {
     const reason = open ? state.refused[name] : "not connected";
@@ -284,6 +284,8 @@ function refresh() {
   }
   press("pause", Boolean(state?.paused), "Resume", "Pause");
   press("record", Boolean(state?.recording), "Stop recording", "Record");
+  // An animation would have the browser draw the page anew at every refresh of the screen.
+  put($("record").dataset, "beat", String(Number(Boolean(state?.recording)) && Math.floor(performance.now() / 500) % 2));
 }
 
 function press(id, pressed, on, off) {
