@@ -66,15 +66,17 @@ TURN = 0.2
 """Least cosine of the angle between an outline beside a marker and the chord below it: where the outline
 turns back further, no curve is laid below the marker but the chord itself."""
 
-TANGENT = 4
+TANGENT = 5
 """Points of an outline over which its direction beside a marker is measured."""
 
 _PROFILE_STEP = 0.5
 _FEW = 8
 _ENOUGH = 8000
 """Pixels that are enough for the profile: of a window of n times as many, every n-th row is taken."""
-_FIXED = 4
-"""Bits behind the point of an outline's coordinates."""
+_INWARDS = np.array([1, -1], np.float32) / 16
+"""Part of a pixel by which a continued outline is drawn in, so that halfway is outside on every side."""
+_STEPS = 24
+"""Points of a continued part, more than it is pixels long: lines drawn by OpenCV differ with their direction."""
 _POCKET = 0.8
 """Part of an area between a region and the frame's border that the region's hull covers if it belongs."""
 
@@ -174,14 +176,14 @@ def _crossing(profile: list[float], at: list[float], part: float) -> float:
 
 
 def _outlined(mask: Mask, hidden: Mask | None) -> tuple[Mask, Outlines]:
-    """The parts of a region with their holes filled, and their outlines in fixed point.
+    """The parts of a region with their holes filled, and their outlines.
 
     mask : (h, w) uint8, 0 or 1. hidden : the same: what is not known of the mask.
     """
     known = mask if hidden is None else np.asarray(cv2.bitwise_or(mask, hidden), np.uint8)
     found, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if hidden is None:
-        outlines = [np.asarray(outline[:, 0], np.int32) << _FIXED for outline in found]
+        outlines = [np.asarray(outline[:, 0], np.int32) for outline in found]
     else:
         # Smoothing has carried what was painted one pixel further.
         grown = np.asarray(cv2.dilate(hidden, np.ones((3, 3), np.uint8)), np.uint8)
@@ -192,12 +194,12 @@ def _outlined(mask: Mask, hidden: Mask | None) -> tuple[Mask, Outlines]:
         ]
     filled = np.zeros_like(mask)
     if outlines:
-        cv2.fillPoly(filled, outlines, (1.0,), cv2.LINE_8, _FIXED)
+        cv2.fillPoly(filled, outlines, (1.0,))
     return filled, outlines
 
 
 def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | None:
-    """An outline, (n, 2) px, its hidden parts replaced by cubics, in fixed point; None if all is hidden.
+    """An outline, (n, 2) px, its hidden parts replaced by cubics; None if all is hidden.
 
     Between the last point before a marker and the first behind it runs the cubic that has the outline's
     direction at both (Hermite); where the outline turns back, which no cubic should guess, a straight line.
@@ -205,10 +207,11 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     below = hidden[outline[:, 1], outline[:, 0]] > 0
     unseen = np.count_nonzero(below)
     if unseen == 0:
-        return np.asarray(outline << _FIXED, np.int32)
+        return outline
     if unseen == len(below):
         return None
-    start = int(np.argmin(below))
+    # Begin behind a hidden part, so that no seen part is cut in two.
+    start = int(np.argmax(below < np.roll(below, 1)))
     below = np.concatenate([below[start:], below[:start], below[start : start + 1]])
     points = np.concatenate([outline[start:], outline[:start]]).astype(np.float32)
     count = len(points)
@@ -227,15 +230,16 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     ahead = along.min(axis=0) > TURN
     # With tangents of this length, equal angles at both ends make a curve as high as the circle's arc.
     ways *= (4 / np.maximum(2 + along.sum(axis=0), 1))[:, None]
+    ways[:, ~ahead] = chord[~ahead]
     curves = _CUBICS @ np.stack([before, ways[0], after, ways[1]], axis=1)
+    inwards = chord[:, ::-1] * _INWARDS / np.sqrt(np.maximum(square, 1))[:, None]
+    curves += inwards[:, None]
     pieces, last = [], 0
-    for curve, smooth, left, back in zip(curves, ahead, first.tolist(), behind.tolist(), strict=True):
-        pieces.append(points[last:left])
-        if smooth:
-            pieces.append(curve)
+    for curve, left, back in zip(curves, first.tolist(), behind.tolist(), strict=True):
+        pieces += [points[last:left], curve]
         last = back
     pieces.append(points[last:])
-    return np.rint(np.concatenate(pieces) * (1 << _FIXED)).astype(np.int32)
+    return np.rint(np.concatenate(pieces)).astype(np.int32)
 
 
 def _cubics(steps: int) -> Float:
@@ -246,7 +250,7 @@ def _cubics(steps: int) -> Float:
     return cubics.astype(np.float32)
 
 
-_CUBICS = _cubics(8)
+_CUBICS = _cubics(_STEPS)
 
 
 def _solid(filled: Mask) -> bool:
@@ -285,7 +289,7 @@ def _pockets(filled: Mask, outlines: Outlines) -> Mask:
         ends = [*ends[1:], ends[0] + len(rim)]
     height, width = filled.shape
     hull = np.zeros_like(filled)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), (1.0,), cv2.LINE_8, _FIXED)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), (1.0,))
     closed = False
     for start, end in zip(starts, ends, strict=True):
         seed = _on_rim((start + end) // 2 % len(rim), width, height)
