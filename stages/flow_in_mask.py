@@ -21,7 +21,7 @@ class FlowInMask:
         """Which markers count as inside, and how they are averaged."""
 
         dilate: float = Field(
-            0.4,
+            0.3,
             ge=0,
             le=1000,
             description="markers whose centre is up to this far outside the contact's outline count too, px; "

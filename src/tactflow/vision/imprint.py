@@ -76,7 +76,7 @@ _ENOUGH = 8000
 _INWARDS = np.array([1, -1], np.float32) / 16
 """Part of a pixel by which a continued outline is drawn in, so that halfway is outside on every side."""
 _STEPS = 24
-"""Points of a continued part, more than it is pixels long: lines drawn by OpenCV differ with their direction."""
+"""Points of a continued part, more than it has pixels: lines drawn by OpenCV depend on their direction."""
 _POCKET = 0.8
 """Part of an area between a region and the frame's border that the region's hull covers if it belongs."""
 
@@ -239,7 +239,7 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
         pieces += [points[last:left], curve]
         last = back
     pieces.append(points[last:])
-    return np.rint(np.concatenate(pieces)).astype(np.int32)
+    return np.asarray(np.rint(np.concatenate(pieces)), np.int32)
 
 
 def _cubics(steps: int) -> Float:
