@@ -336,9 +336,9 @@ class ContactDetector:
             window = mask[
                 _CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop
             ]
-            window |= 255 * (large > 0).view(np.uint8)
+            window |= np.asarray(cv2.compare(large, np.zeros(1), cv2.CMP_GT), np.uint8)
         mask = np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
-        self._outline = mask if mask.any() else None
+        self._outline = mask if cv2.countNonZero(mask) else None
         return ContactResult(mask, self._outline is not None, strength)
 
     def _clear(
