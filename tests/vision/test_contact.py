@@ -6,6 +6,7 @@ import csv
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
+from tactflow.vision import contact, imprint
 from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.imprint import _solid
@@ -453,6 +455,12 @@ class _Sensor:
     def look(self, index: int) -> ContactResult:
         return self.detector.detect(self._unmarked(self.preprocess(self.scene.frame(index))))
 
+    def look_below_markers(self, index: int) -> ContactResult:
+        """The same, told where the markers are."""
+        assert self.dot is not None
+        image = self.preprocess(self.scene.frame(index))
+        return self.detector.detect(self._unmarked(image), marker_mask(image, self.dot))
+
 
 @pytest.mark.parametrize(
     "scene", ["press", "cable", "box", "press?light=bright", "press?light=mixed", "press?markers=none"]
@@ -480,6 +488,39 @@ def test_simulated_contacts_are_found_from_half_depth_on_with_their_outline(scen
     # Measured over whole recordings: medians 0.91 to 0.98, and 0.2 to 0.6 px.
     assert np.median(hulls) > 0.88
     assert np.median(centers) < 1
+
+
+@pytest.mark.parametrize("scene", ["press", "cable", "two", "press?light=mixed"])
+def test_looking_closely_only_around_a_contact_gives_what_looking_everywhere_gives(
+    scene: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The profile across the rim is taken from every line of a small region, but some of a large one.
+    monkeypatch.setattr(imprint, "_ENOUGH", 10**9)
+    around, everywhere = _Sensor(scene, 90), _Sensor(scene, 90)
+    windows = contact._blobs
+
+    def whole(square: NDArray[np.float32], *thresholds: Any) -> list[Any]:
+        rows, columns = slice(0, square.shape[0]), slice(0, square.shape[1])
+        found = []
+        for blob_rows, blob_columns, inside in windows(square, *thresholds):
+            shares.append(inside.size / square.size)
+            belongs = np.zeros(square.shape, np.bool_)
+            belongs[blob_rows, blob_columns] = inside
+            found.append((rows, columns, belongs))
+        return found
+
+    shares: list[float] = []
+    touching = 0
+    for index in range(12, 60, 4):
+        near = around.look_below_markers(index)
+        with monkeypatch.context() as patch:
+            patch.setattr(contact, "_blobs", whole)
+            far = everywhere.look_below_markers(index)
+        touching += near.touching
+        assert np.array_equal(near.mask, far.mask)
+        assert near.strength == far.strength
+    assert touching >= 5
+    assert max(shares) < 1
 
 
 @pytest.mark.parametrize("scene", ["idle?drift=0.18", "idle?flicker=0.06&gain=0.03", "idle?noise=6", "idle"])
