@@ -20,6 +20,7 @@ from tactflow import __version__
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
+from tactflow.engine.rate import SLACK, RateLimit
 from tactflow.engine.stage import StageParams
 from tactflow.message import encode_message
 from tactflow.ports import Image
@@ -35,9 +36,6 @@ log = logging.getLogger("tactflow")
 
 BACKLOG_SHARE = 4
 """Frames from memory that are written per new frame, so that saving them never holds up the run."""
-
-SLACK = 5e-7
-"""Times of a recording are multiples of 1 / fps in floating point; so much, s, they may be off."""
 
 
 class Record:
@@ -130,7 +128,7 @@ class Record:
         self._warned = False
         self._touching = False
         self._touched = 0.0
-        self._preview_due = float("-inf")
+        self._previews = RateLimit(params.preview) if params.preview else None
         self._counts = {"frames": 0, "files": 0, "bytes": 0}
 
     def open(self) -> None:
@@ -247,19 +245,11 @@ class Record:
         # A reference image that is not part of the source has no results of its own.
         if frame.seq >= 0:
             message = encode_message(tick, image, contact, flow, markers, detail=True)
-            if self._preview_is_due(frame.t):
+            if self._previews is not None and self._previews.due(frame.t):
                 jpeg = self._jpeg(frame.image if image is None else image)
                 picture = encode_picture(jpeg, self._sensor, time)
         pixels = self._coder.encode(frame)
         return Entry(time, frame.seq, frame.reference, frame.epoch, pixels, message, picture)
-
-    def _preview_is_due(self, t: float) -> bool:
-        rate = self.params.preview
-        if rate == 0 or t + SLACK < self._preview_due:
-            return False
-        start = self._preview_due if t - self._preview_due < 1 / rate else t
-        self._preview_due = start + 1 / rate
-        return True
 
     def _jpeg(self, image: Image) -> bytes:
         done, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, self.params.quality))

@@ -190,7 +190,6 @@ class Capture:
         if source is None:
             raise SourceError(f"{self.description}: is not open")
         count = self.params.reference if isinstance(self.params.reference, int) else 1
-        references_left = count if self._reference_image is None else 0
         pace = Pace(self._stop) if self.params.realtime and not source.live else None
         if isinstance(source, StampedSource):
             yield from self._replay(source, pace, count)
@@ -198,7 +197,7 @@ class Capture:
         if isinstance(source, LiveSource):
             yield from self._watch(source, count)
             return
-        epoch = 0
+        references = _References(self._retake, count, count if self._reference_image is None else 0)
         seq = -1
         while not self._stop.is_set():
             item = source.read()
@@ -213,17 +212,12 @@ class Capture:
                 return
             if seq == self.params.skip and self._reference_image is not None:
                 yield self._reference_frame(image, t)
-            if self._retake.is_set():
-                self._retake.clear()
-                epoch += 1
-                references_left = count
-            reference = references_left > 0
-            references_left -= reference
+            reference, epoch = references.next()
             yield Frame(self._sensor, seq, t, image, time.perf_counter(), reference, epoch)
 
     def _replay(self, source: StampedSource, pace: Pace | None, count: int) -> Iterator[Frame]:
         """Frames as they were captured the first time; references that are retaken now come on top."""
-        retaken = references_left = 0
+        references = _References(self._retake, count, 0)
         while not self._stop.is_set():
             item = source.read_stamped()
             if item is None:
@@ -231,21 +225,15 @@ class Capture:
             image, t, stamp = item
             if pace is not None and stamp.paced and not pace.wait_for(t):
                 return
-            if self._retake.is_set() and stamp.seq >= 0:
-                self._retake.clear()
-                retaken += 1
-                references_left = count
-            again = references_left > 0
-            references_left -= again
+            again, retaken = references.next(retake=stamp.seq >= 0)
             reference, epoch = stamp.reference or again, stamp.epoch + retaken
             yield Frame(self._sensor, stamp.seq, t, _read_only(image), time.perf_counter(), reference, epoch)
 
     def _watch(self, source: LiveSource, count: int) -> Iterator[Frame]:
         """Frames of a source that numbers them where they arrive, and that may go and come back."""
         p = self.params
-        references_left = count if self._reference_image is None else 0
         shown = self._reference_image is None
-        epoch = 0
+        references = _References(self._retake, count, count if shown else 0)
         connection, begins = 0, p.skip
         while not self._stop.is_set():
             arrival = source.read_arrival()
@@ -261,12 +249,7 @@ class Capture:
             if not shown:
                 shown = True
                 yield self._reference_frame(image, arrival.t)
-            if self._retake.is_set():
-                self._retake.clear()
-                epoch += 1
-                references_left = count
-            reference = references_left > 0
-            references_left -= reference
+            reference, epoch = references.next()
             yield Frame(self._sensor, arrival.seq, arrival.t, image, arrival.captured, reference, epoch)
 
     def _reference_frame(self, first: NDArray[np.uint8], t: float) -> Frame:
@@ -279,6 +262,29 @@ class Capture:
                 "they must be equally large"
             )
         return Frame(self._sensor, -1, t, _read_only(image), time.perf_counter(), reference=True)
+
+
+class _References:
+    """Which frames are references, and in which epoch: the first ones, and as many whenever they are retaken.
+
+    retake : set from any thread to take new ones. count : how many then. left : how many at the start.
+    """
+
+    def __init__(self, retake: threading.Event, count: int, left: int) -> None:
+        self._retake = retake
+        self._count = count
+        self._left = left
+        self._epoch = 0
+
+    def next(self, *, retake: bool = True) -> tuple[bool, int]:
+        """Whether the next frame is a reference, and its epoch. With `retake` False none begins with it."""
+        if retake and self._retake.is_set():
+            self._retake.clear()
+            self._epoch += 1
+            self._left = self._count
+        reference = self._left > 0
+        self._left -= reference
+        return reference, self._epoch
 
 
 def _read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

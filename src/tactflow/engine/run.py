@@ -360,7 +360,7 @@ class Runner:
     def _wanted(sink: RunningNode, frame: Frame) -> bool:
         if frame.reference and getattr(sink.instance, "takes_references", False):
             return True
-        return frame.seq >= 0 and sink.due(frame) and (sink.wants is None or sink.wants())
+        return frame.seq >= 0 and sink.rate_limit.due(frame.t) and (sink.wants is None or sink.wants())
 
     # -- statistics ---------------------------------------------------------------------------------------
 

@@ -20,6 +20,7 @@ from tactflow.engine.frame import Absent, Frame, Tick
 from tactflow.engine.graph import Gate, Node
 from tactflow.engine.link import Link
 from tactflow.engine.plan import Plan
+from tactflow.engine.rate import RateLimit
 from tactflow.engine.stage import Port, SignalPort, port_type
 from tactflow.engine.stats import Durations, NodeStats, SignalStats
 from tactflow.engine.trace import Track
@@ -120,19 +121,7 @@ class RunningNode:
         self.last: list[Any] | None = None
         self.last_arguments: list[Any] | None = None
         self.check = ArrayCheck(node) if check else None
-        self.next_due = float("-inf")
-
-    def due(self, frame: Frame) -> bool:
-        """Whether a rate-limited sink's next time has come; goes by capture time."""
-        rate = self.node.max_rate
-        if rate is None:
-            return True
-        # Half a microsecond of slack: times of a recording are multiples of 1 / fps in floating point.
-        if frame.t + 5e-7 < self.next_due:
-            return False
-        start = self.next_due if frame.t - self.next_due < 1.0 / rate else frame.t
-        self.next_due = start + 1.0 / rate
-        return True
+        self.rate_limit = RateLimit(node.max_rate)
 
     def reset(self) -> None:
         """A new reference follows: forget what was learned from the last one."""
