@@ -38,8 +38,6 @@ SIGMA = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5)
 DRAWS = 400
 NEAR = 3.0
 """Marks nearer than this to the true outline tell how well it is known at marks, px."""
-UNDECIDED = 0.25
-"""Marks nearer than this to the true outline are in or out by chance, px."""
 COLOURS = (
     "#1f4e79", "#c0392b", "#4a7a3f", "#d9a300", "#7d3c98", "#16a085",
     "#d35400", "#2c3e50", "#8e6e53", "#c2185b", "#00838f",
@@ -51,7 +49,7 @@ class Curve:
     """One scene.
 
     expected : (S,) px, mean error for each of `SIGMA`. measured : px, of the default pipeline.
-    decided : px, the same over the frames in which no marker is `UNDECIDED` or nearer to the true outline.
+    decided : px, the same over the frames in which no marker is at the rim (`Truth.at_rim`).
     sigma : px, standard deviation of its outline at the markers; None where there are too few.
     """
 
@@ -109,7 +107,7 @@ def curves(say: Callable[[str], None]) -> list[Curve]:
     with tempfile.TemporaryDirectory() as folder:
         for rendered in render_all(cases, Path(folder)):
             pipeline = LockstepPipeline(on_recording(load_pipeline(PIPELINE), rendered.path), None)
-            score, decided, off, index = FlowScore(), FlowScore(), [], None
+            score, off, index = FlowScore(), [], None
             depths, moves = [], []
             for outcome in iter(pipeline.step, None):
                 number, mapping, markers = outcome.frame.seq, outcome.mapping, outcome.markers
@@ -122,8 +120,6 @@ def curves(say: Callable[[str], None]) -> list[Curve]:
                 depth = true_depth(rendered.scene, number)
                 if not (depth[truth.visible] > 0).any():
                     continue
-                if (np.abs(depth[truth.visible]) > UNDECIDED).all():
-                    decided.add(outcome.flow, truth)
                 depths.append(depth[truth.visible])
                 moves.append((truth.position - truth.origin)[truth.visible])
                 mask = outcome.contact_mask
@@ -134,7 +130,7 @@ def curves(say: Callable[[str], None]) -> list[Curve]:
                     off.extend((seen - depth)[near].tolist())
             if not depths:
                 continue
-            measured, certain = (each.errors().get("flow_error") for each in (score, decided))
+            measured, certain = (score.errors().get(key) for key in ("flow_error", "flow_decided"))
             sigma = float(np.std(off)) if len(off) >= 20 else None
             curve = Curve(rendered.case.label, expected_errors(depths, moves, rng), measured, certain, sigma)
             found.append(curve)

@@ -122,3 +122,10 @@ def test_misfits_are_refused_with_what_came() -> None:
         remove_markers(np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint8))
     with pytest.raises(ValueError, match="radius: required > 0"):
         remove_markers(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.uint8), radius=0)
+
+
+def test_any_mask_value_but_zero_means_a_marker() -> None:
+    image = np.random.default_rng(3).integers(0, 255, (40, 52, 3), dtype=np.uint8)
+    mask = np.zeros((40, 52), np.uint8)
+    mask[11:18, 21:30] = 255
+    assert np.array_equal(remove_markers(image, mask // 255), remove_markers(image, mask))

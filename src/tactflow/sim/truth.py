@@ -81,15 +81,20 @@ def principal_angle(columns: NDArray[np.int64], rows: NDArray[np.int64]) -> floa
     return 90.0 if angle <= -90.0 else angle
 
 
+def _pixels(width: int, height: int) -> NDArray[np.float64]:
+    """(H * W, 2): x and y of every pixel, line by line."""
+    return (
+        np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
+    )
+
+
 @lru_cache(maxsize=8)
 def _pixel_centres(
     camera: Camera, size: tuple[int, int], mapping: Any
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Gel coordinates (H, W) of each pixel's centre, and whether the raw frame covers it."""
     width, height = size if mapping is None else mapping.size
-    grid = (
-        np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
-    )
+    grid = _pixels(width, height)
     raw = grid if mapping is None else np.asarray(mapping.to_raw(grid), dtype=np.float64)
     seen = np.all((raw >= -0.5) & (raw <= np.array(size) - 0.5), axis=1).reshape(height, width)
     mapped = camera.to_gel(raw).astype(np.float32).reshape(height, width, 2)
@@ -214,9 +219,7 @@ def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
 def _sample_places(mapping: Any) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Raw coordinates (H, W) of the four samples of each processed pixel."""
     width, height = mapping.size
-    grid = (
-        np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
-    )
+    grid = _pixels(width, height)
     places = []
     for shift in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         raw = np.asarray(mapping.to_raw(grid + shift), dtype=np.float32).reshape(height, width, 2)

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.imprint import imprint
 from tactflow.vision.light import LightChange, light_change
+from tactflow.vision.marker_mask import halved_mask
 from tactflow.vision.seed_contact import seed_contact_mask
 
 ContactMethod = Literal["noise", "colour", "seed"]
@@ -433,11 +434,7 @@ def _halved_mask(mask: NDArray[np.uint8], rows: slice, columns: slice) -> NDArra
     if part.shape != (high, wide):
         below, beside = high - part.shape[0], wide - part.shape[1]
         part = np.asarray(cv2.copyMakeBorder(part, 0, below, 0, beside, cv2.BORDER_CONSTANT), np.uint8)
-    # A pixel of 255 in four leaves 63, and one of 1 none: so the mask is spread to 0 and 255 first.
-    full = cv2.compare(part, np.zeros(1), cv2.CMP_GT)
-    return (np.asarray(cv2.resize(full, (wide // 2, high // 2), interpolation=cv2.INTER_AREA)) > 0).view(
-        np.uint8
-    )
+    return np.asarray(halved_mask(part) & np.uint8(1), np.uint8)
 
 
 def _squared_length(vectors: Float) -> Float:

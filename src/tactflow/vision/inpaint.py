@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.marker_mask import doubled
+from tactflow.vision.marker_mask import doubled, halved_mask
 
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 
@@ -98,7 +98,7 @@ def _normalized(image: NDArray[np.uint8], mask: NDArray[np.uint8], radius: float
     half = ((width + right) // 2, (height + bottom) // 2)
     quarter = (half[0] // 2, half[1] // 2)
     # Only whole 2 x 2 blocks count: the soft rim of a marker is left out with it.
-    valid = cv2.inRange(cv2.resize(hidden, half, interpolation=cv2.INTER_AREA), (0.0,), (0.0,))
+    valid = cv2.bitwise_not(halved_mask(hidden))
     # The fourth channel carries the weight: 255 where valid, else 0.
     picture = cv2.cvtColor(cv2.resize(whole, half, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2BGRA)
     kept = cv2.copyTo(picture, valid).astype(np.float32)
