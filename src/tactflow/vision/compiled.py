@@ -1,0 +1,139 @@
+"""Loops compiled by numba where it is installed (`pip install "tactflow[fast]"`).
+
+What is costly in a vision method is written twice: once with numpy and OpenCV, which is what runs without
+numba, and once as plain loops over pixels that numba compiles. Both give the same numbers, to the rounding
+that the method states. A method looks like this:
+
+    @kernel("void(uint8[:, ::1], float32[::1])")
+    def _sums(picture, sums): ...            # loops
+
+    def column_sums(picture):
+        if compiled.active():
+            sums = np.zeros(picture.shape[1], np.float32)
+            _sums(picture, sums)
+            return sums
+        return picture.sum(axis=0, dtype=np.float32)
+
+Kernels are compiled on their first call, or by `load`, which the constructor of a stage calls so that no
+frame has to wait; numba keeps the result on disk, so this costs seconds once and milliseconds later. They run
+without Python's lock: several segments of a pipeline work at the same time.
+
+`TACTFLOW_COMPILED=0` in the environment switches them off.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Generic, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+VARIABLE = "TACTFLOW_COMPILED"
+"""Environment variable; 0, off, no or false: numba is not used although it is there."""
+
+_REASSOCIATED = {"reassoc", "contract", "arcp", "nsz"}
+"""Freedoms of the compiler: sums in any order. It must still respect NaN and infinity."""
+
+_lock = threading.Lock()
+_wanted = os.environ.get(VARIABLE, "1").strip().lower() not in ("0", "off", "no", "false")
+
+
+class Kernel(Generic[P, R]):
+    """A function that numba compiles when it is first needed.
+
+    signature : numba's, so that no call has to find out its types. C-contiguous arrays are `[:, ::1]`.
+    reorder : whether sums of floats may be taken in any order, which lets them run in parallel lanes; if not,
+        operations are those of the Python code, in its order.
+    """
+
+    def __init__(self, function: Callable[P, R], signature: str, reorder: bool) -> None:
+        self.plain = function
+        self._signature = signature
+        self._reorder = reorder
+        self._compiled: Callable[P, R] | None = None
+        self.__doc__ = function.__doc__
+        self.__name__ = function.__name__
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        if self._compiled is None:
+            self.load()
+            assert self._compiled is not None
+        return self._compiled(*args, **kwargs)
+
+    def load(self) -> None:
+        """Compile now, or take what is on disk; nothing happens where kernels are not active."""
+        if self._compiled is not None or not active():
+            return
+        with _lock:
+            if self._compiled is None:
+                self._compiled = self._compile()
+
+    def _compile(self) -> Callable[P, R]:
+        options: dict[str, Any] = {
+            "nogil": True,
+            "error_model": "numpy",
+            "fastmath": _REASSOCIATED if self._reorder else False,
+        }
+        njit: Any = import_module("numba").njit
+        try:
+            found: Callable[P, R] = njit(self._signature, cache=True, **options)(self.plain)
+        except (RuntimeError, OSError):
+            # No place on disk where numba could keep the result.
+            found = njit(self._signature, **options)(self.plain)
+        return found
+
+
+def kernel(signature: str, *, reorder: bool = False) -> Callable[[Callable[P, R]], Kernel[P, R]]:
+    """Decorator of a function of loops; see `Kernel`."""
+
+    def wrap(function: Callable[P, R]) -> Kernel[P, R]:
+        return Kernel(function, signature, reorder)
+
+    return wrap
+
+
+def active() -> bool:
+    """Whether kernels are used: numba is there, works, and is not switched off."""
+    return _wanted and _works()
+
+
+def numba_version() -> str | None:
+    """Version of numba if kernels are used, else None."""
+    return str(import_module("numba").__version__) if active() else None
+
+
+@contextmanager
+def switched(on: bool) -> Iterator[None]:
+    """Use kernels, or do not, in this block; for comparisons. Acts on the whole process."""
+    global _wanted
+    before = _wanted
+    _wanted = on
+    try:
+        yield
+    finally:
+        _wanted = before
+
+
+@cache
+def _works() -> bool:
+    if find_spec("numba") is None:
+        return False
+    try:
+        import_module("numba")
+    except Exception as error:
+        warnings.warn(
+            f"numba is installed but does not start ({error}); going on without it, more slowly. "
+            f"`pip install -U numba` may mend it, {VARIABLE}=0 silences this.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return False
+    return True
