@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled, marker_appearance_kernels
+from tactflow.vision.markers import to_gray
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -22,6 +25,7 @@ _ROUNDS: Final = 3
 # Error that remains without noise, px: edges sharper than the pixels allow cannot be interpolated exactly
 # (measured on rendered dots with edges of 0.5 to 0.7 px standard deviation: 0.003 to 0.005 px).
 _SAMPLING: Final = 0.004
+_LANES: Final = 32
 
 
 class MarkerAppearance:
@@ -53,12 +57,15 @@ class MarkerAppearance:
         self._first = self.pad * (width + 1)
         self._offsets = (grid_y[disc] * width + grid_x[disc]).astype(np.int64)
         self.pixels = int(disc.sum())
+        self._disc = np.array([grid_x[disc], grid_y[disc]], np.int64)
         x, y = grid_x[disc] / radius, grid_y[disc] / radius
 
         count = len(origin)
         self._rows = np.arange(count)
         steps = (np.arange(_PHASES) + 0.5) / _PHASES - 0.5
-        weights = np.empty((_PHASES, _PHASES, count, 6, self.pixels), np.float32)
+        # Rows of whole vector registers: the pixels after the patch's own weigh nothing.
+        length = -(-self.pixels // _LANES) * _LANES
+        weights = np.zeros((_PHASES, _PHASES, count, 6, length), np.float32)
         gram = np.empty((_PHASES, _PHASES, count, 3, 3), np.float32)
         spread = np.empty((_PHASES, _PHASES, count), np.float32)
         half = 0.25
@@ -81,34 +88,45 @@ class MarkerAppearance:
                 # A trace of ridge keeps marks without contrast solvable; they are never trusted anyway.
                 ridge = 1e-6 * np.trace(products, axis1=1, axis2=2) + 1e-6
                 inverse = np.linalg.inv(products + ridge[:, None, None] * np.eye(3))
-                weights[row, column, :, :3] = inverse @ basis
-                weights[row, column, :, 3:] = plane.transpose(0, 2, 1)
+                weights[row, column, :, :3, : self.pixels] = inverse @ basis
+                weights[row, column, :, 3:, : self.pixels] = plane.transpose(0, 2, 1)
                 gram[row, column] = products
                 spread[row, column] = 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
         # Of each mark at each phase: what gives gain and shift, and the light's plane, orthonormal.
-        self._weights = weights.reshape(_PHASES * _PHASES * count, 6, self.pixels)
+        self._weights = weights.reshape(_PHASES * _PHASES * count, 6, length)
         self._gram = gram.reshape(_PHASES * _PHASES * count, 3, 3)
         self._spread = spread.reshape(_PHASES * _PHASES * count) / np.float32(max(self.pixels - 6, 1))
         self._phase_strides = np.array([count, _PHASES * count])
         self._limits = np.array([reference.shape[1] - 1, reference.shape[0] - 1], np.float64)
+        self._whole = np.array([reach, _PHASES, _ROUNDS])
+        self._real = np.array([radius, _CONVERGED, _SAMPLING])
+        marker_appearance_kernels.measure.load()
 
-    def padded(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The frame with a rim, flat, so that patches may reach over its border."""
+    def view(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """What `measure` wants of an image (H, W, 3) BGR or (H, W) grey.
+
+        Compiled, it reads the pixels around the marks, (H, W, channels); otherwise all are made grey, with a
+        rim, so that patches may reach over the border, flat.
+        """
+        if compiled.active():
+            return np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
         pad = self.pad
         return np.asarray(
-            cv2.copyMakeBorder(gray, pad, pad, pad, pad, cv2.BORDER_REPLICATE), np.uint8
+            cv2.copyMakeBorder(to_gray(image), pad, pad, pad, pad, cv2.BORDER_REPLICATE), np.uint8
         ).ravel()
 
     def measure(
-        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None
+        self, view: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None
     ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
         """Measure marks from starting points (n, 2), right to about a radius.
 
-        marks : (n,) which marks these are; None for all.
+        view : of the frame. marks : (n,) which marks these are; None for all.
         Returns positions (n, 2), gain (n,), explained share of the contrast (n,), standard error (n,).
         """
         marks = self._rows if marks is None else marks
-        position, gain, share, stderr = self._step(flat, start, marks)
+        if view.ndim == 3:
+            return self._measure_compiled(view, start, marks)
+        position, gain, share, stderr = self._step(view, start, marks)
         for _ in range(_ROUNDS):
             # Where nothing like the mark is in sight, more steps lead nowhere.
             again = _longer(position - start, _CONVERGED) & (share > 0.3) & (gain > 0.2)
@@ -117,9 +135,29 @@ class MarkerAppearance:
                 break
             start = position.copy()
             position[active], gain[active], share[active], stderr[active] = self._step(
-                flat, position[active], marks[active]
+                view, position[active], marks[active]
             )
         return position, gain, share, stderr
+
+    def _measure_compiled(
+        self, view: NDArray[np.uint8], start: FloatArray, marks: IntArray
+    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
+        position = np.empty((len(marks), 2))
+        found = np.empty((3, len(marks)), np.float32)
+        marker_appearance_kernels.measure(
+            view,
+            np.ascontiguousarray(start),
+            marks,
+            self._weights,
+            self._gram,
+            self._spread,
+            self._disc,
+            self._whole,
+            self._real,
+            position,
+            found,
+        )
+        return position, found[0], found[1], found[2]
 
     def _step(
         self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray
@@ -130,9 +168,10 @@ class MarkerAppearance:
         quarter = (inside * _PHASES + _PHASES / 2).astype(np.int64)
         index = quarter // _PHASES @ self._strides + self._first
         which = quarter % _PHASES @ self._phase_strides + marks
-        patch = flat.take(index[:, None] + self._offsets).astype(np.float32)
+        patch = np.zeros((len(marks), self._weights.shape[2]), np.float32)
+        patch[:, : self.pixels] = flat.take(index[:, None] + self._offsets)
         # Far from zero, sums of squares would lose digits.
-        patch -= np.float32(128)
+        patch[:, : self.pixels] -= np.float32(128)
         sums = np.matmul(self._weights.take(which, axis=0), patch[:, :, None])
         theta, level = sums[:, :3], sums[:, 3:, 0]
         seen = np.vecdot(np.matmul(self._gram.take(which, axis=0), theta)[:, :, 0], theta[:, :, 0])

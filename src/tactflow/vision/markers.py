@@ -49,14 +49,19 @@ class Detection:
     edges: NDArray[np.int64]
 
 
-def to_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 BGR, or (H, W) uint8, to (H, W) uint8 luma; raises ValueError on anything else."""
+def require_image(image: NDArray[np.uint8]) -> None:
+    """Raises ValueError for anything but (H, W, 3) or (H, W) uint8, not empty."""
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise ValueError(
             f"required image to be (H, W, 3) or (H, W) uint8, got shape {image.shape}, dtype {image.dtype}"
         )
     if min(image.shape[:2]) < 1:
         raise ValueError(f"required a non-empty image, got shape {image.shape}")
+
+
+def to_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 BGR, or (H, W) uint8, to (H, W) uint8 luma; raises ValueError on anything else."""
+    require_image(image)
     if image.ndim == 2:
         return np.ascontiguousarray(image)
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_BGR2GRAY), np.uint8)

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled, tracking_kernels
 from tactflow.vision.marker_appearance import MarkerAppearance
 from tactflow.vision.marker_matching import choose_spots
-from tactflow.vision.markers import Detection, refine_centers, to_gray
+from tactflow.vision.markers import Detection, refine_centers, require_image, to_gray
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]
@@ -58,16 +59,16 @@ class _Spots:
         return np.asarray(response, np.float32)
 
     def find(
-        self, gray: NDArray[np.uint8], least: float, low: FloatArray, high: FloatArray
+        self, image: NDArray[np.uint8], least: float, low: FloatArray, high: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Spots (M, 2), px, between two corners, and their strength (M,), 1 for a typical mark."""
         factor = self._factor
         left, top = np.maximum((low - self._margin) // factor * factor, 0).astype(np.int64).tolist()
         right, bottom = (high + self._margin).astype(np.int64).tolist()
-        gray = gray[top : max(bottom, 0), left : max(right, 0)]
-        if min(gray.shape) < 3 * factor:
+        image = image[top : max(bottom, 0), left : max(right, 0)]
+        if min(image.shape[:2]) < 3 * factor:
             return np.zeros((0, 2)), np.zeros(0)
-        response = self._response(gray)
+        response = self._response(to_gray(image))
         highest = cv2.dilate(response, self._neighbourhood)
         peak = cv2.compare(response, highest, cv2.CMP_GE)
         _, strong = cv2.threshold(response, least * self.typical, 255, cv2.THRESH_BINARY)
@@ -103,7 +104,8 @@ class MarkerTracker:
     what a mark did before only serves as a starting point, and identities rest on the smoothness of the whole
     displacement field, so a wrong one does not survive.
 
-    Measured in float32; positions and standard errors are those of float64 to 1e-4 px.
+    Measured in float32; positions and standard errors are those of float64 to 1e-4 px, and those with numba
+    are those without to 1e-5 px where no step is at the edge of being repeated.
 
     Parameters
     ----------
@@ -154,7 +156,7 @@ class MarkerTracker:
             mean, self._origin, detection.dot_radius, detection.polarity == "dark"
         )
         self._spots = _Spots(np.rint(mean).astype(np.uint8), detection)
-        self._edges = detection.edges
+        self._edges = np.ascontiguousarray(detection.edges, np.int64).reshape(-1, 2)
         self._edge_length = np.linalg.norm(
             self._origin[self._edges[:, 0]] - self._origin[self._edges[:, 1]], axis=1
         )
@@ -167,9 +169,15 @@ class MarkerTracker:
         self._rim = np.array([links < usual for links in degree])
         self._rim_weight = [3 if links < usual else 1 for links in degree]
         self._island = _islands(self._neighbours)
+        links = [link for of_mark in self._neighbours for link in of_mark]
+        self._links = np.array(links, np.int64).reshape(-1, 2)
+        self._rim_weights, self._islands = np.array(self._rim_weight), np.array(self._island, np.int64)
+        self._links_begin = np.cumsum([0, *degree], dtype=np.int64)
         self._cell = 0.12 * self._pitch
         self._raster_shape = tuple(int(side / self._cell) + 2 for side in self._shape)
         self._around, self._around_weight = _surroundings(self._origin, self._pitch)
+        for compiled_loop in (tracking_kernels.judge, tracking_kernels.largest_part):
+            compiled_loop.load()
         self.reset()
 
     def reset(self) -> None:
@@ -185,16 +193,18 @@ class MarkerTracker:
         image : (H, W, 3) uint8 BGR or (H, W) uint8, of the reference's size.
         Returns fresh arrays; `stderr` is NaN for marks that are not seen. Raises ValueError for another size.
         """
-        gray = to_gray(image)
-        if gray.shape != self._shape:
-            raise ValueError(f"required a frame of (height, width) {self._shape}, got {gray.shape}")
-        flat = self._appearance.padded(gray)
-        position, gain, share, stderr = self._appearance.measure(flat, self._position)
-        move = _lengths(position - self._position)
-        seen = _trusted(gain, share) & (move < 0.8 * self._radius)
-        stretch = self._stretch(position)
-        if self._doubtful(seen, move, stretch):
-            position, seen, stderr = self._search(gray, flat, position, seen, stderr, stretch)
+        require_image(image)
+        if image.shape[:2] != self._shape:
+            raise ValueError(f"required a frame of (height, width) {self._shape}, got {image.shape[:2]}")
+        if not compiled.active():
+            image = to_gray(image)
+        view = self._appearance.view(image)
+        position, gain, share, stderr = self._appearance.measure(view, self._position)
+        seen, stretch, doubt = self._judge(position, gain, share)
+        self._age += 1
+        # Something is missing or strongly stretched: look again now and then.
+        if doubt == 2 or (doubt == 1 and self._age >= 10):
+            position, seen, stderr = self._search(image, view, position, seen, stderr, stretch)
             self._accepted = self._stretch(position)
             self._age = 0
         status = np.full(self._count, MarkerStatus.TRACKED, np.uint8)
@@ -211,24 +221,46 @@ class MarkerTracker:
         change = _lengths(moved[self._edges[:, 0]] - moved[self._edges[:, 1]])
         return np.asarray(change / self._edge_length, np.float64)
 
-    def _doubtful(self, seen: BoolArray, move: FloatArray, stretch: FloatArray) -> bool:
-        """Whether measuring where the marks were last may have missed or mistaken one."""
-        self._age += 1
-        if bool((self._seen & ~seen).any()):
-            return True
+    def _judge(
+        self, position: FloatArray, gain: NDArray[Any], share: NDArray[Any]
+    ) -> tuple[BoolArray, FloatArray, int]:
+        """Which marks are seen, how the field is stretched, and whether measuring the marks where they were
+        last may have missed or mistaken one: 0 no, 1 as long as something is missing, 2 most likely."""
+        longest, restless = 0.8 * self._radius, 0.1 * self._pitch
+        if compiled.active():
+            seen, stretch = np.empty(self._count, np.bool_), np.empty(len(self._edges))
+            doubt = tracking_kernels.judge(
+                position,
+                self._position,
+                self._origin,
+                gain,
+                share,
+                self._edges,
+                self._edge_length,
+                self._accepted,
+                self._seen,
+                longest,
+                restless,
+                seen,
+                stretch,
+            )
+            return seen, stretch, doubt
+        move = _lengths(position - self._position)
+        seen = _trusted(gain, share) & (move < longest)
+        stretch = self._stretch(position)
         rough = stretch > np.maximum(0.4, self._accepted + 0.15)
         rough |= stretch > 0.7
-        if bool((rough & seen[self._edges[:, 0]] & seen[self._edges[:, 1]]).any()):
-            return True
-        if bool(seen.all()) and float(stretch.max(initial=0.0)) < 0.4:
-            return False
-        # Something is missing or strongly stretched: look again when the rest has moved, and now and then.
-        return self._age >= 10 or float(move[seen].max(initial=0.0)) > 0.1 * self._pitch
+        if (self._seen & ~seen).any() or (rough & seen[self._edges[:, 0]] & seen[self._edges[:, 1]]).any():
+            return seen, stretch, 2
+        if seen.all() and stretch.max(initial=0.0) < 0.4:
+            return seen, stretch, 0
+        # Something is missing or strongly stretched: look at once where the rest has moved.
+        return seen, stretch, 2 if move[seen].max(initial=0.0) > restless else 1
 
     def _search(
         self,
-        gray: NDArray[np.uint8],
-        flat: NDArray[np.uint8],
+        image: NDArray[np.uint8],
+        view: NDArray[np.uint8],
         position: FloatArray,
         seen: BoolArray,
         stderr: NDArray[Any],
@@ -236,10 +268,10 @@ class MarkerTracker:
     ) -> tuple[FloatArray, BoolArray, NDArray[Any]]:
         """Joint choice among the spots of the whole frame, for marks outside the largest smooth part."""
         if int(self._rim[seen].sum()) < 0.85 * int(self._rim.sum()):
-            jump = self._common_jump(gray)
+            jump = self._common_jump(image)
             if jump is not None:
                 start = self._position + jump
-                position, gain, share, stderr = self._appearance.measure(flat, start)
+                position, gain, share, stderr = self._appearance.measure(view, start)
                 seen = _trusted(gain, share) & (_lengths(position - start) < 0.8 * self._radius)
                 stretch = self._stretch(position)
         settled = self._largest_part(seen, stretch)
@@ -250,7 +282,7 @@ class MarkerTracker:
         common = _median(moved[settled])
         expected = np.stack([self._position[free], self._origin[free] + common])
         low, high = expected.min(axis=(0, 1)) - self._farthest, expected.max(axis=(0, 1)) + self._farthest
-        spots, strength = self._spots.find(gray, 0.25, low, high)
+        spots, strength = self._spots.find(image, 0.25, low, high)
         # What was measured without belonging to that part is a spot like any other, if it is not one already.
         own = position[free[seen[free]]]
         own = own[~self._near(own, spots, 0.35)]
@@ -271,7 +303,7 @@ class MarkerTracker:
         )
         result, stderr, found = position.copy(), stderr.copy(), settled.copy()
         given = chosen >= 0
-        self._take(flat, free[given], spots[chosen[given]], result, stderr, found)
+        self._take(view, free[given], spots[chosen[given]], result, stderr, found)
         unused = np.ones(len(spots), bool)
         unused[chosen[given]] = False
         if not found.all() and unused.any():
@@ -283,10 +315,10 @@ class MarkerTracker:
             mutual = (away.argmin(axis=0)[spot] == np.arange(len(missing))) & (
                 away.min(axis=1) < 0.4 * self._pitch
             )
-            self._take(flat, missing[mutual], spots[unused][spot[mutual]], result, stderr, found)
+            self._take(view, missing[mutual], spots[unused][spot[mutual]], result, stderr, found)
         return result, found, stderr
 
-    def _common_jump(self, gray: NDArray[np.uint8]) -> FloatArray | None:
+    def _common_jump(self, image: NDArray[np.uint8]) -> FloatArray | None:
         """The displacement since the last frame that nearly all marks share, if there is clearly one.
 
         Every pair of a mark and a spot votes for its displacement (a Hough transform; Ballard 1981). Only
@@ -294,7 +326,7 @@ class MarkerTracker:
         but those of one side would agree with.
         """
         size = np.array([self._shape[1], self._shape[0]], np.float64)
-        spots, _ = self._spots.find(gray, 0.4, np.zeros(2), size)
+        spots, _ = self._spots.find(image, 0.4, np.zeros(2), size)
         if len(spots) == 0:
             return None
         cell = 0.1 * self._pitch
@@ -318,7 +350,7 @@ class MarkerTracker:
 
     def _take(
         self,
-        flat: NDArray[np.uint8],
+        view: NDArray[np.uint8],
         marks: IntArray,
         spots: FloatArray,
         position: FloatArray,
@@ -328,7 +360,7 @@ class MarkerTracker:
         """Measure marks at their spots and enter what is found, in place."""
         if len(marks) == 0:
             return
-        measured, gain, share, error = self._appearance.measure(flat, spots, marks)
+        measured, gain, share, error = self._appearance.measure(view, spots, marks)
         sharp = _trusted(gain, share) & (_lengths(measured - spots) < 0.6 * self._radius + 0.5)
         position[marks] = np.where(sharp[:, None], measured, spots)
         # A spot that hardly looks like the mark any more is still its place, to a part of its radius.
@@ -357,6 +389,12 @@ class MarkerTracker:
         Marks at the rim count three times: they hardly move, so the part that holds them is the right one.
         Where the marks of the reference fall into several grids without links, each has its own part.
         """
+        settled = np.zeros(self._count, np.bool_)
+        if compiled.active():
+            tracking_kernels.largest_part(
+                seen, stretch, self._links_begin, self._links, self._rim_weights, self._islands, settled
+            )
+            return settled
         linked = (stretch < 0.3).tolist()
         waiting = seen.tolist()
         neighbours = self._neighbours
@@ -375,7 +413,6 @@ class MarkerTracker:
             island = self._island[seed]
             if weight > best.get(island, (0, []))[0]:
                 best[island] = (weight, part)
-        settled = np.zeros(self._count, bool)
         for _, part in best.values():
             settled[part] = True
         return settled
