@@ -10,6 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from tactflow.vision import compiled
+
 
 class _Double:
     """A module in which everything of 32 bits is of 64 bits."""
@@ -33,13 +35,17 @@ OPENCV = _Double(cv2, CV_32F=cv2.CV_64F, batchDistance=_distances)
 
 @contextmanager
 def in_double(*modules: ModuleType) -> Iterator[None]:
-    """Inside the `with` block the functions of these modules compute in float64 where they use float32."""
+    """Inside the `with` block the functions of these modules compute in float64 where they use float32.
+
+    Compiled kernels have fixed types, and are not used.
+    """
     before = [(module, module.np, module.cv2) for module in modules if hasattr(module, "cv2")]
     try:
         for module in modules:
             module.np = NUMPY  # type: ignore[attr-defined]
             module.cv2 = OPENCV  # type: ignore[attr-defined]
-        yield
+        with compiled.switched(False):
+            yield
     finally:
         for module, numpy, opencv in before:
             module.np, module.cv2 = numpy, opencv  # type: ignore[attr-defined]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision import (
     change,
+    comparison,
     contact,
     imprint,
     inpaint,
@@ -141,10 +142,10 @@ def test_results_a_million_pixels_away_are_drawn_without_overflow() -> None:
 def both(compute: Callable[[], Any], *modules: Any) -> tuple[Any, Any]:
     """The result in single precision, and in double precision."""
     single = compute()
-    light._positions.cache_clear()
+    light.positions.cache_clear()
     with in_double(*modules):
         double = compute()
-    light._positions.cache_clear()
+    light.positions.cache_clear()
     return single, double
 
 
@@ -157,7 +158,7 @@ def test_single_precision_costs_the_contact_nothing(method: str) -> None:
         detector.add_reference(pictures.reference)
         return detector.detect(pictures.touched)
 
-    single, double = both(compute, contact, light, imprint)
+    single, double = both(compute, contact, comparison, light, imprint)
     # The bound of the docstring; measured 0 px and 1.4e-7.
     assert apart(single.mask, double.mask) <= 1
     assert single.strength == pytest.approx(double.strength, rel=1e-5)
@@ -183,10 +184,13 @@ def test_single_precision_costs_the_outline_nothing(kind: str) -> None:
 
 
 def test_single_precision_costs_the_fit_of_the_light_nothing() -> None:
-    cells = contact._cells(gel(dots=False).reference)[1], contact._cells(gel(dots=False).touched)[1]
+    untouched, touched = (
+        comparison._smoothed(comparison._cells(picture)[1])
+        for picture in (gel(dots=False).reference, gel(dots=False).touched)
+    )
 
     def compute() -> NDArray[Any]:
-        return light.LightChange(cells[0], np.full_like(cells[0], 0.25)).fit(cells[1])
+        return light.LightChange(untouched, np.full_like(untouched, 0.25)).fit(touched)
 
     single, double = both(compute, light)
     assert double.dtype == np.float64

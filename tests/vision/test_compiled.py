@@ -44,6 +44,22 @@ def test_a_kernel_does_what_its_loops_say() -> None:
         assert np.array_equal(fast, slow)
 
 
+def test_a_kernel_reads_what_must_not_be_written() -> None:
+    if not compiled.active():
+        pytest.skip('numba is not here: pip install "tactflow[fast]"')
+    values, sums = np.arange(4.0), np.empty(4)
+    values.setflags(write=False)
+    _running_sum(values, sums)
+    assert sums.tolist() == [0, 1, 3, 6]
+
+
+def test_a_kernel_refuses_what_its_signature_does_not_name() -> None:
+    if not compiled.active():
+        pytest.skip('numba is not here: pip install "tactflow[fast]"')
+    with pytest.raises(TypeError):
+        _running_sum(np.arange(8.0)[::2], np.empty(4))
+
+
 def test_switching_acts_inside_its_block_only() -> None:
     before = compiled.active()
     with compiled.switched(False):

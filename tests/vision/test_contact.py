@@ -23,6 +23,8 @@ from tactflow.vision.marker_mask import find_dot, marker_mask
 
 Image = NDArray[np.uint8]
 
+pytestmark = pytest.mark.usefixtures("each_way")
+
 
 def _gel(shape: tuple[int, int] = (160, 128)) -> NDArray[np.float64]:
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]] / max(shape)

@@ -16,6 +16,8 @@ from tactflow.vision.imprint import fill, imprint
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
 
+pytestmark = pytest.mark.usefixtures("each_way")
+
 SIZE = 100
 DOT = 7
 """Radius of a removed marker with its soft rim, px at half resolution: a large one."""

@@ -31,7 +31,10 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from types import ModuleType
 from typing import Any, Generic, ParamSpec, TypeVar
+
+import numpy as np
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -66,7 +69,12 @@ class Kernel(Generic[P, R]):
         if self._compiled is None:
             self.load()
             assert self._compiled is not None
-        return self._compiled(*args, **kwargs)
+        try:
+            return self._compiled(*args, **kwargs)
+        except TypeError:
+            # To numba, an array that must not be written is of another type.
+            given: Any = [_writable(value) for value in args]
+            return self._compiled(*given, **kwargs)
 
     def load(self) -> None:
         """Compile now, or take what is on disk; nothing happens where kernels are not active."""
@@ -100,6 +108,14 @@ def kernel(signature: str, *, reorder: bool = False) -> Callable[[Callable[P, R]
     return wrap
 
 
+def load(*modules: ModuleType) -> None:
+    """Load all kernels of some modules."""
+    for module in modules:
+        for value in vars(module).values():
+            if isinstance(value, Kernel):
+                value.load()
+
+
 def active() -> bool:
     """Whether kernels are used: numba is there, works, and is not switched off."""
     return _wanted and _works()
@@ -120,6 +136,11 @@ def switched(on: bool) -> Iterator[None]:
         yield
     finally:
         _wanted = before
+
+
+def _writable(value: object) -> object:
+    """A copy of an array that must not be written; anything else as it is."""
+    return value.copy() if isinstance(value, np.ndarray) and not value.flags.writeable else value
 
 
 @cache

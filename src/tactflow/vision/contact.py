@@ -31,29 +31,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.imprint import imprint
-from tactflow.vision.light import LightChange, light_change
-from tactflow.vision.marker_mask import halved_mask
+from tactflow.vision import comparison_kernels, compiled, imprint_kernels
+from tactflow.vision.comparison import CELL, UntouchedGel
+from tactflow.vision.imprint import fill_level, hidden_cells, outline_level
 from tactflow.vision.seed_contact import seed_contact_mask
 
 ContactMethod = Literal["noise", "colour", "seed"]
 Float = NDArray[np.float32]
 
-_CELL = 4
-"""Side of a cell, px: averages 16 pixels, so that noise of 2 grey levels is half a level."""
-_PRIOR = 8
-"""Number of frames that the noise guessed from the first frame's own grain counts for."""
-_QUANTISATION = 12**-0.5
-"""Standard deviation of rounding to whole grey levels."""
-_LEVELS = 6
-"""Ranges of brightness for which noise is guessed separately (shot noise grows with the light)."""
-_CORRELATED = 2.0
-"""How much less than white noise the guessed noise shrinks by smoothing: demosaicing and video compression
-leave little noise between neighbours, and more over distances."""
-_DARK = 0.1
-"""Part of the mean brightness that is added before changes are taken relative to the brightness."""
-_SHARP = 0.05
-"""Relative change by which an edge, moved by `shift`, begins to count less for the outline."""
 _WEAK = 0.02
 """Places with less of the summed squared deviation than this part of the main one's are wrinkles of it."""
 _LEAVE = 0.7
@@ -91,21 +76,6 @@ class ContactResult:
     mask: NDArray[np.uint8]
     touching: bool
     strength: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Reference:
-    """The untouched gel: (h, w, 3) float32 at a quarter, (2h, 2w, 3) at half resolution."""
-
-    mean: Float
-    shade: Float
-    weight: Float
-    sharper: Float
-    grey: Float
-    light: LightChange
-    half: Float
-    half_shade: Float
-    half_scale: Float
 
 
 def chi_square_threshold(probability: float) -> float:
@@ -185,17 +155,14 @@ class ContactDetector:
         self._relaxation = relaxation
         self._creep = creep
         self._distance = distance
+        if method == "noise":
+            compiled.load(comparison_kernels, imprint_kernels)
         self.reset()
 
     def reset(self) -> None:
         """Forget the reference."""
         self._last: NDArray[np.uint8] | None = None
-        self._count = 0
-        self._mean: Float | None = None
-        self._half: Float | None = None
-        self._squares: Float | None = None
-        self._noise: Float | None = None
-        self._known: _Reference | None = None
+        self._gel: UntouchedGel | None = None
         self._before: NDArray[np.bool_] | None = None
         self._limits: dict[int, float] = {}
         self._strongest = self._strongest_wide = 0.0
@@ -218,21 +185,11 @@ class ContactDetector:
         if self._method != "noise":
             self._last = image.copy()
             return
-        half, cells = _cells(image)
-        smooth = np.asarray(cv2.blur(cells, (3, 3)), np.float32)
-        if self._mean is None or self._half is None or self._squares is None:
-            self._mean, self._half = smooth, half.astype(np.float32)
-            self._squares = np.zeros_like(smooth)
-            self._noise = _spatial_noise(cells)
+        if self._gel is None:
+            self._gel = UntouchedGel(image, self._repeatability, self._tint, self._shift)
         else:
-            known = self._reference()
-            change = self._change(smooth, known)[0]
-            self._squares = self._squares + change * change * np.float32(self._count / (self._count + 1))
-            self._mean = self._mean + change / np.float32(self._count + 1)
-            self._half = self._half + (half - self._half) / np.float32(self._count + 1)
-        self._count += 1
+            self._gel.add(image)
         self._last = image
-        self._known = None
 
     def detect(self, image: NDArray[np.uint8], hidden: NDArray[np.uint8] | None = None) -> ContactResult:
         """Compare a frame with the untouched gel.
@@ -265,56 +222,13 @@ class ContactDetector:
         if self._last is not None and image.shape != self._last.shape:
             raise ValueError(f"required the reference's shape {self._last.shape}, got {image.shape}")
 
-    def _reference(self) -> _Reference:
-        if self._known is not None:
-            return self._known
-        assert self._mean is not None
-        assert self._half is not None
-        assert self._squares is not None
-        assert self._noise is not None
-        mean, count = self._mean, self._count
-        variance = (_PRIOR * self._noise**2 + self._squares) / (_PRIOR + count - 1)
-        steady = variance * (1 + 1 / count) + (self._shift / _CELL * _steepness(mean)) ** 2
-        variance = steady + (self._repeatability * mean) ** 2
-        light = LightChange(mean, np.asarray(variance, np.float32))
-        weight = 1 / np.sqrt(variance)
-        # One factor for all channels, so that a change in proportion to the brightness is none of colour.
-        sharper = (variance / (steady + (self._tint * mean) ** 2)).min(axis=2)
-        grey = mean * weight
-        grey /= np.linalg.norm(grey, axis=2, keepdims=True) + np.float32(1e-6)
-        dark = _DARK * self._half.mean(axis=(0, 1)) + 1
-        edge = self._shift / 2 * _steepness(self._half) / (_SHARP * (self._half + dark))
-        self._known = _Reference(
-            mean=mean,
-            shade=light.shade(mean),
-            weight=np.asarray(weight, np.float32),
-            sharper=np.asarray(sharper, np.float32),
-            grey=np.asarray(grey * weight * np.sqrt(sharper)[..., None], np.float32),
-            light=light,
-            half=self._half,
-            half_shade=light.shade(self._half),
-            half_scale=np.asarray(1 / ((self._half + dark) * np.sqrt(1 + edge**2)), np.float32),
-        )
-        return self._known
-
-    def _change(self, smooth: Float, known: _Reference) -> tuple[Float, Float]:
-        """Cells minus reference minus the light's change, and the latter's coefficients."""
-        found = known.light.fit(smooth)
-        expected = light_change(found, known.shade, slice(None), slice(None))
-        expected += known.mean
-        return np.subtract(smooth, expected, out=expected), found
-
     def _against_noise(self, image: NDArray[np.uint8], hidden: NDArray[np.uint8] | None) -> ContactResult:
-        known = self._reference()
-        half, cells = _cells(image)
-        change, found = self._change(np.asarray(cv2.blur(cells, (3, 3)), np.float32), known)
-        square = _squared_length(change * known.weight)
-        colour = _colour_change(change, square, known)
-        evidence = np.maximum(square, colour)
-        largest, largest_colour = cv2.minMaxLoc(square)[1], cv2.minMaxLoc(colour)[1]
-        strength = math.sqrt(max(largest, largest_colour))
+        assert self._gel is not None
         before, self._before = self._before, None
-        left = 1.0 if before is None else self._left(evidence, before)
+        change = self._gel.compare(image, before, self._evidence)
+        square, colour, evidence, left = change.square, change.colour, change.evidence, change.left
+        largest, largest_colour = change.largest, change.largest_colour
+        strength = math.sqrt(max(largest, largest_colour))
         self._evidence = evidence
         blobs = self._clear(square, largest, before, left)
         clear = bool(blobs)
@@ -330,15 +244,12 @@ class ContactDetector:
         self._before = _union(blobs, square.shape)
         if not clear and left < 1 - self._creep and self._outline is not None:
             return ContactResult(self._outline.copy(), True, strength)
-        mask = np.zeros((cells.shape[0] * _CELL, cells.shape[1] * _CELL), np.uint8)
+        mask = np.zeros(image.shape[:2], np.uint8)
         for rows, columns, inside in blobs:
-            level = _level(half, found, known, rows, columns, inside, hidden)
-            large = cv2.resize(level, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-            window = mask[
-                _CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop
-            ]
-            window |= np.asarray(cv2.compare(large, np.zeros(1), cv2.CMP_GT), np.uint8)
-        mask = np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
+            top, start = CELL * rows.start, CELL * columns.start
+            lengths = self._gel.lengths(change, rows, columns, inside)
+            below = None if hidden is None else hidden_cells(hidden, top, start, inside)
+            fill_level(outline_level(lengths, _BRIDGE / 2, below), top, start, mask)
         self._outline = mask if cv2.countNonZero(mask) else None
         return ContactResult(mask, self._outline is not None, strength)
 
@@ -384,14 +295,6 @@ class ContactDetector:
             return []
         return _blobs(evidence, self._limit(colour.size) / 4, math.inf, 0.0, belongs)
 
-    def _left(self, evidence: Float, before: NDArray[np.bool_]) -> float:
-        """Part of the change of the frame before that is left where that showed contact."""
-        if self._evidence is None:
-            return 1.0
-        inside = before.astype(np.float32).ravel()
-        now, then = float(inside @ evidence.ravel()), float(inside @ self._evidence.ravel())
-        return math.sqrt(now / then) if then > 0 else 1.0
-
     def _extent(self, cells: int) -> float:
         """Cells that a change of colour covers which is contact for its extent."""
         return max(_WIDE * cells, _CLUSTER * math.log(cells / self._false_alarms))
@@ -405,61 +308,12 @@ class ContactDetector:
 _Blob = tuple[slice, slice, NDArray[np.bool_]]
 
 
-def _level(
-    half: NDArray[np.uint8],
-    found: Float,
-    known: _Reference,
-    rows: slice,
-    columns: slice,
-    inside: NDArray[np.bool_],
-    hidden: NDArray[np.uint8] | None,
-) -> Float:
-    """Level set of one contact's outline, at half resolution, over a window given in cells."""
-    fine = slice(2 * rows.start, 2 * rows.stop), slice(2 * columns.start, 2 * columns.stop)
-    answer = np.asarray(cv2.subtract(half[fine], known.half[fine], dtype=cv2.CV_32F), np.float32)
-    expected = light_change(found, known.half_shade, *fine)
-    answer -= expected
-    answer *= known.half_scale[fine]
-    answer = np.asarray(cv2.GaussianBlur(answer, (3, 3), 0.8, dst=expected), np.float32)
-    size = (2 * inside.shape[1], 2 * inside.shape[0])
-    belongs = cv2.resize(inside.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    below = None if hidden is None else _halved_mask(hidden, rows, columns)
-    return imprint(answer, np.asarray(belongs, np.uint8), _BRIDGE / 2, below)
-
-
-def _halved_mask(mask: NDArray[np.uint8], rows: slice, columns: slice) -> NDArray[np.uint8]:
-    """A window, given in cells, of a mask at half resolution: 1 where any pixel is not 0, else 0."""
-    part = mask[_CELL * rows.start : _CELL * rows.stop, _CELL * columns.start : _CELL * columns.stop]
-    high, wide = _CELL * (rows.stop - rows.start), _CELL * (columns.stop - columns.start)
-    if part.shape != (high, wide):
-        below, beside = high - part.shape[0], wide - part.shape[1]
-        part = np.asarray(cv2.copyMakeBorder(part, 0, below, 0, beside, cv2.BORDER_CONSTANT), np.uint8)
-    return np.asarray(halved_mask(part) & np.uint8(1), np.uint8)
-
-
-def _squared_length(vectors: Float) -> Float:
-    """(h, w) float32: sum over the three channels of the squares of (h, w, 3) float32, which are lost."""
-    vectors *= vectors
-    return np.asarray(cv2.transform(vectors, np.ones((1, 3), np.float32)), np.float32)
-
-
 def _union(blobs: list[_Blob], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """(h, w) bool: cells of all blobs."""
     cells = np.zeros(shape, np.bool_)
     for rows, columns, inside in blobs:
         cells[rows, columns] |= inside
     return cells
-
-
-def _colour_change(change: Float, square: Float, known: _Reference) -> Float:
-    """(h, w) float32: squared deviation of the colour, chi-square with two degrees of freedom: without the
-    part of the change in which all channels go along with the brightness.
-
-    change : (h, w, 3) float32, grey levels. square : (h, w) float32, its squared deviation.
-    """
-    along = np.asarray(cv2.transform(change * known.grey, np.ones((1, 3), np.float32)), np.float32)
-    along *= along
-    return np.asarray(cv2.subtract(square * known.sharper, along, dst=along), np.float32)
 
 
 def _wide_change(colour: Float, extent: float) -> NDArray[np.bool_] | None:
@@ -487,7 +341,7 @@ def _blobs(
     outlines, _ = cv2.findContours(changed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     height, width = square.shape
     least = min(_LEAST, square.size // 4)
-    found: list[tuple[float, _Blob]] = []
+    found: list[_Blob] = []
     for outline in outlines:
         left, top, wide, high = cv2.boundingRect(outline)
         if wide * high < least:
@@ -504,51 +358,12 @@ def _blobs(
         peak = cv2.minMaxLoc(square[rows, columns], inside)[1]
         stays = before is not None and peak >= stay and bool((before[rows, columns] & belongs).any())
         if peak >= start or stays:
-            energy = cv2.mean(square[rows, columns], inside)[0] * area
-            found.append((energy, (rows, columns, belongs)))
-    found.sort(key=lambda entry: -entry[0])
-    return [blob for energy, blob in found[:_BLOBS] if energy >= _WEAK * found[0][0]]
-
-
-def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Float]:
-    """Means over 2 x 2 px, uint8, and over 4 x 4 px, float32; the border is repeated to make whole cells."""
-    bottom, right = -image.shape[0] % _CELL, -image.shape[1] % _CELL
-    padded = np.ascontiguousarray(image)
-    if bottom or right:
-        padded = np.asarray(cv2.copyMakeBorder(padded, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
-    height, width = padded.shape[:2]
-    half = cv2.resize(padded, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    cells = cv2.resize(half, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
-    return np.asarray(half, np.uint8), cells.astype(np.float32)
-
-
-def _steepness(picture: Float) -> Float:
-    """Grey levels per cell by which the brightness changes, here or in the cells around."""
-    along = cv2.Scharr(picture, cv2.CV_32F, 1, 0, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
-    across = cv2.Scharr(picture, cv2.CV_32F, 0, 1, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.dilate(cv2.magnitude(along, across), np.ones((3, 3), np.uint8)), np.float32)
-
-
-def _spatial_noise(cells: Float) -> Float:
-    """Standard deviation of smoothed cells guessed from one frame, as a function of brightness.
-
-    Second differences of neighbouring cells see the noise and hardly the shading; their median is not moved
-    by markers. Grain of the gel counts as noise here, which errs on the side of silence.
-    """
-    noise = np.full_like(cells, _QUANTISATION)
-    if cells.shape[1] < 3:
-        return noise
-    second = np.abs(cells[:, :-2] - 2 * cells[:, 1:-1] + cells[:, 2:]) * np.float32(1.4826 / math.sqrt(6))
-    for channel in range(3):
-        level = cells[:, 1:-1, channel].ravel()
-        order = np.argsort(level)
-        parts = [part for part in np.array_split(order, _LEVELS) if part.size]
-        center = [float(level[part].mean()) for part in parts]
-        spread = [float(np.median(second[..., channel].ravel()[part])) for part in parts]
-        noise[..., channel] = np.interp(cells[..., channel], center, spread)
-    # Smoothing 3 x 3 would divide by three were the cells independent; demosaicing and compression see to
-    # it that they are not quite.
-    return np.asarray(np.hypot(noise, _QUANTISATION) * (_CORRELATED / 3), np.float32)
+            found.append((rows, columns, belongs))
+    if len(found) < 2:
+        return found
+    energies = [float(square[rows, columns][belongs].sum()) for rows, columns, belongs in found]
+    order = sorted(range(len(found)), key=lambda index: -energies[index])
+    return [found[index] for index in order[:_BLOBS] if energies[index] >= _WEAK * energies[order[0]]]
 
 
 def _colour_distance(

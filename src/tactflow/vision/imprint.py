@@ -11,9 +11,22 @@ the change is not: averaged along the whole outline, the profile of the change a
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from tactflow.vision import compiled
+from tactflow.vision.imprint_kernels import (
+    cap_change,
+    continue_outline,
+    halve_window,
+    raise_level,
+    settle_level,
+    sum_profile,
+)
+from tactflow.vision.marker_mask import halved_mask
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
@@ -73,14 +86,32 @@ _PROFILE_STEP = 0.5
 _FEW = 8
 _ENOUGH = 8000
 """Pixels that are enough for the profile: of a window of n times as many, every n-th row is taken."""
-_INWARDS = np.array([1, -1], np.float32) / 16
+_INWARD = 1 / 16
 """Part of a pixel by which a continued outline is drawn in, so that halfway is outside on every side."""
 _STEPS = 24
 """Points of a continued part, more than it has pixels: lines drawn by OpenCV depend on their direction."""
 _POCKET = 0.8
 """Part of an area between a region and the frame's border that the region's hull covers if it belongs."""
 
+_NOTHING = np.zeros((0, 0), np.uint8)
+
 Outlines = list[NDArray[np.int32]]
+
+
+@dataclass(frozen=True, slots=True)
+class Lengths:
+    """A relative change without its colour.
+
+    strength : (h, w) float32, its length over the channels. mean : (h, w) float32, its mean over them. Both 0
+    where it does not belong to the contact. tone : sum of `mean`. total, squares : sum of `strength`, and of
+    its squares.
+    """
+
+    strength: Float
+    mean: Float
+    tone: float
+    total: float
+    squares: float
 
 
 def imprint(change: Float, inside: Mask, bridge: float = 4.0, hidden: Mask | None = None) -> Float:
@@ -100,22 +131,74 @@ def imprint(change: Float, inside: Mask, bridge: float = 4.0, hidden: Mask | Non
     level : (h, w) float32, positive inside the contact, negative outside; to be interpolated. Against float64
         it differs by at most 1e-3.
     """
+    if hidden is not None:
+        hidden = np.asarray(cv2.bitwise_and(hidden, hidden, mask=inside), np.uint8)
+    return outline_level(lengths_of(change, inside), bridge, hidden)
+
+
+def lengths_of(change: Float, inside: Mask) -> Lengths:
+    """How strong a change is: (h, w, 3) float32, of which only what is not 0 in `inside`, (h, w), counts."""
     sums = np.array([[1, 1, 1]], np.float32)
     mean = np.asarray(cv2.copyTo(cv2.transform(change, sums / 3), inside), np.float32)
     strength = np.asarray(cv2.sqrt(cv2.copyTo(cv2.transform(change * change, sums), inside)), np.float32)
-    typical = cv2.norm(strength, cv2.NORM_L2SQR) / max(cv2.norm(strength, cv2.NORM_L1), 1e-9)
+    total, squares = cv2.norm(strength, cv2.NORM_L1), cv2.norm(strength, cv2.NORM_L2SQR)
+    return Lengths(strength, mean, cv2.sumElems(mean)[0], total, squares)
+
+
+def outline_level(lengths: Lengths, bridge: float, hidden: Mask | None) -> Float:
+    """`imprint` of a change whose strength is known; its arrays are used up. hidden : 0 outside of it."""
+    strength, mean = lengths.strength, lengths.mean
+    typical = lengths.squares / max(lengths.total, 1e-9)
     cap = max(GLOSS * typical, 1e-9)
-    np.minimum(strength, np.float32(cap), out=strength)
-    sign = -1 if cv2.sumElems(mean)[0] < 0 else 1
-    mean *= np.float32(sign)
-    common: Float = np.minimum(mean, np.float32(cap / 3**0.5), out=mean)
-    if hidden is not None:
-        hidden = np.asarray(cv2.bitwise_and(hidden, hidden, mask=inside), np.uint8)
-        if not cv2.countNonZero(hidden):
-            hidden = None
-    if 6 * cv2.norm(common, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
-        return _brightened(common, _peak(common), hidden)
+    even, sign = cap / 3**0.5, -1.0 if lengths.tone < 0 else 1.0
+    if compiled.active():
+        sums = np.empty(2)
+        cap_change(strength, mean, sign, cap, even, sums)
+        squares, tones = sums.tolist()
+    else:
+        np.minimum(strength, np.float32(cap), out=strength)
+        np.multiply(mean, np.float32(sign), out=mean)
+        np.minimum(mean, np.float32(even), out=mean)
+        squares, tones = cv2.norm(strength, cv2.NORM_L2SQR), cv2.norm(mean, cv2.NORM_L2SQR)
+    if hidden is not None and not cv2.countNonZero(hidden):
+        hidden = None
+    if 6 * tones > squares:
+        return _brightened(mean, _peak(mean), hidden)
     return _tilted(strength, min(_peak(strength), UNEVEN * typical), bridge, hidden)
+
+
+def hidden_cells(hidden: Mask, top: int, left: int, inside: NDArray[np.bool_]) -> Mask:
+    """A window of a mask at half resolution, (2 h, 2 w) uint8: 1 where any pixel is not 0 and counts, else 0.
+
+    hidden : (H, W) uint8, over whose border the window may reach. top, left : of the window, px. inside :
+    (h, w) bool, which blocks of 4 x 4 px count.
+    """
+    high, wide = 2 * inside.shape[0], 2 * inside.shape[1]
+    if compiled.active():
+        halved = np.empty((high, wide), np.uint8)
+        halve_window(np.ascontiguousarray(hidden), top, left, inside.view(np.uint8), halved)
+        return halved
+    part = hidden[top : top + 2 * high, left : left + 2 * wide]
+    below, beside = 2 * high - part.shape[0], 2 * wide - part.shape[1]
+    if below or beside:
+        part = np.asarray(cv2.copyMakeBorder(part, 0, below, 0, beside, cv2.BORDER_CONSTANT), np.uint8)
+    counts = cv2.resize(inside.view(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.bitwise_and(halved_mask(part), counts), np.uint8)
+
+
+def fill_level(level: Float, top: int, left: int, mask: Mask) -> None:
+    """Set to 255 the pixels of a mask where a level set, interpolated to twice its size, is positive.
+
+    level : (h, w) float32. top, left : its place in the mask, over whose border it may reach. mask : (H, W)
+    uint8, changed in place.
+    """
+    if compiled.active():
+        raise_level(level, top, left, mask)
+        return
+    window = mask[top : top + 2 * level.shape[0], left : left + 2 * level.shape[1]]
+    large = cv2.resize(level, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+    above = np.asarray(cv2.compare(large, np.zeros(1), cv2.CMP_GT), np.uint8)
+    window |= above[: window.shape[0], : window.shape[1]]
 
 
 def _peak(values: Float) -> float:
@@ -128,10 +211,14 @@ def _brightened(mean: Float, peak: float, hidden: Mask | None) -> Float:
     if hidden is not None:
         # The change is smooth here: what is painted next to what is seen is nearly right.
         hidden = np.asarray(cv2.erode(hidden, np.ones((3, 3), np.uint8)), np.uint8)
-    filled = _pockets(*_outlined((level > 0).view(np.uint8), hidden))
-    wrong = (level > 0).view(np.uint8) != filled
-    level[wrong] = np.where(filled[wrong], np.float32(HALF), np.float32(-HALF))
-    return np.asarray(np.minimum(level, np.float32(HALF)) * np.float32(8), np.float32)
+    above = (level > 0).view(np.uint8)
+    filled = _pockets(*_outlined(above, hidden))
+    if compiled.active():
+        settle_level(level, filled, HALF, 8)
+        return level
+    sides = np.where(filled, np.float32(HALF), np.float32(-HALF))
+    level = np.where(above == filled, np.minimum(level, np.float32(HALF)), sides)
+    return np.asarray(level * np.float32(8), np.float32)
 
 
 def _tilted(strength: Float, peak: float, bridge: float, hidden: Mask | None) -> Float:
@@ -145,15 +232,7 @@ def _tilted(strength: Float, peak: float, bridge: float, hidden: Mask | None) ->
     if cv2.countNonZero(filled) == filled.size:
         return np.ones_like(strength)
     depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
-    rows = slice(None, None, max(1, filled.size // _ENOUGH))
-    seen = depth[rows]
-    if hidden is not None:
-        seen = np.asarray(cv2.copyTo(seen, 1 - hidden[rows]), np.float32)
-    flat = seen.ravel()
-    within = np.flatnonzero(flat)
-    bins = (flat[within] * np.float32(1 / _PROFILE_STEP)).astype(np.intp)
-    count = np.bincount(bins)[1:]
-    total = np.bincount(bins, weights=strength[rows].ravel()[within])[1:]
+    count, total = _profile(depth, strength, hidden)
     known = np.flatnonzero(count >= _FEW)
     if known.size < 2:
         return np.asarray(depth - np.float32(0.5), np.float32)
@@ -163,6 +242,28 @@ def _tilted(strength: Float, peak: float, bridge: float, hidden: Mask | None) ->
     middle = float(depth.max())
     soft = top - skirt - SHARP_SKIRT * (middle - top) - BLUR
     return np.asarray(depth - np.float32(min(rim + SOFTNESS * max(soft, 0.0), DEEPEST * middle)), np.float32)
+
+
+def _profile(
+    depth: Float, strength: Float, hidden: Mask | None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Number and sum of the strengths in bins of depth, from the second bin on."""
+    every = max(1, depth.size // _ENOUGH)
+    if compiled.active():
+        size = int((depth.shape[0] + depth.shape[1]) / _PROFILE_STEP) + 2
+        count, total = np.zeros(size, np.int64), np.zeros(size)
+        covered = _NOTHING if hidden is None else hidden
+        sum_profile(depth, strength, covered, every, 1 / _PROFILE_STEP, count, total)
+        return count[1:], total[1:]
+    rows = slice(None, None, every)
+    seen = depth[rows]
+    if hidden is not None:
+        seen = np.asarray(cv2.copyTo(seen, 1 - hidden[rows]), np.float32)
+    flat = seen.ravel()
+    within = np.flatnonzero(flat)
+    bins = (flat[within] * np.float32(1 / _PROFILE_STEP)).astype(np.intp)
+    numbers, sums = np.bincount(bins), np.bincount(bins, weights=strength[rows].ravel()[within])
+    return np.asarray(numbers[1:], np.int64), np.asarray(sums[1:], np.float64)
 
 
 def _crossing(profile: list[float], at: list[float], part: float) -> float:
@@ -204,6 +305,10 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     Between the last point before a marker and the first behind it runs the cubic that has the outline's
     direction at both (Hermite); where the outline turns back, which no cubic should guess, a straight line.
     """
+    if compiled.active():
+        line = np.empty((len(outline) + len(outline) // 2 * len(_CUBICS), 2), np.int32)
+        count = continue_outline(outline, hidden, _CUBICS, _INWARD, TANGENT, TURN, line)
+        return outline if count < 0 else line[:count] if count else None
     below = hidden[outline[:, 1], outline[:, 0]] > 0
     unseen = np.count_nonzero(below)
     if unseen == 0:
@@ -213,7 +318,7 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     # Begin behind a hidden part, so that no seen part is cut in two.
     start = int(np.argmax(below < np.roll(below, 1)))
     below = np.concatenate([below[start:], below[:start], below[start : start + 1]])
-    points = np.concatenate([outline[start:], outline[:start]]).astype(np.float32)
+    points = np.concatenate([outline[start:], outline[:start]]).astype(np.float64)
     count = len(points)
     # The first point is seen, so a change is in turn the first hidden one of a part and the first behind it.
     change = np.flatnonzero(below[1:] != below[:-1]) + 1
@@ -232,7 +337,7 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     ways *= (4 / np.maximum(2 + along.sum(axis=0), 1))[:, None]
     ways[:, ~ahead] = chord[~ahead]
     curves = _CUBICS @ np.stack([before, ways[0], after, ways[1]], axis=1)
-    inwards = chord[:, ::-1] * _INWARDS / np.sqrt(np.maximum(square, 1))[:, None]
+    inwards = chord[:, ::-1] * (_INWARD, -_INWARD) / np.sqrt(np.maximum(square, 1))[:, None]
     curves += inwards[:, None]
     pieces, last = [], 0
     for curve, left, back in zip(curves, first.tolist(), behind.tolist(), strict=True):
@@ -242,12 +347,11 @@ def _continued(outline: NDArray[np.int32], hidden: Mask) -> NDArray[np.int32] | 
     return np.asarray(np.rint(np.concatenate(pieces)), np.int32)
 
 
-def _cubics(steps: int) -> Float:
-    """(steps - 1, 4) float32: Hermite's cubics between start and end, both left out."""
+def _cubics(steps: int) -> NDArray[np.float64]:
+    """(steps - 1, 4): Hermite's cubics between start and end, both left out."""
     t = np.arange(1, steps) / steps
     back = 1 - t
-    cubics = np.stack([(1 + 2 * t) * back**2, t * back**2, t**2 * (3 - 2 * t), -(t**2) * back], axis=1)
-    return cubics.astype(np.float32)
+    return np.stack([(1 + 2 * t) * back**2, t * back**2, t**2 * (3 - 2 * t), -(t**2) * back], axis=1)
 
 
 _CUBICS = _cubics(_STEPS)

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.comparison_kernels import coarse_excess, fit_light
+
 Float = NDArray[np.float32]
 
 _BLOCK = 8
@@ -37,6 +39,7 @@ class LightChange:
         """reference, variance : (h, w, 3) float32, mean and variance of the cells of the untouched gel."""
         height, width = reference.shape[:2]
         self._blocks = (max(1, width // _BLOCK), max(1, height // _BLOCK))
+        self._by_rows, self._by_columns = _shares(self._blocks[1], height), _shares(self._blocks[0], width)
         self._center: Float = np.asarray(reference.mean(axis=(0, 1)), np.float32)
         x = np.broadcast_to(np.linspace(-0.5, 0.5, width, dtype=np.float32), (height, width))
         y = np.broadcast_to(np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None], (height, width))
@@ -49,8 +52,11 @@ class LightChange:
         self._basis: Float = np.ascontiguousarray(basis, np.float32)
         self._solve: Float = np.ascontiguousarray((inverse @ basis).transpose(0, 2, 1), np.float32)
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
+        self._solve_planes: Float = np.ascontiguousarray(self._solve.transpose(0, 2, 1))
         self._reference = self._coarse(reference)
-        self._limit: Float = np.float32(_CLIP) * np.sqrt(self._coarse(variance)).T[:, None, :]
+        self._planes: Float = np.ascontiguousarray(self._reference.T)
+        limit = np.float32(_CLIP) * np.sqrt(self._coarse(variance)).T[:, None, :]
+        self._limit: Float = np.ascontiguousarray(limit)
         self._lower: Float = -self._limit
 
     def shade(self, reference: Float) -> Float:
@@ -75,6 +81,16 @@ class LightChange:
                 break
         return np.asarray(found[:, 0], np.float32)
 
+    def fit_planes(self, planes: Float) -> Float:
+        """The same by compiled loops. planes : (3, h, w) float32, the frame's channels."""
+        excess = np.empty((3, self._reference.shape[0]), np.float32)
+        coarse_excess(planes, self._by_rows, self._by_columns, self._planes, excess)
+        found = np.zeros((3, 4), np.float32)
+        found[:, 0] = np.sort(excess, axis=1)[:, excess.shape[1] // 2]
+        limit = self._limit[:, 0]
+        fit_light(excess, self._basis, self._solve_planes, self._shrink, limit, _ROUNDS, _SETTLED, found)
+        return found
+
     def _coarse(self, cells: Float) -> Float:
         small = cv2.resize(np.ascontiguousarray(cells), self._blocks, interpolation=cv2.INTER_AREA)
         return np.asarray(small.reshape(-1, cells.shape[2]), np.float32)
@@ -87,7 +103,7 @@ def light_change(found: Float, shade: Float, rows: slice, columns: slice) -> Flo
     rows, columns : the window.
     """
     height, width = shade.shape[:2]
-    x, y = _positions(width)[columns], _positions(height)[rows]
+    x, y = positions(width)[columns], positions(height)[rows]
     offset, along_x, along_y, gain = found.T
     change: Float = np.asarray(cv2.transform(shade[rows, columns], np.diag(gain)), np.float32)
     flat = change.reshape(y.size, -1)
@@ -101,8 +117,15 @@ def light_change(found: Float, shade: Float, rows: slice, columns: slice) -> Flo
     return change
 
 
+def _shares(blocks: int, count: int) -> Float:
+    """(blocks, count) float32: which part of a block's mean each of `count` pixels in a row makes."""
+    edges = np.arange(blocks + 1) * (count / blocks)
+    pixels = np.arange(count)
+    covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
+    return np.asarray(np.maximum(covered, 0) * (blocks / count), np.float32)
+
+
 @lru_cache(maxsize=16)
-def _positions(count: int) -> Float:
-    positions = np.linspace(-0.5, 0.5, count, dtype=np.float32)
-    positions.setflags(write=False)
-    return positions
+def positions(count: int) -> Float:
+    """(count,) float32: where the pixels of a line are, -0.5 to 0.5; not to be written."""
+    return np.linspace(-0.5, 0.5, count, dtype=np.float32)
