@@ -7,6 +7,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled
+
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
@@ -25,6 +27,11 @@ _FORBIDDEN: Final = 1e3
 _LABELS: Final = 8
 # Where everybody's own best spot stretches no link by more than this, the own best is the joint best.
 _SMOOTH: Final = 0.35
+# Propagation ends when the best labels did not change so many times in a row, or after so many rounds.
+# Damping keeps messages around loops from oscillating.
+_CALM: Final = 3
+_MOST_ROUNDS: Final = 24
+_DAMPING: Final = 0.3
 
 
 def choose_spots(
@@ -70,6 +77,19 @@ def choose_spots(
     chosen = np.full(count, -1, np.int64)
     if count == 0 or len(spots) == 0:
         return chosen
+    if compiled.active():
+        return _choose_compiled(
+            np.ascontiguousarray(origin, np.float64),
+            np.ascontiguousarray(edges, np.int64),
+            np.ascontiguousarray(free, np.int64),
+            np.ascontiguousarray(settled, np.bool_),
+            np.ascontiguousarray(displacement, np.float64),
+            np.ascontiguousarray(expected, np.float64),
+            np.ascontiguousarray(spots, np.float64),
+            np.ascontiguousarray(strength, np.float64),
+            pitch,
+            farthest,
+        )
     rest, place = _complex(origin), _complex(spots)
     away = np.abs(_complex(expected)[:, :, None] - place).min(axis=0)
     labels = min(_LABELS, int((away <= farthest).sum(axis=1).max()))
@@ -127,6 +147,43 @@ def choose_spots(
     return _decide(belief, label)
 
 
+def _choose_compiled(
+    origin: FloatArray,
+    edges: IntArray,
+    free: IntArray,
+    settled: BoolArray,
+    displacement: FloatArray,
+    expected: FloatArray,
+    spots: FloatArray,
+    strength: FloatArray,
+    pitch: float,
+    farthest: float,
+) -> IntArray:
+    chosen, slot = np.full(len(free), -1, np.int64), np.empty(len(origin), np.int64)
+    label, unary = np.empty((len(free), _LABELS), np.int64), np.empty((len(free), _LABELS + 1))
+    labels = propose(
+        origin,
+        edges,
+        free,
+        settled,
+        displacement,
+        expected,
+        spots,
+        strength,
+        pitch,
+        farthest,
+        slot,
+        label,
+        unary,
+        chosen,
+    )
+    if labels < 0:
+        raise IndexError(f"required marks 0 to {len(origin) - 1} in edges and free, got others")
+    if labels > 0:
+        agree(origin, edges, free, slot, spots, label, unary, labels, chosen)
+    return chosen
+
+
 def _decide(belief: FloatArray, label: IntArray) -> IntArray:
     """The cheapest label of each mark; of two marks that want one spot, the surer one gets it."""
     count, labels = label.shape
@@ -171,16 +228,217 @@ def _propagate(unary: FloatArray, first: IntArray, second: IntArray, pair: NDArr
     belief = unary
     choice = np.argmin(belief, axis=1)
     unchanged = 0
-    for _ in range(24):
+    for _ in range(_MOST_ROUNDS):
         outgoing = belief[source] - message[reverse]
         fresh = (outgoing.T[:, :, None] + cost).min(axis=0)
         fresh -= fresh.min(axis=1, keepdims=True)
-        # Damping keeps messages around loops from oscillating.
-        message = 0.7 * fresh + 0.3 * message
+        message = (1 - _DAMPING) * fresh + _DAMPING * message
         belief = unary + collect @ message
         latest = np.argmin(belief, axis=1)
         unchanged = unchanged + 1 if np.array_equal(latest, choice) else 0
-        if unchanged == 3:
+        if unchanged == _CALM:
             break
         choice = latest
     return belief
+
+
+@compiled.kernel(
+    "int64(float64[:, ::1], int64[:, ::1], int64[::1], boolean[::1], float64[:, ::1], float64[:, :, ::1],"
+    "float64[:, ::1], float64[::1], float64, float64, int64[::1], int64[:, ::1], float64[:, ::1], int64[::1])"
+)
+def propose(
+    origin: FloatArray,
+    edges: IntArray,
+    free: IntArray,
+    settled: BoolArray,
+    displacement: FloatArray,
+    expected: FloatArray,
+    spots: FloatArray,
+    strength: FloatArray,
+    pitch: float,
+    farthest: float,
+    slot: IntArray,
+    label: IntArray,
+    unary: FloatArray,
+    chosen: IntArray,
+) -> int:
+    """The first half of `choose_spots`: the spots that each mark may choose and what they cost it alone.
+
+    Into `slot` (N,), the number of each mark among the free ones or -1; `label` (n, 8), the nearest spots;
+    `unary` (n, 9), their costs, and last that of no spot. Returns the number of labels, or 0 where nothing is
+    left to do: nothing is in reach, or everybody's best, now in `chosen`, is smooth; or -1 where `edges` or
+    `free` name marks that there are not.
+    """
+    count, opinions = len(free), len(expected)
+    for e in range(len(edges)):
+        if min(edges[e, 0], edges[e, 1]) < 0 or max(edges[e, 0], edges[e, 1]) >= len(origin):
+            return -1
+    for n in range(count):
+        if free[n] < 0 or free[n] >= len(origin):
+            return -1
+    most = min(_LABELS, len(spots))
+    away = np.empty((count, _LABELS))
+    slot[:] = -1
+    labels = 0
+    for n in range(count):
+        slot[free[n]] = n
+        filled = within = 0
+        for spot in range(len(spots)):
+            squared = np.inf
+            for k in range(opinions):
+                away_x, away_y = expected[k, n, 0] - spots[spot, 0], expected[k, n, 1] - spots[spot, 1]
+                squared = min(squared, away_x * away_x + away_y * away_y)
+            if filled == most and squared >= away[n, most - 1]:
+                continue
+            place = filled if filled < most else most - 1
+            while place > 0 and away[n, place - 1] > squared:
+                away[n, place], label[n, place] = away[n, place - 1], label[n, place - 1]
+                place -= 1
+            away[n, place], label[n, place] = squared, spot
+            filled = min(filled + 1, most)
+        for place in range(most):
+            away[n, place] = np.sqrt(away[n, place])
+            within += away[n, place] <= farthest
+        labels = max(labels, within)
+    if labels == 0:
+        return 0
+    for n in range(count):
+        for k in range(labels):
+            cost = away[n, k] / pitch
+            unary[n, k] = _SURPRISE * (cost * cost) + 0.4 * max(1.0 - strength[label[n, k]], 0.0)
+            if away[n, k] > farthest:
+                unary[n, k] = _FORBIDDEN
+        unary[n, labels] = _MISSING
+    for one in range(2):
+        for e in range(len(edges)):
+            n, anchor = slot[edges[e, one]], edges[e, 1 - one]
+            if n < 0 or not settled[anchor]:
+                continue
+            mark = free[n]
+            span_x, span_y = origin[anchor, 0] - origin[mark, 0], origin[anchor, 1] - origin[mark, 1]
+            scale = 1.0 / (span_x * span_x + span_y * span_y)
+            for k in range(labels):
+                change_x = displacement[anchor, 0] - (spots[label[n, k], 0] - origin[mark, 0])
+                change_y = displacement[anchor, 1] - (spots[label[n, k], 1] - origin[mark, 1])
+                stretch = (change_x * change_x + change_y * change_y) * scale
+                unary[n, k] += min(_STRETCH * stretch, _WORST_STRETCH)
+                if (change_x * span_x + change_y * span_y) * scale < -0.75:
+                    unary[n, k] += _FOLD
+            unary[n, labels] += _MISSING_LINK
+    taken = np.zeros(len(spots), np.bool_)
+    for n in range(count):
+        own = np.argmin(unary[n, : labels + 1])
+        if own == labels or taken[label[n, own]]:
+            return labels
+        chosen[n] = label[n, own]
+        taken[label[n, own]] = True
+    for e in range(len(edges)):
+        one, other = edges[e, 0], edges[e, 1]
+        first, second = slot[one], slot[other]
+        if not ((first >= 0 or settled[one]) and (second >= 0 or settled[other])) or max(first, second) < 0:
+            continue
+        span_x, span_y = origin[other, 0] - origin[one, 0], origin[other, 1] - origin[one, 1]
+        change_x = displacement[other, 0] if second < 0 else spots[chosen[second], 0] - origin[other, 0]
+        change_y = displacement[other, 1] if second < 0 else spots[chosen[second], 1] - origin[other, 1]
+        change_x -= displacement[one, 0] if first < 0 else spots[chosen[first], 0] - origin[one, 0]
+        change_y -= displacement[one, 1] if first < 0 else spots[chosen[first], 1] - origin[one, 1]
+        if not np.hypot(change_x, change_y) < _SMOOTH * np.hypot(span_x, span_y):
+            return labels
+    return 0
+
+
+@compiled.kernel(
+    "void(float64[:, ::1], int64[:, ::1], int64[::1], int64[::1], float64[:, ::1], int64[:, ::1],"
+    "float64[:, ::1], int64, int64[::1])"
+)
+def agree(
+    origin: FloatArray,
+    edges: IntArray,
+    free: IntArray,
+    slot: IntArray,
+    spots: FloatArray,
+    label: IntArray,
+    unary: FloatArray,
+    labels: int,
+    chosen: IntArray,
+) -> None:
+    """The second half of `choose_spots`, of what `propose` gave: propagation and decision, into `chosen`."""
+    count, states, links = len(free), labels + 1, 0
+    for e in range(len(edges)):
+        links += slot[edges[e, 0]] >= 0 and slot[edges[e, 1]] >= 0
+    # Link by link, there and back: who sends to whom, and what its label costs with the receiver's.
+    source, target = np.empty(2 * links, np.int64), np.empty(2 * links, np.int64)
+    pair = np.full((2 * links, states, states), _MISSING_LINK)
+    link = 0
+    for e in range(len(edges)):
+        one, other = edges[e, 0], edges[e, 1]
+        first, second = slot[one], slot[other]
+        if first < 0 or second < 0:
+            continue
+        source[link], target[link], source[link + 1], target[link + 1] = first, second, second, first
+        span_x, span_y = origin[other, 0] - origin[one, 0], origin[other, 1] - origin[one, 1]
+        scale = 1.0 / (span_x * span_x + span_y * span_y)
+        for k in range(labels):
+            here = label[first, k]
+            for m in range(labels):
+                there = label[second, m]
+                change_x = (spots[there, 0] - origin[other, 0]) - (spots[here, 0] - origin[one, 0])
+                change_y = (spots[there, 1] - origin[other, 1]) - (spots[here, 1] - origin[one, 1])
+                stretch = (change_x * change_x + change_y * change_y) * scale
+                cost = min(_STRETCH * stretch, _WORST_STRETCH)
+                if (change_x * span_x + change_y * span_y) * scale < -0.75:
+                    cost += _FOLD
+                if here == there:
+                    cost += _SHARED
+                pair[link, k, m] = pair[link + 1, m, k] = cost
+        link += 2
+    message = np.zeros((2 * links, states))
+    latest = np.empty((2 * links, states))
+    belief = unary[:, :states].copy()
+    total = np.empty((count, states))
+    choice = np.empty(count, np.int64)
+    for n in range(count):
+        choice[n] = np.argmin(belief[n])
+    unchanged = 0
+    for _ in range(_MOST_ROUNDS if links else 0):
+        total[:] = 0.0
+        for link in range(2 * links):
+            fresh = latest[link]
+            fresh[:] = np.inf
+            for k in range(states):
+                # The way back is the other of the two.
+                outgoing = belief[source[link], k] - message[link ^ 1, k]
+                for m in range(states):
+                    fresh[m] = min(fresh[m], outgoing + pair[link, k, m])
+            least = fresh[0]
+            for m in range(1, states):
+                least = min(least, fresh[m])
+            for m in range(states):
+                fresh[m] = (1 - _DAMPING) * (fresh[m] - least) + _DAMPING * message[link, m]
+                total[target[link], m] += fresh[m]
+        message, latest = latest, message
+        same = True
+        for n in range(count):
+            for m in range(states):
+                belief[n, m] = unary[n, m] + total[n, m]
+            best = np.argmin(belief[n])
+            same = same and best == choice[n]
+            choice[n] = best
+        unchanged = unchanged + 1 if same else 0
+        if unchanged == _CALM:
+            break
+    # Of two marks that want one spot, the surer one gets it.
+    owner = np.full(len(spots), -1, np.int64)
+    surplus = np.empty(count)
+    chosen[:] = -1
+    for n in range(count):
+        surplus[n] = belief[n, choice[n]] - belief[n, labels]
+        if choice[n] == labels:
+            continue
+        spot = label[n, choice[n]]
+        rival = owner[spot]
+        if rival >= 0:
+            if surplus[rival] <= surplus[n]:
+                continue
+            chosen[rival] = -1
+        owner[spot], chosen[n] = n, spot

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled, tracking_kernels
+from tactflow.vision import compiled, marker_matching, tracking_kernels
 from tactflow.vision.marker_appearance import MarkerAppearance
-from tactflow.vision.marker_matching import choose_spots
 from tactflow.vision.markers import Detection, refine_centers, require_image, to_gray
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -21,6 +20,16 @@ BoolArray = NDArray[np.bool_]
 
 # A mark is lost when the weights of the found marks around it (one a pitch away has 0.66) sum to less.
 _LEAST_SUPPORT: Final = 0.6
+# Spots for which there is room at first.
+_ROOM: Final = 1024
+_LOOPS: Final = (
+    tracking_kernels.judge,
+    tracking_kernels.largest_part,
+    tracking_kernels.peaks,
+    tracking_kernels.near,
+    marker_matching.propose,
+    marker_matching.agree,
+)
 
 
 class _Spots:
@@ -68,10 +77,25 @@ class _Spots:
         image = image[top : max(bottom, 0), left : max(right, 0)]
         if min(image.shape[:2]) < 3 * factor:
             return np.zeros((0, 2)), np.zeros(0)
-        response = self._response(to_gray(image))
+        response = self._response(_gray_part(image))
+        points, value = self._peaks(response, least * self.typical)
+        strength = np.asarray(value / self.typical, np.float64)
+        return points * factor + ((factor - 1) / 2 + left, (factor - 1) / 2 + top), strength
+
+    def _peaks(self, response: NDArray[np.float32], least: float) -> tuple[FloatArray, NDArray[np.float32]]:
+        """Highest pixels of their neighbourhood, (M, 2) with the vertex of a parabola along each axis, and
+        their response (M,)."""
+        if compiled.active():
+            room = _ROOM
+            while True:
+                points, value = np.empty((room, 2)), np.empty(room, np.float32)
+                count = tracking_kernels.peaks(response, least, len(self._neighbourhood) // 2, points, value)
+                if count <= room:
+                    return points[:count], value[:count]
+                room = count
         highest = cv2.dilate(response, self._neighbourhood)
         peak = cv2.compare(response, highest, cv2.CMP_GE)
-        _, strong = cv2.threshold(response, least * self.typical, 255, cv2.THRESH_BINARY)
+        _, strong = cv2.threshold(response, least, 255, cv2.THRESH_BINARY)
         peak = cv2.bitwise_and(peak, strong.astype(np.uint8))
         peak[0] = peak[-1] = 0
         peak[:, 0] = peak[:, -1] = 0
@@ -86,8 +110,7 @@ class _Spots:
             bend = np.minimum(before + after - 2 * value, np.float32(-1e-6))
             offset = 0.5 * (before - after) / bend
             points[:, axis] = whole + np.minimum(np.maximum(offset, -0.5), 0.5)
-        strength = np.asarray(value / self.typical, np.float64)
-        return points * factor + ((factor - 1) / 2 + left, (factor - 1) / 2 + top), strength
+        return points, value
 
 
 class MarkerTracker:
@@ -157,6 +180,10 @@ class MarkerTracker:
         )
         self._spots = _Spots(np.rint(mean).astype(np.uint8), detection)
         self._edges = np.ascontiguousarray(detection.edges, np.int64).reshape(-1, 2)
+        if len(self._edges) and not 0 <= self._edges.min() <= self._edges.max() < self._count:
+            raise ValueError(
+                f"required edges between marks 0 to {self._count - 1}, got {self._edges.tolist()}"
+            )
         self._edge_length = np.linalg.norm(
             self._origin[self._edges[:, 0]] - self._origin[self._edges[:, 1]], axis=1
         )
@@ -175,9 +202,10 @@ class MarkerTracker:
         self._links_begin = np.cumsum([0, *degree], dtype=np.int64)
         self._cell = 0.12 * self._pitch
         self._raster_shape = tuple(int(side / self._cell) + 2 for side in self._shape)
+        self._around_spot, self._around_mark = self._disc(0.35), self._disc(0.3)
         self._around, self._around_weight = _surroundings(self._origin, self._pitch)
-        for compiled_loop in (tracking_kernels.judge, tracking_kernels.largest_part):
-            compiled_loop.load()
+        for loop in _LOOPS:
+            loop.load()
         self.reset()
 
     def reset(self) -> None:
@@ -196,8 +224,7 @@ class MarkerTracker:
         require_image(image)
         if image.shape[:2] != self._shape:
             raise ValueError(f"required a frame of (height, width) {self._shape}, got {image.shape[:2]}")
-        if not compiled.active():
-            image = to_gray(image)
+        image = np.ascontiguousarray(image) if compiled.active() else to_gray(image)
         view = self._appearance.view(image)
         position, gain, share, stderr = self._appearance.measure(view, self._position)
         seen, stretch, doubt = self._judge(position, gain, share)
@@ -285,11 +312,11 @@ class MarkerTracker:
         spots, strength = self._spots.find(image, 0.25, low, high)
         # What was measured without belonging to that part is a spot like any other, if it is not one already.
         own = position[free[seen[free]]]
-        own = own[~self._near(own, spots, 0.35)]
-        unclaimed = ~self._near(spots, position[settled], 0.3)
+        own = own[~self._near(own, spots, self._around_spot)]
+        unclaimed = ~self._near(spots, position[settled], self._around_mark)
         spots = np.concatenate([spots[unclaimed], own])
         strength = np.concatenate([strength[unclaimed], np.full(len(own), 0.5)])
-        chosen = choose_spots(
+        chosen = marker_matching.choose_spots(
             self._origin,
             self._edges,
             free,
@@ -367,19 +394,26 @@ class MarkerTracker:
         stderr[marks] = np.where(sharp, error, 0.15 * self._radius)
         found[marks] = sharp | ((gain > 0.3) & (gain < 3.0) & (share > 0.33))
 
-    def _near(self, points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
-        """Which points have one of the others within so many pitches, to a tenth of a pitch; by a raster, so
-        that the cost does not grow with the product of their numbers."""
+    def _disc(self, distance: float) -> NDArray[np.uint8]:
+        """Cells within so many pitches of a cell."""
+        size = 2 * round(distance * self._pitch / self._cell) + 1
+        return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
+
+    def _near(self, points: FloatArray, others: FloatArray, disc: NDArray[np.uint8]) -> BoolArray:
+        """Which points have one of the others within a disc, to a tenth of a pitch; by a raster, so that the
+        cost does not grow with the product of their numbers."""
         if len(points) == 0 or len(others) == 0:
             return np.zeros(len(points), bool)
         height, width = self._raster_shape
         raster = np.zeros((height, width), np.uint8)
         scale, limits = 1 / self._cell, np.array([width - 1, height - 1])
+        if compiled.active():
+            found = np.empty(len(points), np.bool_)
+            tracking_kernels.near(points, others, scale, disc, raster, found)
+            return found
         column, row = np.minimum(np.maximum((others * scale + 0.5).astype(np.int64), 0), limits).T
         raster[row, column] = 1
-        size = 2 * round(distance * self._pitch * scale) + 1
-        element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        raster = np.asarray(cv2.dilate(raster, element), np.uint8)
+        raster = np.asarray(cv2.dilate(raster, disc), np.uint8)
         column, row = np.minimum(np.maximum((points * scale + 0.5).astype(np.int64), 0), limits).T
         return np.asarray(raster[row, column] > 0, np.bool_)
 
@@ -436,6 +470,11 @@ class MarkerTracker:
         position[missing[placed]] = self._origin[missing[placed]] + fitted[placed]
         position[missing[~placed]] = self._position[missing[~placed]]
         status[missing[~placed]] = MarkerStatus.LOST
+
+
+def _gray_part(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Of a part of a contiguous image, without a copy as `to_gray` makes."""
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _median(vectors: FloatArray) -> FloatArray:

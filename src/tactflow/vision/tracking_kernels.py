@@ -108,3 +108,65 @@ def largest_part(
     for home in range(count):
         for number in range(begin[home], end[home]):
             settled[order[number]] = True
+
+
+@kernel("int64(float32[:, ::1], float64, int64, float64[:, ::1], float32[::1])")
+def peaks(
+    response: NDArray[np.float32], least: float, reach: int, points: FloatArray, height: NDArray[np.float32]
+) -> int:
+    """What `_Spots._peaks` finds, into `points` and `height`; returns how many there are.
+
+    reach : of the square in which they are the highest. Only as many as there is room for are written.
+    """
+    count, rows, columns = 0, response.shape[0], response.shape[1]
+    half, flat, floor = np.float32(0.5), np.float32(-1e-6), np.float32(least)
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            value = response[row, column]
+            if not value > floor:
+                continue
+            highest = True
+            for y in range(max(row - reach, 0), min(row + reach + 1, rows)):
+                for x in range(max(column - reach, 0), min(column + reach + 1, columns)):
+                    highest = highest and not response[y, x] > value
+                if not highest:
+                    break
+            if not highest:
+                continue
+            if count < len(points):
+                before, after = response[row, column - 1], response[row, column + 1]
+                offset = half * (before - after) / min(before + after - (value + value), flat)
+                points[count, 0] = column + min(max(offset, -half), half)
+                before, after = response[row - 1, column], response[row + 1, column]
+                offset = half * (before - after) / min(before + after - (value + value), flat)
+                points[count, 1] = row + min(max(offset, -half), half)
+                height[count] = value
+            count += 1
+    return count
+
+
+@kernel("void(float64[:, ::1], float64[:, ::1], float64, uint8[:, ::1], uint8[:, ::1], boolean[::1])")
+def near(
+    points: FloatArray,
+    others: FloatArray,
+    scale: float,
+    element: NDArray[np.uint8],
+    raster: NDArray[np.uint8],
+    found: BoolArray,
+) -> None:
+    """Which points have one of the others within the element around their cell. raster : zeros, is used up;
+    `scale` cells per px."""
+    height, width = raster.shape
+    for n in range(len(others)):
+        column = min(max(int(others[n, 0] * scale + 0.5), 0), width - 1)
+        row = min(max(int(others[n, 1] * scale + 0.5), 0), height - 1)
+        raster[row, column] = 1
+    reach = element.shape[0] // 2
+    for n in range(len(points)):
+        column = min(max(int(points[n, 0] * scale + 0.5), 0), width - 1)
+        row = min(max(int(points[n, 1] * scale + 0.5), 0), height - 1)
+        found[n] = False
+        for y in range(max(row - reach, 0), min(row + reach + 1, height)):
+            for x in range(max(column - reach, 0), min(column + reach + 1, width)):
+                if raster[y, x] and element[y - row + reach, x - column + reach]:
+                    found[n] = True
