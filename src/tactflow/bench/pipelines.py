@@ -23,6 +23,7 @@ from tactflow.bench.timing import BLOCK, CopyUnit, Samples, quiet, timed
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
+from tactflow.vision import compiled
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.inpaint import SEED_RADIUS, remove_markers
 from tactflow.vision.seed_contact import seed_contact_mask, seed_difference, seed_marker_mask
@@ -102,6 +103,8 @@ class Times:
     stages: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
+PLAIN = "default-plain"
+"""Name under which the default pipeline runs without compiled kernels, where they would be used."""
 ORIGINAL = "original script"
 """The yardstick plus what the script repeats in every frame without need."""
 
@@ -197,7 +200,9 @@ def take_turns(
                 longest = 0
                 for name in list(active):
                     try:
-                        outcomes = running[name].block(block)
+                        # A pipeline waits outside of its turn, so that this acts on no other.
+                        with compiled.switched(compiled.active() and name != PLAIN):
+                            outcomes = running[name].block(block)
                     except TactflowError as error:
                         failures[name] = str(error)
                         active.remove(name)
