@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -102,6 +103,29 @@ def test_a_broken_numba_is_reported_and_left_alone(monkeypatch: pytest.MonkeyPat
         pytest.warns(RuntimeWarning, match=r"does not start \(Numba needs NumPy 1.0 or less\).*pip install"),
     ):
         assert not compiled.active()
+
+
+def test_compiling_is_announced_once_and_not_again_when_it_is_on_disk(tmp_path: Path) -> None:
+    if not compiled.active():
+        pytest.skip('numba is not here: pip install "tactflow[fast]"')
+    module = tmp_path / "loops.py"
+    module.write_text(
+        "import logging; logging.basicConfig(level='INFO')\n"
+        "from tactflow.vision import compiled\n"
+        "@compiled.kernel('int64(int64)')\n"
+        "def twice(n): return 2 * n\n"
+        "@compiled.kernel('int64(int64)')\n"
+        "def thrice(n): return 3 * n\n"
+        "import sys; compiled.load(sys.modules[__name__])\n"
+        "print(twice(3) + thrice(5))\n"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    said = [
+        subprocess.run([sys.executable, module], env=environment, capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+    assert [run.stdout.strip() for run in said] == ["21", "21"]
+    assert [run.stderr.count("once") for run in said] == [1, 0]
 
 
 def test_a_kernel_works_where_its_result_cannot_be_kept() -> None:

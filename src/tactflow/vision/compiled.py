@@ -23,6 +23,7 @@ without Python's lock: several segments of a pipeline work at the same time.
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 import warnings
@@ -35,6 +36,8 @@ from types import ModuleType
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
+
+logger = logging.getLogger("tactflow")
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -92,11 +95,14 @@ class Kernel(Generic[P, R]):
         }
         njit: Any = import_module("numba").njit
         try:
-            found: Callable[P, R] = njit(self._signature, cache=True, **options)(self.plain)
+            found: Any = njit(self._signature, cache=True, **options)(self.plain)
         except (RuntimeError, OSError):
             # No place on disk where numba could keep the result.
             found = njit(self._signature, **options)(self.plain)
-        return found
+        if found.stats.cache_misses:
+            _tell_once()
+        compiled_function: Callable[P, R] = found
+        return compiled_function
 
 
 def kernel(signature: str, *, reorder: bool = False) -> Callable[[Callable[P, R]], Kernel[P, R]]:
@@ -136,6 +142,11 @@ def switched(on: bool) -> Iterator[None]:
         yield
     finally:
         _wanted = before
+
+
+@cache
+def _tell_once() -> None:
+    logger.info("compiling loops for this processor: takes some seconds, once")
 
 
 def _writable(value: object) -> object:
