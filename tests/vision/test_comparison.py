@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision import comparison, compiled, imprint
 from tactflow.vision.comparison import CELL, Change, UntouchedGel
-from tactflow.vision.contact import ContactDetector
+from tactflow.vision.contact import ContactDetector, _closed_changes
 
 Image = NDArray[np.uint8]
 
@@ -129,6 +129,18 @@ def test_both_ways_fill_a_level_set_alike(
         with compiled.switched(on):
             imprint.fill_level(level, top, left, masks[-1])
     assert np.array_equal(*masks)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES, st.integers(0, 2**16))
+def test_both_ways_close_changes_alike(size: tuple[int, int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    square = (rng.random(size) < rng.uniform(0, 1)).astype(np.float32)
+    closed = []
+    for on in (True, False):
+        with compiled.switched(on):
+            closed.append(_closed_changes(square, 0.5))
+    assert np.array_equal(*closed)
 
 
 @pytest.mark.parametrize("seed", range(8))

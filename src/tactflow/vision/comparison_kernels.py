@@ -265,3 +265,29 @@ def relative_change(
             sums += length[x]
             tones += tone[x]
     summary[0], summary[1], summary[2] = tones, sums, squares
+
+
+@kernel("void(float32[:, ::1], float32, uint8[:, ::1])")
+def close_changes(square: Float, weak: float, closed: Byte) -> None:
+    """1 where `square` is above `weak`, after closing by 3 x 3, else 0; `closed` is filled."""
+    high, wide = square.shape
+    # A rim for each step: what is outside neither grows nor eats.
+    grown = np.ones((high + 2, wide + 2), np.uint8)
+    above = np.zeros((high + 2, wide + 2), np.uint8)
+    line = np.empty(wide + 2, np.uint8)
+    for y in range(high):
+        row = above[y + 1, 1:]
+        for x in range(wide):
+            row[x] = np.uint8(square[y, x] > weak)
+    for y in range(high):
+        upper, here, lower, row = above[y], above[y + 1], above[y + 2], grown[y + 1, 1:]
+        for x in range(wide + 2):
+            line[x] = upper[x] | here[x] | lower[x]
+        for x in range(wide):
+            row[x] = line[x] | line[x + 1] | line[x + 2]
+    for y in range(high):
+        upper, here, lower, row = grown[y], grown[y + 1], grown[y + 2], closed[y]
+        for x in range(wide + 2):
+            line[x] = upper[x] & here[x] & lower[x]
+        for x in range(wide):
+            row[x] = line[x] & line[x + 1] & line[x + 2]

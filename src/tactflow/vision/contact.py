@@ -327,6 +327,16 @@ def _wide_change(colour: Float, extent: float) -> NDArray[np.bool_] | None:
     return np.asarray(wide[labels], np.bool_) if wide.any() else None
 
 
+def _closed_changes(square: Float, weak: float) -> NDArray[np.uint8]:
+    """(h, w) uint8: 1 where a squared deviation is above `weak`, after closing by 3 x 3 cells, else 0."""
+    if compiled.active():
+        closed = np.empty(square.shape, np.uint8)
+        comparison_kernels.close_changes(square, weak, closed)
+        return closed
+    above = (square > weak).view(np.uint8)
+    return np.asarray(cv2.morphologyEx(above, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
+
+
 def _blobs(
     square: Float, weak: float, start: float, stay: float, before: NDArray[np.bool_] | None
 ) -> list[_Blob]:
@@ -335,9 +345,7 @@ def _blobs(
     square : (h, w) float32, squared deviations. weak : belongs to a contact if connected to it. start : makes
     a new contact. stay : keeps one. before : the cells that were in contact in the frame before.
     """
-    changed = np.asarray(
-        cv2.morphologyEx((square > weak).view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8
-    )
+    changed = _closed_changes(square, weak)
     outlines, _ = cv2.findContours(changed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     height, width = square.shape
     least = min(_LEAST, square.size // 4)
