@@ -12,8 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.types import Flow, Markers, MarkerStatus
+
+pytestmark = pytest.mark.usefixtures("each_way")
 
 GRID = np.stack(np.meshgrid(np.arange(10, 200, 15.0), np.arange(10, 160, 15.0)), axis=-1).reshape(-1, 2)
 EVERYWHERE = np.full((160, 200), 255, np.uint8)
@@ -106,10 +109,21 @@ def test_lost_markers_do_not_count_and_inferred_ones_do() -> None:
 
 def test_the_standard_error_needs_two_tracked_markers() -> None:
     status = np.full(len(GRID), MarkerStatus.INFERRED, np.uint8)
-    status[0] = MarkerStatus.TRACKED
     flow = flow_in_mask(markers(GRID + 1.0, status=status), EVERYWHERE)
     assert flow.stderr is None
     assert flow.count == len(GRID)
+    status[:2] = MarkerStatus.TRACKED
+    assert flow_in_mask(markers(GRID + 1.0, status=status), EVERYWHERE).stderr is not None
+
+
+def test_a_single_tracked_marker_stands_alone() -> None:
+    # What is inferred comes from neighbours, of which only one is in the contact.
+    status = np.full(len(GRID), MarkerStatus.INFERRED, np.uint8)
+    status[7] = MarkerStatus.TRACKED
+    position = GRID + 1.0
+    position[7] += 3.0
+    flow = flow_in_mask(markers(position, status=status), EVERYWHERE)
+    assert flow == Flow((4.0, 4.0), 1)
 
 
 def test_the_current_position_decides_who_is_inside() -> None:
@@ -206,6 +220,34 @@ def test_inside_is_the_same_as_looking_up_the_distance(
         squared = (columns - x) ** 2 + (rows - y) ** 2
         expected[k] = bool(len(squared)) and squared.min() <= dilate**2 + 1e-9
     np.testing.assert_array_equal(inside_mask(points, mask, dilate), expected)
+
+
+def test_with_numba_and_without_it_the_flow_is_the_same() -> None:
+    with compiled.switched(True):
+        if not compiled.active():
+            pytest.skip('numba is not here: pip install "tactflow[fast]"')
+    rng = np.random.default_rng(5)
+    for count in [1, 2, 3, 4, 5, 9, 40] * 6:
+        origin = rng.uniform(5, 150, (count, 2))
+        if rng.random() < 0.2:
+            origin[:, 1] = origin[:, 0]
+        position = origin + rng.normal(0, 2, (count, 2))
+        given = markers(position, np.asfortranarray(origin), rng.choice(3, count, p=[0.7, 0.2, 0.1]))
+        found = []
+        for on in (True, False):
+            with compiled.switched(on):
+                found.append(flow_in_mask(given, EVERYWHERE, dilate=9))
+        fast, slow = found
+        assert (fast.count, fast.rotation is None) == (slow.count, slow.rotation is None)
+        if slow.mean is None:
+            assert fast.mean is None
+            continue
+        # Derived: sums of 40 numbers of up to 2e2 px in doubles, in another order; squares of them.
+        assert fast.mean == pytest.approx(slow.mean, abs=1e-12)
+        assert fast.stderr == pytest.approx(slow.stderr, abs=1e-10)
+        assert fast.rotation == pytest.approx(slow.rotation, abs=1e-9)
+        assert fast.divergence == pytest.approx(slow.divergence, abs=1e-11)
+        assert fast.residual == pytest.approx(slow.residual, abs=1e-10)
 
 
 def test_the_inputs_stay_as_they_are() -> None:

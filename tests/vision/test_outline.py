@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled
 from tactflow.vision.flow import flow_in_mask, inside_mask
-from tactflow.vision.outline import inside_outline
+from tactflow.vision.outline import inside_outline, outline_depth
 from tactflow.vision.types import Markers
+
+pytestmark = pytest.mark.usefixtures("each_way")
 
 Y, X = np.mgrid[:160, :200]
 RADIUS = 4.65
@@ -113,6 +117,46 @@ def test_the_smallest_pictures_have_an_inside(shape: tuple[int, int]) -> None:
     mask = np.full(shape, 255, np.uint8)
     assert inside_outline(np.zeros((1, 2)), mask, HIDDEN).all()
     assert not inside_outline(np.array([[40.0, 40.0]]), mask, HIDDEN).any()
+
+
+def scribble(rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A region of any kind: smooth, with holes, in pieces, of single pixels, thin, cut by the border."""
+    kind = rng.integers(5)
+    if kind == 0:
+        return np.asarray(rng.random((1 + rng.integers(40), 1 + rng.integers(40))) < 0.4, np.uint8)
+    mask = np.zeros((int(rng.integers(1, 160)), int(rng.integers(1, 200))), np.uint8)
+    for _ in range(rng.integers(1, 5)):
+        center = int(rng.integers(mask.shape[1])), int(rng.integers(mask.shape[0]))
+        size = int(rng.integers(1, 60)), int(rng.integers(1, 60))
+        filled = -1 if kind < 4 else 1
+        cv2.ellipse(mask, center, size, float(rng.uniform(0, 180)), 0, 360, int(rng.integers(3)), filled)
+    return mask
+
+
+def test_with_numba_and_without_it_distances_are_the_same() -> None:
+    with compiled.switched(True):
+        if not compiled.active():
+            pytest.skip('numba is not here: pip install "tactflow[fast]"')
+    rng = np.random.default_rng(11)
+    bridged = 0
+    for _ in range(400):
+        mask = scribble(rng)
+        height, width = mask.shape
+        marks = rng.uniform(-12, [width + 12, height + 12], (30, 2))
+        # Some in the middle of a pixel, and so with distances on a threshold.
+        marks[:10] = np.rint(marks[:10])
+        hidden = float(rng.choice([0.0, 1.0, 3.5, 7.15, 12.0, 300.0]))
+        if rng.random() < 0.3:
+            mask, marks = np.asfortranarray(mask), np.asfortranarray(marks)
+        with compiled.switched(True):
+            fast = outline_depth(marks, mask, hidden, hidden + 5)
+        with compiled.switched(False):
+            slow = outline_depth(marks, mask, hidden, hidden + 5)
+            bridged += np.count_nonzero(slow != outline_depth(marks, mask, 0.0, hidden + 5))
+        # Derived: the ridge, 1e-6, and the tie, 1e-6 px, are what decides about an outline of two points
+        # around a mark; all else agrees to the 16 digits of doubles times a condition of at most 1e8.
+        np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-5)
+    assert bridged > 1000
 
 
 def test_quarter_turns_change_nothing() -> None:

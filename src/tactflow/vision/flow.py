@@ -9,10 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled
+from tactflow.vision.compiled import kernel
 from tactflow.vision.outline import inside_outline
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 Method = Literal["mean", "seed"]
+FloatArray = NDArray[np.float64]
 
 # Markers whose scatter across a line is below this share of that along it do not span a plane.
 _FLAT: Final = 1e-3
@@ -36,9 +39,11 @@ def flow_in_mask(
         (`tactflow.vision.outline`) and the distance counts to a fraction of a pixel; otherwise it is that
         between the pixel that a centre falls on and the nearest pixel of the mask.
     method : "mean" uses tracked and inferred markers with equal weight, since the mean is one over the
-        contact's area and not over how well each marker is seen; lost ones count nowhere. "seed" is the
-        original: every marker, position and displacement cut to whole pixels, a square of side
-        2 * round(dilate) + 1 as structuring element, nothing but mean and count.
+        contact's area and not over how well each marker is seen; but a single tracked marker stands alone,
+        since an inferred one has its motion from neighbours, which are then outside and move otherwise.
+        Lost ones count nowhere. "seed" is the original: every marker, position and displacement cut to
+        whole pixels, a square of side 2 * round(dilate) + 1 as structuring element, nothing but mean and
+        count.
 
     rotation and divergence come from the least-squares similarity that takes the markers' origins to their
     positions (closed form, as in Umeyama, 1991, here by complex numbers). Both and the residual are the
@@ -58,40 +63,84 @@ def flow_in_mask(
         raise ValueError(f"required method to be 'mean' or 'seed', got {method!r}")
     if method == "seed":
         return _seed_flow(markers, mask, round(dilate))
-    chosen = np.flatnonzero(markers.status != _LOST)
-    position = markers.position[chosen]
     if markers.radius is None:
-        chosen = chosen[inside_mask(position, mask, dilate)]
+        inside = inside_mask(markers.position, mask, dilate)
     else:
-        chosen = chosen[inside_outline(position, mask, markers.radius + HIDDEN, dilate)]
+        inside = inside_outline(markers.position, mask, markers.radius + HIDDEN, dilate)
+    chosen = np.flatnonzero(inside & (markers.status != _LOST))
+    seen = chosen[markers.status[chosen] == _TRACKED]
+    if len(seen) == 1:
+        chosen = seen
     count = len(chosen)
     if count == 0:
         return Flow(None, 0)
-    origin = markers.origin[chosen].astype(np.float64, copy=False)
-    moved = markers.position[chosen].astype(np.float64, copy=False) - origin
-    mean = moved.mean(axis=0)
-    left = moved - mean
-    tracked = int(np.count_nonzero(markers.status[chosen] == _TRACKED))
+    sums = _sums(np.asarray(markers.origin, np.float64), np.asarray(markers.position, np.float64), chosen)
+    x, y, turned, growth_x, growth_y, rest_x, rest_y = sums
     rotation = divergence = residual = None
-    parameters = 1
-    grid = origin - origin.mean(axis=0)
-    if count >= 3 and _spans_plane(grid):
-        z = grid[:, 0] + 1j * grid[:, 1]
-        d = left[:, 0] + 1j * left[:, 1]
-        growth = complex(np.vdot(z, d)) / float(np.vdot(z, z).real)
-        rest = d - growth * z
-        left = np.column_stack([rest.real, rest.imag])
-        # y points down: a positive turn of z is clockwise on the screen.
-        rotation = -math.degrees(math.atan2(growth.imag, 1 + growth.real)) + 0.0
-        divergence = 2 * growth.real + abs(growth) ** 2
-        residual = math.sqrt(float(np.vdot(rest, rest).real) / count)
-        # The similarity has four parameters, two for each axis.
-        parameters = 2
+    if turned:
+        # y points down: a positive turn is clockwise on the screen.
+        rotation = -math.degrees(math.atan2(growth_y, 1 + growth_x)) + 0.0
+        divergence = 2 * growth_x + growth_x * growth_x + growth_y * growth_y
+        residual = math.sqrt((rest_x + rest_y) / count)
     stderr = None
-    if tracked >= 2:
-        scatter = np.sqrt((left**2).sum(axis=0) / (count - parameters) / tracked)
-        stderr = (float(scatter[0]), float(scatter[1]))
-    return Flow((float(mean[0]), float(mean[1])), count, stderr, rotation, divergence, residual)
+    if len(seen) >= 2:
+        # The similarity has four parameters, two for each axis; the mean has one for each.
+        free = (count - (2 if turned else 1)) * len(seen)
+        stderr = (math.sqrt(rest_x / free), math.sqrt(rest_y / free))
+    return Flow((x, y), count, stderr, rotation, divergence, residual)
+
+
+def _sums(origin: FloatArray, position: FloatArray, chosen: NDArray[np.intp]) -> list[float]:
+    """Mean displacement x, y; 1 if the similarity is known, else 0; its real and imaginary part, less 1; the
+    sums of the squares, x and y, of what it leaves; of the markers `chosen` (n,) of (N, 2) px. See `_fit`."""
+    if compiled.active():
+        sums = np.empty(7)
+        _fit(np.ascontiguousarray(origin), np.ascontiguousarray(position), chosen, sums)
+        return sums.tolist()
+    grid = origin[chosen]
+    left = position[chosen] - grid
+    mean = left.mean(axis=0)
+    left -= mean
+    grid -= grid.mean(axis=0)
+    growth = np.zeros(2)
+    x, y = grid.T
+    squares = float(x @ x), float(y @ y)
+    scatter = squares[0] + squares[1]
+    # Product over squared sum of the principal scatters; about their ratio where one is small.
+    turned = len(grid) >= 3 and squares[0] * squares[1] - float(x @ y) ** 2 > _FLAT**2 * scatter**2
+    if turned:
+        growth = np.array([x @ left[:, 0] + y @ left[:, 1], x @ left[:, 1] - y @ left[:, 0]]) / scatter
+        left -= np.column_stack([growth[0] * x - growth[1] * y, growth[1] * x + growth[0] * y])
+    return [*mean.tolist(), float(turned), *growth.tolist(), *(left * left).sum(axis=0).tolist()]
+
+
+@kernel("void(float64[:, ::1], float64[:, ::1], int64[::1], float64[::1])")
+def _fit(origin: FloatArray, position: FloatArray, chosen: NDArray[np.intp], sums: FloatArray) -> None:
+    """Set `sums`, see `_sums`."""
+    count = chosen.size
+    at_x = at_y = mean_x = mean_y = 0.0
+    for index in chosen:
+        at_x, at_y = at_x + origin[index, 0], at_y + origin[index, 1]
+        mean_x += position[index, 0] - origin[index, 0]
+        mean_y += position[index, 1] - origin[index, 1]
+    at_x, at_y, mean_x, mean_y = at_x / count, at_y / count, mean_x / count, mean_y / count
+    xx = xy = yy = along = across = 0.0
+    for index in chosen:
+        x, y = origin[index, 0] - at_x, origin[index, 1] - at_y
+        u = position[index, 0] - origin[index, 0] - mean_x
+        v = position[index, 1] - origin[index, 1] - mean_y
+        xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
+        along, across = along + x * u + y * v, across + x * v - y * u
+    turned = count >= 3 and xx * yy - xy * xy > _FLAT * _FLAT * (xx + yy) * (xx + yy)
+    growth_x, growth_y = (along / (xx + yy), across / (xx + yy)) if turned else (0.0, 0.0)
+    rest_x = rest_y = 0.0
+    for index in chosen:
+        x, y = origin[index, 0] - at_x, origin[index, 1] - at_y
+        u = position[index, 0] - origin[index, 0] - mean_x - (growth_x * x - growth_y * y)
+        v = position[index, 1] - origin[index, 1] - mean_y - (growth_y * x + growth_x * y)
+        rest_x, rest_y = rest_x + u * u, rest_y + v * v
+    sums[0], sums[1], sums[2], sums[3], sums[4] = mean_x, mean_y, turned, growth_x, growth_y
+    sums[5], sums[6] = rest_x, rest_y
 
 
 def _check(mask: NDArray[np.uint8], dilate: float) -> None:
@@ -149,13 +198,6 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
 def _clip(values: NDArray[np.intp], high: int) -> NDArray[np.intp]:
     # np.clip costs 6 us a call on small arrays, these two 1 us.
     return np.minimum(np.maximum(values, 0), high)
-
-
-def _spans_plane(grid: NDArray[np.float64]) -> bool:
-    xx, yy = float(grid[:, 0] @ grid[:, 0]), float(grid[:, 1] @ grid[:, 1])
-    xy = float(grid[:, 0] @ grid[:, 1])
-    # Product over squared sum of the principal scatters; about their ratio where one is small.
-    return xx * yy - xy * xy > _FLAT**2 * (xx + yy) ** 2
 
 
 def _seed_flow(markers: Markers, mask: NDArray[np.uint8], dilate: int) -> Flow:

@@ -1,42 +1,38 @@
 """The outline of a contact where marks hide it: bridged from what is seen to both sides.
 
 Under a mark, and next to it, the gel's own light is not seen but filled in. A contact's region has a dent or
-a bulge there, by one to three pixels (measured on simulated contacts: -1.5 px on average, to within 1.5 px
-standard deviation; half a pixel where no mark is near). Whether a mark at the rim is inside must therefore
-not be asked of the region's pixels below it.
+a bulge there, however it was found: where the region's own outline is continued below marks, it errs at them
+by 0.9 px (scaled median deviation, on 600 simulated contacts), the bridge by 0.4 to 0.5 px. Whether a mark at
+the rim is inside must therefore not be asked of the region's pixels below it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled, outline_kernels
+from tactflow.vision.outline_kernels import ALONG, RIDGE, SIDE, STEPS, TIE
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-# How much of the outline to each side of a gap takes part in its bridge, in half widths of the gap (less: the
-# pixels' stairs tilt it; more: it cuts corners), and how many points of that.
-_SIDE: Final = 1.5
-_POINTS: Final = 12
 # For each point to the sides of a gap: whether it belongs to the first end or to the second, to which side
 # that is, and how far out it lies.
-_WHICH: Final = np.repeat([0, 1], _POINTS)
-_SIGN: Final = np.repeat([-1.0, 1.0], _POINTS)
-_OUTWARD: Final = _SIGN * np.tile(np.linspace(0, 1, _POINTS), 2)
-# Where along a gap its bridge is evaluated, in half widths from the middle.
-_STEPS: Final = np.linspace(-1, 1, 9)
-_BRIDGE: Final = np.stack([_STEPS**0, _STEPS, _STEPS**2], axis=1)
-_TANGENT: Final = np.stack([0 * _STEPS, _STEPS**0, 2 * _STEPS], axis=1)
+_WHICH: Final = np.repeat([0, 1], len(ALONG))
+_SIGN: Final = np.repeat([-1.0, 1.0], len(ALONG))
+_OUTWARD: Final = _SIGN * np.tile(ALONG, 2)
+_BRIDGE: Final = np.stack([STEPS**0, STEPS, STEPS**2], axis=1)
+_TANGENT: Final = np.stack([0 * STEPS, STEPS**0, 2 * STEPS], axis=1)
+_RIDGE: Final = np.diag(RIDGE)
+# Of an outline with more points, every second is enough.
 _MANY: Final = 400
 _NOBODY: Final = np.zeros(0, np.intp)
-# Weight of outline that other marks hide, against what is seen: it decides only where there is no other.
-_ELSEWHERE: Final = 0.02
-# A trace of ridge keeps a side of a few points solvable.
-_RIDGE: Final = np.diag([1e-9, 1e-6, 1e-6])
 
 
 def inside_outline(
@@ -71,45 +67,69 @@ def outline_depth(points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, 
 
     points, mask, hidden : as `inside_outline` takes them. reach : px, >= hidden; marks further than this from
         the region's bounding box are told -inf.
+
+    With numba and without, distances agree to 1e-5 px.
     """
     depth = np.full(len(points), -np.inf)
     if len(points) == 0 or mask.size == 0:
         return depth
     left, top, width, height = cv2.boundingRect(mask)
-    near = np.flatnonzero(
-        (points[:, 0] > left - reach)
-        & (points[:, 0] < left + width - 1 + reach)
-        & (points[:, 1] > top - reach)
-        & (points[:, 1] < top + height - 1 + reach)
-    )
-    if width == 0 or len(near) == 0:
+    if width == 0:
         return depth
     region = mask[top : top + height, left : left + width]
-    marks = np.asarray(points[near] - (left, top), np.float64)
+    lines = cv2.findContours(region, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE, offset=(left, top))[0]
+    box = (left - reach, top - reach, left + width - 1 + reach, top + height - 1 + reach)
+    outlines = [np.asarray(line[:: 2 if len(line) > _MANY else 1, 0], np.int32) for line in lines]
+    spacings = [2 if len(line) > _MANY else 1 for line in lines]
+    if compiled.active():
+        outline_kernels.outline_depths(
+            np.ascontiguousarray(points, np.float64),
+            np.ascontiguousarray(mask),
+            np.concatenate(outlines) if len(outlines) > 1 else np.ascontiguousarray(outlines[0]),
+            np.array([len(outline) for outline in outlines]),
+            np.array(spacings),
+            box,
+            hidden,
+            depth,
+        )
+        return depth
+    x, y = points[:, 0], points[:, 1]
+    near = np.flatnonzero((x > box[0]) & (y > box[1]) & (x < box[2]) & (y < box[3]))
+    if len(near):
+        depth[near] = _depths(np.asarray(points[near], np.float64), mask, outlines, spacings, hidden)
+    return depth
+
+
+def _depths(
+    marks: FloatArray,
+    mask: NDArray[np.uint8],
+    outlines: Sequence[NDArray[np.int32]],
+    spacings: Sequence[int],
+    hidden: float,
+) -> FloatArray:
+    """(n,) px: what the kernel `outline_depths` computes, for marks (n, 2) near the region."""
     column, row = np.rint(marks).astype(np.intp).T
-    on = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    on[on] = region[row[on], column[on]] != 0
-    squared = np.full(len(near), np.inf)
-    bridged = np.full(len(near), np.inf)
-    for outline in cv2.findContours(region, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]:
-        # Every second point is enough where there are many.
-        spacing = 2 if len(outline) > _MANY else 1
-        corners = outline[::spacing, 0].astype(np.float64)
+    on = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
+    on[on] = mask[row[on], column[on]] != 0
+    squared = np.full(len(marks), np.inf)
+    bridged = np.full(len(marks), np.inf)
+    for outline, spacing in zip(outlines, spacings, strict=True):
+        corners = outline.astype(np.float64)
         away = marks[:, :1] - corners[:, 0], marks[:, 1:] - corners[:, 1]
         lengths = away[0] * away[0] + away[1] * away[1]
-        np.minimum(squared, lengths.min(axis=1), out=squared)
-        seen = lengths > hidden * hidden
-        everywhere = np.asarray(seen.all(axis=0), np.bool_)
-        which, before, after = (_NOBODY,) * 3 if everywhere.all() else _gaps(seen)
+        nearest = lengths.min(axis=1)
+        np.minimum(squared, nearest, out=squared)
+        if nearest.min() > hidden * hidden:
+            continue
+        which, before, after = _gaps(lengths > hidden * hidden)
         if len(which):
-            found = _beyond(marks[which], corners, everywhere, before, after, hidden / spacing)
+            found = _beyond(marks[which], corners, before, after, hidden / spacing)
             for mark, value in zip(which.tolist(), found.tolist(), strict=True):
-                if abs(value) < abs(bridged[mark]):
+                if abs(value + TIE) < abs(bridged[mark] + TIE):
                     bridged[mark] = value
     distance = np.sqrt(squared)
     plain = np.where(on, distance + 0.5, 0.5 - distance)
-    depth[near] = np.where(np.isfinite(bridged), bridged + 0.5, plain)
-    return depth
+    return np.where(np.isfinite(bridged), bridged + 0.5, plain)
 
 
 def _gaps(seen: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
@@ -121,6 +141,8 @@ def _gaps(seen: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
     count = seen.shape[1]
     first = seen.argmax(axis=1)
     marks = np.flatnonzero(seen[np.arange(len(seen)), first] & ~seen.all(axis=1))
+    if len(marks) == 0:
+        return (_NOBODY,) * 3
     # Each row begins with a point that is seen, so that no gap goes round the end.
     rows = np.take_along_axis(seen[marks], (np.arange(count + 1) + first[marks, None]) % count, axis=1)
     row, place = np.nonzero(rows[:, 1:] != rows[:, :-1])
@@ -129,19 +151,14 @@ def _gaps(seen: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _beyond(
-    marks: FloatArray,
-    outline: FloatArray,
-    seen: NDArray[np.bool_],
-    before: IntArray,
-    after: IntArray,
-    half_width: float,
+    marks: FloatArray, outline: FloatArray, before: IntArray, after: IntArray, half_width: float
 ) -> FloatArray:
     """Signed distance (g,), px, of marks (g, 2) from the bridges over their gaps, positive inside.
 
     half_width : of a gap, points of the outline.
     """
     count = len(outline)
-    side = min(_SIDE * half_width, count / 2 - 1)
+    side = min(SIDE * half_width, count / 2 - 1)
     borders = np.stack([before, after], axis=1)
     ends = (borders.take(_WHICH, axis=1) + np.rint(_OUTWARD * side).astype(np.intp)) % count
     known = outline.take(ends, axis=0)
@@ -153,13 +170,13 @@ def _beyond(
     powers = np.empty((len(marks), 3, len(_WHICH)))
     powers[:, 0], powers[:, 1] = 1, place
     np.multiply(place, place, out=powers[:, 2])
-    weighted = powers * np.maximum(seen.take(ends), _ELSEWHERE)[:, None]
-    fit = np.linalg.solve(weighted @ powers.transpose(0, 2, 1) + _RIDGE, weighted @ known)
-    offset = marks[:, None] - _BRIDGE @ fit
+    # Relative to the mark, so that its place in the frame costs no digits.
+    fit = np.linalg.solve(powers @ powers.transpose(0, 2, 1) + _RIDGE, powers @ (known - marks[:, None]))
+    offset = _BRIDGE @ fit
     tangent = _TANGENT @ fit
-    nearest = (offset * offset).sum(axis=2).argmin(axis=1)
+    nearest = ((offset * offset).sum(axis=2) + TIE * STEPS).argmin(axis=1)
     rows = np.arange(len(marks))
     offset, tangent = offset[rows, nearest], tangent[rows, nearest]
     # Outlines go round so that the region lies to their left, as seen with y down.
-    across = tangent[:, 1] * offset[:, 0] - tangent[:, 0] * offset[:, 1]
+    across = tangent[:, 0] * offset[:, 1] - tangent[:, 1] * offset[:, 0]
     return np.asarray(across / np.maximum(np.sqrt((tangent * tangent).sum(axis=1)), 1e-9), np.float64)
