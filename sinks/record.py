@@ -26,6 +26,7 @@ from tactflow.message import encode_message
 from tactflow.ports import Image
 from tactflow.recording import missing_packages
 from tactflow.recording.names import next_name
+from tactflow.vision import compiled
 from tactflow.vision.types import Contact, Flow, Markers
 
 if TYPE_CHECKING:
@@ -375,6 +376,7 @@ class Record:
         facts = {
             "tactflow": __version__,
             "numpy": np.__version__,
+            "numba": compiled.numba_version() or "not used",
             "opencv": cv2.__version__,
             "python": platform.python_version(),
             "machine": f"{platform.system()} {platform.machine()}",
