@@ -65,8 +65,8 @@ def inside_outline(
 def outline_depth(points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, reach: float) -> FloatArray:
     """How deep marks lie inside a region: their distance (N,) from its outline, px, negative outside.
 
-    points, mask, hidden : as `inside_outline` takes them. reach : px, >= hidden; marks further than this from
-        the region's bounding box are told -inf.
+    points, mask, hidden : as `inside_outline` takes them. reach : px, >= hidden; where the outline is further
+        away, a mark is told inf inside, -inf outside.
 
     With numba and without, distances agree to 1e-5 px.
     """
@@ -90,13 +90,14 @@ def outline_depth(points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, 
             np.array(spacings),
             box,
             hidden,
+            reach,
             depth,
         )
         return depth
     x, y = points[:, 0], points[:, 1]
     near = np.flatnonzero((x > box[0]) & (y > box[1]) & (x < box[2]) & (y < box[3]))
     if len(near):
-        depth[near] = _depths(np.asarray(points[near], np.float64), mask, outlines, spacings, hidden)
+        depth[near] = _depths(np.asarray(points[near], np.float64), mask, outlines, spacings, hidden, reach)
     return depth
 
 
@@ -106,6 +107,7 @@ def _depths(
     outlines: Sequence[NDArray[np.int32]],
     spacings: Sequence[int],
     hidden: float,
+    reach: float,
 ) -> FloatArray:
     """(n,) px: what the kernel `outline_depths` computes, for marks (n, 2) near the region."""
     column, row = np.rint(marks).astype(np.intp).T
@@ -127,7 +129,7 @@ def _depths(
             for mark, value in zip(which.tolist(), found.tolist(), strict=True):
                 if abs(value + TIE) < abs(bridged[mark] + TIE):
                     bridged[mark] = value
-    distance = np.sqrt(squared)
+    distance = np.where(squared < reach * reach, np.sqrt(squared), np.inf)
     plain = np.where(on, distance + 0.5, 0.5 - distance)
     return np.where(np.isfinite(bridged), bridged + 0.5, plain)
 

@@ -29,7 +29,7 @@ _APART: Final = math.sqrt(2) + 1e-9
 
 @kernel(
     "void(float64[:, ::1], uint8[:, ::1], int32[:, ::1], int64[::1], int64[::1],"
-    " UniTuple(float64, 4), float64, float64[::1])"
+    " UniTuple(float64, 4), float64, float64, float64[::1])"
 )
 def outline_depths(
     points: Double,
@@ -39,6 +39,7 @@ def outline_depths(
     spacings: NDArray[np.int64],
     box: tuple[float, float, float, float],
     hidden: float,
+    reach: float,
     depth: Double,
 ) -> None:
     """Set the `depth` of each point that lies in `box` (left, top, right, bottom).
@@ -50,10 +51,10 @@ def outline_depths(
         x, y = points[mark, 0], points[mark, 1]
         if not (box[0] < x < box[2] and box[1] < y < box[3]):
             continue
-        nearest = bridged = np.inf
+        nearest, far, bridged = reach * reach, reach, np.inf
         end = 0
         for line in range(counts.size):
-            count, step = counts[line], _APART * spacings[line]
+            count, share = counts[line], 1 / (_APART * spacings[line])
             begin, end = end, end + count
             # From a point that is seen on, so that no gap goes round the end.
             first = begin
@@ -62,17 +63,19 @@ def outline_depths(
                 if away_x * away_x + away_y * away_y > hidden * hidden:
                     break
                 first += 1
+            some = first < end
+            index = here = first if some else begin
+            last = index + count
             before = -1
-            index = 0
-            while index <= count:
-                # Where all is hidden, `first` is the end, and the walk goes round from the beginning.
-                here = begin + (first - begin + index) % count
+            while index <= last:
+                here = index if index < end else index - count
                 away_x, away_y = x - outlines[here, 0], y - outlines[here, 1]
                 square = away_x * away_x + away_y * away_y
-                nearest = min(nearest, square)
+                if square < nearest:
+                    nearest, far = square, max(math.sqrt(square), hidden)
                 if square <= hidden * hidden:
-                    if before < 0 and first < end:
-                        before = begin + (first - begin + index - 1) % count
+                    if before < 0 and some:
+                        before = here - 1 if here > begin else end - 1
                     index += 1
                     continue
                 if before >= 0:
@@ -85,7 +88,9 @@ def outline_depths(
                     for sign in (-1, 1):
                         corner = before if sign < 0 else here
                         for out in ALONG:
-                            known = begin + (corner - begin + int(np.rint(sign * out * side))) % count
+                            # At most half way round.
+                            known = corner + int(np.rint(sign * out * side))
+                            known += count if known < begin else -count if known >= end else 0
                             away_x = np.float64(outlines[known, 0] - outlines[corner, 0])
                             away_y = np.float64(outlines[known, 1] - outlines[corner, 1])
                             t = sign * (1 + math.sqrt(away_x * away_x + away_y * away_y) / half)
@@ -117,10 +122,11 @@ def outline_depths(
                         bridged = value
                     before = -1
                 # No point that is left out is nearer than the nearest so far, or hidden.
-                index += max(1, int((math.sqrt(square) - max(math.sqrt(nearest), hidden)) / step))
+                index += max(1, int((math.sqrt(square) - far) * share))
         if bridged < np.inf:
             depth[mark] = bridged + 0.5
             continue
         column, row = int(np.rint(x)), int(np.rint(y))
         on = 0 <= column < mask.shape[1] and 0 <= row < mask.shape[0] and mask[row, column] != 0
-        depth[mark] = math.sqrt(nearest) + 0.5 if on else 0.5 - math.sqrt(nearest)
+        distance = math.sqrt(nearest) if nearest < reach * reach else np.inf
+        depth[mark] = distance + 0.5 if on else 0.5 - distance
