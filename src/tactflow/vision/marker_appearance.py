@@ -55,7 +55,6 @@ class MarkerAppearance:
         width = reference.shape[1] + 2 * self.pad
         self._strides = np.array([1, width])
         self._first = self.pad * (width + 1)
-        self._offsets = (grid_y[disc] * width + grid_x[disc]).astype(np.int64)
         self.pixels = int(disc.sum())
         self._disc = np.array([grid_x[disc], grid_y[disc]], np.int64)
         x, y = grid_x[disc] / radius, grid_y[disc] / radius
@@ -65,21 +64,25 @@ class MarkerAppearance:
         steps = (np.arange(_PHASES) + 0.5) / _PHASES - 0.5
         # Rows of whole vector registers: the pixels after the patch's own weigh nothing.
         length = -(-self.pixels // _LANES) * _LANES
+        self._offsets = np.zeros(length, np.int64)
+        self._offsets[: self.pixels] = self._disc[1] * width + self._disc[0]
         weights = np.zeros((_PHASES, _PHASES, count, 6, length), np.float32)
         gram = np.empty((_PHASES, _PHASES, count, 3, 3), np.float32)
         spread = np.empty((_PHASES, _PHASES, count), np.float32)
-        half = 0.25
-        for row, phase_y in enumerate(steps):
-            for column, phase_x in enumerate(steps):
-                phase = np.array([phase_x, phase_y])
+        # A slope spans the phases on either side, in binary fractions: most looks serve several times.
+        half = 1 / _PHASES
+        looks: dict[tuple[float, float], FloatArray] = {}
 
-                def look(shift_x: float, shift_y: float, phase: FloatArray = phase) -> FloatArray:
-                    points = origin - phase - (shift_x, shift_y)
-                    return _resample(reference, points, reach)[:, disc]
+        def look(right: float, down: float) -> FloatArray:
+            if (right, down) not in looks:
+                looks[right, down] = _resample(reference, origin - (right, down), reach)[:, disc]
+            return looks[right, down]
 
-                mark = look(0, 0)
-                slope_x = (look(half, 0) - look(-half, 0)) / (2 * half)
-                slope_y = (look(0, half) - look(0, -half)) / (2 * half)
+        for row, phase_y in enumerate(steps.tolist()):
+            for column, phase_x in enumerate(steps.tolist()):
+                mark = look(phase_x, phase_y)
+                slope_x = (look(phase_x + half, phase_y) - look(phase_x - half, phase_y)) / (2 * half)
+                slope_y = (look(phase_x, phase_y + half) - look(phase_x, phase_y - half)) / (2 * half)
                 lit = mark if dark else np.ones_like(mark)
                 plane, _ = np.linalg.qr(np.stack([np.ones_like(lit), lit * x, lit * y], axis=2))
                 basis = np.stack([mark, slope_x, slope_y], axis=1)
@@ -109,7 +112,7 @@ class MarkerAppearance:
         rim, so that patches may reach over the border, flat.
         """
         if compiled.active():
-            return np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
+            return np.ascontiguousarray(image if image.ndim == 3 else image[:, :, None])
         pad = self.pad
         return np.asarray(
             cv2.copyMakeBorder(to_gray(image), pad, pad, pad, pad, cv2.BORDER_REPLICATE), np.uint8
@@ -168,10 +171,10 @@ class MarkerAppearance:
         quarter = (inside * _PHASES + _PHASES / 2).astype(np.int64)
         index = quarter // _PHASES @ self._strides + self._first
         which = quarter % _PHASES @ self._phase_strides + marks
-        patch = np.zeros((len(marks), self._weights.shape[2]), np.float32)
-        patch[:, : self.pixels] = flat.take(index[:, None] + self._offsets)
+        patch = flat.take(index[:, None] + self._offsets).astype(np.float32)
         # Far from zero, sums of squares would lose digits.
-        patch[:, : self.pixels] -= np.float32(128)
+        patch -= np.float32(128)
+        patch[:, self.pixels :] = 0
         sums = np.matmul(self._weights.take(which, axis=0), patch[:, :, None])
         theta, level = sums[:, :3], sums[:, 3:, 0]
         seen = np.vecdot(np.matmul(self._gram.take(which, axis=0), theta)[:, :, 0], theta[:, :, 0])

@@ -20,6 +20,9 @@ BoolArray = NDArray[np.bool_]
 
 # A mark is lost when the weights of the found marks around it (one a pitch away has 0.66) sum to less.
 _LEAST_SUPPORT: Final = 0.6
+# Neighbours whose displacements differ by less than this share of their distance are beyond doubt.
+_STEEP: Final = 0.4
+_TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 # Spots for which there is room at first.
 _ROOM: Final = 1024
 _LOOPS: Final = (
@@ -167,6 +170,7 @@ class MarkerTracker:
             raise ValueError(f"required max_displacement > 0 px, got {max_displacement:g}")
         mean = np.asarray(np.mean(np.stack(grays), axis=0, dtype=np.float32))
         self._shape = grays[0].shape
+        self._shapes = (self._shape, (*self._shape, 3))
         self._origin = np.array(detection.centers, np.float64)
         if len(grays) > 1:
             dark = mean if detection.polarity == "dark" else 255 - mean
@@ -187,6 +191,7 @@ class MarkerTracker:
         self._edge_length = np.linalg.norm(
             self._origin[self._edges[:, 0]] - self._origin[self._edges[:, 1]], axis=1
         )
+        self._edge_first, self._edge_second = map(np.ascontiguousarray, self._edges.T)
         self._neighbours: list[list[tuple[int, int]]] = [[] for _ in range(self._count)]
         for number, (first, second) in enumerate(self._edges.tolist()):
             self._neighbours[first].append((second, number))
@@ -212,7 +217,7 @@ class MarkerTracker:
         """Forget what was tracked; the reference stays."""
         self._position = self._origin.copy()
         self._seen = np.ones(self._count, bool)
-        self._accepted = np.zeros(len(self._edges))
+        self._steepest = np.full(len(self._edges), _STEEP)
         self._age = 0
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
@@ -221,8 +226,8 @@ class MarkerTracker:
         image : (H, W, 3) uint8 BGR or (H, W) uint8, of the reference's size.
         Returns fresh arrays; `stderr` is NaN for marks that are not seen. Raises ValueError for another size.
         """
-        require_image(image)
-        if image.shape[:2] != self._shape:
+        if image.shape not in self._shapes or image.dtype != np.uint8:
+            require_image(image)
             raise ValueError(f"required a frame of (height, width) {self._shape}, got {image.shape[:2]}")
         image = np.ascontiguousarray(image) if compiled.active() else to_gray(image)
         view = self._appearance.view(image)
@@ -232,11 +237,12 @@ class MarkerTracker:
         # Something is missing or strongly stretched: look again now and then.
         if doubt == 2 or (doubt == 1 and self._age >= 10):
             position, seen, stderr = self._search(image, view, position, seen, stderr, stretch)
-            self._accepted = self._stretch(position)
+            # What this search has left stretched is no reason for another, within bounds.
+            self._steepest = np.minimum(np.maximum(_STEEP, self._stretch(position) + 0.15), 0.7)
             self._age = 0
-        status = np.full(self._count, MarkerStatus.TRACKED, np.uint8)
+        status = np.full(self._count, _TRACKED)
         stderr = stderr.astype(np.float64)
-        if not seen.all():
+        if doubt and not seen.all():
             stderr[~seen] = np.nan
             self._infer(position, seen, status)
         self._position, self._seen = position, seen
@@ -245,7 +251,7 @@ class MarkerTracker:
     def _stretch(self, position: FloatArray) -> FloatArray:
         """By how much the displacements of neighbours differ, as a fraction of their distance: (E,)."""
         moved = position - self._origin
-        change = _lengths(moved[self._edges[:, 0]] - moved[self._edges[:, 1]])
+        change = _lengths(moved.take(self._edge_first, axis=0) - moved.take(self._edge_second, axis=0))
         return np.asarray(change / self._edge_length, np.float64)
 
     def _judge(
@@ -264,10 +270,11 @@ class MarkerTracker:
                 share,
                 self._edges,
                 self._edge_length,
-                self._accepted,
+                self._steepest,
                 self._seen,
                 longest,
                 restless,
+                _STEEP,
                 seen,
                 stretch,
             )
@@ -275,12 +282,13 @@ class MarkerTracker:
         move = _lengths(position - self._position)
         seen = _trusted(gain, share) & (move < longest)
         stretch = self._stretch(position)
-        rough = stretch > np.maximum(0.4, self._accepted + 0.15)
-        rough |= stretch > 0.7
-        if (self._seen & ~seen).any() or (rough & seen[self._edges[:, 0]] & seen[self._edges[:, 1]]).any():
-            return seen, stretch, 2
-        if seen.all() and stretch.max(initial=0.0) < 0.4:
+        if seen.all() and stretch.max(initial=0.0) < _STEEP:
             return seen, stretch, 0
+        rough = np.flatnonzero(stretch > self._steepest)
+        if (self._seen & ~seen).any() or (
+            seen[self._edge_first[rough]] & seen[self._edge_second[rough]]
+        ).any():
+            return seen, stretch, 2
         # Something is missing or strongly stretched: look at once where the rest has moved.
         return seen, stretch, 2 if move[seen].max(initial=0.0) > restless else 1
 

@@ -14,7 +14,7 @@ BoolArray = NDArray[np.bool_]
 
 @kernel(
     "int64(float64[:, ::1], float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1],"
-    "float64[::1], float64[::1], boolean[::1], float64, float64, boolean[::1], float64[::1])"
+    "float64[::1], float64[::1], boolean[::1], float64, float64, float64, boolean[::1], float64[::1])"
 )
 def judge(
     position: FloatArray,
@@ -24,20 +24,21 @@ def judge(
     share: NDArray[np.float32],
     edges: IntArray,
     length: FloatArray,
-    accepted: FloatArray,
+    steepest: FloatArray,
     seen_before: BoolArray,
     longest: float,
     restless: float,
+    steep: float,
     seen: BoolArray,
     stretch: FloatArray,
 ) -> int:
     """What `MarkerTracker._judge` finds out, into `seen` and `stretch`; returns the doubt.
 
     longest : step of a mark that is seen, px. restless : step that calls for a search where something is
-    missing, px.
+    missing, px. steep, steepest : of the whole field, and of each edge (E,), beyond which there is doubt.
     """
     missing = lost = rough = False
-    farthest = steepest = 0.0
+    farthest = most = 0.0
     for n in range(len(position)):
         move_x, move_y = position[n, 0] - before[n, 0], position[n, 1] - before[n, 1]
         move = np.sqrt(move_x * move_x + move_y * move_y)
@@ -53,12 +54,12 @@ def judge(
         change_x = (position[one, 0] - origin[one, 0]) - (position[other, 0] - origin[other, 0])
         change_y = (position[one, 1] - origin[one, 1]) - (position[other, 1] - origin[other, 1])
         stretch[e] = np.sqrt(change_x * change_x + change_y * change_y) / length[e]
-        steepest = max(steepest, stretch[e])
-        if stretch[e] > 0.7 or stretch[e] > max(0.4, accepted[e] + 0.15):
+        most = max(most, stretch[e])
+        if stretch[e] > steepest[e]:
             rough = rough or (seen[one] and seen[other])
     if lost or rough:
         return 2
-    if not missing and steepest < 0.4:
+    if not missing and most < steep:
         return 0
     return 2 if farthest > restless else 1
 
