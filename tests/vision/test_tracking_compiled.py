@@ -63,7 +63,7 @@ def check_measures(
     np.testing.assert_allclose(found[3], expected[3], atol=1e-5, rtol=rounding)
 
 
-# Where a patch has hardly any contrast beside its light, what the mark leaves unexplained is the difference of
+# Where a patch has hardly any contrast beside its light, what the mark leaves unexplained is a difference of
 # sums up to 1e6 times as large, whose rounding shows: measured 1.2e-3 of it.
 FLAT = 5e-3
 
