@@ -12,6 +12,8 @@ from tactflow.vision.marker_mask import Dot, find_dot, marker_mask
 
 Image = NDArray[np.uint8]
 
+pytestmark = pytest.mark.usefixtures("each_way")
+
 
 def _dots(
     shape: tuple[int, int] = (200, 160), radius: float = 5.0, pitch: int = 30, dark: bool = True

@@ -23,6 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactflow.vision.halving import halved
+
 Method = Literal["area", "pyramid"]
 FloatArray = NDArray[np.float64]
 
@@ -232,7 +234,7 @@ class Preprocessor:
         """Exact mapping between raw and processed pixels."""
         self._rotate = rotate
         self._method = method
-        self._shrunk: list[NDArray[Any]] = []
+        self._shrunk: list[NDArray[np.uint8]] = []
         self._resampler: _Resampler | None = None
         if lens is not None or homography is not None:
             self._resampler = _Resampler(self.mapping if method == "area" else before_pyramid)
@@ -258,7 +260,7 @@ class Preprocessor:
         if self._method == "pyramid" and self._levels:
             return self._pyramid(block if self._rotate == 0 else cv2.rotate(block, _ROTATIONS[self._rotate]))
         if self._levels:
-            block = self._shrink(block)
+            block = self._shrink(image)
         if self._rotate:
             return cv2.rotate(block, _ROTATIONS[self._rotate])  # type: ignore[return-value]
         if self._levels:
@@ -269,17 +271,17 @@ class Preprocessor:
             return same
         return np.ascontiguousarray(block)
 
-    def _shrink(self, block: NDArray[Any]) -> NDArray[Any]:
+    def _shrink(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Block averages, by halving: three times as fast as one step of four, for 1/8 grey level of bias."""
+        block: tuple[slice, slice] | None = self._block
         for level in range(self._levels):
-            size = (block.shape[1] // 2, block.shape[0] // 2)
             if level == self._levels - 1 and self._rotate == 0:
-                return cv2.resize(block, size, interpolation=cv2.INTER_AREA)
+                return halved(image, block)
             # What is halved or rotated afterwards can live in a buffer of our own.
             if len(self._shrunk) <= level:
-                self._shrunk.append(np.empty((size[1], size[0], 3), np.uint8))
-            block = cv2.resize(block, size, dst=self._shrunk[level], interpolation=cv2.INTER_AREA)
-        return block
+                self._shrunk.append(halved(image, block))
+            image, block = halved(image, block, into=self._shrunk[level]), None
+        return image
 
     def _pyramid(self, image: NDArray[Any]) -> NDArray[Any]:
         for _ in range(self._levels):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -11,6 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled
+from tactflow.vision.halving import halve_block, halved
+from tactflow.vision.marker_mask_kernels import contrast_with_circle, cover_spots
 from tactflow.vision.markers import NoMarkersError, detect_markers
 
 Polarity = Literal["dark", "bright"]
@@ -18,7 +22,7 @@ Polarity = Literal["dark", "bright"]
 _DIRECTIONS = 12
 """Points on the circle around a spot that are compared with it."""
 _RIM = 1.5
-"""Soft rim of a dot that is covered too, pixels at half resolution."""
+"""Soft rim of a dot that is covered too, pixels at half resolution: all that touch it, also by a corner."""
 _SHARE = 0.25
 """Part of the dots' median contrast from which on something is a dot: worn dots keep that much."""
 _LEAST = 6.0
@@ -60,7 +64,7 @@ def find_dot(
         found = detect_markers(image, dot_radius=radius, polarity=polarity)
     except NoMarkersError:
         return None
-    response = _response(_halved(image), found.dot_radius, found.polarity)
+    response = _response(halved(_even(image)), found.dot_radius, found.polarity)
     columns, rows = np.clip(np.rint((found.centers - 0.5) / 2).astype(int).T, 0, None)
     at = response[np.minimum(rows, response.shape[0] - 1), np.minimum(columns, response.shape[1] - 1)]
     return Dot(found.dot_radius, found.polarity, max(_LEAST, _SHARE * float(np.median(at))))
@@ -94,13 +98,23 @@ def marker_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
         raise ValueError(
             f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
         )
-    response = _response(_halved(image), dot.radius, dot.polarity)
-    _, cores = cv2.threshold(response, dot.contrast, 255, cv2.THRESH_BINARY)
-    grown = cv2.dilate(cores, _disc(_RIM))
     height, width = image.shape[:2]
-    # Every pixel twice along a line, then every line twice: a quarter of the time of `cv2.resize`.
-    lines = np.asarray(cv2.merge([grown, grown]).reshape(len(grown), -1), np.uint8)
-    return np.ascontiguousarray(doubled(lines)[:height, :width])
+    whole = _even(image)
+    if compiled.active():
+        mask = _compiled_mask(whole, dot)
+    else:
+        response = _response(halved(whole), dot.radius, dot.polarity)
+        _, cores = cv2.threshold(response, dot.contrast, 255, cv2.THRESH_BINARY)
+        grown = cv2.dilate(cores, _disc(_RIM))
+        # Every pixel twice along a line, then every line twice: a quarter of the time of `cv2.resize`.
+        mask = doubled(np.asarray(cv2.merge([grown, grown]).reshape(len(grown), -1), np.uint8))
+    return np.ascontiguousarray(mask[:height, :width])
+
+
+def load_kernels() -> None:
+    """Compile what `marker_mask` runs where numba is there, so that no frame waits for it."""
+    for kernel in (halve_block, contrast_with_circle, cover_spots):
+        kernel.load()
 
 
 def doubled(lines: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -119,18 +133,56 @@ def halved_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.threshold(small, 0, 255, cv2.THRESH_BINARY)[1], np.uint8)
 
 
-def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    padded = np.ascontiguousarray(image)
+def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image with its last row and column repeated where their number is odd."""
     bottom, right = image.shape[0] % 2, image.shape[1] % 2
     if bottom or right:
-        padded = np.asarray(cv2.copyMakeBorder(padded, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
-    size = (padded.shape[1] // 2, padded.shape[0] // 2)
-    return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return np.asarray(cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
+    return np.ascontiguousarray(image)
+
+
+class _Buffers:
+    """What `_compiled_mask` computes in; the half-size picture has a margin as wide as the circle."""
+
+    def __init__(self, height: int, width: int, radius: float, polarity: Polarity) -> None:
+        rows, columns = _around(_outer(radius))
+        reach = self.reach = len(_circle(_outer(radius))) // 2
+        high, wide = height + 2 * reach, width + 2 * reach
+        # Outside the frame nothing is as dark as a dot, or as bright.
+        self.half = np.full((high, 3 * wide), 255 if polarity == "dark" else 0, np.uint8)
+        self.inverted = np.empty_like(self.half)
+        self.steps = 3 * (rows * wide + columns)
+        self.contrast = np.zeros(self.half.size, np.uint8)
+        self.spots = np.empty((high, wide), np.uint8)
+        self.doubled = np.empty(2 * self.spots.size, np.uint8)
+
+
+_kept = threading.local()
+"""The buffers of each thread, for frames of one size and one kind of dot."""
+
+
+def _compiled_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
+    """`marker_mask` of an image of even height and width."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    kind = (height, width, dot.radius, dot.polarity)
+    if getattr(_kept, "kind", None) != kind:
+        _kept.kind, _kept.buffers = kind, _Buffers(*kind)
+    own: _Buffers = _kept.buffers
+    reach, picture = own.reach, own.half
+    halve_block(image.reshape(len(image), -1), 0, 0, own.half, reach, reach, height, width)
+    if dot.polarity == "bright":
+        # A bright dot is a dark one in the negative.
+        picture = np.invert(own.half, out=own.inverted)
+    contrast_with_circle(picture, reach, own.steps, own.contrast)
+    limit = min(255, math.floor(dot.contrast))
+    mask = np.empty((2 * height, 2 * width), np.uint8)
+    cover_spots(own.contrast, limit, reach, _corner(dot.radius), own.spots, own.doubled, mask)
+    return mask
 
 
 def _response(half: NDArray[np.uint8], radius: float, polarity: Polarity) -> NDArray[np.uint8]:
     """Contrast of each pixel with the least different one on a circle around it; median of the channels."""
-    circle = _circle((radius + max(radius, 4.0) + 1) / 2)
+    circle = _circle(_outer(radius))
     if polarity == "dark":
         contrast = cv2.subtract(cv2.erode(half, circle), half)
     else:
@@ -138,19 +190,35 @@ def _response(half: NDArray[np.uint8], radius: float, polarity: Polarity) -> NDA
     first, second, third = cv2.split(contrast)
     median = np.asarray(cv2.max(cv2.min(first, second), cv2.min(cv2.max(first, second), third)), np.uint8)
     # In a corner of the frame most of the circle is missing: any dark corner would be a spot.
-    reach = len(circle) // 4
-    for rows in (slice(0, reach), slice(-reach, None)):
-        median[rows, :reach] = 0
-        median[rows, -reach:] = 0
+    side = _corner(radius)
+    for rows in (slice(0, side), slice(-side, None)):
+        median[rows, :side] = 0
+        median[rows, -side:] = 0
     return median
+
+
+def _outer(radius: float) -> float:
+    """Radius at half resolution of the circle that a dot of a radius at full resolution is compared with."""
+    return (radius + max(radius, 4.0) + 1) / 2
+
+
+def _corner(radius: float) -> int:
+    """Side of the squares in the corners of the half-size frame in which no dot is looked for."""
+    return len(_circle(_outer(radius))) // 4
+
+
+@lru_cache(maxsize=32)
+def _around(radius: float) -> NDArray[np.int64]:
+    """Rows and columns of the places of a circle, from its centre: (2, _DIRECTIONS)."""
+    turn = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
+    return np.rint(radius * np.stack([np.sin(turn), np.cos(turn)])).astype(np.int64)
 
 
 @lru_cache(maxsize=32)
 def _circle(radius: float) -> NDArray[np.uint8]:
     reach = int(np.ceil(radius))
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
-    turn = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
-    rows, columns = np.rint(radius * np.stack([np.sin(turn), np.cos(turn)])).astype(int) + reach
+    rows, columns = _around(radius) + reach
     kernel[rows, columns] = 1
     return kernel
 
