@@ -97,9 +97,9 @@ class _Spots:
                     return points[:count], value[:count]
                 room = count
         highest = cv2.dilate(response, self._neighbourhood)
+        # Above `least` is the same as at least the next number in this precision.
+        np.maximum(highest, np.nextafter(np.float32(least), np.float32(np.inf)), out=highest)
         peak = cv2.compare(response, highest, cv2.CMP_GE)
-        _, strong = cv2.threshold(response, least, 255, cv2.THRESH_BINARY)
-        peak = cv2.bitwise_and(peak, strong.astype(np.uint8))
         peak[0] = peak[-1] = 0
         peak[:, 0] = peak[:, -1] = 0
         at = np.flatnonzero(peak)
