@@ -47,9 +47,13 @@ def measure(
     offsets = np.empty(pixels, np.int64)
     for p in range(pixels):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
+    words = np.empty(pixels, np.int32)
     patch = np.zeros(weights.shape[2], np.float32)
     blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
-    bits, middle, one, two = np.int32(15), np.int32(128), np.uintp(1), np.uintp(2)
+    bits, middle, low = np.int32(15), np.int32(128), np.int32(255)
+    byte, two_bytes, three_bytes = np.int32(8), np.int32(16), np.int32(24)
+    # Unsigned indices spare numba the question whether they count from the end.
+    one, two, three = np.uintp(1), np.uintp(2), np.uintp(3)
     # Patches lie far apart in memory, and waiting for one after the other takes longer than all arithmetic:
     # so first the ends of all rows are read, which the processor does for many at a time.
     touched = 0
@@ -62,6 +66,7 @@ def measure(
             touched += flat[np.uintp(row * width * channels + right)]
     for n in range(len(marks)):
         x, y = start[n, 0], start[n, 1]
+        seen_left = seen_top = -1
         for number in range(rounds + 1):
             # Written so that NaN, too, becomes a place inside the image.
             inside_x = min(x, width - 1.0) if x > 0.0 else 0.0
@@ -70,30 +75,39 @@ def measure(
             quarter_y = int(inside_y * phases + phases / 2)
             left, top = quarter_x // phases, quarter_y // phases
             which = (quarter_x % phases + quarter_y % phases * phases) * count + marks[n]
-            # Grey as OpenCV makes it of BGR, less 128: far from zero, sums of squares would lose digits.
-            # Unsigned indices spare numba the question whether they count from the end.
-            if left >= reach and top >= reach and left + reach < width and top + reach < height:
-                base = (top * width + left) * channels
-                if channels == 3:
+            # A step of less than a pixel often sees the same patch from another phase.
+            if left != seen_left or top != seen_top:
+                seen_left, seen_top = left, top
+                # With the pixel after it, which is read too, the patch is inside the image.
+                if left >= reach and top >= reach and left + reach + 1 < width and top + reach < height:
+                    base = (top * width + left) * channels
                     for p in range(pixels):
                         i = np.uintp(base + offsets[p])
-                        level = blue * np.int32(flat[i]) + green * np.int32(flat[i + one])
-                        level += red * np.int32(flat[i + two]) + half
+                        if channels == 3:
+                            # Four bytes, so that the compiler makes one load of them.
+                            word = np.int32(flat[i]) | np.int32(flat[i + one]) << byte
+                            word |= np.int32(flat[i + two]) << two_bytes
+                            words[p] = word | np.int32(flat[i + three]) << three_bytes
+                        else:
+                            words[p] = np.int32(flat[i])
+                else:
+                    for p in range(pixels):
+                        row = min(max(top + disc[1, p], 0), height - 1)
+                        column = min(max(left + disc[0, p], 0), width - 1)
+                        i = np.uintp((row * width + column) * channels)
+                        words[p] = np.int32(flat[i])
+                        if channels == 3:
+                            words[p] |= np.int32(flat[i + one]) << byte
+                            words[p] |= np.int32(flat[i + two]) << two_bytes
+                # Grey as OpenCV makes it of BGR, less 128: far from zero, sums of squares would lose digits.
+                if channels == 3:
+                    for p in range(pixels):
+                        level = blue * (words[p] & low) + green * ((words[p] >> byte) & low)
+                        level += red * ((words[p] >> two_bytes) & low) + half
                         patch[p] = np.float32((level >> bits) - middle)
                 else:
                     for p in range(pixels):
-                        patch[p] = np.float32(np.int32(flat[np.uintp(base + offsets[p])]) - middle)
-            else:
-                for p in range(pixels):
-                    row = min(max(top + disc[1, p], 0), height - 1)
-                    column = min(max(left + disc[0, p], 0), width - 1)
-                    i = np.uintp((row * width + column) * channels)
-                    if channels == 3:
-                        level = blue * np.int32(flat[i]) + green * np.int32(flat[i + one])
-                        level += red * np.int32(flat[i + two]) + half
-                        patch[p] = np.float32((level >> bits) - middle)
-                    else:
-                        patch[p] = np.float32(np.int32(flat[i]) - middle)
+                        patch[p] = np.float32(words[p] - middle)
             weight = weights[which]
             gain = shift_x = shift_y = light = slope_x = slope_y = contrast = np.float32(0.0)
             for p in range(len(patch)):
