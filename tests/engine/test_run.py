@@ -228,6 +228,23 @@ def test_an_absent_value_skips_who_requires_it_with_the_same_reason(toy_runner: 
     assert rows(runner)[3][4] == {"gated": "third"}
 
 
+@pytest.mark.parametrize("check", [False, True])
+@pytest.mark.parametrize(("use", "sign"), [("ByName", 1), ("Turned", -1)])
+def test_inputs_reach_functions_that_take_them_by_name_only(
+    toy_runner: MakeRunner, use: str, sign: int, check: bool
+) -> None:
+    runner = toy_runner({"odd": {"use": use}}, {"out": {"use": "LateTick"}}, check=check)
+    ran(runner)
+    totals = [sum(range(i + 1)) for i in range(20)]
+    assert rows(runner) == [(i, sign * (i - total), total) for i, total in enumerate(totals)]
+
+
+def test_an_optional_input_that_nothing_is_connected_to_is_none(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(sinks={"out": {"use": "LateTick"}})
+    ran(runner)
+    assert rows(runner) == [(i, None, sum(range(i + 1))) for i in range(20)]
+
+
 # -- references -------------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,39 @@ def test_quantiles_are_within_the_width_of_a_bin(q: float) -> None:
     exact = float(np.quantile(values, q, method="inverted_cdf"))
     assert durations.quantile(q) == pytest.approx(exact, rel=0.0101)
     assert durations.total == pytest.approx(values.sum())
+
+
+def test_nothing_is_lost_or_counted_twice_while_others_ask() -> None:
+    durations = Durations()
+    answers: list[int] = []
+    done = threading.Event()
+
+    def ask() -> None:
+        while not done.is_set():
+            answers.append(durations.count)
+
+    asking = [threading.Thread(target=ask) for _ in range(2)]
+    for thread in asking:
+        thread.start()
+    for _ in range(20_000):
+        durations.add(2.0**-10)
+    done.set()
+    for thread in asking:
+        thread.join()
+    assert durations.count == 20_000
+    assert durations.total == 20_000 * 2.0**-10, "sums of powers of two are exact"
+    assert durations.quantile(0.0) == durations.quantile(1.0)
+    assert max(answers, default=0) <= 20_000
+
+
+def test_a_quantile_counts_the_last_duration_added() -> None:
+    durations = Durations()
+    for count in range(1, 1000):
+        durations.add(1e-3)
+        assert durations.count == count
+    durations.add(1.0)
+    # Bins are answered by their middle: at most 1.01 % off.
+    assert durations.quantile(1.0) == pytest.approx(1.0, rel=0.0101)
 
 
 def test_nothing_counted_has_no_quantile() -> None:

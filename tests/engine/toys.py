@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -179,6 +180,36 @@ class Rare(Counted):
     def process(self, level: Number) -> Number | Absent:
         self.saw(int(level.value))
         return Absent("third") if level.value % 3 == 0 else level
+
+
+class ByName(Counted):
+    """Takes its inputs by name only."""
+
+    def process(self, *, level: Number, total: Number) -> Number:
+        return Number(level.value - total.value)
+
+
+class Turned(Counted):
+    """Its function is wrapped in one that takes everything by name, and shows the inner one's annotations."""
+
+    @staticmethod
+    def turned(function: Callable[..., Number]) -> Callable[..., Number]:
+        @functools.wraps(function)
+        def call(self: Turned, **inputs: Number) -> Number:
+            return Number(-function(self, **inputs).value)
+
+        return call
+
+    @turned
+    def process(self, level: Number, total: Number) -> Number:
+        return Number(level.value - total.value)
+
+
+class LateTick(Counted):
+    """A sink that asks for the tick behind its inputs."""
+
+    def write(self, number: Number | None, total: Number, tick: Tick) -> None:
+        self.rows = [*getattr(self, "rows", []), (tick.frame.seq, number and number.value, total.value)]
 
 
 class Vandal(Counted):

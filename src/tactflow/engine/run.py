@@ -16,7 +16,7 @@ from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.link import Link
 from tactflow.engine.plan import Plan, make_plan
-from tactflow.engine.segment import NodeFailedError, RunningNode, RunningTick, Segment
+from tactflow.engine.segment import NOTHING, NodeFailedError, RunningNode, RunningTick, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.engine.trace import Trace
 
@@ -74,6 +74,8 @@ class Runner:
         self.trace = trace
         self.latency = Durations()
         self.nodes: dict[str, RunningNode] = {}
+        self._slots: dict[tuple[str, str], int] = {}
+        self._demands: dict[tuple[str, ...], frozenset[str]] = {}
         self.plan: Plan = make_plan(pipeline)
         self._links: list[Link[RunningTick]] = []
         self._segments: dict[str, Segment] = {}
@@ -203,11 +205,15 @@ class Runner:
         live = bool(getattr(self._source, "live", False))
         self.plan = make_plan(pipeline, live=live)
         pruned = {node.id for node in self.plan.pruned}
+        ports = [(id_, port.name) for id_, n in pipeline.nodes.items() for port in n.component.ports.outputs]
+        self._slots = {port: slot for slot, port in enumerate(ports, start=NOTHING + 1)}
         for node in pipeline.nodes.values():
             if node.component.kind == "source" or node.id in pruned:
                 continue
             instance = self._build(node, StageError)
-            self.nodes[node.id] = RunningNode(node, instance, skipping=pipeline.skipping, check=self.check)
+            self.nodes[node.id] = RunningNode(
+                node, instance, self._slots, skipping=pipeline.skipping, check=self.check
+            )
 
     def _build(self, node: Node, kind: type[TactflowError]) -> Any:
         """Construct a node's class with what its constructor asks for, and open it."""
@@ -295,8 +301,10 @@ class Runner:
     def _capture_loop(self) -> None:
         segment = self._segments[self._source_segment]
         node = self.pipeline.source
-        key = (node.id, node.component.ports.outputs[0].name)
+        slot = self._slots[node.id, node.component.ports.outputs[0].name]
+        table = NOTHING + 1 + len(self._slots)
         sinks = [n for n in self.nodes.values() if n.is_sink]
+        add_duration = self._source_stats.durations.add
         index = 0
         try:
             frames = iter(self._source.frames())
@@ -309,17 +317,16 @@ class Runner:
                     segment.current = None
                 if frame is None:
                     break
-                if not self._may_go_on():
+                if self._paused and not self._may_go_on():
                     continue
                 ended = time.perf_counter()
-                self._source_stats.runs += 1
-                self._source_stats.durations.add(ended - began)
+                add_duration(ended - began)
                 if segment.track is not None:
                     segment.track.add(node.id, began, ended, {"seq": frame.seq})
                 if frame.seq >= 0:
                     self._frames += 1
-                tick = RunningTick(index, frame, self._demand(sinks, frame))
-                tick.values[key] = frame
+                tick = RunningTick(index, frame, self._demand(sinks, frame), table)
+                tick.values[slot] = frame
                 index += 1
                 segment.handle(tick)
                 if self.max_frames is not None and self._frames >= self.max_frames:
@@ -338,9 +345,7 @@ class Runner:
                 link.close()
 
     def _may_go_on(self) -> bool:
-        """Whether the frame just captured is to be handled; while paused, waits or lets it go."""
-        if not self._paused:
-            return True
+        """While paused: whether the frame just captured is to be handled; waits for that, or lets it go."""
         with self._turn:
             if not getattr(self._source, "live", False):
                 self._turn.wait_for(lambda: not self._paused or self._steps or self._stopping.is_set())
@@ -354,11 +359,15 @@ class Runner:
         One with `takes_references` gets all references; no other gets a reference image that is not part of
         the source.
         """
-        return frozenset(sink.id for sink in sinks if not sink.disabled and self._wanted(sink, frame))
+        wanted = tuple([sink.id for sink in sinks if not sink.disabled and self._wanted(sink, frame)])
+        demand = self._demands.get(wanted)
+        if demand is None:
+            demand = self._demands[wanted] = frozenset(wanted)
+        return demand
 
     @staticmethod
     def _wanted(sink: RunningNode, frame: Frame) -> bool:
-        if frame.reference and getattr(sink.instance, "takes_references", False):
+        if frame.reference and sink.takes_references:
             return True
         return frame.seq >= 0 and sink.rate_limit.due(frame.t) and (sink.wants is None or sink.wants())
 
@@ -389,7 +398,7 @@ class Runner:
                 sinks[node.id] = entry
             else:
                 stages[node.id] = entry
-            signals.update({f"{key[0]}.{key[1]}": dict(signal) for key, signal in node.signals.items()})
+            signals.update({f"{node.id}.{name}": dict(signal) for name, (_, signal) in node.signals.items()})
         links = {}
         for link in self._links:
             s = link.stats()

@@ -7,11 +7,12 @@ gate never runs what only that stage needs.
 
 from __future__ import annotations
 
+import inspect
 import logging
-import time
 import traceback
-from collections.abc import Callable, Sequence
-from operator import is_
+from collections.abc import Callable, Mapping, Sequence
+from operator import is_, itemgetter
+from time import perf_counter
 from typing import Any, Protocol
 
 from tactflow.engine.check import ArrayCheck
@@ -27,8 +28,16 @@ from tactflow.engine.trace import Track
 
 logger = logging.getLogger("tactflow")
 
-Key = tuple[str, str]
-"""A port of a node: (node id, port name)."""
+Slots = Mapping[tuple[str, str], int]
+"""(node id, port name) of every output -> its place in a tick's table of values, from 1."""
+
+NOTHING = 0
+"""The place in that table of what an optional input gets that is connected to nothing: always None."""
+
+_NO_VALUE = (Absent, tuple)
+_DISABLED = Absent("disabled")
+_ERROR = Absent("error")
+_NONE = Absent("none")
 
 
 class Run(Protocol):
@@ -44,38 +53,40 @@ class Run(Protocol):
 class RunningTick:
     """One frame's journey: a table of values that segments fill in, each its own part.
 
-    demand : ids of the sinks that want this tick. reasons : why a port was not computed in this tick; a
-    port may have both a reason and a value, when its last value was repeated.
+    demand : ids of the sinks that want this tick. values : one per slot; None for what nobody has made yet.
+    reasons : slot -> why it was not computed in this tick; a slot may have both a reason and a value, when
+    its last value was repeated. absent : False as long as no value of the table can be an `Absent`.
     """
 
-    __slots__ = ("demand", "frame", "index", "reasons", "values")
+    __slots__ = ("absent", "demand", "frame", "index", "reasons", "values")
 
-    def __init__(self, index: int, frame: Frame, demand: frozenset[str]) -> None:
+    def __init__(self, index: int, frame: Frame, demand: frozenset[str], slots: int) -> None:
         self.index = index
         self.frame = frame
         self.demand = demand
-        self.values: dict[Key, Any] = {}
-        self.reasons: dict[Key, str] = {}
+        self.values: list[Any] = [None] * slots
+        self.reasons: dict[int, str] = {}
+        self.absent = False
 
 
 class _RunningGate:
-    """A gate with its memory: frames since it was last open."""
+    """A gate with its memory: frames since it was last open. slot : of its signal."""
 
-    __slots__ = ("key", "plan", "since_open", "since_true")
+    __slots__ = ("absent", "no_memory", "plan", "since_open", "since_true", "slot")
 
-    def __init__(self, plan: Gate) -> None:
+    def __init__(self, plan: Gate, slots: Slots) -> None:
         self.plan = plan
-        self.key: Key = (plan.signal.node, plan.signal.port)
+        self.slot = slots[plan.signal.node, plan.signal.port]
+        self.absent = Absent(plan.reason)
+        self.no_memory = not plan.hold and plan.at_least_every is None
         self.since_true: int | None = None
         self.since_open = 0
-
-    @property
-    def has_memory(self) -> bool:
-        return self.plan.hold > 0 or self.plan.at_least_every is not None or self.plan.otherwise == "repeat"
 
     def is_open(self, signal: Any) -> bool:
         """Take in this tick's signal. An absent signal closes the gate."""
         true = signal is not None and not isinstance(signal, Absent) and bool(signal)
+        if self.no_memory:
+            return true
         self.since_true = 0 if true else None if self.since_true is None else self.since_true + 1
         every = self.plan.at_least_every
         held = self.since_true is not None and self.since_true <= self.plan.hold
@@ -88,39 +99,86 @@ class _RunningGate:
 
 
 class RunningNode:
-    """A stage or sink at run time: the instance, where its inputs come from, what it has done."""
+    """A stage or sink at run time: the instance, where its inputs come from, what it has done.
 
-    def __init__(self, node: Node, instance: Any, *, skipping: bool, check: bool) -> None:
+    How it is called is decided here once, not in every frame. pick : takes its arguments from a tick's
+    values. slots : of its outputs. single : the only one of them, if it is no signal. positional : its
+    function takes just these arguments, in this order; tick_first : the same behind a `Tick`. Else they are
+    given by name.
+    """
+
+    __slots__ = (
+        "check",
+        "disabled",
+        "function",
+        "gates",
+        "id",
+        "input_slots",
+        "inputs",
+        "instance",
+        "is_sink",
+        "last",
+        "last_arguments",
+        "names",
+        "node",
+        "pick",
+        "positional",
+        "rate_limit",
+        "remembers",
+        "repeats",
+        "reuses",
+        "signals",
+        "single",
+        "slots",
+        "stateful",
+        "stats",
+        "takes_references",
+        "takes_tick",
+        "tick_first",
+        "wants",
+    )
+
+    def __init__(self, node: Node, instance: Any, slots: Slots, *, skipping: bool, check: bool) -> None:
         self.node = node
         self.id = node.id
         self.instance = instance
-        self.is_sink = node.component.kind == "sink"
+        component = node.component
+        self.is_sink = component.kind == "sink"
         self.function: Callable[..., Any] = getattr(
             instance, "write" if self.is_sink else "process", _no_function
         )
-        self.inputs: list[tuple[Port, Key | None]] = []
-        for port in node.component.ports.inputs:
+        self.inputs: list[tuple[Port, int]] = []
+        for port in component.ports.inputs:
             ref = node.inputs.get(port.name)
-            self.inputs.append((port, (ref.node, ref.port) if ref else None))
+            self.inputs.append((port, slots[ref.node, ref.port] if ref else NOTHING))
         self.names = [port.name for port, _ in self.inputs]
-        self.input_keys = [key for _, key in self.inputs if key is not None]
-        self.outputs: list[Key] = [(node.id, port.name) for port in node.component.ports.outputs]
-        self.gates = [_RunningGate(gate) for gate in node.gates] if skipping else []
-        self.stateful = node.component.memory == "stateful" or any(g.has_memory for g in self.gates)
+        self.pick = _picker([slot for _, slot in self.inputs])
+        self.input_slots = [slot for _, slot in self.inputs if slot != NOTHING]
+        self.slots = [slots[node.id, port.name] for port in component.ports.outputs]
+        self.gates = [_RunningGate(gate, slots) for gate in node.gates] if skipping else []
+        self.repeats = any(gate.plan.otherwise == "repeat" for gate in self.gates)
+        self.stateful = (
+            component.memory == "stateful" or self.repeats or any(not gate.no_memory for gate in self.gates)
+        )
         self.stats = NodeStats()
         self.signals = {
-            key: SignalStats()
-            for key, port in zip(self.outputs, node.component.ports.outputs, strict=True)
+            port.name: (slot, SignalStats())
+            for slot, port in zip(self.slots, component.ports.outputs, strict=True)
             if isinstance(port_type(port.annotation), SignalPort)
         }
+        self.single = self.slots[0] if len(self.slots) == 1 and not self.signals else NOTHING
         self.disabled = False
         self.wants: Callable[[], bool] | None = getattr(instance, "wants", None)
-        self.takes_tick = node.component.ports.takes_tick
-        self.repeats = any(gate.plan.otherwise == "repeat" for gate in self.gates)
+        self.takes_references = bool(getattr(instance, "takes_references", False))
+        self.takes_tick = component.ports.takes_tick
         self.reuses = skipping and not self.stateful and not self.is_sink
-        self.last: list[Any] | None = None
-        self.last_arguments: list[Any] | None = None
+        self.remembers = self.repeats or self.reuses
+        self.last: Sequence[Any] | None = None
+        self.last_arguments: Sequence[Any] | None = None
         self.check = ArrayCheck(node) if check else None
+        order = _parameters(self.function)
+        self.positional = order == self.names and not self.takes_tick and not check
+        self.tick_first = order == ["tick", *self.names]
         self.rate_limit = RateLimit(node.max_rate)
 
     def reset(self) -> None:
@@ -130,6 +188,28 @@ class RunningNode:
             gate.reset()
         if hasattr(self.instance, "reset"):
             self.instance.reset()
+
+
+def _picker(slots: Sequence[int]) -> Callable[[list[Any]], Sequence[Any]]:
+    """What takes the values at these slots out of a table."""
+    if len(slots) > 1:
+        return itemgetter(*slots)
+    # A getter of one index would return the value itself, one of a slice returns a list of it.
+    return itemgetter(slice(slots[0], slots[0] + 1) if slots else slice(0))
+
+
+def _parameters(function: Callable[..., Any]) -> list[str] | None:
+    """The names under which a function takes its arguments by position; None where it takes others too.
+
+    What a decorator says about the function inside does not count: arguments are given to the decorator.
+    """
+    try:
+        parameters = inspect.signature(function, follow_wrapped=False).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    if any(parameter.kind is not parameter.POSITIONAL_OR_KEYWORD for parameter in parameters):
+        return None
+    return [parameter.name for parameter in parameters]
 
 
 def _no_function(**_: Any) -> None:
@@ -157,10 +237,10 @@ class _Step:
         self.gates: list[tuple[_RunningGate, _Step | None, bool]] = []
         for gate in node.gates:
             # The memory of a later segment's gate is not known here: such a gate may be open.
-            plain = not gate.plan.hold and gate.plan.at_least_every is None
-            decides = own or (plain and gate.key[0] in known)
-            self.gates.append((gate, steps.get(gate.key[0]), decides))
-        makers = dict.fromkeys(key[0] for key in node.input_keys)
+            maker = gate.plan.signal.node
+            decides = own or (gate.no_memory and maker in known)
+            self.gates.append((gate, steps.get(maker), decides))
+        makers = dict.fromkeys(ref.node for ref in node.node.inputs.values() if ref)
         self.before = [steps[maker] for maker in makers if maker in steps]
 
 
@@ -177,6 +257,7 @@ class Segment:
         plan = run.plan
         self.nodes = [run.nodes[i] for i in plan.segments[name] if i in run.nodes]
         mine = {node.id for node in self.nodes}
+        self._slots = {slot: node.id for node in self.nodes for slot in node.slots}
         known = mine | {i for a in plan.ancestors[name] for i in plan.segments[a]}
         # Every input comes before its user in the pipeline, so a step finds those it needs.
         steps: dict[str, _Step] = {}
@@ -199,15 +280,15 @@ class Segment:
             self.execute(tick)
             self.forward(tick)
             return
-        began = time.perf_counter()
+        began = perf_counter()
         for link in self.inputs:
             track.arrives((link.name, tick.index), began)
         self.execute(tick)
         self.forward(tick)
-        mine = {node.id for node in self.nodes}
-        skipped = {node: reason for (node, _), reason in list(tick.reasons.items()) if node in mine}
+        mine = self._slots
+        skipped = {mine[slot]: reason for slot, reason in list(tick.reasons.items()) if slot in mine}
         name = f"frame {tick.frame.seq}" if tick.frame.seq >= 0 else "reference image"
-        track.add(name, began, time.perf_counter(), {"seq": tick.frame.seq, "skipped": skipped})
+        track.add(name, began, perf_counter(), {"seq": tick.frame.seq, "skipped": skipped})
 
     def execute(self, tick: RunningTick) -> None:
         """Compute what this tick needs from this segment."""
@@ -215,105 +296,111 @@ class Segment:
             self.epoch = tick.frame.epoch
             for node in self.nodes:
                 node.reset()
+        index = tick.index
         for step in self._stateful:
-            self._visit(step, tick)
+            if step.seen != index:
+                self._visit(step, tick)
         demand = tick.demand
         if demand:
             for step in self._sinks:
-                if step.node.id in demand:
+                if step.node.id in demand and step.seen != index:
                     self._visit(step, tick)
-        index = tick.index
+        self.current = None
         for step in self._own:
             if step.seen != index:
                 step.node.stats.skips["no_demand"] += 1
         if demand and self.data_sinks:
-            self.run.latency.add(time.perf_counter() - tick.frame.captured)
+            self.run.latency.add(perf_counter() - tick.frame.captured)
 
     def _visit(self, step: _Step, tick: RunningTick) -> None:
-        """Pull one node, at most once a tick: first its gates, then its inputs, then the node itself."""
-        if step.seen == tick.index:
-            return
-        step.seen = tick.index
-        reason = None
+        """Pull one node, once a tick: first its gates, then its inputs, then the node itself."""
+        step.seen = index = tick.index
+        node = step.node
+        closed: Absent | None = None
         for gate, maker, decides in step.gates:
-            if maker is not None:
+            if maker is not None and maker.seen != index:
                 self._visit(maker, tick)
-            if not decides:
+            signal = tick.values[gate.slot]
+            if not decides or (signal is True and gate.no_memory):
                 continue
-            signal = tick.values.get(gate.key)
             if step.own:
-                if not gate.is_open(signal):
-                    reason = reason or (signal.reason if isinstance(signal, Absent) else gate.plan.reason)
+                if not gate.is_open(signal) and closed is None:
+                    closed = signal if isinstance(signal, Absent) else gate.absent
             elif isinstance(signal, Absent) or not signal:
                 return
-        if reason is not None:
-            self._skip(step.node, tick, reason, repeat=step.node.repeats)
+        if closed is not None:
+            self._skip(node, tick, closed, repeat=node.repeats)
             return
         for maker in step.before:
-            if maker.seen != tick.index:
+            if maker.seen != index:
                 self._visit(maker, tick)
-        if step.own:
-            self._run(step.node, tick)
-
-    def _skip(self, node: RunningNode, tick: RunningTick, reason: str, *, repeat: bool = False) -> None:
-        node.stats.skips[reason] += 1
-        values = node.last if repeat and node.last is not None else [Absent(reason)] * len(node.outputs)
-        for key, value in zip(node.outputs, values, strict=True):
-            tick.values[key] = value
-            tick.reasons[key] = reason
-            if key in node.signals:
-                node.signals[key].add(not isinstance(value, Absent) and bool(value))
-
-    def _run(self, node: RunningNode, tick: RunningTick) -> None:
-        if node.disabled:
-            self._skip(node, tick, "disabled")
+        if not step.own:
             return
-        arguments: list[Any] = []
-        for port, key in node.inputs:
-            value = None if key is None else tick.values.get(key)
-            if isinstance(value, Absent):
-                if not port.optional:
-                    self._skip(node, tick, value.reason)
-                    return
-                value = None
-            arguments.append(value)
+        if node.disabled:
+            self._skip(node, tick, _DISABLED)
+            return
+        arguments = node.pick(tick.values)
+        if tick.absent:
+            arguments = list(arguments)
+            for number, (port, _) in enumerate(node.inputs):
+                value = arguments[number]
+                if isinstance(value, Absent):
+                    if not port.optional:
+                        self._skip(node, tick, value)
+                        return
+                    arguments[number] = None
         # A pure stage with the very inputs of its last run would give the very outputs of its last run.
         same = node.last_arguments
-        if same is not None and all(map(is_, arguments, same)):
+        if same is not None and arguments[0] is same[0] and all(map(is_, arguments, same)):
             assert node.last is not None
             node.stats.skips["unchanged"] += 1
             self._publish(node, tick, node.last)
             return
         self.current = node.id
-        began = time.perf_counter()
+        began = perf_counter()
         try:
-            values = self._call(node, tick, arguments)
+            result = node.function(*arguments) if node.positional else self._call(node, tick, arguments)
+            plain = node.single and result is not None and not isinstance(result, _NO_VALUE)
+            values = (result,) if plain else _values(result, len(node.slots))
+            if node.check is not None:
+                node.check.outputs(arguments, values)
         except Exception as error:
             self._failed(node, tick, arguments, error)
             return
-        finally:
-            self.current = None
-        ended = time.perf_counter()
-        node.stats.runs += 1
+        ended = perf_counter()
         node.stats.durations.add(ended - began)
         if self.track is not None:
             self.track.add(node.id, began, ended, {"seq": tick.frame.seq})
-        if node.repeats or node.reuses:
+        if node.remembers:
             node.last = values
-        if node.reuses:
-            node.last_arguments = arguments
-        self._publish(node, tick, values)
+            if node.reuses:
+                node.last_arguments = arguments
+        if plain and not (node.reuses and tick.reasons):
+            tick.values[node.single] = result
+        else:
+            self._publish(node, tick, values)
 
-    def _call(self, node: RunningNode, tick: RunningTick, arguments: Sequence[Any]) -> list[Any]:
-        """Call a node's function; under check, with read-only inputs and a look at what it returns."""
-        given = arguments if node.check is None else [node.check.read_only(value) for value in arguments]
-        named = dict(zip(node.names, given, strict=True))
+    def _skip(self, node: RunningNode, tick: RunningTick, absent: Absent, *, repeat: bool = False) -> None:
+        reason = absent.reason
+        node.stats.skips[reason] += 1
+        tick.absent = True
+        last = node.last if repeat else None
+        for number, slot in enumerate(node.slots):
+            tick.values[slot] = absent if last is None else last[number]
+            tick.reasons[slot] = reason
+        if node.signals:
+            self._count_signals(node, tick)
+
+    def _call(self, node: RunningNode, tick: RunningTick, arguments: Sequence[Any]) -> Any:
+        """Call a function by name or with a `Tick`; under check, with read-only inputs."""
+        check = node.check
+        given = arguments if check is None else [check.read_only(value) for value in arguments]
         if node.takes_tick:
-            named["tick"] = Tick(tick.frame, self._skipped(node, tick))
-        values = _values(node.function(**named), len(node.outputs))
-        if node.check is not None:
-            node.check.outputs(arguments, values)
-        return values
+            told = Tick(tick.frame, self._skipped(node, tick))
+            if node.tick_first:
+                return node.function(told, *given)
+            return node.function(tick=told, **dict(zip(node.names, given, strict=True)))
+        return node.function(**dict(zip(node.names, given, strict=True)))
 
     def _publish(self, node: RunningNode, tick: RunningTick, values: Sequence[Any]) -> None:
         """Enter a node's outputs into the tick's table.
@@ -323,20 +410,30 @@ class Segment:
         """
         inherited = None
         if node.reuses and tick.reasons:
-            reasons = [tick.reasons.get(key) for key in node.input_keys]
+            reasons = [tick.reasons.get(slot) for slot in node.input_slots]
             if reasons and None not in reasons:
                 inherited = reasons[0]
-        for key, value in zip(node.outputs, values, strict=True):
-            reason = value.reason if isinstance(value, Absent) else inherited
-            if reason is not None:
-                tick.reasons[key] = reason
-            tick.values[key] = value
-            if key in node.signals:
-                node.signals[key].add(not isinstance(value, Absent) and bool(value))
+        table = tick.values
+        for slot, value in zip(node.slots, values, strict=True):
+            table[slot] = value
+            if isinstance(value, Absent):
+                tick.absent = True
+                tick.reasons[slot] = value.reason
+            elif inherited is not None:
+                tick.reasons[slot] = inherited
+        if node.signals:
+            self._count_signals(node, tick)
+
+    def _count_signals(self, node: RunningNode, tick: RunningTick) -> None:
+        for slot, signal in node.signals.values():
+            value = tick.values[slot]
+            signal.add(not isinstance(value, Absent) and bool(value))
 
     def _skipped(self, node: RunningNode, tick: RunningTick) -> dict[str, str]:
         reasons = tick.reasons
-        return {port.name: reasons[key] for port, key in node.inputs if key is not None and key in reasons}
+        if not reasons:
+            return {}
+        return {port.name: reasons[slot] for port, slot in node.inputs if slot in reasons}
 
     def _failed(
         self, node: RunningNode, tick: RunningTick, arguments: Sequence[Any], error: Exception
@@ -354,10 +451,10 @@ class Segment:
         if policy.action == "disable":
             node.disabled = True
             logger.warning("%s\n  %s is disabled for the rest of the run", failure, node.id)
-            self._skip(node, tick, "disabled")
+            self._skip(node, tick, _DISABLED)
         else:
             logger.warning("%s\n  frame skipped (%d of %d)", failure, node.stats.errors, policy.budget)
-            self._skip(node, tick, "error")
+            self._skip(node, tick, _ERROR)
 
     def forward(self, tick: RunningTick) -> None:
         """Hand the tick to the next segments. One that holds only sinks gets it only if one of them asked."""
@@ -403,16 +500,17 @@ class Segment:
                 link.close()
 
 
-def _values(result: Any, count: int) -> list[Any]:
+def _values(result: Any, count: int) -> Sequence[Any]:
     """What a node returned, as one value per output port; None stands for absent."""
     if isinstance(result, Absent) or (result is None and count):
-        return [result or Absent("none")] * count
-    if count == 1 and not isinstance(result, tuple):
-        return [result]
-    values = list(result) if isinstance(result, tuple) else [result] if count else []
+        return [result or _NONE] * count
+    values: Sequence[Any] = result if isinstance(result, tuple) else [result] if count else ()
     if len(values) != count:
         raise TypeError(f"required {count} outputs, got {len(values)}")
-    return [Absent("none") if value is None else value for value in values]
+    for value in values:
+        if value is None:
+            return [_NONE if value is None else value for value in values]
+    return values
 
 
 def describe_failure(node: Node, frame: Frame, arguments: Sequence[Any], error: Exception) -> StageError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -176,27 +176,29 @@ class ArrayFile:
     live = False
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        self._frames: NDArray[Any] | None = _map_array(path)
+        frames = _map_array(path)
         self.fps: float | None = fps or DEFAULT_FPS
         self._rate = fps or DEFAULT_FPS
         self._index = 0
-        self._normalise = Normaliser(str(path))
-        count, height, width = self._frames.shape[:3]
+        count, height, width = frames.shape[:3]
+        as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,) and frames.flags.c_contiguous
+        self._frames: Iterator[BgrImage] = iter(frames) if as_wanted else map(Normaliser(str(path)), frames)
         self.total: int | None = count
         self.size: tuple[int, int] | None = (width, height)
         self.description = f"{path}, {count} frames"
 
     def read(self) -> tuple[BgrImage, float] | None:
         """The next frame and its time; see `Source.read`."""
-        if self._frames is None or self._index >= len(self._frames):
+        image = next(self._frames, None)
+        if image is None:
             return None
         index = self._index
         self._index += 1
-        return self._normalise(self._frames[index]), index / self._rate
+        return image, index / self._rate
 
     def close(self) -> None:
         """Read no more; the file stays mapped for as long as a frame of it is in use."""
-        self._frames = None
+        self._frames = iter(())
 
 
 def _map_array(path: Path) -> NDArray[Any]:
