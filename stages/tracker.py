@@ -13,7 +13,7 @@ from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
 from tactflow.vision.markers import Detection, detect_markers
 from tactflow.vision.seed_tracker import SeedTracker
-from tactflow.vision.tracking import MarkerTracker
+from tactflow.vision.tracking import MarkerTracker, load_loops
 from tactflow.vision.types import Markers
 
 
@@ -48,6 +48,8 @@ class Tracker:
 
     def __init__(self, params: Params) -> None:
         self._params = params
+        if params.method == "appearance":
+            load_loops()
         self.reset()
 
     def reset(self) -> None:

@@ -103,7 +103,6 @@ class MarkerAppearance:
         self._limits = np.array([reference.shape[1] - 1, reference.shape[0] - 1], np.float64)
         self._whole = np.array([reach, _PHASES, _ROUNDS])
         self._real = np.array([radius, _CONVERGED, _SAMPLING])
-        marker_appearance_kernels.measure.load()
 
     def view(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """What `measure` wants of an image (H, W, 3) BGR or (H, W) grey.

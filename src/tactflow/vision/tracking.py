@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled, marker_matching, tracking_kernels
+from tactflow.vision import compiled, marker_appearance_kernels, marker_matching, tracking_kernels
 from tactflow.vision.marker_appearance import MarkerAppearance
 from tactflow.vision.markers import Detection, refine_centers, require_image, to_gray
 from tactflow.vision.types import Markers, MarkerStatus
@@ -25,14 +25,6 @@ _STEEP: Final = 0.4
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 # Spots for which there is room at first.
 _ROOM: Final = 1024
-_LOOPS: Final = (
-    tracking_kernels.judge,
-    tracking_kernels.largest_part,
-    tracking_kernels.peaks,
-    tracking_kernels.near,
-    marker_matching.propose,
-    marker_matching.agree,
-)
 
 
 class _Spots:
@@ -209,8 +201,7 @@ class MarkerTracker:
         self._raster_shape = tuple(int(side / self._cell) + 2 for side in self._shape)
         self._around_spot, self._around_mark = self._disc(0.35), self._disc(0.3)
         self._around, self._around_weight = _surroundings(self._origin, self._pitch)
-        for loop in _LOOPS:
-            loop.load()
+        load_loops()
         self.reset()
 
     def reset(self) -> None:
@@ -478,6 +469,11 @@ class MarkerTracker:
         position[missing[placed]] = self._origin[missing[placed]] + fitted[placed]
         position[missing[~placed]] = self._position[missing[~placed]]
         status[missing[~placed]] = MarkerStatus.LOST
+
+
+def load_loops() -> None:
+    """Compile what the tracker uses, or take it from disk, so that no frame has to wait."""
+    compiled.load(marker_appearance_kernels, marker_matching, tracking_kernels)
 
 
 def _gray_part(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
