@@ -101,48 +101,48 @@ def contact_geometry(
         return None
     roi: NDArray[Any] = mask[top : top + height, left : left + width]
     contours: Sequence[NDArray[Any]]
-    contours, _ = cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    corner = (0, 0) if method == "seed" else (left, top)
+    contours, _ = cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=corner)
     if method == "seed":
         return _seed_contact(contours, left, top, mask.shape[1], cv2.countNonZero(roi))
-    several = len(contours) > 1
-    kept = [contour for contour in contours if _filled_area(contour) >= min_area]
-    if several and len(kept) > 1 and max_gap is not None:
-        kept = _largest_group(kept, roi.shape, max_gap)
-    if not kept:
-        return None
-    if len(kept) < len(contours):
-        filled = np.zeros(roi.shape, np.uint8)
-        cv2.drawContours(filled, kept, -1, 255, cv2.FILLED)
-        roi = cv2.bitwise_and(roi, roi, mask=filled)
-    outline = kept[0] if len(kept) == 1 else np.concatenate(kept)
+    sums = _pixel_sums(roi)
+    if len(contours) > 1 or sums[0] < min_area:
+        kept = [contour for contour in contours if _filled_area(contour) >= min_area]
+        if len(kept) > 1 and max_gap is not None:
+            kept = _largest_group(kept, corner, roi.shape, max_gap)
+        if not kept:
+            return None
+        if len(kept) < len(contours):
+            filled = np.zeros(roi.shape, np.uint8)
+            cv2.drawContours(filled, kept, -1, 255, cv2.FILLED, offset=(-left, -top))
+            sums = _pixel_sums(cv2.bitwise_and(roi, roi, mask=filled))
+        contours = kept
+    outline = contours[0] if len(contours) == 1 else np.concatenate(contours)
     polygon = cv2.convexHull(outline)
     # Sums over pixels in whole numbers: no cancellation, a vertical bar is exactly vertical.
-    count, sx, sy, sxx, sxy, syy = _pixel_sums(roi)
+    count, sx, sy, sxx, sxy, syy = sums
     xx, xy, yy = count * sxx - sx * sx, count * sxy - sx * sy, count * syy - sy * sy
     spread = math.hypot(xx - yy, 2 * xy)
     square = float(count) * count
     major = (xx + yy + spread) / (2 * square)
     minor = (xx * yy - xy * xy) / (square * square * major) if major > 0 else 0.0
     confidence = min(1.0, spread / (xx + yy)) if xx + yy > 0 else 0.0
-    center = (sx / count, sy / count)
+    center = (sx / count + left, sy / count + top)
     angle = slope = None
     if confidence > min_confidence and confidence > _anisotropy_limit(
-        kept, count, center, (xx, xy, yy), confidence
+        contours, count, center, (xx, xy, yy), confidence
     ):
         angle, slope = _direction(0.5 * math.atan2(2 * xy, xx - yy))
     ellipse = None
-    place = (center[0] + left, center[1] + top)
     # A straight line of pixels one pixel wide has a variance of up to 1/12 across.
     if count >= 5 and minor > 1 / 12 + 1e-9:
-        ellipse = Ellipse(place, (4 * math.sqrt(major), 4 * math.sqrt(minor)), angle)
-    vertices = polygon.reshape(-1, 2).astype(np.float64)
-    vertices += (left, top)
+        ellipse = Ellipse(center, (4 * math.sqrt(major), 4 * math.sqrt(minor)), angle)
     return Contact(
         area=_pixels_in_hull(polygon),
-        center=place,
+        center=center,
         angle=angle,
         slope=slope,
-        hull=vertices,
+        hull=polygon[:, 0].astype(np.float64),
         ellipse=ellipse,
         confidence=confidence,
         region_area=float(count),
@@ -236,20 +236,30 @@ def _filled_area(contour: NDArray[Any]) -> float:
 
 
 def _pixels_in_hull(polygon: NDArray[Any]) -> float:
-    vertices = polygon.reshape(-1, 2)
-    edges = np.diff(vertices, axis=0, prepend=vertices[-1:])
-    on_border = int(np.gcd(edges[:, 0], edges[:, 1]).sum())
-    return cv2.contourArea(polygon) + on_border / 2 + 1
+    """Grid points in or on a polygon (n, 1, 2) of grid points (Pick's theorem); exact."""
+    # Of a few vertices, numbers are quicker than arrays.
+    places: list[list[int]] = polygon[:, 0].tolist()
+    twice = on_border = 0
+    x, y = places[-1]
+    for next_x, next_y in places:
+        twice += x * next_y - next_x * y
+        on_border += math.gcd(next_x - x, next_y - y)
+        x, y = next_x, next_y
+    return (abs(twice) + on_border) / 2 + 1
 
 
 def _largest_group(
-    contours: list[NDArray[Any]], shape: tuple[int, ...], max_gap: float
+    contours: list[NDArray[Any]], corner: tuple[int, int], shape: tuple[int, ...], max_gap: float
 ) -> list[NDArray[Any]]:
-    """The contours of the group with the most pixels; groups are linked by gaps of at most max_gap."""
+    """The contours of the group with the most pixels; groups are linked by gaps of at most max_gap.
+
+    corner, shape : of the window that holds them, (x, y) and (h, w) px.
+    """
     reach = min(max_gap, float(sum(shape)))
     border = math.ceil(reach / 2) + 1
+    left, top = corner[0] - border, corner[1] - border
     free = np.full((shape[0] + 2 * border, shape[1] + 2 * border), 255, np.uint8)
-    cv2.drawContours(free, contours, -1, 0, cv2.FILLED, offset=(border, border))
+    cv2.drawContours(free, contours, -1, 0, cv2.FILLED, offset=(-left, -top))
     # Two blobs grown by half the gap each touch where the gap was bridged.
     distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
     _, labels = cv2.connectedComponents((distance <= reach / 2).astype(np.uint8))
@@ -257,7 +267,7 @@ def _largest_group(
     names = []
     for contour in contours:
         x, y = contour[0, 0]
-        name = int(labels[y + border, x + border])
+        name = int(labels[y - top, x - left])
         names.append(name)
         sizes[name] = sizes.get(name, 0.0) + _filled_area(contour)
     largest = max(sizes, key=lambda name: sizes[name])
@@ -265,7 +275,7 @@ def _largest_group(
 
 
 def _anisotropy_limit(
-    contours: list[NDArray[Any]],
+    contours: Sequence[NDArray[Any]],
     count: int,
     center: tuple[float, float],
     second: tuple[int, int, int],
@@ -297,9 +307,9 @@ def _anisotropy_limit(
     deviations = []
     turns = []
     for contour in contours:
-        x = (contour[:, 0, 0] - center[0]) / l11
-        y = (contour[:, 0, 1] - center[1] - l21 * x) / l22
-        z = x + 1j * y
+        z = np.empty(len(contour), np.complex128)
+        z.real = (contour[:, 0, 0] - center[0]) / l11
+        z.imag = (contour[:, 0, 1] - center[1] - l21 * z.real) / l22
         distance = np.maximum(np.abs(z), 1e-9)
         turn = z / distance
         # Share of the full turn that each outline point stands for.
@@ -309,10 +319,11 @@ def _anisotropy_limit(
         turns.append(turn)
     turn = np.concatenate(turns)
     powers = np.empty((len(_HARMONICS), len(turn)), np.complex128)
-    powers[0] = turn * turn * turn
+    np.multiply(turn * turn, turn * np.concatenate(deviations), out=powers[0])
     for k in range(1, len(powers)):
         np.multiply(powers[k - 1], turn, out=powers[k])
-    power = np.abs(powers @ np.concatenate(deviations)) ** 2
+    # Summed by numpy itself: a library of linear algebra would start threads for this.
+    power = np.abs(powers.sum(axis=1)) ** 2
     rough = 4 * math.sqrt(_MEDIAN_RATIO * float(np.median(power)))
     return min(max(limit, rough), _LINEAR_LIMIT)
 
