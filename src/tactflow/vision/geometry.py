@@ -276,11 +276,11 @@ class Preprocessor:
         block: tuple[slice, slice] | None = self._block
         for level in range(self._levels):
             if level == self._levels - 1 and self._rotate == 0:
-                return halved(image, block)
+                return halved(image, block, far=level == 0)
             # What is halved or rotated afterwards can live in a buffer of our own.
             if len(self._shrunk) <= level:
                 self._shrunk.append(halved(image, block))
-            image, block = halved(image, block, into=self._shrunk[level]), None
+            image, block = halved(image, block, into=self._shrunk[level], far=level == 0), None
         return image
 
     def _pyramid(self, image: NDArray[Any]) -> NDArray[Any]:

@@ -174,7 +174,7 @@ def _fill_compiled(whole: NDArray[np.uint8], mask: NDArray[np.uint8], reach: int
     own: _Buffers = _kept.buffers
     section = width + 2 * reach
     picture = whole.reshape(len(whole), -1)
-    halve_block(picture, 0, 0, own.half, 0, 0, 2 * height, 2 * width)
+    halve_block(picture, 0, 0, own.half, 0, 0, 2 * height, 2 * width, False)
     sum_valid(mask, own.either, own.valid, own.half, own.cells, reach, own.masked)
     far = _FAR * 16 / (2 * reach + 1) ** 2
     few = sum_windows(own.cells, reach, own.rows, own.columns, far, 64 * _LEAST, own.lines, own.sums)

@@ -169,7 +169,7 @@ def _compiled_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
         _kept.kind, _kept.buffers = kind, _Buffers(*kind)
     own: _Buffers = _kept.buffers
     reach, picture = own.reach, own.half
-    halve_block(image.reshape(len(image), -1), 0, 0, own.half, reach, reach, height, width)
+    halve_block(image.reshape(len(image), -1), 0, 0, own.half, reach, reach, height, width, False)
     if dot.polarity == "bright":
         # A bright dot is a dark one in the negative.
         picture = np.invert(own.half, out=own.inverted)
