@@ -67,9 +67,9 @@ class _Spots:
     ) -> tuple[FloatArray, FloatArray]:
         """Spots (M, 2), px, between two corners, and their strength (M,), 1 for a typical mark."""
         factor = self._factor
-        left, top = np.maximum((low - self._margin) // factor * factor, 0).astype(np.int64).tolist()
-        right, bottom = (high + self._margin).astype(np.int64).tolist()
-        image = image[top : max(bottom, 0), left : max(right, 0)]
+        left, top = (max(int((side - self._margin) // factor) * factor, 0) for side in low.tolist())
+        right, bottom = (max(int(side + self._margin), 0) for side in high.tolist())
+        image = image[top:bottom, left:right]
         if min(image.shape[:2]) < 3 * factor:
             return np.zeros((0, 2)), np.zeros(0)
         response = self._response(_gray_part(image))
@@ -191,6 +191,7 @@ class MarkerTracker:
         degree = [len(links) for links in self._neighbours]
         usual = sorted(degree)[len(degree) // 2]
         self._rim = np.array([links < usual for links in degree])
+        self._enough_rim = 0.85 * np.count_nonzero(self._rim)
         self._rim_weight = [3 if links < usual else 1 for links in degree]
         self._island = _islands(self._neighbours)
         links = [link for of_mark in self._neighbours for link in of_mark]
@@ -293,7 +294,7 @@ class MarkerTracker:
         stretch: FloatArray,
     ) -> tuple[FloatArray, BoolArray, NDArray[Any]]:
         """Joint choice among the spots of the whole frame, for marks outside the largest smooth part."""
-        if int(self._rim[seen].sum()) < 0.85 * int(self._rim.sum()):
+        if np.count_nonzero(self._rim & seen) < self._enough_rim:
             jump = self._common_jump(image)
             if jump is not None:
                 start = self._position + jump
@@ -306,8 +307,9 @@ class MarkerTracker:
             return position, seen, stderr
         moved = position - self._origin
         common = _median(moved[settled])
-        expected = np.stack([self._position[free], self._origin[free] + common])
-        low, high = expected.min(axis=(0, 1)) - self._farthest, expected.max(axis=(0, 1)) + self._farthest
+        expected = np.concatenate([self._position[free], self._origin[free] + common])
+        low, high = expected.min(axis=0) - self._farthest, expected.max(axis=0) + self._farthest
+        expected = expected.reshape(2, len(free), 2)
         spots, strength = self._spots.find(image, 0.25, low, high)
         # What was measured without belonging to that part is a spot like any other, if it is not one already.
         own = position[free[seen[free]]]
