@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
+from tactflow.stages.tracker import Tracker
+from tactflow.vision import compiled, marker_appearance_kernels, marker_matching, tracking_kernels
 from tactflow.vision.marker_appearance import MarkerAppearance
 from tactflow.vision.marker_matching import choose_spots
 from tactflow.vision.markers import Detection, detect_markers, neighbour_graph, to_gray
@@ -270,6 +271,20 @@ def test_marks_that_are_not_there_are_refused(edges: list[list[int]], free: list
             origin, np.array(edges), np.array(free), np.zeros(2, bool), np.zeros((2, 2)), origin[None, :1],
             origin, np.ones(2), pitch=10.0, farthest=13.0,
         )  # fmt: skip
+
+
+def test_the_stage_has_its_loops_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    loops = [
+        loop
+        for module in (marker_appearance_kernels, marker_matching, tracking_kernels)
+        for loop in vars(module).values()
+        if isinstance(loop, compiled.Kernel)
+    ]
+    assert len(loops) == 7
+    for loop in loops:
+        monkeypatch.setattr(loop, "_compiled", None)
+    Tracker(Tracker.Params())
+    assert all(loop._compiled is not None for loop in loops)
 
 
 def _sequence(jumpy: bool) -> list[NDArray[np.uint8]]:

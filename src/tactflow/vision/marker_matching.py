@@ -104,17 +104,14 @@ def choose_spots(
 
     slot = np.full(len(origin), -1, np.int64)
     slot[free] = np.arange(count)
-    ends = slot[edges]
-    smooth = True
     # Settled neighbours pull each mark on their own.
     shift = _complex(displacement)
-    anchored = [
-        (ends[pulled, one], edges[pulled, other])
-        for one, other in ((0, 1), (1, 0))
-        for pulled in ((ends[:, one] >= 0) & settled[edges[:, other]],)
-    ]
-    mark = np.concatenate([pair[0] for pair in anchored])
-    anchor = np.concatenate([pair[1] for pair in anchored])
+    one, other = edges[:, 0], edges[:, 1]
+    first, second = slot[one], slot[other]
+    starts, stops = first >= 0, second >= 0
+    there, back = np.flatnonzero(starts & settled[other]), np.flatnonzero(stops & settled[one])
+    mark = np.concatenate([first[there], second[back]])
+    anchor = np.concatenate([other[there], one[back]])
     if len(mark):
         cost = np.full((len(mark), labels + 1), _MISSING_LINK)
         span = rest[anchor] - rest[free[mark]]
@@ -122,8 +119,8 @@ def choose_spots(
         np.add.at(unary, mark, cost)
 
     own = np.argmin(unary, axis=1)
-    inner = np.flatnonzero((ends >= 0).all(axis=1))
-    first, second = ends[inner, 0], ends[inner, 1]
+    inner = np.flatnonzero(starts & stops)
+    first, second = first[inner], second[inner]
     span = rest[free[second]] - rest[free[first]]
     smooth = bool((own < labels).all())
     if smooth:
@@ -217,29 +214,30 @@ def _disagreement(first: ComplexArray, second: ComplexArray, span: ComplexArray)
 
 def _propagate(unary: FloatArray, first: IntArray, second: IntArray, pair: NDArray[Any]) -> FloatArray:
     """Min-sum belief propagation: (n, L) costs, links with (L, L) costs each -> (n, L) beliefs (costs)."""
-    source = np.concatenate([first, second])
-    links = len(first)
-    reverse = np.concatenate([np.arange(links) + links, np.arange(links)])
-    # Axes: the label of the sender, the link, the label of the receiver: a minimum over the first is fastest.
-    cost = np.concatenate([pair.transpose(1, 0, 2), pair.transpose(2, 0, 1)], axis=1)
-    collect = np.zeros((len(unary), 2 * links))
-    collect[source[reverse], np.arange(2 * links)] = 1.0
-    message = np.zeros((2 * links, unary.shape[1]))
-    belief = unary
-    choice = np.argmin(belief, axis=1)
+    links, labels = len(first), unary.shape[1]
+    source, target = np.concatenate([first, second]), np.concatenate([second, first])
+    # Axes: the label of the sender, that of the receiver, the link there and back: longest last is fastest.
+    cost = np.concatenate([pair.transpose(1, 2, 0), pair.transpose(2, 1, 0)], axis=2)
+    collect = np.zeros((2 * links, len(unary)))
+    collect[np.arange(2 * links), target] = 1.0
+    message = np.zeros((labels, 2 * links))
+    own = np.ascontiguousarray(unary.T)
+    belief = own
+    choice = belief.argmin(axis=0)
     unchanged = 0
     for _ in range(_MOST_ROUNDS):
-        outgoing = belief[source] - message[reverse]
-        fresh = (outgoing.T[:, :, None] + cost).min(axis=0)
-        fresh -= fresh.min(axis=1, keepdims=True)
+        back = message.reshape(labels, 2, links)[:, ::-1].reshape(labels, 2 * links)
+        outgoing = belief.take(source, axis=1) - back
+        fresh = (outgoing[:, None] + cost).min(axis=0)
+        fresh -= fresh.min(axis=0)
         message = (1 - _DAMPING) * fresh + _DAMPING * message
-        belief = unary + collect @ message
-        latest = np.argmin(belief, axis=1)
-        unchanged = unchanged + 1 if np.array_equal(latest, choice) else 0
+        belief = own + message @ collect
+        latest = belief.argmin(axis=0)
+        unchanged = unchanged + 1 if (latest == choice).all() else 0
         if unchanged == _CALM:
             break
         choice = latest
-    return belief
+    return np.ascontiguousarray(belief.T)
 
 
 @compiled.kernel(
