@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision import compiled
 from tactflow.vision.comparison_kernels import relative_change, smooth_cells, weigh_change
+from tactflow.vision.halving import halved
 from tactflow.vision.imprint import Lengths, lengths_of
 from tactflow.vision.light import LightChange, light_change, positions
 
@@ -199,9 +200,9 @@ class _Planes:
         self, image: NDArray[np.uint8], before: NDArray[np.bool_] | None, then: Float | None
     ) -> Change:
         high, wide = self._shape
-        half = np.empty((2 * high, 2 * wide, 3), np.uint8)
+        half, cells = _cells(image)
         smooth = np.empty((3, high, wide), np.float32)
-        smooth_cells(_whole(image).reshape(4 * high, -1), half.reshape(2 * high, -1), smooth)
+        smooth_cells(cells.reshape(high, -1), smooth)
         found = self._light.fit_planes(smooth)
         square, colour, evidence = np.empty((3, high, wide), np.float32)
         summary = np.empty(4)
@@ -282,21 +283,14 @@ def _smoothed(cells: NDArray[np.uint8]) -> Float:
     return np.asarray(cv2.blur(cells.astype(np.float32), (3, 3)), np.float32)
 
 
-def _whole(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The picture, its border repeated to make whole cells."""
-    bottom, right = -image.shape[0] % CELL, -image.shape[1] % CELL
-    if bottom or right:
-        return np.asarray(cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
-    return np.ascontiguousarray(image)
-
-
 def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Means over 2 x 2 px and over 4 x 4 px."""
-    whole = _whole(image)
-    height, width = whole.shape[:2]
-    half = cv2.resize(whole, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    cells = cv2.resize(half, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
-    return np.asarray(half, np.uint8), np.asarray(cells, np.uint8)
+    """Means over 2 x 2 px and over 4 x 4 px; the border is repeated to make whole cells."""
+    bottom, right = -image.shape[0] % CELL, -image.shape[1] % CELL
+    whole = np.ascontiguousarray(image)
+    if bottom or right:
+        whole = np.asarray(cv2.copyMakeBorder(whole, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
+    half = halved(whole)
+    return half, halved(half)
 
 
 def _steepness(picture: Float) -> Float:

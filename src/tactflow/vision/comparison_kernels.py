@@ -16,32 +16,14 @@ Double = NDArray[np.float64]
 Byte = NDArray[np.uint8]
 
 
-@kernel("void(uint8[:, ::1], uint8[:, ::1], float32[:, :, ::1])")
-def smooth_cells(picture: Byte, half: Byte, smooth: Float) -> None:
-    """Means over 2 x 2 px, and means over 4 x 4 px, in whole grey levels, smoothed over 3 x 3 of them.
+@kernel("void(uint8[:, ::1], float32[:, :, ::1])")
+def smooth_cells(cells: Byte, smooth: Float) -> None:
+    """Means over 3 x 3 cells, plane by plane.
 
-    picture : (4 h, 12 w). half : (2 h, 6 w) and smooth : (3, h, w) are filled.
+    cells : (h, 3 w). smooth : (3, h, w), filled.
     """
     high, wide = smooth.shape[1:]
-    one, two = np.uint16(1), np.uint16(2)
-    sums = np.empty(picture.shape[1], np.uint16)
-    for y in range(half.shape[0]):
-        upper, lower, line = picture[2 * y], picture[2 * y + 1], half[y]
-        for x in range(sums.size):
-            sums[x] = np.uint16(upper[x]) + np.uint16(lower[x]) + one
-        for x in range(2 * wide):
-            line[3 * x] = (sums[6 * x] + sums[6 * x + 3]) >> two
-            line[3 * x + 1] = (sums[6 * x + 1] + sums[6 * x + 4]) >> two
-            line[3 * x + 2] = (sums[6 * x + 2] + sums[6 * x + 5]) >> two
-    cells = np.empty((high, 3 * wide), np.uint8)
-    for y in range(high):
-        upper, lower, line = half[2 * y], half[2 * y + 1], cells[y]
-        for x in range(6 * wide):
-            sums[x] = np.uint16(upper[x]) + np.uint16(lower[x]) + one
-        for x in range(wide):
-            line[3 * x] = (sums[6 * x] + sums[6 * x + 3]) >> two
-            line[3 * x + 1] = (sums[6 * x + 1] + sums[6 * x + 4]) >> two
-            line[3 * x + 2] = (sums[6 * x + 2] + sums[6 * x + 5]) >> two
+    sums = np.empty(3 * wide, np.uint16)
     ninth = np.float32(1 / 9)
     for y in range(high):
         above = min(1, high - 1) if y == 0 else y - 1
@@ -50,14 +32,13 @@ def smooth_cells(picture: Byte, half: Byte, smooth: Float) -> None:
         for x in range(3 * wide):
             sums[x] = np.uint16(upper[x]) + np.uint16(line[x]) + np.uint16(lower[x])
         for channel in range(3):
-            row = smooth[channel, y]
-            for x in range(1, wide - 1):
-                at = 3 * x + channel
-                row[x] = np.float32(sums[at - 3] + sums[at] + sums[at + 3]) * ninth
-            second, last = min(1, wide - 1), wide - 1
-            row[0] = np.float32(sums[channel] + 2 * sums[3 * second + channel]) * ninth
-            beside = 3 * max(last - 1, 0) + channel
-            row[last] = np.float32(sums[3 * last + channel] + 2 * sums[beside]) * ninth
+            row, part = smooth[channel, y], sums[channel:]
+            inner = row[1:]
+            for x in range(wide - 2):
+                inner[x] = np.float32(part[3 * x] + part[3 * x + 3] + part[3 * x + 6]) * ninth
+            last = wide - 1
+            row[0] = np.float32(part[0] + 2 * part[3 * min(1, last)]) * ninth
+            row[last] = np.float32(part[3 * last] + 2 * part[3 * max(last - 1, 0)]) * ninth
 
 
 @kernel(
