@@ -55,6 +55,22 @@ def test_a_dent_or_a_bulge_below_a_mark_does_not_move_it(dent: float) -> None:
         assert inside_mask(wrong, picture(bent)).all() == (dent > 0)
 
 
+@pytest.mark.parametrize("radius", [11.0, 14.0, 20.0, 40.0])
+def test_the_bridge_over_a_rim_is_as_round_as_the_rim(radius: float) -> None:
+    rng = np.random.default_rng(8)
+    errors = []
+    for _ in range(60):
+        x, y = rng.uniform(90, 110), rng.uniform(70, 90)
+        depth, angle = rng.uniform(-2, 2), rng.uniform(0, 2 * math.pi)
+        mark = np.array([[x + (radius - depth) * math.cos(angle), y + (radius - depth) * math.sin(angle)]])
+        found = outline_depth(mark, picture(disc(x, y, radius) & ~disc(*mark[0], 5.0)), HIDDEN, HIDDEN + 1)
+        errors.append(found[0] - depth)
+    # Measured over the four radii: 0.04 to 0.06 px on average, that is half of what the pixels' stairs
+    # shift a rim; 0.10 to 0.14 px standard deviation.
+    assert abs(np.mean(errors)) < 0.12
+    assert np.std(errors) < 0.2
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.3, 0.9, 2.0, 4.0])
 def test_the_distance_counts_to_a_fraction_of_a_pixel(angle: float) -> None:
     along = np.array([math.cos(angle), math.sin(angle)])

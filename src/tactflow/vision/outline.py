@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled, outline_kernels
-from tactflow.vision.outline_kernels import ALONG, RIDGE, SIDE, STEPS, TIE
+from tactflow.vision.outline_kernels import ALONG, RIDGE, SIDE, TIE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -27,8 +27,6 @@ IntArray = NDArray[np.intp]
 _WHICH: Final = np.repeat([0, 1], len(ALONG))
 _SIGN: Final = np.repeat([-1.0, 1.0], len(ALONG))
 _OUTWARD: Final = _SIGN * np.tile(ALONG, 2)
-_BRIDGE: Final = np.stack([STEPS**0, STEPS, STEPS**2], axis=1)
-_TANGENT: Final = np.stack([0 * STEPS, STEPS**0, 2 * STEPS], axis=1)
 _RIDGE: Final = np.diag(RIDGE)
 # Of an outline with more points, every second is enough.
 _MANY: Final = 400
@@ -44,12 +42,13 @@ def inside_outline(
     mask : (H, W) uint8, non-zero in the region. A pixel is a square: the outline runs half a pixel outside of
         the centres of the outermost ones.
     hidden : px, >= 0. Outline that is nearer than this to a mark is not trusted for this mark: it is replaced
-        by the parabola that fits what is seen of it to both sides. Larger values are safer against dents and
-        know less of corners.
+        by the circle, or line, that fits what is seen of it to both sides. Larger values are safer against
+        dents and know less of corners.
     dilate : px, >= 0, to a fraction of a pixel.
 
-    The parabola is a least-squares fit of both coordinates as polynomials of second degree in the distance
-    from the middle of the gap (Lancaster and Salkauskas, "Curve and surface fitting", 1986, ch. 2).
+    The circle is the least-squares fit of its equation, which is linear in three parameters (Kasa, "A circle
+    fitting procedure and its error analysis", IEEE Trans. Instrum. Meas. 1976); one of them is the curvature,
+    so that a line is a circle like others.
 
     Returns (N,) bool. Raises ValueError if mask is not (H, W) uint8, or if hidden or dilate is negative or
     not finite. Computed in float64.
@@ -124,8 +123,11 @@ def _depths(
         if nearest.min() > hidden * hidden:
             continue
         which, before, after = _gaps(lengths > hidden * hidden)
+        # The whole outline but for one pixel says nothing about its direction.
+        known = (outline[before] != outline[after]).any(axis=1)
+        which, before, after = which[known], before[known], after[known]
         if len(which):
-            found = _beyond(marks[which], corners, before, after, hidden / spacing)
+            found = _beyond(marks[which], corners, before, after, hidden / spacing, max(hidden, 1.0))
             for mark, value in zip(which.tolist(), found.tolist(), strict=True):
                 if abs(value + TIE) < abs(bridged[mark] + TIE):
                     bridged[mark] = value
@@ -153,32 +155,29 @@ def _gaps(seen: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _beyond(
-    marks: FloatArray, outline: FloatArray, before: IntArray, after: IntArray, half_width: float
+    marks: FloatArray, outline: FloatArray, before: IntArray, after: IntArray, half_width: float, unit: float
 ) -> FloatArray:
     """Signed distance (g,), px, of marks (g, 2) from the bridges over their gaps, positive inside.
 
-    half_width : of a gap, points of the outline.
+    half_width : of a gap, points of the outline. unit : px, a length of the size of a gap.
+
+    With the mark as origin, the curve is v = a + b u + c (u^2 + v^2), at a distance of
+    2 a / (g + sqrt(g^2 - 4 a c)), where g^2 = 1 + b^2; for c = 0 that is the distance from a line.
     """
     count = len(outline)
     side = min(SIDE * half_width, count / 2 - 1)
     borders = np.stack([before, after], axis=1)
     ends = (borders.take(_WHICH, axis=1) + np.rint(_OUTWARD * side).astype(np.intp)) % count
-    known = outline.take(ends, axis=0)
+    known = (outline.take(ends, axis=0) - marks[:, None]) / unit
     corners = outline.take(borders, axis=0)
     chord = corners[:, 1] - corners[:, 0]
-    half = np.maximum(0.5 * np.sqrt((chord * chord).sum(axis=1)), 0.5)
-    away = known - corners.take(_WHICH, axis=1)
-    place = _SIGN * (1 + np.sqrt((away * away).sum(axis=2)) / half[:, None])
-    powers = np.empty((len(marks), 3, len(_WHICH)))
-    powers[:, 0], powers[:, 1] = 1, place
-    np.multiply(place, place, out=powers[:, 2])
-    # Relative to the mark, so that its place in the frame costs no digits.
-    fit = np.linalg.solve(powers @ powers.transpose(0, 2, 1) + _RIDGE, powers @ (known - marks[:, None]))
-    offset = _BRIDGE @ fit
-    tangent = _TANGENT @ fit
-    nearest = ((offset * offset).sum(axis=2) + TIE * STEPS).argmin(axis=1)
-    rows = np.arange(len(marks))
-    offset, tangent = offset[rows, nearest], tangent[rows, nearest]
-    # Outlines go round so that the region lies to their left, as seen with y down.
-    across = tangent[:, 0] * offset[:, 1] - tangent[:, 1] * offset[:, 0]
-    return np.asarray(across / np.maximum(np.sqrt((tangent * tangent).sum(axis=1)), 1e-9), np.float64)
+    along, down = (chord / np.sqrt((chord * chord).sum(axis=1))[:, None]).T[:, :, None]
+    # Along the chord, and into the region, which lies to the left of its outlines, as seen with y down.
+    u = known[..., 0] * along + known[..., 1] * down
+    v = known[..., 0] * down - known[..., 1] * along
+    rows = np.stack([np.ones_like(u), u, u * u + v * v], axis=1)
+    fit = np.linalg.solve(rows @ rows.transpose(0, 2, 1) + _RIDGE, rows @ v[..., None])
+    a, b, c = fit[..., 0].T
+    slope = 1 + b * b
+    distance = -2 * a / (np.sqrt(slope) + np.sqrt(np.maximum(slope - 4 * a * c, 0)))
+    return np.asarray(distance * unit, np.float64)

@@ -17,13 +17,11 @@ SIDE: Final = 1.5
 and the pixels' stairs tilt it; more, and it cuts corners."""
 ALONG: Final = np.linspace(0, 1, 12)
 """Where the points of a side lie that are taken, from the gap outwards."""
-STEPS: Final = np.linspace(-1, 1, 9)
-"""Where along a gap its bridge is evaluated, in half widths from the middle."""
 RIDGE: Final = (1e-9, 1e-6, 1e-6)
 """Added to the squares of the fit: a trace that keeps a side of a few points solvable."""
 TIE: Final = 1e-6
-"""Breaks ties, px or px^2: of the two sides of a line one pixel wide, that one counts which has the mark
-outside; of a bridge's places, the first."""
+"""Of two bridges at the same distance but for so much, px, that one counts which has the mark outside: both
+sides of a line that is one pixel wide."""
 _APART: Final = math.sqrt(2) + 1e-9
 
 
@@ -45,8 +43,9 @@ def outline_depths(
     """Set the `depth` of each point that lies in `box` (left, top, right, bottom).
 
     outlines : (n, 2) px, closed, one after the other, each of so many points as `counts` says, which are
-        `spacings` steps to a neighbouring pixel apart.
+        `spacings` steps to a neighbouring pixel apart. hidden, reach : see `outline.outline_depth`.
     """
+    unit = max(hidden, 1.0)
     for mark in range(points.shape[0]):
         x, y = points[mark, 0], points[mark, 1]
         if not (box[0] < x < box[2] and box[1] < y < box[3]):
@@ -78,49 +77,44 @@ def outline_depths(
                         before = here - 1 if here > begin else end - 1
                     index += 1
                     continue
+                chord_x = chord_y = 0.0
                 if before >= 0:
-                    value = 0.0
-                    side = min(SIDE * hidden / spacings[line], count / 2 - 1)
                     chord_x = np.float64(outlines[here, 0] - outlines[before, 0])
                     chord_y = np.float64(outlines[here, 1] - outlines[before, 1])
-                    half = max(0.5 * math.sqrt(chord_x * chord_x + chord_y * chord_y), 0.5)
-                    s1 = s2 = s3 = s4 = x0 = x1 = x2 = y0 = y1 = y2 = 0.0
+                chord = math.sqrt(chord_x * chord_x + chord_y * chord_y) * unit
+                if chord > 0:
+                    side = min(SIDE * hidden / spacings[line], count / 2 - 1)
+                    s1 = s2 = s3 = s4 = s5 = v0 = v1 = v2 = 0.0
                     for sign in (-1, 1):
                         corner = before if sign < 0 else here
                         for out in ALONG:
                             # At most half way round.
                             known = corner + int(np.rint(sign * out * side))
                             known += count if known < begin else -count if known >= end else 0
-                            away_x = np.float64(outlines[known, 0] - outlines[corner, 0])
-                            away_y = np.float64(outlines[known, 1] - outlines[corner, 1])
-                            t = sign * (1 + math.sqrt(away_x * away_x + away_y * away_y) / half)
                             away_x, away_y = outlines[known, 0] - x, outlines[known, 1] - y
-                            s1, s2, s3, s4 = s1 + t, s2 + t * t, s3 + t * t * t, s4 + t * t * t * t
-                            x0, x1, x2 = x0 + away_x, x1 + t * away_x, x2 + t * t * away_x
-                            y0, y1, y2 = y0 + away_y, y1 + t * away_y, y2 + t * t * away_y
+                            # Along the chord, and into the region.
+                            u = (away_x * chord_x + away_y * chord_y) / chord
+                            v = (away_x * chord_y - away_y * chord_x) / chord
+                            w = u * u + v * v
+                            s1, s2, s3, s4, s5 = s1 + u, s2 + w, s3 + u * u, s4 + u * w, s5 + w * w
+                            v0, v1, v2 = v0 + v, v1 + u * v, v2 + w * v
                     # Cholesky's factors without their roots.
                     s0 = 2 * ALONG.size + RIDGE[0]
                     below1, below2 = s1 / s0, s2 / s0
-                    d1 = s2 + RIDGE[1] - below1 * s1
-                    mixed = s3 - below2 * s1
+                    d1 = s3 + RIDGE[1] - below1 * s1
+                    mixed = s4 - below2 * s1
                     below = mixed / d1
-                    d2 = s4 + RIDGE[2] - below2 * s2 - below * mixed
-                    x1, y1 = x1 - below1 * x0, y1 - below1 * y0
-                    x2, y2 = (x2 - below2 * x0 - below * x1) / d2, (y2 - below2 * y0 - below * y1) / d2
-                    x1, y1 = x1 / d1 - below * x2, y1 / d1 - below * y2
-                    x0, y0 = x0 / s0 - below1 * x1 - below2 * x2, y0 / s0 - below1 * y1 - below2 * y2
-                    closest = np.inf
-                    for u in STEPS:
-                        away_x, away_y = x0 + u * (x1 + u * x2), y0 + u * (y1 + u * y2)
-                        square_there = away_x * away_x + away_y * away_y + TIE * u
-                        if square_there < closest:
-                            closest = square_there
-                            along_x, along_y = x1 + 2 * u * x2, y1 + 2 * u * y2
-                            length = max(math.sqrt(along_x * along_x + along_y * along_y), 1e-9)
-                            value = (along_x * away_y - along_y * away_x) / length
+                    d2 = s5 + RIDGE[2] - below2 * s2 - below * mixed
+                    v1 -= below1 * v0
+                    v2 = (v2 - below2 * v0 - below * v1) / d2
+                    v1 = v1 / d1 - below * v2
+                    v0 = v0 / s0 - below1 * v1 - below2 * v2
+                    slope = 1 + v1 * v1
+                    root = math.sqrt(max(slope - 4 * v0 * v2, 0.0))
+                    value = -2 * v0 / (math.sqrt(slope) + root) * unit
                     if abs(value + TIE) < abs(bridged + TIE):
                         bridged = value
-                    before = -1
+                before = -1
                 # No point that is left out is nearer than the nearest so far, or hidden.
                 index += max(1, int((math.sqrt(square) - far) * share))
         if bridged < np.inf:
