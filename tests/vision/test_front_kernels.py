@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, get_args
 
 import cv2
@@ -186,3 +187,20 @@ def test_frames_of_different_sizes_and_dots_may_take_turns() -> None:
                     assert np.array_equal(marker_mask(picture, dot), mask)
                 difference = remove_markers(picture, known[0]).astype(int) - unmarked
                 assert np.abs(difference).max() <= 1
+
+
+def test_threads_do_not_disturb_each_other() -> None:
+    pictures = [_picture(200, 151 + index, seed=2 * index + 1) for index in range(2)]
+    pictures += [picture[::-1].copy() for picture in pictures]
+
+    def both(picture: Image) -> tuple[Image, Image]:
+        mask = marker_mask(picture, Dot(4.0))
+        return mask, remove_markers(picture, mask)
+
+    with compiled.switched(True):
+        alone = [both(picture) for picture in pictures]
+        with ThreadPoolExecutor(4) as threads:
+            together = list(threads.map(both, pictures * 50))
+    for index, (mask, unmarked) in enumerate(together):
+        assert np.array_equal(mask, alone[index % 4][0])
+        assert np.array_equal(unmarked, alone[index % 4][1])
