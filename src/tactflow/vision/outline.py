@@ -69,34 +69,31 @@ def outline_depth(points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, 
 
     With numba and without, distances agree to 1e-5 px.
     """
-    depth = np.full(len(points), -np.inf)
     if len(points) == 0 or mask.size == 0:
-        return depth
-    left, top, width, height = cv2.boundingRect(mask)
-    if width == 0:
-        return depth
-    region = mask[top : top + height, left : left + width]
-    lines = cv2.findContours(region, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE, offset=(left, top))[0]
-    box = (left - reach, top - reach, left + width - 1 + reach, top + height - 1 + reach)
-    outlines = [np.asarray(line[:: 2 if len(line) > _MANY else 1, 0], np.int32) for line in lines]
-    spacings = [2 if len(line) > _MANY else 1 for line in lines]
+        return np.full(len(points), -np.inf)
+    lines = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
+    if len(lines) == 0:
+        return np.full(len(points), -np.inf)
+    steps = [2 if len(line) > _MANY else 1 for line in lines]
+    outlines = [np.asarray(line[::step, 0], np.int32) for line, step in zip(lines, steps, strict=True)]
     if compiled.active():
+        depth = np.empty(len(points))
         outline_kernels.outline_depths(
             np.ascontiguousarray(points, np.float64),
             np.ascontiguousarray(mask),
             np.concatenate(outlines) if len(outlines) > 1 else np.ascontiguousarray(outlines[0]),
-            np.array([len(outline) for outline in outlines]),
-            np.array(spacings),
-            box,
+            np.array([steps, list(map(len, outlines))]),
             hidden,
             reach,
             depth,
         )
         return depth
-    x, y = points[:, 0], points[:, 1]
-    near = np.flatnonzero((x > box[0]) & (y > box[1]) & (x < box[2]) & (y < box[3]))
+    depth = np.full(len(points), -np.inf)
+    every = np.concatenate(outlines)
+    low, high = every.min(axis=0) - reach, every.max(axis=0) + reach
+    near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
     if len(near):
-        depth[near] = _depths(np.asarray(points[near], np.float64), mask, outlines, spacings, hidden, reach)
+        depth[near] = _depths(np.asarray(points[near], np.float64), mask, outlines, steps, hidden, reach)
     return depth
 
 
@@ -104,7 +101,7 @@ def _depths(
     marks: FloatArray,
     mask: NDArray[np.uint8],
     outlines: Sequence[NDArray[np.int32]],
-    spacings: Sequence[int],
+    steps: Sequence[int],
     hidden: float,
     reach: float,
 ) -> FloatArray:
@@ -114,7 +111,7 @@ def _depths(
     on[on] = mask[row[on], column[on]] != 0
     squared = np.full(len(marks), np.inf)
     bridged = np.full(len(marks), np.inf)
-    for outline, spacing in zip(outlines, spacings, strict=True):
+    for outline, step in zip(outlines, steps, strict=True):
         corners = outline.astype(np.float64)
         away = marks[:, :1] - corners[:, 0], marks[:, 1:] - corners[:, 1]
         lengths = away[0] * away[0] + away[1] * away[1]
@@ -127,7 +124,7 @@ def _depths(
         known = (outline[before] != outline[after]).any(axis=1)
         which, before, after = which[known], before[known], after[known]
         if len(which):
-            found = _beyond(marks[which], corners, before, after, hidden / spacing, max(hidden, 1.0))
+            found = _beyond(marks[which], corners, before, after, hidden / step, max(hidden, 1.0))
             for mark, value in zip(which.tolist(), found.tolist(), strict=True):
                 if abs(value + TIE) < abs(bridged[mark] + TIE):
                     bridged[mark] = value

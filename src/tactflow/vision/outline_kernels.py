@@ -25,35 +25,37 @@ sides of a line that is one pixel wide."""
 _APART: Final = math.sqrt(2) + 1e-9
 
 
-@kernel(
-    "void(float64[:, ::1], uint8[:, ::1], int32[:, ::1], int64[::1], int64[::1],"
-    " UniTuple(float64, 4), float64, float64, float64[::1])"
-)
+@kernel("void(float64[:, ::1], uint8[:, ::1], int32[:, ::1], int64[:, ::1], float64, float64, float64[::1])")
 def outline_depths(
     points: Double,
     mask: NDArray[np.uint8],
     outlines: NDArray[np.int32],
-    counts: NDArray[np.int64],
-    spacings: NDArray[np.int64],
-    box: tuple[float, float, float, float],
+    lines: NDArray[np.int64],
     hidden: float,
     reach: float,
     depth: Double,
 ) -> None:
-    """Set the `depth` of each point that lies in `box` (left, top, right, bottom).
+    """Set the `depth` of each point, as `outline.outline_depth` returns it.
 
-    outlines : (n, 2) px, closed, one after the other, each of so many points as `counts` says, which are
-        `spacings` steps to a neighbouring pixel apart. hidden, reach : see `outline.outline_depth`.
+    outlines : (n, 2) px, closed, one after the other. lines : (2, k), for each of them how many steps to a
+    neighbouring pixel its points are apart, and how many it has.
     """
+    left = right = outlines[0, 0]
+    top = bottom = outlines[0, 1]
+    for index in range(outlines.shape[0]):
+        left, right = min(left, outlines[index, 0]), max(right, outlines[index, 0])
+        top, bottom = min(top, outlines[index, 1]), max(bottom, outlines[index, 1])
     unit = max(hidden, 1.0)
     for mark in range(points.shape[0]):
         x, y = points[mark, 0], points[mark, 1]
-        if not (box[0] < x < box[2] and box[1] < y < box[3]):
+        if not (left - reach < x < right + reach and top - reach < y < bottom + reach):
+            depth[mark] = -np.inf
             continue
         nearest, far, bridged = reach * reach, reach, np.inf
         end = 0
-        for line in range(counts.size):
-            count, share = counts[line], 1 / (_APART * spacings[line])
+        for line in range(lines.shape[1]):
+            step, count = lines[0, line], lines[1, line]
+            share = 1 / (_APART * step)
             begin, end = end, end + count
             # From a point that is seen on, so that no gap goes round the end.
             first = begin
@@ -83,7 +85,7 @@ def outline_depths(
                     chord_y = np.float64(outlines[here, 1] - outlines[before, 1])
                 chord = math.sqrt(chord_x * chord_x + chord_y * chord_y) * unit
                 if chord > 0:
-                    side = min(SIDE * hidden / spacings[line], count / 2 - 1)
+                    side = min(SIDE * hidden / step, count / 2 - 1)
                     s1 = s2 = s3 = s4 = s5 = v0 = v1 = v2 = 0.0
                     for sign in (-1, 1):
                         corner = before if sign < 0 else here
