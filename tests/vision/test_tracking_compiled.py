@@ -89,7 +89,7 @@ def test_marks_measure_alike_at_and_beyond_the_border() -> None:
         [
             [x, y]
             for x in (-500.0, -0.4, 0.0, 0.6, width - 8.0, width - 6.0, width - 4.0, width + 300.0)
-            for y in (-9.0, 0.0, 2.5, height - 0.5, 1e7)
+            for y in (-9.0, 2.5, 70.0, height - 5.0, 1e7)
         ]
     )
     marks = np.arange(len(places))
