@@ -9,6 +9,7 @@ from pydantic import Field
 from tactflow.engine.frame import Absent
 from tactflow.engine.stage import StageParams
 from tactflow.ports import ContactMask
+from tactflow.vision import compiled, hull_kernels
 from tactflow.vision.hull import contact_geometry
 from tactflow.vision.types import Contact
 
@@ -43,6 +44,7 @@ class Hull:
 
     def __init__(self, params: Params) -> None:
         self._params = params
+        compiled.load(hull_kernels)
 
     def process(self, contact_mask: ContactMask) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""

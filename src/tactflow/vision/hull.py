@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactflow.vision import compiled, hull_kernels
 from tactflow.vision.types import Contact, Ellipse
 
 Method = Literal["moments", "seed"]
@@ -96,7 +97,7 @@ def contact_geometry(
         raise ValueError(f"required method to be 'moments' or 'seed', got {method!r}")
     if mask.size == 0:
         return None
-    left, top, width, height = cv2.boundingRect(mask)
+    (left, top, width, height), sums = _measured(mask)
     if width == 0:
         return None
     roi: NDArray[Any] = mask[top : top + height, left : left + width]
@@ -105,7 +106,6 @@ def contact_geometry(
     contours, _ = cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=corner)
     if method == "seed":
         return _seed_contact(contours, left, top, mask.shape[1], cv2.countNonZero(roi))
-    sums = _pixel_sums(roi)
     if len(contours) > 1 or sums[0] < min_area:
         kept = [contour for contour in contours if _filled_area(contour) >= min_area]
         if len(kept) > 1 and max_gap is not None:
@@ -198,12 +198,23 @@ def _direction(theta: float) -> tuple[float, float | None]:
     return angle + 0.0, slope
 
 
-def _pixel_sums(roi: NDArray[Any]) -> tuple[int, int, int, int, int, int]:
+def _measured(mask: NDArray[np.uint8]) -> tuple[list[int], list[int]]:
+    """Bounding box (left, top, width, height) of the non-zero pixels, and `_pixel_sums` inside of it."""
+    if compiled.active():
+        found = np.empty(10, np.int64)
+        hull_kernels.measure_region(np.ascontiguousarray(mask), found)
+        numbers: list[int] = found.tolist()
+        return numbers[:4], numbers[4:]
+    left, top, width, height = box = cv2.boundingRect(mask)
+    return list(box), _pixel_sums(mask[top : top + height, left : left + width]) if width else []
+
+
+def _pixel_sums(roi: NDArray[Any]) -> list[int]:
     """Over the non-zero pixels: their number and the sums of x, y, x^2, x y and y^2; exact."""
     if roi.size < _LARGE:
         moments = cv2.moments(roi, binaryImage=True)
         m00, m10, m01 = round(moments["m00"]), round(moments["m10"]), round(moments["m01"])
-        return m00, m10, m01, round(moments["m20"]), round(moments["m11"]), round(moments["m02"])
+        return [m00, m10, m01, round(moments["m20"]), round(moments["m11"]), round(moments["m02"])]
     # By runs of pixels, of which a large region has few. Each line starts with a pixel outside.
     width = roi.shape[1] + 1
     inside = np.zeros((len(roi), width), np.bool_)
@@ -220,14 +231,14 @@ def _pixel_sums(roi: NDArray[Any]) -> tuple[int, int, int, int, int, int]:
     # The sum of the squares below n is (n - 1) n (2 n - 1) / 6.
     squares = ((after - 1) * after * (2 * after - 1) - (first - 1) * first * (2 * first - 1)) // 6
     lines = y * length
-    return (
+    return [
         int(length.sum()),
         int(x.sum()),
         int(lines.sum()),
         int(squares.sum()),
         int((y * x).sum()),
         int((y * lines).sum()),
-    )
+    ]
 
 
 def _filled_area(contour: NDArray[Any]) -> float:
