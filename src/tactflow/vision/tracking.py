@@ -359,10 +359,10 @@ class MarkerTracker:
             return None
         cell = 0.1 * self._pitch
         reach = int(self._farthest / cell)
-        votes = (spots[None] - self._position[:, None]).reshape(-1, 2)
+        votes = _differences(self._position, spots, (reach + 1) * cell)
         bins = np.rint(votes / cell).astype(np.int64)
-        votes = votes[(np.abs(bins) <= reach).all(axis=1)]
-        bins = bins[(np.abs(bins) <= reach).all(axis=1)] + reach
+        near = (np.abs(bins) <= reach).all(axis=1)
+        votes, bins = votes[near], bins[near] + reach
         side = 2 * reach + 1
         counts = np.bincount(bins[:, 1] * side + bins[:, 0], minlength=side * side).reshape(side, side)
         around = cv2.boxFilter(
@@ -481,6 +481,16 @@ def load_loops() -> None:
 def _gray_part(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Of a part of a contiguous image, without a copy as `to_gray` makes."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def _differences(points: FloatArray, others: FloatArray, reach: float) -> FloatArray:
+    """All others - points (n, 2) whose y is within reach, so that not everything meets everything."""
+    others = others[np.argsort(others[:, 1])]
+    first = np.searchsorted(others[:, 1], points[:, 1] - reach)
+    count = np.searchsorted(others[:, 1], points[:, 1] + reach) - first
+    before = np.cumsum(count) - count
+    other = np.arange(count.sum()) + np.repeat(first - before, count)
+    return np.asarray(others[other] - np.repeat(points, count, axis=0), np.float64)
 
 
 def _median(vectors: FloatArray) -> FloatArray:
