@@ -31,25 +31,28 @@ _OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 
 
 class _Kept:
-    """The JSON of an array, kept until another one comes.
+    """What the encoder is given for an array; when the array comes again, its finished text.
 
     Origins stay the same for a whole epoch, statuses for many frames, and an unchanged scene repeats its
-    positions; their texts are most of a message, and to compare bytes takes a twentieth of the time.
+    positions. Their texts are most of a message, and to compare bytes takes a twentieth of the time.
 
-    write : makes the text of an array.
+    encodable : from an array to what the encoder takes.
     """
 
-    def __init__(self, write: Callable[[NDArray[Any]], bytes]) -> None:
-        self._write = write
-        self._last: tuple[Any, bytes, orjson.Fragment] = (None, b"", orjson.Fragment(b"[]"))
+    def __init__(self, encodable: Callable[[NDArray[Any]], Any]) -> None:
+        self._encodable = encodable
+        self._last: tuple[bytes, Any, orjson.Fragment | None] = (b"", None, None)
 
-    def __call__(self, array: NDArray[Any]) -> orjson.Fragment:
-        data = array.tobytes()
-        dtype, known, text = self._last
-        if known != data or dtype != array.dtype:
-            text = orjson.Fragment(self._write(array))
-            # One assignment, so that sinks in several threads may use it.
-            self._last = (array.dtype, data, text)
+    def __call__(self, array: NDArray[Any]) -> Any:
+        data, dtype = array.tobytes(), array.dtype
+        known, known_dtype, text = self._last
+        # Each time one assignment, so that sinks in several threads may use it.
+        if known != data or known_dtype != dtype:
+            self._last = (data, dtype, None)
+            return self._encodable(array)
+        if text is None:
+            text = orjson.Fragment(orjson.dumps(self._encodable(array), option=_OPTIONS))
+            self._last = (data, dtype, text)
         return text
 
 
@@ -118,7 +121,7 @@ def _contact(contact: Contact, detail: bool) -> dict[str, Any]:
         "center": _pair(contact.center, "contact.center"),
         "angle": _optional(contact.angle, "contact.angle"),
         "slope": _optional(contact.slope, "contact.slope"),
-        "hull": orjson.Fragment(_points(contact.hull, "contact.hull")),
+        "hull": _points(contact.hull, "contact.hull"),
         "ellipse": None
         if ellipse is None
         else {
@@ -175,18 +178,19 @@ def _pair(pair: tuple[float, float], name: str) -> list[float]:
     return [_number(pair[0], name), _number(pair[1], name)]
 
 
-def _points(points: NDArray[Any], name: str) -> bytes:
+def _points(points: NDArray[Any], name: str) -> NDArray[np.float64]:
     # The encoder takes contiguous arrays only.
-    text = orjson.dumps(np.ascontiguousarray(points, np.float64), option=_OPTIONS)
-    # It writes NaN and infinity as null.
-    if b"null" in text:
+    points = np.ascontiguousarray(points, np.float64)
+    # A sum of squares is finite only if every number is: one pass, no temporary. (It overflows for numbers
+    # beyond 1e154, which are no pixels either.)
+    if not math.isfinite(np.vdot(points, points)):
         raise ValueError(f"{name}: required finite numbers, got NaN or infinity")
-    return text
+    return points
 
 
 _origin = _Kept(lambda points: _points(points, "markers.origin"))
 _position = _Kept(lambda points: _points(points, "markers.position"))
-_status = _Kept(lambda status: orjson.dumps([STATUS_NAMES[value] for value in status.tolist()]))
+_status = _Kept(lambda status: [STATUS_NAMES[value] for value in status.tolist()])
 
 
 # -- the schema ----------------------------------------------------------------------------------------------

@@ -359,17 +359,25 @@ class Runner:
         One with `takes_references` gets all references; no other gets a reference image that is not part of
         the source.
         """
-        wanted = tuple([sink.id for sink in sinks if not sink.disabled and self._wanted(sink, frame)])
+        wanted = tuple(
+            [
+                sink.id
+                for sink in sinks
+                if not sink.disabled
+                and (
+                    (frame.reference and sink.takes_references)
+                    or (
+                        frame.seq >= 0
+                        and (sink.rate_limit is None or sink.rate_limit.due(frame.t))
+                        and (sink.wants is None or sink.wants())
+                    )
+                )
+            ]
+        )
         demand = self._demands.get(wanted)
         if demand is None:
             demand = self._demands[wanted] = frozenset(wanted)
         return demand
-
-    @staticmethod
-    def _wanted(sink: RunningNode, frame: Frame) -> bool:
-        if frame.reference and sink.takes_references:
-            return True
-        return frame.seq >= 0 and sink.rate_limit.due(frame.t) and (sink.wants is None or sink.wants())
 
     # -- statistics ---------------------------------------------------------------------------------------
 

@@ -135,6 +135,7 @@ class RunningNode:
         "takes_references",
         "takes_tick",
         "tick_first",
+        "took",
         "wants",
     )
 
@@ -161,6 +162,7 @@ class RunningNode:
             component.memory == "stateful" or self.repeats or any(not gate.no_memory for gate in self.gates)
         )
         self.stats = NodeStats()
+        self.took = self.stats.durations.add
         self.signals = {
             port.name: (slot, SignalStats())
             for slot, port in zip(self.slots, component.ports.outputs, strict=True)
@@ -179,7 +181,7 @@ class RunningNode:
         order = _parameters(self.function)
         self.positional = order == self.names and not self.takes_tick and not check
         self.tick_first = order == ["tick", *self.names]
-        self.rate_limit = RateLimit(node.max_rate)
+        self.rate_limit = None if node.max_rate is None else RateLimit(node.max_rate)
 
     def reset(self) -> None:
         """A new reference follows: forget what was learned from the last one."""
@@ -224,24 +226,33 @@ class _Step:
     """A node as one segment sees it, with all that it pulls looked up once.
 
     own : evaluated here; else it belongs to a later segment and is only walked through, to what it needs from
-    here. gates : each with the step that makes its signal (None: made earlier) and whether it decides here.
-    before : steps that make its inputs. seen : index of the tick in which it was visited last.
+    here. gates : each with the step that makes its signal (None: made already) and whether it decides here.
+    opens : slot of the signal that decides alone, by being True in this very tick; NOTHING if it is not that
+    simple. before : steps that make its inputs and may not have been visited. seen : index of the tick in
+    which it was visited last.
+
+    Stateful steps are visited first and in the pipeline's order, so whoever takes from one finds it visited.
     """
 
-    __slots__ = ("before", "gates", "node", "own", "seen")
+    __slots__ = ("before", "gates", "node", "opens", "own", "seen")
 
     def __init__(self, node: RunningNode, own: bool, known: set[str], steps: dict[str, _Step]) -> None:
         self.node = node
         self.own = own
         self.seen = -1
+        pulled = {id_: step for id_, step in steps.items() if not step.node.stateful}
         self.gates: list[tuple[_RunningGate, _Step | None, bool]] = []
         for gate in node.gates:
             # The memory of a later segment's gate is not known here: such a gate may be open.
             maker = gate.plan.signal.node
             decides = own or (gate.no_memory and maker in known)
-            self.gates.append((gate, steps.get(maker), decides))
+            self.gates.append((gate, pulled.get(maker), decides))
+        self.opens = NOTHING
+        if len(self.gates) == 1:
+            gate, to_pull, _ = self.gates[0]
+            self.opens = gate.slot if gate.no_memory and to_pull is None else NOTHING
         makers = dict.fromkeys(ref.node for ref in node.node.inputs.values() if ref)
-        self.before = [steps[maker] for maker in makers if maker in steps]
+        self.before = [pulled[maker] for maker in makers if maker in pulled]
 
 
 class Segment:
@@ -313,42 +324,27 @@ class Segment:
             self.run.latency.add(perf_counter() - tick.frame.captured)
 
     def _visit(self, step: _Step, tick: RunningTick) -> None:
-        """Pull one node, once a tick: first its gates, then its inputs, then the node itself."""
+        """Pull one node, once a tick: first its gates, then its inputs, then the node itself.
+
+        Between two stages little of this is left in the processor's caches, so what it costs is the memory it
+        touches. What happens in most frames stands here in one piece, the rest elsewhere.
+        """
         step.seen = index = tick.index
-        node = step.node
-        closed: Absent | None = None
-        for gate, maker, decides in step.gates:
-            if maker is not None and maker.seen != index:
-                self._visit(maker, tick)
-            signal = tick.values[gate.slot]
-            if not decides or (signal is True and gate.no_memory):
-                continue
-            if step.own:
-                if not gate.is_open(signal) and closed is None:
-                    closed = signal if isinstance(signal, Absent) else gate.absent
-            elif isinstance(signal, Absent) or not signal:
-                return
-        if closed is not None:
-            self._skip(node, tick, closed, repeat=node.repeats)
+        table = tick.values
+        if step.gates and table[step.opens] is not True and not self._opened(step, tick):
             return
         for maker in step.before:
             if maker.seen != index:
                 self._visit(maker, tick)
         if not step.own:
             return
-        if node.disabled:
-            self._skip(node, tick, _DISABLED)
-            return
-        arguments = node.pick(tick.values)
-        if tick.absent:
-            arguments = list(arguments)
-            for number, (port, _) in enumerate(node.inputs):
-                value = arguments[number]
-                if isinstance(value, Absent):
-                    if not port.optional:
-                        self._skip(node, tick, value)
-                        return
-                    arguments[number] = None
+        node = step.node
+        arguments = node.pick(table)
+        if tick.absent or node.disabled:
+            present = self._present(node, tick, arguments)
+            if present is None:
+                return
+            arguments = present
         # A pure stage with the very inputs of its last run would give the very outputs of its last run.
         same = node.last_arguments
         if same is not None and arguments[0] is same[0] and all(map(is_, arguments, same)):
@@ -368,7 +364,7 @@ class Segment:
             self._failed(node, tick, arguments, error)
             return
         ended = perf_counter()
-        node.stats.durations.add(ended - began)
+        node.took(ended - began)
         if self.track is not None:
             self.track.add(node.id, began, ended, {"seq": tick.frame.seq})
         if node.remembers:
@@ -376,9 +372,42 @@ class Segment:
             if node.reuses:
                 node.last_arguments = arguments
         if plain and not (node.reuses and tick.reasons):
-            tick.values[node.single] = result
+            table[node.single] = result
         else:
             self._publish(node, tick, values)
+
+    def _opened(self, step: _Step, tick: RunningTick) -> bool:
+        """Whether the gates of a step are open; if not, its outputs are entered as they are then."""
+        closed: Absent | None = None
+        for gate, maker, decides in step.gates:
+            if maker is not None and maker.seen != tick.index:
+                self._visit(maker, tick)
+            if not decides:
+                continue
+            signal = tick.values[gate.slot]
+            if step.own:
+                if not gate.is_open(signal) and closed is None:
+                    closed = signal if isinstance(signal, Absent) else gate.absent
+            elif isinstance(signal, Absent) or not signal:
+                return False
+        if closed is not None:
+            self._skip(step.node, tick, closed, repeat=step.node.repeats)
+        return closed is None
+
+    def _present(self, node: RunningNode, tick: RunningTick, values: Sequence[Any]) -> Sequence[Any] | None:
+        """The arguments of a node, absent ones as None; None if it cannot be called, which is entered."""
+        if node.disabled:
+            self._skip(node, tick, _DISABLED)
+            return None
+        arguments = list(values)
+        for number, (port, _) in enumerate(node.inputs):
+            value = arguments[number]
+            if isinstance(value, Absent):
+                if not port.optional:
+                    self._skip(node, tick, value)
+                    return None
+                arguments[number] = None
+        return arguments
 
     def _skip(self, node: RunningNode, tick: RunningTick, absent: Absent, *, repeat: bool = False) -> None:
         reason = absent.reason
