@@ -23,6 +23,8 @@ _LEAST_SUPPORT: Final = 0.6
 # Neighbours whose displacements differ by less than this share of their distance are beyond doubt.
 _STEEP: Final = 0.4
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
+# This ridge turns a quadratic fit into a plane, and a plane into a mean, where there is too little to fit it.
+_RIDGE: Final = np.diag([1e-9, 0.05, 0.05, 0.3, 0.3, 0.3])
 # Spots for which there is room at first.
 _ROOM: Final = 1024
 
@@ -461,11 +463,11 @@ class MarkerTracker:
         offset = (self._origin[around] - self._origin[missing][:, None]) / self._pitch
         moved = (position - self._origin)[around]
         x, y = offset[..., 0], offset[..., 1]
-        basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)
-        weighted = basis * weight[:, :, None]
-        # The ridge turns the fit into a plane, and a plane into a mean, where there is too little to fit it.
-        normal = weighted.transpose(0, 2, 1) @ basis + np.diag([1e-9, 0.05, 0.05, 0.3, 0.3, 0.3])
-        fitted = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ moved)[:, 0]
+        basis = np.empty((*x.shape, 6))
+        for number, term in enumerate((1.0, x, y, x * x, x * y, y * y)):
+            basis[..., number] = term
+        weighted = (basis * weight[:, :, None]).transpose(0, 2, 1)
+        fitted = np.linalg.solve(weighted @ basis + _RIDGE, weighted @ moved)[:, 0]
         support = weight.sum(axis=1)
         placed = support > _LEAST_SUPPORT
         position[missing[placed]] = self._origin[missing[placed]] + fitted[placed]
