@@ -2,8 +2,8 @@
 
 Under a mark, and next to it, the gel's own light is not seen but filled in. A contact's region has a dent or
 a bulge there, however it was found: where the region's own outline is continued below marks, it errs at them
-by 0.9 px (scaled median deviation, 11 000 marks of simulated contacts), the bridge by 0.6 px. Whether a mark at
-the rim is inside must therefore not be asked of the region's pixels below it.
+by 0.9 px (scaled median deviation, 11 000 marks of simulated contacts), the bridge by 0.6 px. Whether a mark
+at the rim is inside must therefore not be asked of the region's pixels below it.
 """
 
 from __future__ import annotations
