@@ -89,8 +89,8 @@ def outline_depth(points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, 
         )
         return depth
     depth = np.full(len(points), -np.inf)
-    every = np.concatenate(outlines)
-    low, high = every.min(axis=0) - reach, every.max(axis=0) + reach
+    left, top, width, height = cv2.boundingRect(np.concatenate(outlines))
+    low, high = (left - reach, top - reach), (left + width - 1 + reach, top + height - 1 + reach)
     near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
     if len(near):
         depth[near] = _depths(np.asarray(points[near], np.float64), mask, outlines, steps, hidden, reach)
@@ -120,9 +120,6 @@ def _depths(
         if nearest.min() > hidden * hidden:
             continue
         which, before, after = _gaps(lengths > hidden * hidden)
-        # The whole outline but for one pixel says nothing about its direction.
-        known = (outline[before] != outline[after]).any(axis=1)
-        which, before, after = which[known], before[known], after[known]
         if len(which):
             found = _beyond(marks[which], corners, before, after, hidden / step, max(hidden, 1.0))
             for mark, value in zip(which.tolist(), found.tolist(), strict=True):
@@ -154,7 +151,8 @@ def _gaps(seen: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
 def _beyond(
     marks: FloatArray, outline: FloatArray, before: IntArray, after: IntArray, half_width: float, unit: float
 ) -> FloatArray:
-    """Signed distance (g,), px, of marks (g, 2) from the bridges over their gaps, positive inside.
+    """Signed distance (g,), px, of marks (g, 2) from the bridges over their gaps, positive inside; inf where
+    the whole outline but for one point is hidden, which has no direction.
 
     half_width : of a gap, points of the outline. unit : px, a length of the size of a gap.
 
@@ -168,13 +166,15 @@ def _beyond(
     known = (outline.take(ends, axis=0) - marks[:, None]) / unit
     corners = outline.take(borders, axis=0)
     chord = corners[:, 1] - corners[:, 0]
-    along, down = (chord / np.sqrt((chord * chord).sum(axis=1))[:, None]).T[:, :, None]
+    length = np.sqrt((chord * chord).sum(axis=1))
+    along, down = (chord / np.maximum(length, 1)[:, None]).T[:, :, None]
     # Along the chord, and into the region, which lies to the left of its outlines, as seen with y down.
     u = known[..., 0] * along + known[..., 1] * down
     v = known[..., 0] * down - known[..., 1] * along
-    rows = np.stack([np.ones_like(u), u, u * u + v * v], axis=1)
+    rows = np.empty((len(marks), 3, len(_WHICH)))
+    rows[:, 0], rows[:, 1], rows[:, 2] = 1, u, u * u + v * v
     fit = np.linalg.solve(rows @ rows.transpose(0, 2, 1) + _RIDGE, rows @ v[..., None])
     a, b, c = fit[..., 0].T
     slope = 1 + b * b
     distance = -2 * a / (np.sqrt(slope) + np.sqrt(np.maximum(slope - 4 * a * c, 0)))
-    return np.asarray(distance * unit, np.float64)
+    return np.where(length > 0, distance * unit, np.inf)
