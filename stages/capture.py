@@ -200,6 +200,8 @@ class Capture:
         references = _References(self._retake, count, count if self._reference_image is None else 0)
         seq = -1
         while not self._stop.is_set():
+            if pace is not None and not pace.wait_to_read():
+                return
             item = source.read()
             if item is None:
                 return
@@ -219,6 +221,8 @@ class Capture:
         """Frames as they were captured the first time; references that are retaken now come on top."""
         references = _References(self._retake, count, 0)
         while not self._stop.is_set():
+            if pace is not None and not pace.wait_to_read():
+                return
             item = source.read_stamped()
             if item is None:
                 return

@@ -181,6 +181,60 @@ def test_after_a_long_interruption_the_recording_continues_instead_of_rushing(
     assert clock.now - resumed == pytest.approx(0.1, abs=1e-9)
 
 
+def _played(
+    monkeypatch: pytest.MonkeyPatch, times: list[float], reading: list[float]
+) -> tuple[list[float], list[float]]:
+    """When reading of each frame began, and when it was shown; nothing but reading and waiting takes time."""
+    clock = _Clock()
+    monkeypatch.setattr(pace_module.time, "perf_counter", clock.perf_counter)
+    stop = threading.Event()
+    monkeypatch.setattr(stop, "wait", clock.wait)
+    pace = pace_module.Pace(stop)
+    begun, shown = [], []
+    for t, duration in zip(times, reading, strict=True):
+        assert pace.wait_to_read()
+        begun.append(clock.now)
+        clock.now += duration
+        assert pace.wait_for(t)
+        shown.append(clock.now)
+    return begun, shown
+
+
+@pytest.mark.parametrize("reading", [0.0, 0.004, 0.011])
+def test_a_frame_is_read_just_before_it_is_due(reading: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    times = [index / 60 for index in range(200)]
+    begun, shown = _played(monkeypatch, times, [reading] * 200)
+    np.testing.assert_allclose(np.array(shown) - shown[0], times, atol=1e-9)
+    early = np.array(shown[2:]) - begun[2:]
+    # What reading takes, a quarter of it and a millisecond: or, where that leaves less than a rest for the
+    # work on the last frame, what is left.
+    rest = min(pace_module.GRACE / 60, (1 / 60 - reading) / 2)
+    np.testing.assert_allclose(early, min(1.25 * reading + 0.001, 1 / 60 - rest), atol=1e-9)
+
+
+def test_a_read_that_suddenly_takes_longer_makes_few_frames_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = [index / 60 for index in range(200)]
+    _, shown = _played(monkeypatch, times, [0.002] * 100 + [0.010] * 100)
+    late = np.array(shown) - shown[0] - times
+    # The first was begun 1.25 x 2 + 1 ms before it was due; the next one after a rest.
+    first = 0.010 - 0.0035
+    second = first + pace_module.GRACE / 60 + 0.010 - 1 / 60
+    np.testing.assert_allclose(late[99:103], [0, first, second, 0], atol=1e-9)
+    assert np.count_nonzero(late > 1e-9) == 2
+
+
+def test_reading_that_cannot_keep_up_is_not_slowed_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = [index / 60 for index in range(100)]
+    begun, shown = _played(monkeypatch, times, [0.020] * 100)
+    np.testing.assert_allclose(begun[2:], shown[1:-1], atol=1e-9)
+
+
+def test_behind_a_gap_of_dropped_frames_the_next_one_is_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = [*(index / 60 for index in range(30)), *(2 + index / 60 for index in range(30))]
+    _, shown = _played(monkeypatch, times, [0.003] * 60)
+    np.testing.assert_allclose(np.array(shown) - shown[0], times, atol=1e-9)
+
+
 def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(recording: str) -> None:
     # At this rate the second frame is due after 1000 s; the test's own time limit is far shorter.
     stage = capture(recording, realtime=True, fps=0.001)

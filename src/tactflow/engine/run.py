@@ -9,6 +9,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from tactflow.engine.errors import SourceError, StageError, TactflowError
@@ -16,6 +17,7 @@ from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.link import Link
 from tactflow.engine.plan import Plan, make_plan
+from tactflow.engine.priority import serve_soon
 from tactflow.engine.segment import NOTHING, NodeFailedError, RunningNode, RunningTick, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.engine.trace import Trace
@@ -109,8 +111,8 @@ class Runner:
             self._open()
             self._connect()
             for name, segment in self._segments.items():
-                target = self._capture_loop if name == self._source_segment else segment.loop
-                thread = threading.Thread(target=target, name=f"tactflow-{name}", daemon=True)
+                body = self._capture_loop if name == self._source_segment else partial(self._work, segment)
+                thread = threading.Thread(target=body, name=f"tactflow-{name}", daemon=True)
                 self._threads[name] = thread
             for thread in self._threads.values():
                 thread.start()
@@ -129,6 +131,12 @@ class Runner:
         if self._interrupted:
             return RunResult(INTERRUPTED, None, stats)
         return RunResult(error.exit_code if error else 0, str(error) if error else None, stats)
+
+    def _work(self, segment: Segment) -> None:
+        """Body of the thread of a segment behind the source's."""
+        if getattr(self._source, "live", False) and not all(node.is_sink for node in segment.nodes):
+            serve_soon()
+        segment.loop()
 
     def stop(self, reason: str = "signal") -> None:
         """End the run soon: no more frames are captured, those under way are finished. From any thread."""

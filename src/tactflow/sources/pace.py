@@ -2,8 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+
+LEAD = 1.25
+"""Times as long as reading a frame took of late is set aside for reading the next."""
+SPARE = 0.001
+"""Time that is set aside beside that, s: what it takes to wake up."""
+FORGET = 0.9
+"""What is left of a slow read after each frame."""
+
+GRACE = 0.2
+"""Part of the time between frames for which the next one is not read, even if reading is late: else one late
+frame makes all that follow late."""
 
 MAX_BACKLOG = 0.5
 """A recording that falls further behind than this, s, continues from there: a laptop was asleep, or the
@@ -13,6 +25,9 @@ process was halted, and rushing through what was missed would help nobody."""
 class Pace:
     """Waits until a recording's frames are due, counted from the first one, so that delays do not add up.
 
+    Frames are read just in time: what reads, unpacks or renders the next one right after handing over the
+    last takes the processor from the work on that one, which no camera does.
+
     Parameters
     ----------
     stop : ends every wait at once.
@@ -21,12 +36,36 @@ class Pace:
     def __init__(self, stop: threading.Event) -> None:
         self._stop = stop
         self._start: float | None = None
+        self._last: float | None = None
+        self._interval = math.inf
+        self._slowest = 0.0
+        self._reading: float | None = None
+
+    def wait_to_read(self) -> bool:
+        """Wait until it is time to read the next frame; False if stopped meanwhile."""
+        now = time.perf_counter()
+        wait = 0.0
+        if self._start is not None and self._last is not None and self._interval < math.inf:
+            due = self._start + self._last + self._interval
+            rest = min(GRACE * self._interval, (self._interval - self._slowest) / 2)
+            wait = max(due - LEAD * self._slowest - SPARE - now, rest)
+        if wait > 0 and self._stop.wait(wait):
+            return False
+        self._reading = time.perf_counter()
+        return not self._stop.is_set()
 
     def wait_for(self, t: float) -> bool:
         """Wait until time t of the recording, s; False if stopped meanwhile."""
         now = time.perf_counter()
+        if self._reading is not None:
+            self._slowest = max(now - self._reading, FORGET * self._slowest)
+            self._reading = None
         if self._start is None:
             self._start = now - t
+        if self._last is not None:
+            # The shortest so far: behind a gap, where frames were dropped, the next one is not late.
+            self._interval = min(self._interval, max(0.0, t - self._last))
+        self._last = t
         wait = self._start + t - now
         if wait < -MAX_BACKLOG:
             self._start = now - t
