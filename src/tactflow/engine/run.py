@@ -110,6 +110,8 @@ class Runner:
         try:
             self._open()
             self._connect()
+            # Opening may take long: a camera that wakes up, kernels that are compiled.
+            self._began = time.perf_counter()
             for name, segment in self._segments.items():
                 body = self._capture_loop if name == self._source_segment else partial(self._work, segment)
                 thread = threading.Thread(target=body, name=f"tactflow-{name}", daemon=True)
