@@ -122,9 +122,9 @@ class View:
         missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
         if missing:
             log.warning(
-                "view: not shown, because %s is not installed: pip install 'tactflow[view]'; "
+                "view: not shown, because there is no %s: pip install 'tactflow[view]'; "
                 "--set sinks.view=null leaves the view out",
-                " and ".join(missing),
+                " and no ".join(missing),
             )
             return
         p = self.params
