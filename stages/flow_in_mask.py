@@ -33,7 +33,8 @@ class FlowInMask:
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(flow, outline_kernels)
+        if params.method == "mean":
+            compiled.load(flow, outline_kernels)
 
     def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside."""

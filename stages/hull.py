@@ -44,7 +44,8 @@ class Hull:
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(hull_kernels)
+        if params.method == "moments":
+            compiled.load(hull_kernels)
 
     def process(self, contact_mask: ContactMask) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""

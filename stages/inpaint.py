@@ -8,7 +8,8 @@ from pydantic import Field
 
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
-from tactflow.vision.inpaint import SEED_RADIUS, load_kernels, remove_markers
+from tactflow.vision import compiled, halving, inpaint_kernels
+from tactflow.vision.inpaint import SEED_RADIUS, remove_markers
 
 
 class Inpaint:
@@ -25,7 +26,8 @@ class Inpaint:
         radius: float = Field(SEED_RADIUS, gt=0, le=100, description="neighbourhood, processed px")
 
     def __init__(self, params: Params) -> None:
-        load_kernels()
+        if params.method == "normalized":
+            compiled.load(halving, inpaint_kernels)
         self._params = params
 
     def process(self, image: Image, marker_mask: MarkerMask) -> Unmarked:

@@ -9,7 +9,8 @@ from pydantic import Field
 
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image, MarkerMask
-from tactflow.vision.marker_mask import Dot, find_dot, load_kernels, marker_mask
+from tactflow.vision import compiled, halving, marker_mask_kernels
+from tactflow.vision.marker_mask import Dot, find_dot, marker_mask
 from tactflow.vision.seed_contact import seed_marker_mask
 
 
@@ -34,7 +35,8 @@ class MarkerMaskStage:
         )
 
     def __init__(self, params: Params) -> None:
-        load_kernels()
+        if params.method == "dog":
+            compiled.load(halving, marker_mask_kernels)
         self._params = params
         self._dot: Dot | None = None
         self._looked = False

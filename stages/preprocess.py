@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
+from tactflow.vision import compiled, halving
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
-from tactflow.vision.halving import halve_block
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 Row = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -74,7 +74,8 @@ class Preprocess:
         )
 
     def __init__(self, params: Params) -> None:
-        halve_block.load()
+        if params.method == "area":
+            compiled.load(halving)
         self._params = params
         self._preprocessor: Preprocessor | None = None
 

@@ -11,9 +11,10 @@ from pydantic import Field
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
+from tactflow.vision import compiled, marker_appearance_kernels, marker_matching, tracking_kernels
 from tactflow.vision.markers import Detection, detect_markers
 from tactflow.vision.seed_tracker import SeedTracker
-from tactflow.vision.tracking import MarkerTracker, load_loops
+from tactflow.vision.tracking import MarkerTracker
 from tactflow.vision.types import Markers
 
 
@@ -49,7 +50,7 @@ class Tracker:
     def __init__(self, params: Params) -> None:
         self._params = params
         if params.method == "appearance":
-            load_loops()
+            compiled.load(marker_appearance_kernels, marker_matching, tracking_kernels)
         self.reset()
 
     def reset(self) -> None:

@@ -89,12 +89,6 @@ def remove_markers(
     )
 
 
-def load_kernels() -> None:
-    """Compile what `remove_markers` runs where numba is there, so that no frame waits for it."""
-    for kernel in (halve_block, sum_valid, sum_windows, fill_masked):
-        kernel.load()
-
-
 def _normalized(image: NDArray[np.uint8], mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
     """Normalized convolution on means over 4 x 4 px: sum of the valid over their weight."""
     height, width = mask.shape

@@ -111,12 +111,6 @@ def marker_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
     return np.ascontiguousarray(mask[:height, :width])
 
 
-def load_kernels() -> None:
-    """Compile what `marker_mask` runs where numba is there, so that no frame waits for it."""
-    for kernel in (halve_block, contrast_with_circle, cover_spots):
-        kernel.load()
-
-
 def doubled(lines: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Every line twice: (h, w) or (h, w, C) uint8 -> twice as high."""
     twice = np.empty((len(lines), 2, *lines.shape[1:]), np.uint8)
