@@ -18,6 +18,9 @@ Kernels are compiled on their first call, or by `load`, which the constructor of
 frame has to wait; numba keeps the result on disk, so this costs seconds once and milliseconds later. They run
 without Python's lock: several segments of a pipeline work at the same time.
 
+Constants that a kernel uses stand in its own file: numba compiles it again when that file has changed, and
+does not look at others.
+
 `TACTFLOW_COMPILED=0` in the environment switches them off.
 """
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled, marker_appearance_kernels
+from tactflow.vision.marker_appearance_kernels import ALIKE_GAIN, ALIKE_SHARE, LEAST_DIVISOR, LEAST_REST
 from tactflow.vision.markers import to_gray
 
 FloatArray = NDArray[np.float64]
@@ -130,8 +131,7 @@ class MarkerAppearance:
             return self._measure_compiled(view, start, marks)
         position, gain, share, stderr = self._step(view, start, marks)
         for _ in range(_ROUNDS):
-            # Where nothing like the mark is in sight, more steps lead nowhere.
-            again = _longer(position - start, _CONVERGED) & (share > 0.3) & (gain > 0.2)
+            again = _longer(position - start, _CONVERGED) & (share > ALIKE_SHARE) & (gain > ALIKE_GAIN)
             active = np.flatnonzero(again)
             if len(active) == 0:
                 break
@@ -178,12 +178,12 @@ class MarkerAppearance:
         theta, level = sums[:, :3], sums[:, 3:, 0]
         seen = np.vecdot(np.matmul(self._gram.take(which, axis=0), theta)[:, :, 0], theta[:, :, 0])
         gain = theta[:, 0, 0]
-        safe = np.maximum(gain, np.float32(0.15))
+        safe = np.maximum(gain, LEAST_DIVISOR)
         step = theta[:, 1:, 0] / safe[:, None]
         np.minimum(np.maximum(step, -self.radius, out=step), self.radius, out=step)
         position = (quarter + 0.5) / _PHASES - 0.5 + step
         contrast = np.vecdot(patch, patch) - np.vecdot(level, level)
-        rest = np.maximum(contrast - seen, np.float32(1e-3))
+        rest = np.maximum(contrast - seen, LEAST_REST)
         stderr = np.sqrt(rest * self._spread.take(which) / (safe * safe) + np.float32(_SAMPLING**2))
         return position, gain, seen / (seen + rest), stderr
 

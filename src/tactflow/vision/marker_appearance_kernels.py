@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,15 @@ from tactflow.vision.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+# These stand here, where numba sees that they have changed, for both ways of computing.
+LEAST_REST: Final = np.float32(1e-3)
+"""Square of contrast that is never explained."""
+LEAST_DIVISOR: Final = np.float32(0.15)
+"""Gain by which a step is divided at least: of a faint mark it would be all noise."""
+ALIKE_SHARE: Final = np.float32(0.3)
+ALIKE_GAIN: Final = np.float32(0.2)
+"""Where less of the mark is in sight, more steps lead nowhere."""
 
 
 @kernel(
@@ -124,14 +135,14 @@ def measure(
             seen += shift_x * (product[1, 0] * gain + product[1, 1] * shift_x + product[1, 2] * shift_y)
             seen += shift_y * (product[2, 0] * gain + product[2, 1] * shift_x + product[2, 2] * shift_y)
             contrast -= light * light + slope_x * slope_x + slope_y * slope_y
-            rest = max(contrast - seen, np.float32(1e-3))
-            safe = max(gain, np.float32(0.15))
+            rest = max(contrast - seen, LEAST_REST)
+            safe = max(gain, LEAST_DIVISOR)
             share = seen / (seen + rest)
             now_x = (quarter_x + 0.5) / phases - 0.5 + min(max(shift_x / safe, -radius), radius)
             now_y = (quarter_y + 0.5) / phases - 0.5 + min(max(shift_y / safe, -radius), radius)
             far = (now_x - x) ** 2 + (now_y - y) ** 2 > converged
             x, y = now_x, now_y
-            if number == rounds or not (far and share > np.float32(0.3) and gain > np.float32(0.2)):
+            if number == rounds or not (far and share > ALIKE_SHARE and gain > ALIKE_GAIN):
                 break
         position[n, 0], position[n, 1] = x, y
         found[0, n], found[1, n] = gain, share

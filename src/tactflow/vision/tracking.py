@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled, marker_appearance_kernels, marker_matching, tracking_kernels
+from tactflow.vision import compiled, marker_matching, tracking_kernels
 from tactflow.vision.marker_appearance import MarkerAppearance
 from tactflow.vision.markers import Detection, refine_centers, require_image, to_gray
 from tactflow.vision.types import Markers, MarkerStatus
@@ -204,7 +204,6 @@ class MarkerTracker:
         self._raster_shape = tuple(int(side / self._cell) + 2 for side in self._shape)
         self._around_spot, self._around_mark = self._disc(0.35), self._disc(0.3)
         self._around, self._around_weight = _surroundings(self._origin, self._pitch)
-        load_loops()
         self.reset()
 
     def reset(self) -> None:
@@ -432,7 +431,7 @@ class MarkerTracker:
                 seen, stretch, self._links_begin, self._links, self._rim_weights, self._islands, settled
             )
             return settled
-        linked = (stretch < 0.3).tolist()
+        linked = (stretch < tracking_kernels.LINKED).tolist()
         waiting = seen.tolist()
         neighbours = self._neighbours
         best: dict[int, tuple[int, list[int]]] = {}
@@ -475,11 +474,6 @@ class MarkerTracker:
         status[missing[~placed]] = MarkerStatus.LOST
 
 
-def load_loops() -> None:
-    """Compile what the tracker uses, or take it from disk, so that no frame has to wait."""
-    compiled.load(marker_appearance_kernels, marker_matching, tracking_kernels)
-
-
 def _gray_part(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Of a part of a contiguous image, without a copy as `to_gray` makes."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
@@ -508,7 +502,8 @@ def _lengths(vectors: FloatArray) -> FloatArray:
 
 
 def _trusted(gain: NDArray[Any], share: NDArray[Any]) -> BoolArray:
-    return np.asarray((gain > 0.2) & (gain < 3.0) & (share > 0.5), np.bool_)
+    strong = (gain > tracking_kernels.LEAST_GAIN) & (gain < tracking_kernels.MOST_GAIN)
+    return np.asarray(strong & (share > tracking_kernels.LEAST_SHARE), np.bool_)
 
 
 def _islands(neighbours: list[list[tuple[int, int]]]) -> list[int]:

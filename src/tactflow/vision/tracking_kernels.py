@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,14 @@ from tactflow.vision.compiled import kernel
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+# These stand here, where numba sees that they have changed, for both ways of computing.
+LEAST_GAIN: Final = np.float32(0.2)
+MOST_GAIN: Final = np.float32(3.0)
+LEAST_SHARE: Final = np.float32(0.5)
+"""Of a mark that is seen: its contrast against that in the reference, and how much of it is explained."""
+LINKED: Final = 0.3
+"""Neighbours whose displacements differ by less than this part of their distance move together."""
 
 
 @kernel(
@@ -42,7 +52,7 @@ def judge(
     for n in range(len(position)):
         move_x, move_y = position[n, 0] - before[n, 0], position[n, 1] - before[n, 1]
         move = np.sqrt(move_x * move_x + move_y * move_y)
-        trusted = gain[n] > np.float32(0.2) and gain[n] < np.float32(3.0) and share[n] > np.float32(0.5)
+        trusted = gain[n] > LEAST_GAIN and gain[n] < MOST_GAIN and share[n] > LEAST_SHARE
         seen[n] = trusted and move < longest
         if seen[n]:
             farthest = max(farthest, move)
@@ -98,7 +108,7 @@ def largest_part(
             weight += weights[mark]
             for link in range(first[mark], first[mark + 1]):
                 other = links[link, 0]
-                if waiting[other] and stretch[links[link, 1]] < 0.3:
+                if waiting[other] and stretch[links[link, 1]] < LINKED:
                     waiting[other] = False
                     order[filled] = other
                     filled += 1
