@@ -78,18 +78,33 @@ def choose_spots(
     if count == 0 or len(spots) == 0:
         return chosen
     if compiled.active():
-        return _choose_compiled(
-            np.ascontiguousarray(origin, np.float64),
-            np.ascontiguousarray(edges, np.int64),
-            np.ascontiguousarray(free, np.int64),
+        origin = np.ascontiguousarray(origin, np.float64)
+        edges = np.ascontiguousarray(edges, np.int64)
+        free = np.ascontiguousarray(free, np.int64)
+        spots = np.ascontiguousarray(spots, np.float64)
+        slot = np.empty(len(origin), np.int64)
+        label, unary = np.empty((count, _LABELS), np.int64), np.empty((count, _LABELS + 1))
+        labels = propose(
+            origin,
+            edges,
+            free,
             np.ascontiguousarray(settled, np.bool_),
             np.ascontiguousarray(displacement, np.float64),
             np.ascontiguousarray(expected, np.float64),
-            np.ascontiguousarray(spots, np.float64),
+            spots,
             np.ascontiguousarray(strength, np.float64),
             pitch,
             farthest,
+            slot,
+            label,
+            unary,
+            chosen,
         )
+        if labels < 0:
+            raise IndexError(f"required marks 0 to {len(origin) - 1} in edges and free, got others")
+        if labels > 0:
+            agree(origin, edges, free, slot, spots, label, unary, labels, chosen)
+        return chosen
     rest, place = _complex(origin), _complex(spots)
     away = np.abs(_complex(expected)[:, :, None] - place).min(axis=0)
     labels = min(_LABELS, int((away <= farthest).sum(axis=1).max()))
@@ -142,43 +157,6 @@ def choose_spots(
         pair[:, :labels, :labels] += _SHARED * (label[first][:, :, None] == label[second][:, None, :])
         belief = _propagate(unary, first, second, pair)
     return _decide(belief, label)
-
-
-def _choose_compiled(
-    origin: FloatArray,
-    edges: IntArray,
-    free: IntArray,
-    settled: BoolArray,
-    displacement: FloatArray,
-    expected: FloatArray,
-    spots: FloatArray,
-    strength: FloatArray,
-    pitch: float,
-    farthest: float,
-) -> IntArray:
-    chosen, slot = np.full(len(free), -1, np.int64), np.empty(len(origin), np.int64)
-    label, unary = np.empty((len(free), _LABELS), np.int64), np.empty((len(free), _LABELS + 1))
-    labels = propose(
-        origin,
-        edges,
-        free,
-        settled,
-        displacement,
-        expected,
-        spots,
-        strength,
-        pitch,
-        farthest,
-        slot,
-        label,
-        unary,
-        chosen,
-    )
-    if labels < 0:
-        raise IndexError(f"required marks 0 to {len(origin) - 1} in edges and free, got others")
-    if labels > 0:
-        agree(origin, edges, free, slot, spots, label, unary, labels, chosen)
-    return chosen
 
 
 def _decide(belief: FloatArray, label: IntArray) -> IntArray:
