@@ -97,15 +97,15 @@ def contact_geometry(
         raise ValueError(f"required method to be 'moments' or 'seed', got {method!r}")
     if mask.size == 0:
         return None
+    if method == "seed":
+        return _seed_contact(mask)
     (left, top, width, height), sums = _measured(mask)
     if width == 0:
         return None
     roi: NDArray[Any] = mask[top : top + height, left : left + width]
     contours: Sequence[NDArray[Any]]
-    corner = (0, 0) if method == "seed" else (left, top)
+    corner = (left, top)
     contours, _ = cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=corner)
-    if method == "seed":
-        return _seed_contact(contours, left, top, mask.shape[1], cv2.countNonZero(roi))
     if len(contours) > 1 or sums[0] < min_area:
         kept = [contour for contour in contours if _filled_area(contour) >= min_area]
         if len(kept) > 1 and max_gap is not None:
@@ -354,19 +354,22 @@ def _median_ratio(probability: float) -> float:
 _MEDIAN_RATIO: Final = _median_ratio(FALSE_DIRECTION)
 
 
-def _seed_contact(
-    contours: Sequence[NDArray[Any]], left: int, top: int, width: int, region_area: int
-) -> Contact:
-    outline = np.vstack(contours)
+def _seed_contact(mask: NDArray[np.uint8]) -> Contact | None:
+    left, top, width, height = cv2.boundingRect(mask)
+    if width == 0:
+        return None
+    roi = mask[top : top + height, left : left + width]
+    region_area = float(cv2.countNonZero(roi))
+    outline = np.vstack(cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
     polygon = cv2.convexHull(outline)
     vertices = polygon.reshape(-1, 2).astype(np.float64)
     vertices += (left, top)
     if len(vertices) < 2:
         place = (float(vertices[0, 0]), float(vertices[0, 1]))
-        return Contact(0.0, place, None, None, vertices, None, 0.0, float(region_area))
+        return Contact(0.0, place, None, None, vertices, None, 0.0, region_area)
     # OpenCV fits in single precision: relative to the contact, so that its place in the frame costs nothing.
     vx, vy, x, y = (float(value) for value in np.ravel(cv2.fitLine(polygon, cv2.DIST_L2, 0, 0.01, 0.01)))
-    line = _line(vx, vy, x + left, y + top, width)
+    line = _line(vx, vy, x + left, y + top, mask.shape[1])
     return Contact(
         area=cv2.contourArea(polygon),
         center=line.midpoint,
@@ -375,7 +378,7 @@ def _seed_contact(
         hull=vertices,
         ellipse=_seed_ellipse(outline, left, top) if cv2.contourArea(polygon) > 0 else None,
         confidence=1.0,
-        region_area=float(region_area),
+        region_area=region_area,
     )
 
 
