@@ -92,9 +92,7 @@ def encode_message(
             "contact": None if contact is None else _contact(contact, detail),
             "flow": None if flow is None else _flow(flow, detail),
             "markers": None if markers is None else _markers(markers, detail),
-            "skipped": {port: reason for port, reason in tick.skipped.items() if port in _RESULTS}
-            if tick.skipped
-            else {},
+            "skipped": {port: reason for port, reason in tick.skipped.items() if port in _RESULTS},
         },
         option=_OPTIONS,
     )
