@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -171,6 +171,11 @@ class Capture:
     def missed(self) -> int:
         """Frames of a live source that a newer one overtook before they were taken: gaps in `seq`."""
         return self._source.missed if isinstance(self._source, LiveSource) else 0
+
+    @property
+    def threads(self) -> Sequence[threading.Thread]:
+        """Threads of its own that frames arrive in."""
+        return [self._source.reader] if isinstance(self._source, LiveSource) else []
 
     def retake(self) -> None:
         """Make the next frames the new reference, in a new epoch: as many as at the start."""

@@ -220,8 +220,14 @@ class TestSet:
         assert nodes["prepare"].params.model_dump()["gamma"] == 4
 
     def test_it_changes_the_top_level(self, load: Load) -> None:
-        pipeline = load(BODY, "sensor=right", "skipping=false", "opencv_threads=2")
+        pipeline = load(BODY, "sensor=right", "skipping=false", "opencv_threads=2", "realtime_priority=false")
         assert (pipeline.sensor, pipeline.skipping, pipeline.opencv_threads) == ("right", False, 2)
+        assert not pipeline.realtime_priority
+
+    def test_a_run_knows_how_many_others_run_beside_it(self, load: Load) -> None:
+        assert load(BODY).runs == 1
+        shared = "sensors: {left: null, right: null, top: null}\n" + BODY.replace("sensor: left\n", "")
+        assert load(shared).runs == 3
 
     @pytest.mark.parametrize(
         ("override", "words"),

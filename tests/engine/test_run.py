@@ -6,11 +6,12 @@ import itertools
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import pytest
 
+from tactflow.engine import run
 from tactflow.engine.run import Runner, RunResult
 
 MakeRunner = Callable[..., Runner]
@@ -414,6 +415,40 @@ def test_a_live_source_drops_rather_than_lags_and_counts_it(toy_runner: MakeRunn
     link = result.stats["links"]["capture->compute"]
     assert link["policy"] == "latest"
     assert link["drops"] + link["delivered"] == link["offered"] == 300
+
+
+class Asked:
+    """Stands in for `Precedence` and notes who was given it."""
+
+    def __init__(self, realtime: bool, runs: int) -> None:
+        self.how = f"{realtime} {runs}"
+        self.names: set[str] = set()
+
+    def review(self, threads: Collection[threading.Thread]) -> None:
+        self.names |= {thread.name for thread in threads}
+
+
+def test_live_threads_that_somebody_waits_for_get_precedence(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[Asked] = []
+
+    def make(*args: Any) -> Asked:
+        given.append(Asked(*args))
+        return given[-1]
+
+    monkeypatch.setattr(run, "Precedence", make)
+    sinks = {
+        "out": {"use": "Collect"},
+        "far": {"use": "ThreadedCollect"},
+        "later": {"use": "Archive"},
+        "eyes": {"use": "Onlooker"},
+    }
+    live = {"capture": {"realtime": True, "pause": 0.01}}
+    assert ran(toy_runner(live, sinks, realtime_priority=False)).stats["priority"] == "False 1"
+    assert given.pop().names == {"tactflow-capture", "tactflow-compute", "tactflow-far"}
+    assert ran(toy_runner({}, sinks)).stats["priority"] == "ordinary"
+    assert not given, "a recording that waits needs none"
 
 
 def test_frames_that_one_branch_dropped_are_dropped_at_the_join(toy_runner: MakeRunner) -> None:

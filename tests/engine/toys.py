@@ -250,6 +250,19 @@ class ThreadedCollect(Collect):
     when_live = "latest"
 
 
+class Archive(Collect):
+    """What it keeps is looked at later."""
+
+    threaded = True
+    when_live = "block"
+
+
+class Onlooker(Collect):
+    threaded = True
+    when_live = "latest"
+    observer = True
+
+
 class OnlyLevel(Counted):
     """A sink that asks for little."""
 

@@ -139,3 +139,11 @@ def test_a_kernel_works_where_its_result_cannot_be_kept() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "42.0"
+
+
+def test_the_switch_says_when_it_was_set_to_something_unknown() -> None:
+    assert [compiled._asked_for(word) for word in (None, "", "1", " Yes ", "0", "OFF")] == [True] * 4 + [
+        False
+    ] * 2
+    with pytest.warns(RuntimeWarning, match="TACTFLOW_COMPILED=nope: required 1 or 0"):
+        assert compiled._asked_for("nope")

@@ -73,6 +73,11 @@ def pipeline_schema(components: Sequence[Component]) -> Schema:
                 "minimum": 0,
                 "description": "null: OpenCV's choice",
             },
+            "realtime_priority": {
+                "type": "boolean",
+                "default": True,
+                "description": "false does not ask the system to run live frames before all else",
+            },
             "stages": _section("stages", [c for c in components if c.kind != "sink"], definitions),
             "sinks": _section("sinks", [c for c in components if c.kind == "sink"], definitions),
         },

@@ -19,7 +19,7 @@ from tactflow.engine.stage import StageParams
 from tactflow.engine.wiring import Draft
 from tactflow.engine.yamlmap import Entry, Item, Problems, read_value, read_yaml, wrap
 
-TOP_LEVEL = ("sensor", "sensors", "skipping", "opencv_threads", "stages", "sinks")
+TOP_LEVEL = ("sensor", "sensors", "skipping", "opencv_threads", "realtime_priority", "stages", "sinks")
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 
 
@@ -49,6 +49,7 @@ def load_pipeline(
     root = _read(path, overrides, problems)
     root = _add_sinks(root, extra_sinks or {})
     envelope.check_keys(root.entries, TOP_LEVEL, "", problems)
+    runs = max(1, len(sensors.names(root)))
     root, name = sensors.select(root, sensor, problems)
     drafts = [draft for section in _SECTIONS for draft in _drafts(root, section, problems)]
     _check_ids(drafts, problems)
@@ -73,6 +74,8 @@ def load_pipeline(
         nodes=nodes,
         skipping=_flag(root.entries, "skipping", True, problems),
         opencv_threads=envelope.whole(root.entries, "opencv_threads", 0, "", problems),
+        realtime_priority=_flag(root.entries, "realtime_priority", True, problems),
+        runs=runs,
         warnings=_warnings(root, drafts),
         settings=_settings(root, name, drafts),
     )

@@ -113,6 +113,7 @@ class Node:
 class Pipeline:
     """A pipeline that is known to be right. `nodes` is ordered so that every input comes before its user.
 
+    runs : sensors of the same file, each with a run of its own.
     settings : what the file and all overrides come to, as plain values that can be written as YAML again.
     """
 
@@ -122,6 +123,8 @@ class Pipeline:
     nodes: Mapping[str, Node]
     skipping: bool = True
     opencv_threads: int | None = None
+    realtime_priority: bool = True
+    runs: int = 1
     warnings: Sequence[str] = field(default_factory=list[str])
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
 

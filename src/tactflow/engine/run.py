@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from tactflow.engine.errors import SourceError, StageError, TactflowError
@@ -17,7 +16,7 @@ from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.link import Link
 from tactflow.engine.plan import Plan, make_plan
-from tactflow.engine.priority import serve_soon
+from tactflow.engine.priority import Precedence
 from tactflow.engine.segment import NOTHING, NodeFailedError, RunningNode, RunningTick, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.engine.trace import Trace
@@ -95,6 +94,7 @@ class Runner:
         self._paused = False
         self._steps = 0
         self._source: Any = None
+        self._precedence: Precedence | None = None
 
     # -- life cycle ---------------------------------------------------------------------------------------
 
@@ -113,11 +113,13 @@ class Runner:
             # Opening may take long: a camera that wakes up, kernels that are compiled.
             self._began = time.perf_counter()
             for name, segment in self._segments.items():
-                body = self._capture_loop if name == self._source_segment else partial(self._work, segment)
+                body = self._capture_loop if name == self._source_segment else segment.loop
                 thread = threading.Thread(target=body, name=f"tactflow-{name}", daemon=True)
                 self._threads[name] = thread
             for thread in self._threads.values():
                 thread.start()
+            if getattr(self._source, "live", False):
+                self._precedence = Precedence(self.pipeline.realtime_priority, self.pipeline.runs)
             self._wait(on_progress, interval_s)
         except TactflowError as failure:
             self.fail(failure)
@@ -133,12 +135,6 @@ class Runner:
         if self._interrupted:
             return RunResult(INTERRUPTED, None, stats)
         return RunResult(error.exit_code if error else 0, str(error) if error else None, stats)
-
-    def _work(self, segment: Segment) -> None:
-        """Body of the thread of a segment behind the source's."""
-        if getattr(self._source, "live", False) and not all(node.is_sink for node in segment.nodes):
-            serve_soon()
-        segment.loop()
 
     def stop(self, reason: str = "signal") -> None:
         """End the run soon: no more frames are captured, those under way are finished. From any thread."""
@@ -275,6 +271,8 @@ class Runner:
         """Wait for the threads; after the source has ended, not for ever."""
         deadline: float | None = None
         while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
+            if self._precedence is not None:
+                self._precedence.review(self._live_threads())
             self._threads[alive[0]].join(interval_s)
             if on_progress is not None:
                 on_progress(self.progress())
@@ -289,6 +287,11 @@ class Runner:
                 raise StageError(
                     f"the run was stopped, but did not end in {CLOSE_SECONDS:g} s: {hanging} hangs"
                 )
+
+    def _live_threads(self) -> list[threading.Thread]:
+        """The threads that a live frame's results wait for."""
+        own = [thread for name, thread in self._threads.items() if self._segments[name].urgent]
+        return own + list(getattr(self._source, "threads", ()))
 
     def _no_headway(self) -> bool:
         """Whether no link has delivered anything for a moment: draining a long queue is not hanging."""
@@ -439,6 +442,7 @@ class Runner:
             "sinks": sinks,
             "signals": signals,
             "links": links,
+            "priority": "ordinary" if self._precedence is None else self._precedence.how,
             "latency_ms": {"p50": self.latency.milliseconds(0.5), "p99": self.latency.milliseconds(0.99)},
         }
 

@@ -192,6 +192,13 @@ class RunningNode:
             self.instance.reset()
 
 
+def _urgent(node: RunningNode) -> bool:
+    """Whether somebody waits for what a node makes, rather than only looking on or reading it later."""
+    sink = node.instance
+    hands_out = getattr(sink, "when_live", "block") == "latest" and not getattr(sink, "observer", False)
+    return not node.is_sink or hands_out
+
+
 def _picker(slots: Sequence[int]) -> Callable[[list[Any]], Sequence[Any]]:
     """What takes the values at these slots out of a table."""
     if len(slots) > 1:
@@ -259,6 +266,10 @@ class Segment:
     """Evaluates the nodes of one segment for a tick.
 
     track : where to note what is done when; None for nowhere.
+
+    Attributes
+    ----------
+    urgent : whether somebody waits for its results: it computes, or hands the newest ones out.
     """
 
     def __init__(self, name: str, run: Run, track: Track | None = None) -> None:
@@ -279,6 +290,7 @@ class Segment:
         self._stateful = [step for step in steps.values() if step.node.stateful]
         self._sinks = [step for step in steps.values() if step.node.is_sink]
         self.data_sinks = [n for n in self.nodes if n.is_sink and not getattr(n.instance, "observer", False)]
+        self.urgent = not self.nodes or any(map(_urgent, self.nodes))
         self.inputs: list[Link[RunningTick]] = []
         self.outputs: list[tuple[Link[RunningTick], frozenset[str] | None]] = []
         self.epoch = 0

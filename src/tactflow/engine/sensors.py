@@ -15,7 +15,7 @@ from tactflow.engine.graph import Mark
 from tactflow.engine.registry import did_you_mean
 from tactflow.engine.yamlmap import Entry, Item, Problems
 
-CHANGEABLE = ("skipping", "opencv_threads", "stages", "sinks")
+CHANGEABLE = ("skipping", "opencv_threads", "realtime_priority", "stages", "sinks")
 """What a sensor may change."""
 
 PLACEHOLDER = "{sensor}"
@@ -47,7 +47,8 @@ def select(root: Item, chosen: str | None, problems: Problems) -> tuple[Item, st
     name = chosen if chosen in known else known[0] if known else "main"
     changes = entry.item.entries.get(name)
     rest = Item({key: value for key, value in root.entries.items() if key != "sensors"}, root.mark)
-    merged = _laid_over(rest, changes.item) if changes and changes.item.is_mapping else rest
+    # A name with nothing behind it changes nothing.
+    merged = _laid_over(rest, changes.item) if changes and isinstance(changes.item.content, dict) else rest
     return _named(merged, name), name
 
 

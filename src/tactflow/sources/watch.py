@@ -84,6 +84,10 @@ class LiveSource(Protocol):
     def missed(self) -> int:
         """Good frames that a newer one replaced before they were read."""
 
+    @property
+    def reader(self) -> threading.Thread:
+        """The thread that frames arrive in; another one after a read that hung."""
+
     def read_arrival(self) -> Arrival | None:
         """Wait for the newest frame that was not read yet; None at the end and after `stop`."""
 
@@ -151,7 +155,7 @@ class Watched:
         self._opening = False
         self._abandoned: list[threading.Thread] = []
         self._generation = 0
-        self._thread = self._start(source)
+        self.reader = self._start(source)
 
     # -- the side that takes frames -----------------------------------------------------------------------
 
@@ -202,8 +206,8 @@ class Watched:
     def close(self) -> None:
         """Let go of the source. A read that hangs is given a moment; it lets go when it ends."""
         self.stop()
-        if self._thread is not threading.current_thread():
-            self._thread.join(self._watch.hang_after)
+        if self.reader is not threading.current_thread():
+            self.reader.join(self._watch.hang_after)
 
     def _look(self, now: float) -> None:
         """Notice what no frame can tell: silence, a read that hangs, the end of all patience."""
@@ -218,10 +222,10 @@ class Watched:
         if watch.reconnect and self._busy_since is not None and now - self._busy_since >= limit:
             self._abandoned = [thread for thread in self._abandoned if thread.is_alive()]
             if len(self._abandoned) < MAX_ABANDONED:
-                self._abandoned.append(self._thread)
+                self._abandoned.append(self.reader)
                 self._generation += 1
                 self._note("opening hangs" if self._opening else "reading hangs")
-                self._thread = self._start(None)
+                self.reader = self._start(None)
 
     def _gave_up(self, now: float) -> SourceError:
         fault = self._fault

@@ -48,11 +48,28 @@ R = TypeVar("R")
 VARIABLE = "TACTFLOW_COMPILED"
 """Environment variable; 0, off, no or false: numba is not used although it is there."""
 
+_ON = ("1", "on", "yes", "true", "")
+_OFF = ("0", "off", "no", "false")
+
 _REASSOCIATED = {"reassoc", "contract", "arcp", "nsz"}
 """Freedoms of the compiler: sums in any order. It must still respect NaN and infinity."""
 
 _lock = threading.Lock()
-_wanted = os.environ.get(VARIABLE, "1").strip().lower() not in ("0", "off", "no", "false")
+
+
+def _asked_for(value: str | None) -> bool:
+    """What the environment variable says; without it, and if it says something else, kernels are used."""
+    word = "1" if value is None else value.strip().lower()
+    if word not in (*_ON, *_OFF):
+        warnings.warn(
+            f"{VARIABLE}={value}: required 1 or 0; numba is used where it is installed",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return word not in _OFF
+
+
+_wanted = _asked_for(os.environ.get(VARIABLE))
 
 
 class Kernel(Generic[P, R]):
