@@ -6,6 +6,7 @@ import errno
 import logging
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import orjson
@@ -15,6 +16,7 @@ from pydantic import Field
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
+from tactflow.engine.priority import ZMQ_SENDS, threads_named
 from tactflow.engine.stage import StageParams
 from tactflow.message import encode_message
 from tactflow.ports import Image
@@ -107,6 +109,15 @@ class Zmq:
         self._stats_wanted = False
         self._closing = threading.Event()
         self._stats_thread: threading.Thread | None = None
+        self._others: list[int] = []
+        self._io_threads: list[int] = []
+
+    @property
+    def live_threads(self) -> Sequence[int]:
+        """Native ids of the threads in which ZeroMQ sends."""
+        if self._socket is not None and not self._io_threads:
+            self._io_threads = threads_named(ZMQ_SENDS, besides=self._others)
+        return self._io_threads
 
     def open(self) -> None:
         """Bind the socket; afterwards `endpoint` is the real address.
@@ -116,6 +127,7 @@ class Zmq:
         StageError
             If the address is taken or cannot be bound.
         """
+        self._others = threads_named(ZMQ_SENDS)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket = context.socket(zmq.XPUB)
         socket.sndhwm = self.params.backlog

@@ -173,9 +173,10 @@ class Capture:
         return self._source.missed if isinstance(self._source, LiveSource) else 0
 
     @property
-    def threads(self) -> Sequence[threading.Thread]:
-        """Threads of its own that frames arrive in."""
-        return [self._source.reader] if isinstance(self._source, LiveSource) else []
+    def live_threads(self) -> Sequence[int]:
+        """Native ids of threads of its own that frames arrive in."""
+        reader = self._source.reader.native_id if isinstance(self._source, LiveSource) else None
+        return [] if reader is None else [reader]
 
     def retake(self) -> None:
         """Make the next frames the new reference, in a new epoch: as many as at the start."""

@@ -6,7 +6,7 @@ import itertools
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -420,12 +420,18 @@ def test_a_live_source_drops_rather_than_lags_and_counts_it(toy_runner: MakeRunn
 class Asked:
     """Stands in for `Precedence` and notes who was given it."""
 
-    def __init__(self, realtime: bool, runs: int) -> None:
+    def __init__(self, threads: Callable[[], list[int]], realtime: bool, runs: int) -> None:
         self.how = f"{realtime} {runs}"
+        self._threads = threads
         self.names: set[str] = set()
+        self.stopped = False
 
-    def review(self, threads: Collection[threading.Thread]) -> None:
-        self.names |= {thread.name for thread in threads}
+    def start(self) -> None:
+        names = {thread.native_id: thread.name for thread in threading.enumerate()}
+        self.names = {names.get(id_, str(id_)) for id_ in self._threads()}
+
+    def stop(self) -> None:
+        self.stopped = True
 
 
 def test_live_threads_that_somebody_waits_for_get_precedence(
@@ -444,9 +450,15 @@ def test_live_threads_that_somebody_waits_for_get_precedence(
         "later": {"use": "Archive"},
         "eyes": {"use": "Onlooker"},
     }
-    live = {"capture": {"realtime": True, "pause": 0.01}}
+    live = {"capture": {"realtime": True, "pause": 0.01, "reader": 4711}}
     assert ran(toy_runner(live, sinks, realtime_priority=False)).stats["priority"] == "False 1"
-    assert given.pop().names == {"tactflow-capture", "tactflow-compute", "tactflow-far"}
+    asked = given.pop()
+    assert asked.names == {"tactflow-capture", "tactflow-compute", "tactflow-far", "4711"}
+    assert asked.stopped
+    # A sink that keeps results, in the thread that captures.
+    kept = {"out": {"use": "FrameArchive", "segment": "capture"}}
+    ran(toy_runner(live, kept))
+    assert "tactflow-capture" in given.pop().names
     assert ran(toy_runner({}, sinks)).stats["priority"] == "ordinary"
     assert not given, "a recording that waits needs none"
 

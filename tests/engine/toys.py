@@ -37,11 +37,13 @@ class Ramp:
         retake_at: int = -1
         preroll: bool = False
         overtaken: int = 0
+        reader: int | None = None
 
     def __init__(self, params: Params, sensor: str) -> None:
         self.params, self.sensor = params, sensor
         self.live = params.realtime
         self.missed = params.overtaken
+        self.live_threads = [] if params.reader is None else [params.reader]
         self.stopped = threading.Event()
         self.closed = 0
 
@@ -255,6 +257,14 @@ class Archive(Collect):
 
     threaded = True
     when_live = "block"
+
+
+class FrameArchive(Counted):
+    threaded = True
+    when_live = "block"
+
+    def write(self, frame: Frame) -> None:
+        self.saw(frame.seq)
 
 
 class Onlooker(Collect):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -203,6 +205,20 @@ def test_closing_delivers_the_last_messages(subscribe: Subscribing) -> None:
         sink.close()
         assert [receive(socket)[1]["seq"] for _ in range(5)] == [0, 1, 2, 3, 4]
         socket.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are found by their names on Linux only")
+def test_it_names_the_threads_that_zeromq_sends_in(subscribe: Subscribing) -> None:
+    # One of another context, which is not meant.
+    socket = subscribe("tcp://127.0.0.1:9")
+    sink = opened()
+    try:
+        (sending,) = sink.live_threads
+        assert Path(f"/proc/self/task/{sending}/comm").read_text().startswith("ZMQbg/IO")
+    finally:
+        sink.close()
+        socket.close()
+    assert not Path(f"/proc/self/task/{sending}").exists()
 
 
 def test_an_address_in_use_is_an_error_that_says_what_to_try() -> None:

@@ -283,12 +283,35 @@ def test_every_connection_is_closed_again(device: Flaky, watched: Callable[..., 
         time.sleep(0.01)
 
 
+def test_capture_names_the_thread_that_frames_arrive_in_now(device: Flaky) -> None:
+    capture = Capture(
+        Capture.Params(source="0"), opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky")
+    )
+    assert capture.live_threads == []
+    capture.open()
+    frames = capture.frames()
+    assert next(frames).seq == 0
+    (first,) = capture.live_threads
+    names = {thread.native_id: thread.name for thread in threading.enumerate()}
+    assert names[first] == "tactflow-read-flaky"
+    device.does = "hangs"
+    threading.Timer(0.5, setattr, (device, "does", "good")).start()
+    while capture.live_threads == [first]:
+        next(frames)
+    assert len(capture.live_threads) == 1, "the reader that hangs is not waited for any more"
+    capture.stop()
+    device.free.set()
+    capture.close()
+
+
 @pytest.mark.parametrize("on_reconnect", ["keep", "retake"])
 def test_capture_keeps_or_retakes_the_reference_after_a_reconnection(
     on_reconnect: str, device: Flaky
 ) -> None:
     def opener(*_: object, watch: Watch, **__: object) -> Watched:
-        return Watched(device.open, Watch(**{**QUICK, "no_frame_timeout": watch.no_frame_timeout}), "flaky")
+        # Only the fault that is made here shall be one: on a busy machine, silence comes by itself.
+        patient = {**QUICK, "silent_after": PATIENCE, "hang_after": PATIENCE}
+        return Watched(device.open, Watch(**{**patient, "no_frame_timeout": watch.no_frame_timeout}), "flaky")
 
     params = Capture.Params.model_validate(
         {"source": "0", "on_reconnect": on_reconnect, "reference": 2, "skip": 3}

@@ -27,6 +27,7 @@ import zmq
 
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Node, Pipeline
+from tactflow.engine.priority import ZMQ_SENDS, Precedence, threads_named
 from tactflow.engine.run import INTERRUPTED
 from tactflow.engine.sensors import PLACEHOLDER
 
@@ -59,7 +60,8 @@ def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipe
         for endpoint, ids in relays.items():
             upstream = [_private(scratch, name, id_) for name, id_ in ids]
             backlog = sum(getattr(pipelines[name].nodes[id_].params, "backlog", 1) for name, id_ in ids)
-            stack.enter_context(_relay(endpoint, upstream, backlog))
+            realtime = all(pipeline.realtime_priority for pipeline in pipelines.values())
+            stack.enter_context(_relay(endpoint, upstream, backlog, realtime))
         members = []
         for name in pipelines:
             private = [
@@ -175,10 +177,10 @@ def _private(scratch: Path, sensor: str, id_: str) -> str:
 
 
 @contextmanager
-def _relay(endpoint: str, upstream: Sequence[str], backlog: int) -> Iterator[None]:
+def _relay(endpoint: str, upstream: Sequence[str], backlog: int, realtime: bool) -> Iterator[None]:
     """Bind `endpoint` and pass on what the upstream publishers send, while the block lasts.
 
-    backlog : messages that may wait for each subscriber.
+    backlog : messages that may wait for each subscriber. realtime : whether to ask for real-time priority.
     """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     front, back = context.socket(zmq.XPUB), context.socket(zmq.XSUB)
@@ -214,10 +216,14 @@ def _relay(endpoint: str, upstream: Sequence[str], backlog: int) -> Iterator[Non
 
     thread = threading.Thread(target=pass_on, name="tactflow-relay", daemon=True)
     thread.start()
+    sending = [thread.native_id or 0, *threads_named(ZMQ_SENDS)]
+    precedence = Precedence(lambda: sending, realtime, len(upstream), "messages of all sensors")
+    precedence.start()
     print(f"tactflow: publishing {len(upstream)} sensors on {endpoint}", file=sys.stderr)
     try:
         yield
     finally:
+        precedence.stop()
         stop.set()
         thread.join(5)
         front.close()

@@ -6,6 +6,7 @@ the processor out evenly: such a thread waits behind a browser or a renderer, fo
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import logging
 import os
@@ -14,7 +15,8 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from pathlib import Path
 from typing import Any, Literal
 
 log = logging.getLogger("tactflow")
@@ -31,12 +33,19 @@ _ORDINARY = 0
 SHORTEST = 100_000
 """The shortest slice that Linux knows, ns."""
 
+ZMQ_SENDS = "ZMQbg/IO"
+"""What ZeroMQ calls the threads in which it sends."""
+
 MOST = 0.5
-"""Of the processors, this part at most is used with real-time priority: the rest is for everybody else."""
+"""Using more than this part of the processors, a run loses its real-time priority: others must live too."""
 AGAIN = 0.75
-"""Times that, and less, it is given back."""
+"""Using less than so much of that, it may get it back."""
 REVIEW_S = 0.5
-"""Time over which that is counted, s."""
+"""Time over which use is counted, s."""
+PATIENCE_S = 2.0
+"""After a loss, so long at least without it, s; twice as long after each further loss."""
+MOST_PATIENCE_S = 64.0
+"""Never longer than this, s."""
 
 
 def serve_soon(thread: int = 0, slice_ns: int = SHORTEST) -> bool:
@@ -69,65 +78,140 @@ def serve_soon(thread: int = 0, slice_ns: int = SHORTEST) -> bool:
     return bool(done and _ATTRIBUTES.unpack(held.raw)[5] == slice_ns)
 
 
+def threads_named(prefix: str, besides: Collection[int] = ()) -> list[int]:
+    """Native ids of this process's threads whose names for the system begin like this; none but on Linux.
+
+    For threads that a library has started and does not tell of. besides : those that are not meant.
+    """
+    tasks = Path("/proc/self/task")
+    found: list[int] = []
+    for task in tasks.iterdir() if tasks.exists() else ():
+        # A thread may end meanwhile.
+        with contextlib.suppress(OSError):
+            if int(task.name) not in besides and (task / "comm").read_text().startswith(prefix):
+                found.append(int(task.name))
+    return found
+
+
 class Precedence:
     """Lets a run's threads go before everybody else's, as far as the system grants it and others can live.
 
     Real-time priority (SCHED_RR, the lowest of its levels) takes rights: root's, or a limit `rtprio` for the
-    user. Without them, and while the threads want more than `MOST` of all processors, they get short slices.
+    user. Without them, and after the threads have taken too much, they get short slices. A thread whose
+    policy was chosen by somebody else keeps it.
 
     Parameters
     ----------
+    threads : tells the native ids of the threads that live frames wait for; called twice a second.
     realtime : whether to ask for real-time priority at all.
-    runs : how many runs share this machine evenly.
+    runs : how many runs share this machine evenly. work : what the threads do, for messages.
     """
 
-    def __init__(self, realtime: bool = True, runs: int = 1) -> None:
-        # Linux only: elsewhere these calls are missing or mean something else.
-        self._realtime = realtime and sys.platform == "linux"
-        self._most = MOST * _processors() / runs
-        self._used: dict[int, float] = {}
-        self._since = float("-inf")
+    def __init__(
+        self,
+        threads: Callable[[], Collection[int]],
+        realtime: bool = True,
+        runs: int = 1,
+        work: str = "live frames",
+    ) -> None:
         self.how: How = "ordinary"
+        self._work = work
+        self._threads = threads
+        self._realtime = realtime
+        self._most = MOST * _processors() / runs
+        # Seconds of processor time of the threads that are looked after, at the last review.
+        self._used: dict[int, float] = {}
+        self._foreign: set[int] = set()
+        self._reviewed = float("-inf")
+        self._patience = PATIENCE_S
+        self._ask_at = float("-inf")
+        self._end = threading.Event()
+        # A thread of its own, which goes first as well: where others take all there is, an ordinary one would
+        # come too late to stop them.
+        self._guard = threading.Thread(target=self._watch, name="tactflow-priority", daemon=True)
 
-    def review(self, threads: Collection[threading.Thread]) -> None:
-        """Give precedence to these threads, or take it back; takes up to a millisecond twice a second.
+    def start(self) -> None:
+        """Give precedence, and look after it from now on. Does nothing on systems other than Linux."""
+        if sys.platform == "linux":
+            self._guard.start()
 
-        threads : those that work on live frames; ones that have ended are left out.
-        """
+    def stop(self) -> None:
+        """Take it back from all threads that are still there; `how` tells what it was."""
+        self._end.set()
+        if self._guard.is_alive():
+            self._guard.join(REVIEW_S)
+        for thread in self._used:
+            _become_ordinary(thread)
+
+    def _watch(self) -> None:
+        try:
+            while not self._end.is_set():
+                self.review()
+                self._end.wait(REVIEW_S)
+        except Exception as error:
+            log.warning("%s lose precedence: %s: %s", self._work, type(error).__name__, error)
+            self._make("ordinary", self._used)
+
+    def review(self) -> None:
+        """Give or take, by what the threads have used since the last review."""
         now = time.perf_counter()
-        if now - self._since < REVIEW_S:
-            return
-        ids = [t.native_id for t in threads if t.is_alive() and t.native_id is not None]
-        used = {id_: _processor_seconds(id_) for id_ in ids}
+        used, gone = self._look({*self._threads(), self._guard.native_id})
         # Of a thread that was not there the last time, nothing is known yet.
-        spent = sum(seconds - self._used.get(id_, seconds) for id_, seconds in used.items())
-        share = spent / (now - self._since)
+        spent = sum(seconds - self._used.get(thread, seconds) for thread, seconds in used.items())
+        share = spent / (now - self._reviewed)
         new = used.keys() - self._used.keys()
-        self._used, self._since = used, now
-        if self._realtime and self.how == "real-time" and share > self._most:
+        self._used, self._reviewed = used, now
+        # A reader that hung and was replaced is not counted any more.
+        for thread in gone:
+            _become_ordinary(thread)
+        if self.how == "real-time" and share > self._most:
+            self._make("short slices", used)
+            self._tell_loss(share)
+            self._ask_at = now + self._patience
+            self._patience = min(2 * self._patience, MOST_PATIENCE_S)
+        elif (
+            self._realtime and self.how != "real-time" and share < AGAIN * self._most and now >= self._ask_at
+        ):
+            if self._make("real-time", used) and self._ask_at < 0:
+                log.info("%s go first: they have real-time priority", self._work)
+        elif new:
+            self._make(self.how, new)
+
+    def _look(self, threads: Collection[int | None]) -> tuple[dict[int, float], set[int]]:
+        """Processor seconds of the threads that are to be looked after, and those that were until now."""
+        used: dict[int, float] = {}
+        for thread in threads:
+            seconds = None if thread is None else _processor_seconds(thread)
+            if thread is None or seconds is None or thread in self._foreign:
+                continue
+            if thread not in self._used and not _is_ordinary(thread):
+                self._foreign.add(thread)
+            else:
+                used[thread] = seconds
+        return used, set(self._used) - used.keys()
+
+    def _make(self, how: How, threads: Collection[int]) -> bool:
+        """Have threads treated like this, or all of them as near to it as is granted; False if it was not."""
+        if how == "real-time":
+            self._realtime = all(_become_realtime(thread) for thread in threads)
+            if self._realtime:
+                self.how = how
+                return True
+            threads = self._used
+        for thread in threads:
+            _become_ordinary(thread)
+        granted = [serve_soon(thread) for thread in threads]
+        self.how = "short slices" if all(granted) else "ordinary"
+        return self.how == how
+
+    def _tell_loss(self, share: float) -> None:
+        if self._patience == PATIENCE_S:
             log.warning(
-                "live frames take %.1f of %d processors: they lose their real-time priority until it is less",
+                "%s take %.1f of %d processors: they lose their real-time priority until they take less",
+                self._work,
                 share,
                 _processors(),
             )
-            self._make(ids, "short slices")
-        elif self._realtime and self.how != "real-time" and share < AGAIN * self._most:
-            self._make(ids, "real-time")
-        elif new:
-            self._make(sorted(new), self.how)
-
-    def _make(self, ids: Collection[int], how: How) -> None:
-        """Have these threads treated like this, or as near to it as is granted."""
-        if how == "real-time":
-            self._realtime = all(_be_realtime(id_, True) for id_ in ids)
-            if self._realtime:
-                self.how = how
-                log.info("live frames go first: they have real-time priority")
-                return
-        for id_ in ids:
-            _be_realtime(id_, False)
-        granted = [serve_soon(id_) for id_ in ids]
-        self.how = "short slices" if all(granted) else "ordinary"
 
 
 def _processors() -> int:
@@ -135,30 +219,42 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
-def _processor_seconds(thread: int) -> float:
-    """Time for which a thread, by its native id, has had a processor, s; 0 if that cannot be told."""
-    if sys.platform != "linux":
-        return 0.0
-    # The clock of a thread, as Linux makes its number of the thread's (clock_gettime(2), CPUCLOCK_PERTHREAD).
-    clock = (~thread << 3) | 6
-    try:
-        return time.clock_gettime(clock)
-    except OSError:
-        return 0.0
+def _processor_seconds(thread: int) -> float | None:
+    """Time for which a thread of this process has had a processor, s; None if there is no such thread."""
+    if sys.platform == "linux":
+        # The clock of a thread, as Linux makes its number of the thread's (CPUCLOCK_PERTHREAD). Asking for
+        # one of another process is refused.
+        with contextlib.suppress(OSError):
+            return time.clock_gettime((~thread << 3) | 6)
+    return None
 
 
-def _be_realtime(thread: int, wanted: bool) -> bool:
-    """Give a thread real-time priority, or take it away; returns whether that was done."""
-    if sys.platform != "linux":
-        return False
-    # What the thread starts itself, other programs among them, stays ordinary. Who has no more than the right
-    # to this priority cannot take that back.
-    policy = (os.SCHED_RR if wanted else os.SCHED_OTHER) | os.SCHED_RESET_ON_FORK
-    try:
-        if not wanted and os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
+def _is_ordinary(thread: int) -> bool:
+    """Whether a thread runs under the policy that everything has unless somebody says otherwise."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            return os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+    return False
+
+
+def _become_realtime(thread: int) -> bool:
+    """Give a thread real-time priority; False if that is refused. One that has ended needs none."""
+    if sys.platform == "linux":
+        try:
+            # What the thread starts itself, other programs among them, stays ordinary.
+            policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(thread, policy, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))
+        except ProcessLookupError:
             return True
-        level = os.sched_get_priority_min(os.SCHED_RR) if wanted else 0
-        os.sched_setscheduler(thread, policy, os.sched_param(level))
-    except OSError:
-        return False
-    return True
+        except OSError:
+            return False
+        return True
+    return False
+
+
+def _become_ordinary(thread: int) -> None:
+    """Take real-time priority back from a thread that was given it, if it is still there."""
+    if sys.platform == "linux" and _processor_seconds(thread) is not None:
+        with contextlib.suppress(OSError):
+            # Who has no more than the right to real-time priority may not clear what came with it.
+            os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))

@@ -119,7 +119,9 @@ class Runner:
             for thread in self._threads.values():
                 thread.start()
             if getattr(self._source, "live", False):
-                self._precedence = Precedence(self.pipeline.realtime_priority, self.pipeline.runs)
+                pipeline = self.pipeline
+                self._precedence = Precedence(self._live_threads, pipeline.realtime_priority, pipeline.runs)
+                self._precedence.start()
             self._wait(on_progress, interval_s)
         except TactflowError as failure:
             self.fail(failure)
@@ -129,6 +131,8 @@ class Runner:
             for link in self._links:
                 link.abort()
         finally:
+            if self._precedence is not None:
+                self._precedence.stop()
             self._close()
         stats = self._stats(time.perf_counter() - self._began)
         error = self._error
@@ -271,8 +275,6 @@ class Runner:
         """Wait for the threads; after the source has ended, not for ever."""
         deadline: float | None = None
         while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
-            if self._precedence is not None:
-                self._precedence.review(self._live_threads())
             self._threads[alive[0]].join(interval_s)
             if on_progress is not None:
                 on_progress(self.progress())
@@ -288,10 +290,11 @@ class Runner:
                     f"the run was stopped, but did not end in {CLOSE_SECONDS:g} s: {hanging} hangs"
                 )
 
-    def _live_threads(self) -> list[threading.Thread]:
-        """The threads that a live frame's results wait for."""
-        own = [thread for name, thread in self._threads.items() if self._segments[name].urgent]
-        return own + list(getattr(self._source, "threads", ()))
+    def _live_threads(self) -> list[int]:
+        """Native ids of the threads that a live frame's results wait for."""
+        own = [thread.native_id for name, thread in self._threads.items() if self._segments[name].urgent]
+        theirs = [id_ for _, instance in list(self._opened) for id_ in getattr(instance, "live_threads", ())]
+        return [id_ for id_ in (*own, *theirs) if id_ is not None]
 
     def _no_headway(self) -> bool:
         """Whether no link has delivered anything for a moment: draining a long queue is not hanging."""

@@ -269,7 +269,7 @@ class Segment:
 
     Attributes
     ----------
-    urgent : whether somebody waits for its results: it computes, or hands the newest ones out.
+    urgent : whether somebody waits for what it does: it captures, computes, or hands the newest results out.
     """
 
     def __init__(self, name: str, run: Run, track: Track | None = None) -> None:
@@ -290,7 +290,7 @@ class Segment:
         self._stateful = [step for step in steps.values() if step.node.stateful]
         self._sinks = [step for step in steps.values() if step.node.is_sink]
         self.data_sinks = [n for n in self.nodes if n.is_sink and not getattr(n.instance, "observer", False)]
-        self.urgent = not self.nodes or any(map(_urgent, self.nodes))
+        self.urgent = plan.pipeline.source.id in plan.segments[name] or any(map(_urgent, self.nodes))
         self.inputs: list[Link[RunningTick]] = []
         self.outputs: list[tuple[Link[RunningTick], frozenset[str] | None]] = []
         self.epoch = 0

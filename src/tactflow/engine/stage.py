@@ -22,7 +22,8 @@ A pure stage's outputs depend on its inputs alone. A stateful stage sees every a
 What a stage returns it must not change later; what it receives it must not change at all.
 
 A source stage has `frames()`, an iterator of `Frame`, instead of `process`. A sink has `write`, which
-returns nothing and may also take a `Tick`.
+returns nothing and may also take a `Tick`. Either may have `live_threads`, the native ids of threads of its
+own that live results wait for: they are run first, as the run's own are (see `tactflow.engine.priority`).
 """
 
 from __future__ import annotations
