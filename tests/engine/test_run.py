@@ -186,6 +186,20 @@ def test_a_pure_stage_is_not_run_again_on_inputs_it_has_seen(
     assert len(seen(runner, "total")) == 17, "a stateful stage sees a repeated input again"
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_one_gate_says_is_nothing_is_not_repeated_by_another(toy_runner: MakeRunner, order: int) -> None:
+    gates = [
+        {"signal": "pulse.active", "otherwise": "absent"},
+        {"signal": "even.active", "otherwise": "repeat"},
+    ]
+    runner = toy_runner({"even": {"use": "Even"}, "gated": {"when": gates[::order]}})
+    ran(runner)
+    got = {row[0]: row[3] for row in rows(runner)}
+    first = {4: 16.5, 5: 16.5, 6: 36.5}
+    second = {14: 196.5, 15: 196.5, 16: 256.5}
+    assert got == dict.fromkeys(range(20)) | first | second
+
+
 def test_switching_skipping_off_runs_every_stage_in_every_frame(toy_runner: MakeRunner) -> None:
     runner = toy_runner({"level": {"when": REPEAT}}, skipping=False)
     ran(runner)
@@ -386,6 +400,13 @@ def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
     result = toy_runner({**stages, "heavy": {"in": {"level": "vandal"}}}, check=True).run()
     assert result.exit_code == 3
     assert "port half: required shape (H, W) with H = 4, W = 6, got (2, 6)" in str(result.error)
+
+
+def test_a_stage_that_exits_while_it_is_built_is_named(toy_runner: MakeRunner) -> None:
+    result = toy_runner({"quitter": {"use": "Quitter"}, "heavy": {"in": {"level": "quitter"}}}).run()
+    assert result.exit_code == 3
+    assert "quitter" in str(result.error)
+    assert "cannot be opened: SystemExit: 7" in str(result.error)
 
 
 # -- live -------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -128,6 +129,14 @@ class Pulse(Counted):
         return ActivePorts(3 <= frame.seq % 10 <= 6)
 
 
+class Even(Counted):
+    """True in every second frame."""
+
+    def process(self, frame: Frame) -> ActivePorts:
+        self.saw(frame.seq)
+        return ActivePorts(frame.seq % 2 == 0)
+
+
 class HeavyPorts(NamedTuple):
     heavy: Number
 
@@ -212,6 +221,17 @@ class LateTick(Counted):
 
     def write(self, number: Number | None, total: Number, tick: Tick) -> None:
         self.rows = [*getattr(self, "rows", []), (tick.frame.seq, number and number.value, total.value)]
+
+
+class Quitter(Counted):
+    """Ends the program where it should only complain."""
+
+    def __init__(self, params: Counted.Params) -> None:
+        super().__init__(params)
+        sys.exit(7)
+
+    def process(self, level: Number) -> Number:
+        return level
 
 
 class Vandal(Counted):

@@ -72,12 +72,13 @@ class RunningTick:
 class _RunningGate:
     """A gate with its memory: frames since it was last open. slot : of its signal."""
 
-    __slots__ = ("absent", "no_memory", "plan", "since_open", "since_true", "slot")
+    __slots__ = ("absent", "no_memory", "plan", "repeats", "since_open", "since_true", "slot")
 
     def __init__(self, plan: Gate, slots: Slots) -> None:
         self.plan = plan
         self.slot = slots[plan.signal.node, plan.signal.port]
         self.absent = Absent(plan.reason)
+        self.repeats = plan.otherwise == "repeat"
         self.no_memory = not plan.hold and plan.at_least_every is None
         self.since_true: int | None = None
         self.since_open = 0
@@ -157,7 +158,7 @@ class RunningNode:
         self.input_slots = [slot for _, slot in self.inputs if slot != NOTHING]
         self.slots = [slots[node.id, port.name] for port in component.ports.outputs]
         self.gates = [_RunningGate(gate, slots) for gate in node.gates] if skipping else []
-        self.repeats = any(gate.plan.otherwise == "repeat" for gate in self.gates)
+        self.repeats = any(gate.repeats for gate in self.gates)
         self.stateful = (
             component.memory == "stateful" or self.repeats or any(not gate.no_memory for gate in self.gates)
         )
@@ -391,6 +392,7 @@ class Segment:
     def _opened(self, step: _Step, tick: RunningTick) -> bool:
         """Whether the gates of a step are open; if not, its outputs are entered as they are then."""
         closed: Absent | None = None
+        repeat = True
         for gate, maker, decides in step.gates:
             if maker is not None and maker.seen != tick.index:
                 self._visit(maker, tick)
@@ -398,12 +400,18 @@ class Segment:
                 continue
             signal = tick.values[gate.slot]
             if step.own:
-                if not gate.is_open(signal) and closed is None:
+                # A gate whose closing means that there is nothing weighs more than one that repeats.
+                if not gate.is_open(signal) and (closed is None or (repeat and not gate.repeats)):
                     closed = signal if isinstance(signal, Absent) else gate.absent
+                    repeat = gate.repeats
             elif isinstance(signal, Absent) or not signal:
                 return False
         if closed is not None:
-            self._skip(step.node, tick, closed, repeat=step.node.repeats)
+            node = step.node
+            if node.repeats and not repeat:
+                # One gate says that there is nothing: what was before that is not repeated after it either.
+                node.last = node.last_arguments = None
+            self._skip(node, tick, closed, repeat=repeat)
         return closed is None
 
     def _present(self, node: RunningNode, tick: RunningTick, values: Sequence[Any]) -> Sequence[Any] | None:
