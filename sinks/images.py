@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -46,7 +47,7 @@ class Images:
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is written yet."""
         self.params = params
-        self._folder = Path(params.folder).expanduser()
+        self._folder = Path(os.path.expanduser(params.folder))
         self.description = str(self._folder)
         self._next = 0
         self._files = 0

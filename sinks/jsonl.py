@@ -79,7 +79,7 @@ class Jsonl:
         if self.params.path == "-":
             self._file = sys.stdout.buffer
             return
-        path = Path(self.params.path).expanduser()
+        path = Path(os.path.expanduser(self.params.path))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._open_file(path)

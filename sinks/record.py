@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import platform
 import threading
 from collections import deque
@@ -113,7 +114,7 @@ class Record:
         del directory
         self.params = params
         self.description = params.path
-        self._path = Path(params.path).expanduser()
+        self._path = Path(os.path.expanduser(params.path))
         self._trigger = params.trigger or ("start" if params.ring is None else "button")
         self._sensor = sensor
         self._control = control

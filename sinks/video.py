@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import statistics
 import tempfile
@@ -72,7 +73,7 @@ class Video:
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is opened yet."""
         self.params = params
-        self._path = Path(params.path).expanduser()
+        self._path = Path(os.path.expanduser(params.path))
         self.description = str(self._path)
         self._codec = ""
         self._held: list[tuple[float, Picture]] = []

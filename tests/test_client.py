@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from itertools import islice
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tactflow import client
 from tactflow.cli import listen
 from tactflow.client import Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
@@ -143,6 +145,23 @@ def test_silence_is_a_timeout_that_says_what_to_check(publisher: Publisher) -> N
         messages.timeout = 0.05
         with pytest.raises(TimeoutError, match="has the run ended"):
             next(iter(messages))
+
+
+@pytest.mark.parametrize("timeout", [3e6, 1e300])
+def test_a_wait_may_be_longer_than_zeromq_can_count(timeout: float, publisher: Publisher) -> None:
+    with Subscriber(publisher.endpoint, timeout=timeout) as messages:
+        publisher.wait()
+        publisher.send(5)
+        assert messages.receive()["seq"] == 5
+
+
+def test_a_long_wait_is_made_of_short_ones(publisher: Publisher, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "LONGEST_WAIT", 0.02)
+    with Subscriber(publisher.endpoint, timeout=0.1) as messages:
+        began = time.monotonic()
+        with pytest.raises(TimeoutError, match=r"for 0.1 s"):
+            messages.receive()
+        assert time.monotonic() - began >= 0.1
 
 
 def test_a_subscriber_may_start_before_the_publisher_and_survives_its_restart() -> None:

@@ -10,6 +10,7 @@ Nothing here needs OpenCV, or tactflow itself: the same few lines work over plai
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from types import TracebackType
@@ -21,6 +22,8 @@ import zmq
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Where tactflow publishes unless its pipeline says otherwise."""
 
+LONGEST_WAIT = 3600.0
+"""ZeroMQ counts in milliseconds and not for ever; longer waits are made of several of these, s."""
 
 STATISTICS = b"tactflow.stats"
 """Topic of a run's statistics, which no sensor may be called after."""
@@ -101,9 +104,11 @@ class Subscriber:
         """The next message as it was sent, JSON in UTF-8; not counted in `lost`. Raises as `receive`."""
         deadline = None if self.timeout is None else time.monotonic() + self.timeout
         while True:
-            left = None if deadline is None else max(int((deadline - time.monotonic()) * 1000), 0)
-            if not self._socket.poll(left):
-                raise TimeoutError(self._silence())
+            left = math.inf if deadline is None else deadline - time.monotonic()
+            if not self._socket.poll(max(math.ceil(min(left, LONGEST_WAIT) * 1000), 0)):
+                if left <= LONGEST_WAIT:
+                    raise TimeoutError(self._silence())
+                continue
             # Not every message that shares the beginning of our topic is a result: there are statistics too.
             topic, _, body = self._socket.recv().partition(b" ")
             if body.startswith(b"{") and topic != STATISTICS:

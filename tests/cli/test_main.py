@@ -139,3 +139,50 @@ def test_a_packaged_pipeline_is_found_by_its_name(
 def test_every_shipped_pipeline_is_right(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(path)]) == 0
     assert ": OK (" in capsys.readouterr().out
+
+
+def test_a_program_without_standard_output_does_its_work() -> None:
+    done = subprocess.run(
+        ["sh", "-c", f"'{sys.executable}' -m tactflow.cli.main stages >&-"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full here")
+@pytest.mark.parametrize("words", [("stages",), ("schema", "message"), ("sim", "--list"), ("explain",)])
+def test_a_full_disk_behind_standard_output_is_an_error_and_no_traceback(words: tuple[str, ...]) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "tactflow.cli.main", *words],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+            cwd=ROOT,
+        )
+    assert done.returncode == 3
+    assert done.stderr.endswith("tactflow: standard output: No space left on device\n")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["[/y]", "[left]", "[bold]"])
+def test_names_in_brackets_are_shown_as_they_are(name: str, tmp_path: Path) -> None:
+    words = ["run", "--source", "sim:idle?frames=3", "--set", "sinks.zmq=null", "--set", "sinks.view=null"]
+    done = program(*words, "--jsonl", f"{name}.jsonl", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"jsonl_2: {name}.jsonl" in done.stderr.replace("jsonl: [", "jsonl_2: [")
+    missing = program(*words[:1], "--source", f"{name}.png", *words[3:], cwd=tmp_path)
+    assert missing.returncode == 4
+    assert f"{name}.png" in missing.stderr.splitlines()[-1]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere every file name is text")
+def test_a_name_that_is_no_text_is_pointed_at(tmp_path: Path) -> None:
+    done = program("run", "--source", "\udcff.png", "--quiet", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--source: stages.capture: '\\udcff.png' is not UTF-8; rename the file" in done.stderr

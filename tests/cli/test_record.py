@@ -242,6 +242,11 @@ def test_repair_can_write_elsewhere_and_replaces_nothing_unasked(
     assert main(["repair", str(out), "--out", str(copy)]) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert copy.read_bytes() == b"precious"
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    assert main(["repair", str(out), "--out", str(folder), "--overwrite"]) == 2
+    assert f"is a folder; name a file in it, as in {folder / 'a.mcap'}" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "kept"]
     assert main(["repair", str(out), "--out", str(copy), "--overwrite"]) == 0
     assert out.read_bytes() == data
     with copy.open("rb") as file:

@@ -339,3 +339,40 @@ def test_a_validator_that_breaks_is_reported_without_a_traceback(load: Load, tmp
             "stages.prepare.corners=[]",
             "stages.prepare.size=[3, 4]",
         )
+
+
+def with_sinks(first: str, second: str = "") -> str:
+    """The body with other sinks."""
+    return BODY.replace("out: {use: './parts.py:Publish'}", f"{first}\n  {second}")
+
+
+@pytest.mark.parametrize(
+    ("second", "clash"),
+    [
+        ("again: {use: jsonl, path: out/../out/a.jsonl}", True),
+        ("more: {use: jsonl, path: ./out/a.jsonl, detail: true}", True),
+        ("again: {use: jsonl, path: out/b.jsonl}", False),
+    ],
+)
+def test_two_sinks_do_not_write_the_same_file(second: str, clash: bool, load: Load) -> None:
+    text = with_sinks(first="lines: {use: jsonl, path: out/a.jsonl}", second=second)
+    if clash:
+        with pytest.raises(ConfigError, match=r"lines \(.*p.yaml:11:3\) writes .*/out/a.jsonl already"):
+            load(text)
+    else:
+        assert len(load(text).sinks) == 2
+
+
+@pytest.mark.parametrize("path", ["-", "/dev/null"])
+def test_what_is_no_file_may_be_written_by_several_sinks(path: str, load: Load) -> None:
+    first, second = (f"{name}: {{use: jsonl, path: {path}}}" for name in ("one", "two"))
+    assert len(load(with_sinks(first=first, second=second)).sinks) == 2
+
+
+def test_an_option_adds_no_second_sink_for_a_file_that_is_written_already(load: Load) -> None:
+    lines = "lines: {use: jsonl, path: out/a.jsonl, detail: true}"
+    option = {"--jsonl": {"use": "jsonl", "path": "out/a.jsonl"}}
+    kept = load(with_sinks(first=lines, second=""), extra_sinks=option)
+    assert [sink.id for sink in kept.sinks] == ["lines"]
+    with pytest.raises(ConfigError, match=r"--jsonl: .* writes .* already"):
+        load(with_sinks(first=lines[:-1] + ", max_rate: 5}", second=""), extra_sinks=option)

@@ -179,6 +179,25 @@ class StageWithAbsentInput:
     def process(self, contact: Contact | Absent) -> Flow: ...
 
 
+class StageOfNoInstance:
+    @staticmethod
+    def process(image: Image) -> Contact: ...
+
+
+class StageOfTheClass:
+    @classmethod
+    def process(cls, image: Image) -> Contact: ...
+
+
+class StageThatYields:
+    def process(self, image: Image) -> Image:  # type: ignore[misc]
+        yield image
+
+
+class StageThatIsAwaited:
+    async def process(self, image: Image) -> Contact: ...
+
+
 class SinkThatReturns:
     def write(self, contact: Contact) -> int: ...
 
@@ -206,6 +225,10 @@ class SinkWithOtherTick:
         ),
         (StageWithBareInput, "process", "image: a bare array"),
         (StageWithAbsentInput, "process", r"annotated X \| None"),
+        (StageOfNoInstance, "process", "required a method of the instance"),
+        (StageOfTheClass, "process", "required a method of the instance"),
+        (StageThatYields, "process", "it yields"),
+        (StageThatIsAwaited, "process", "async functions are not awaited"),
         (SinkThatReturns, "write", "a sink returns nothing"),
         (SinkWithOtherTick, "write", "must be called tick, not now"),
     ],

@@ -6,11 +6,12 @@ import argparse
 import difflib
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
 from tactflow import __version__
-from tactflow.engine.errors import TactflowError
+from tactflow.engine.errors import StageError, TactflowError
 
 COMMANDS = {
     "run": "run a pipeline",
@@ -35,13 +36,25 @@ only when the command is used.
 
 def entry() -> None:
     """Entry point of the console script."""
+    # A service may be started without them.
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
+    # To be ended by a service or by Ctrl-C is the same.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = main(sys.argv[1:])
         sys.stdout.flush()
-    except BrokenPipeError:
-        # Whoever read our output has left. The interpreter flushes once more at exit: that must go nowhere.
+    except OSError as error:
+        # Whoever read our output has left, or the disk is full. The interpreter flushes once more at exit:
+        # that must go nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+        if not isinstance(error, BrokenPipeError):
+            print(
+                f"tactflow: {error.filename or 'standard output'}: {error.strerror or error}", file=sys.stderr
+            )
+            code = StageError.exit_code
     sys.exit(code)
 
 

@@ -43,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
     out: Path = args.out or path
     if not path.is_file():
         raise SourceError(f"{path}: no such file")
+    if out.is_dir():
+        raise ConfigError(f"--out: {out} is a folder; name a file in it, as in {out / path.name}")
     if args.out is not None and out.exists() and not args.overwrite:
         raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
     try:

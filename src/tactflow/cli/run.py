@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     if result.error is not None:
         print(f"tactflow: {result.error}", file=sys.stderr)
     if not args.quiet:
-        console.print(_summary(result, runner))
+        console.print(_summary(result, runner), markup=False)
     return result.exit_code
 
 

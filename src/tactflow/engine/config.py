@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -61,6 +62,7 @@ def load_pipeline(
         values.setdefault(source.id, {}).update(source_values or {})
     _set_values(drafts, values, problems)
     params = {draft.id: _params(draft, problems) for draft in drafts}
+    drafts = _one_writer_each(drafts, params, extra_sinks or {}, problems)
     wiring.connect(drafts, problems)
     nodes: dict[str, Node] = {}
     for draft in wiring.ordered(drafts, problems):
@@ -184,6 +186,52 @@ def _add_sinks(root: Item, extra: Mapping[str, Mapping[str, Any]]) -> Item:
     return root
 
 
+def _one_writer_each(
+    drafts: Sequence[Draft],
+    params: Mapping[str, StageParams | None],
+    options: Collection[str],
+    problems: Problems,
+) -> list[Draft]:
+    """The drafts without those that an option adds for a file that is written anyway, just as it asks.
+
+    Any other two sinks that would write the same file are a mistake.
+    """
+    kept: list[Draft] = []
+    writers: dict[str, Draft] = {}
+    for draft in drafts:
+        place = _written(draft, params.get(draft.id))
+        other = None if place is None else writers.setdefault(place, draft)
+        if other is None or other is draft:
+            kept.append(draft)
+        elif draft.mark.file not in options or not _does_as_much(other, draft):
+            kept.append(draft)
+            problems.add(
+                draft.mark,
+                f"sinks.{draft.id}: {other.id} ({other.mark}) writes {place} already; choose another path",
+            )
+    return kept
+
+
+def _does_as_much(there: Draft, added: Draft) -> bool:
+    """Whether a sink writes all that one without settings of its own would write."""
+    if there.component is None or added.component is None:
+        return False
+    return there.component.cls is added.component.cls and "max_rate" not in there.item.entries
+
+
+def _written(draft: Draft, params: StageParams | None) -> str | None:
+    """The file or folder that a sink writes; None for a stage, a device and standard output."""
+    if draft.section != "sinks":
+        return None
+    for key in ("path", "folder"):
+        value = getattr(params, key, None)
+        if isinstance(value, str) and value != "-":
+            place = os.path.realpath(os.path.expanduser(value))
+            ordinary = os.path.isfile(place) or os.path.isdir(place) or not os.path.exists(place)
+            return place if ordinary else None
+    return None
+
+
 def _drafts(root: Item, section: Section, problems: Problems) -> list[Draft]:
     entry = root.entries.get(section)
     if entry is None:
@@ -273,6 +321,11 @@ def _params(draft: Draft, problems: Problems) -> StageParams | None:
     given = {key: entry for key, entry in draft.item.entries.items() if key not in keys}
     item = Item(given, draft.mark)
     model = draft.component.params
+    strange = [entry for entry in given.values() if not _is_text(entry.item.plain())]
+    for entry in strange:
+        problems.add(entry.item.mark, f"{draft.path}: {entry.item.plain()!r} is not UTF-8; rename the file")
+    if strange:
+        return None
     try:
         # JSON, because pydantic's strict rules for it fit YAML too: a list may become a tuple, but text or a
         # boolean never becomes a number.
@@ -285,6 +338,15 @@ def _params(draft: Draft, problems: Problems) -> StageParams | None:
             draft.mark, f"{draft.path}: the parameters fail: {type(error).__name__}: {error} ({place})"
         )
     return None
+
+
+def _is_text(value: Any) -> bool:
+    """False for a name of a file that no encoding can write, as the command line may pass it."""
+    try:
+        json.dumps(value, ensure_ascii=False, default=str).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _node(draft: Draft, params: StageParams | None, problems: Problems) -> Node | None:

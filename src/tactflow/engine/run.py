@@ -245,7 +245,7 @@ class Runner:
             raise kind(f"{node.id} ({node.mark}): {error}") from error
         except TactflowError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             place = traceback.extract_tb(error.__traceback__)[-1]
             raise kind(
                 f"{node.id} ({node.mark}): cannot be opened: {type(error).__name__}: {error}\n"

@@ -118,6 +118,7 @@ def read_ports(cls: type, method: str) -> Ports:
     """
     function = inspect.unwrap(getattr(cls, method))
     try:
+        _check_method(cls, function, method)
         return _ports(function, method)
     except _PortError as problem:
         raise ConfigError(f"{_place(function)}: {cls.__name__}.{method}: {problem}") from None
@@ -155,6 +156,16 @@ _ARRAY_ADVICE = (
     "a bare array does not say what it holds; use a type of tactflow.ports (Image, ContactMask, ...) "
     'or Annotated[NDArray[np.uint8], ArrayPort("name", ("H", "W"), "uint8", "unit")]'
 )
+
+
+def _check_method(cls: type, function: Callable[..., Any], method: str) -> None:
+    """Raise if a function cannot be called as the engine does: on an instance, for its result."""
+    if isinstance(inspect.getattr_static(cls, method), staticmethod | classmethod):
+        raise _PortError("required a method of the instance, with self as its first parameter")
+    if inspect.iscoroutinefunction(function) or inspect.isasyncgenfunction(function):
+        raise _PortError("async functions are not awaited here; write def")
+    if method != "frames" and inspect.isgeneratorfunction(function):
+        raise _PortError("it yields, but is called once a frame for what it returns; write return")
 
 
 def _ports(function: Callable[..., Any], method: str) -> Ports:

@@ -204,7 +204,7 @@ def find_path(spec: str, directory: Path | None) -> Path:
     SourceError
         If nothing is there; names files whose names are close.
     """
-    path = Path(spec).expanduser()
+    path = Path(os.path.expanduser(spec))
     candidates = [path]
     if directory is not None and not path.is_absolute():
         candidates.append(directory / path)

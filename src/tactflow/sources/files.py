@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -153,7 +154,7 @@ def open_glob(pattern: str, directory: Path | None = None, fps: float | None = N
 
     The pattern is relative to the current directory, or to `directory` if nothing matches there.
     """
-    expanded = str(Path(pattern).expanduser())
+    expanded = str(Path(os.path.expanduser(pattern)))
     for base in (None, directory):
         found = [Path(base or "", name) for name in glob.glob(expanded, root_dir=base, recursive=True)]
         files = sorted((path for path in found if path.is_file()), key=lambda path: natural_key(str(path)))
@@ -314,7 +315,7 @@ def open_recording(
     SourceError
         If it is not there, or not a recording.
     """
-    if glob.has_magic(spec) and not Path(spec).expanduser().exists():
+    if glob.has_magic(spec) and not Path(os.path.expanduser(spec)).exists():
         return open_glob(spec, directory, fps)
     path = find_path(spec, directory)
     if path.is_dir():
