@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -13,8 +14,10 @@ from pathlib import Path
 import pytest
 import zmq
 
+from tactflow.cli import fleet
 from tactflow.cli.fleet import with_name
 from tactflow.cli.main import main
+from tactflow.engine.errors import ConfigError
 
 GRAPH = """
 opencv_threads: 1
@@ -32,9 +35,9 @@ sinks:
 """
 
 
-def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str, cwd: Path, command: str = "run") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "tactflow", "run", *arguments],
+        [sys.executable, "-m", "tactflow", command, *arguments],
         cwd=cwd,
         capture_output=True,
         text=True,
@@ -140,6 +143,197 @@ def test_a_sensor_that_fails_is_started_again_and_the_others_are_not_disturbed(f
     assert done.stderr.count("right failed") == 0
 
 
+LATE = """
+from pathlib import Path
+
+from tactflow.stages.capture import Capture
+
+
+class Late(Capture):
+    def open(self) -> None:
+        trace = Path("attempts")
+        first = not trace.exists()
+        with trace.open("a") as file:
+            file.write("x")
+        if first:
+            raise OSError("nothing is plugged in")
+        super().open()
+"""
+
+
+@pytest.fixture
+def late(folder: Path) -> Path:
+    """A folder whose left sensor has no source at the first start."""
+    (folder / "late.py").write_text(LATE)
+    text = GRAPH.replace(
+        'capture: {source: "sim:press', "capture: {use: './late.py:Late', source: \"sim:press"
+    )
+    (folder / "pipeline.yaml").write_text(text)
+    return folder
+
+
+def test_a_file_that_may_not_be_touched_is_refused_for_good(folder: Path) -> None:
+    old = folder / "out-left.jsonl"
+    old.write_text("{}\n")
+    done = run("--quiet", cwd=folder)
+    assert done.returncode == 3
+    assert "this file exists" in done.stderr
+    assert "left failed (exit code 3); given up, as out-left.jsonl may not be replaced" in done.stderr
+    assert "starting again" not in done.stderr
+    assert old.read_text() == "{}\n"
+    assert len(rows(folder / "out-right.jsonl")) == 30
+
+
+def test_a_start_after_one_that_came_to_no_file_does_with_it_what_was_asked(late: Path) -> None:
+    (late / "out-left.jsonl").write_text("{}\n")
+    done = run("--quiet", "--set", "sinks.jsonl.overwrite=true", cwd=late)
+    assert done.returncode == 0, done.stderr
+    assert "left failed (exit code 4); starting again in 1 s" in done.stderr
+    assert [row["seq"] for row in rows(late / "out-left.jsonl")] == list(range(40))
+
+
+def test_a_start_after_one_that_came_to_no_recording_replaces_it_as_asked(late: Path) -> None:
+    (late / "a-left.mcap").write_bytes(b"old")
+    (late / "a-right.mcap").write_bytes(b"old")
+    arguments = ("--out", "a.mcap", "--overwrite", "--quiet", "--max-frames", "3")
+    done = run(*arguments, cwd=late, command="record")
+    assert done.returncode == 0, done.stderr
+    assert (late / "attempts").read_text() == "xx"
+    assert sorted(path.name for path in late.glob("*.mcap")) == ["a-left.mcap", "a-right.mcap"]
+    assert (late / "a-left.mcap").read_bytes() != b"old"
+
+
+# A module that a sensor's process imports long before it can end well. What it does there comes last.
+WAITING = """
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from tactflow.stages.capture import Capture
+
+
+class Waiting(Capture):
+    pass
+
+
+if "--sensor" in sys.argv:
+    sensor = sys.argv[sys.argv.index("--sensor") + 1]
+"""
+SAY_SO = """
+    with open(f"here-{sensor}", "a") as file:
+        file.write("x")
+"""
+
+
+def waiting(folder: Path, then: str) -> list[Path]:
+    """A pipeline of two sensors whose processes do this on import; the files that say that they are there."""
+    (folder / "waiting.py").write_text(WAITING + then)
+    text = GRAPH.replace('  capture: {source: "sim:idle"}', "  capture: {use: './waiting.py:Waiting'}")
+    (folder / "pipeline.yaml").write_text(text)
+    return [folder / "here-left", folder / "here-right"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("handler", "code"),
+    [
+        ("signal.SIG_DFL", 0),
+        ("signal.default_int_handler", 0),
+        ("lambda *_: os.kill(os.getpid(), signal.SIGKILL)", 3),
+    ],
+)
+def test_one_signal_soon_after_the_start_ends_all_sensors_well(
+    folder: Path, number: signal.Signals, handler: str, code: int
+) -> None:
+    caught = f"\n    signal.signal(signal.SIGTERM, {handler})"
+    files = waiting(folder, f"{caught}{SAY_SO}    time.sleep(100)\n")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactflow", "run"], cwd=folder, stderr=subprocess.PIPE, text=True
+    )
+    while not all(file.exists() for file in files):
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=40)
+    assert process.returncode == code, errors
+    assert "Traceback" not in errors
+    assert errors.count("was ended by signal 9") == (2 if code else 0)
+
+
+def test_a_sensor_that_is_refused_ends_those_that_are_still_starting(folder: Path) -> None:
+    refuse = f"""
+    while sensor == "left" and not Path("here-right").exists():
+        time.sleep(0.02)
+    if sensor == "left":
+        raise SystemExit(2)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    {SAY_SO}
+    time.sleep(100)
+"""
+    _, right = waiting(folder, refuse)
+    done = run("--quiet", cwd=folder)
+    assert done.returncode == 2, done.stderr
+    assert "starting again" not in done.stderr
+    assert right.read_text() == "x"
+
+
+def test_a_sensor_that_the_system_kills_has_failed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(fleet, "GIVE_UP_AFTER", 0)
+    waiting(folder, "\n    os.kill(os.getpid(), signal.SIGKILL)\n")
+    assert main(["run"]) == 3
+    assert "left failed 1 times in a row (exit code -9); given up" in capfd.readouterr().err
+
+
+def test_the_run_goes_on_when_nobody_reads_its_lines_any_more(folder: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactflow", "run", "--quiet", "--jsonl", "-"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    # Before the first line, so that every sensor's lines find nobody.
+    process.stdout.close()
+    with process.stderr as stream:
+        errors = stream.read()
+    assert process.wait(40) == 0
+    assert errors == b""
+    assert len(rows(folder / "out-left.jsonl")) == 40
+    assert len(rows(folder / "out-right.jsonl")) == 30
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_a_full_disk_behind_standard_output_ends_the_run_with_an_error(folder: Path) -> None:
+    text = GRAPH.replace("frames=40", "frames=90000").replace("frames=30", "frames=90000")
+    (folder / "pipeline.yaml").write_text(text)
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "tactflow", "run", "--quiet", "--jsonl", "-"],
+            cwd=folder,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert done.returncode == 3
+    assert done.stderr == "tactflow: standard output: No space left on device; the run ends\n"
+
+
+def test_a_device_in_the_file_may_be_written_by_all_sensors(folder: Path) -> None:
+    text = (folder / "pipeline.yaml").read_text().replace("out-{sensor}.jsonl", "/dev/null")
+    assert "/dev/null" in text
+    (folder / "pipeline.yaml").write_text(text)
+    done = run(cwd=folder, command="check")
+    assert done.returncode == 0, done.stderr
+
+
 def test_one_signal_ends_all_sensors_well(folder: Path) -> None:
     (folder / "pipeline.yaml").write_text(
         GRAPH.replace("frames=40", "frames=90000").replace("frames=30", "frames=90000")
@@ -165,6 +359,17 @@ def test_one_signal_ends_all_sensors_well(folder: Path) -> None:
         (GRAPH.replace("out-{sensor}.jsonl", "out.jsonl"), [], "left and right would both write out.jsonl"),
         (GRAPH, ["--source", "sim:idle"], "each with its own source"),
         (GRAPH, ["--sensor", "lefft"], "did you mean left?"),
+        (
+            GRAPH,
+            ["--set", "sinks.jsonl_2={use: jsonl, path: same.jsonl}"],
+            "left and right would both write same.jsonl",
+        ),
+        *[
+            (GRAPH, [option, path], f"{option} {path}: required a file, not a folder")
+            for option in ("--jsonl", "--stats", "--trace")
+            for path in (".", "..", "new/", "/", "/tmp")
+        ],
+        (GRAPH, ["--stats", ""], "required a file"),
         (GRAPH.replace("rotate: 0", "rotate: 7"), [], "pipeline.yaml:8:28"),
         (GRAPH.replace("  left: {stages:", "  left: {stagse:"), [], "did you mean stages?"),
         (GRAPH.replace("  left:", "  'le ft':"), [], "a name is a word"),
@@ -213,6 +418,74 @@ def test_check_looks_at_every_sensor(
         "pipeline.yaml: sensor left OK",
         "pipeline.yaml: sensor right OK",
     ]
+
+
+def test_check_tells_what_run_would_refuse_and_all_other_mistakes(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    text = GRAPH.replace("out-{sensor}.jsonl", "out.jsonl").replace("right:", "middle: null\n  right:")
+    (folder / "pipeline.yaml").write_text(text)
+    assert main(["check"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "sinks.jsonl.path: left and middle would both write out.jsonl" in captured.err
+    assert "sinks.jsonl.path: left and right would both write out.jsonl" in captured.err
+    (folder / "pipeline.yaml").write_text(text.replace("rotate: 0", "rotate: 7"))
+    assert main(["check"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("tactflow: 2 mistakes in the pipeline\npipeline.yaml:9:28  ")
+    assert "left and middle would both write out.jsonl" in captured.err
+
+
+def test_check_tells_a_mistake_of_all_sensors_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    text = GRAPH.replace("downsample: 2", "downsample: 0")
+    (folder / "pipeline.yaml").write_text(text)
+    assert main(["check"]) == 2
+    alone = capsys.readouterr().err
+    assert alone.count("downsample: ") == 2, "the message, and the line of the file"
+    (folder / "pipeline.yaml").write_text(text.replace("rotate: 0", "rotate: 7"))
+    assert main(["check"]) == 2
+    both = capsys.readouterr().err
+    assert both.startswith("tactflow: 2 mistakes in the pipeline\n")
+    assert both.count("mistakes") == 1
+    assert alone.removeprefix("tactflow: ") in both
+
+
+@pytest.mark.parametrize(
+    ("path", "names"),
+    [("o-{sensor}.jsonl", ["o-left.jsonl", "o-right.jsonl"]), ("o.jsonl", ["o-left.jsonl", "o-right.jsonl"])],
+)
+def test_added_lines_go_to_a_file_for_each_sensor(path: str, names: list[str], folder: Path) -> None:
+    done = run("--quiet", "--max-frames", "2", "--jsonl", path, "--stats", os.devnull, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert sorted(file.name for file in folder.glob("o-*")) == names
+    assert [len(rows(folder / name)) for name in names] == [2, 2]
+
+
+@pytest.mark.parametrize("path", [os.devnull, "/dev/stdout", "/dev/stderr"])
+def test_devices_are_the_same_for_all_sensors(path: str) -> None:
+    assert with_name(path, "a") == path
+
+
+def test_a_named_pipe_is_the_same_for_all_sensors(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert with_name(str(tmp_path / "pipe"), "a") == str(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("path", ["", ".", "..", "x/", "x/.", "{sensor}/", "there", "in-{sensor}"])
+def test_a_folder_is_no_file_for_each_sensor(
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    (tmp_path / "in-a").mkdir()
+    with pytest.raises(ConfigError, match="required a file, not a folder"):
+        with_name(path, "a")
 
 
 @pytest.mark.parametrize(

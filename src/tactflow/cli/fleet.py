@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
@@ -21,7 +23,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import IO
+from typing import IO, NamedTuple
 
 import zmq
 
@@ -37,6 +39,8 @@ GIVE_UP_AFTER = 5
 """Failures in a row after which a sensor is not started again."""
 GOOD_RUN = 30.0
 """A process that ran so long, s, starts with the first pause again when it fails."""
+STREAMS = ("/dev/stdout", "/dev/stderr")
+"""They lead to the supervisor, even where what they stand for is a regular file just now."""
 
 
 def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipeline]) -> int:
@@ -50,10 +54,12 @@ def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipe
 
     Raises
     ------
-    ConfigError : several sensors would write one file or read one source. StageError : the address for
-        subscribers is taken.
+    ConfigError : several sensors would write one file or read one source, or an option names no file.
+    StageError : the address for subscribers is taken.
     """
-    _refuse_clashes(args, pipelines)
+    problems = [*_option_problems(args, list(pipelines)), *clash_problems(pipelines)]
+    if problems:
+        raise ConfigError("\n".join(problems))
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-")))
         relays = _relays(pipelines)
@@ -76,20 +82,51 @@ def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipe
                 for node in pipelines[name].sinks
                 if node.component.name == "view"
             ]
-            private += _added_sinks(pipelines[name], name)
+            private += _added_sinks(args, pipelines[name], name)
             command = _command(args, file, name, private)
-            members.append(_Member(name, command, _again(command, pipelines[name])))
+            members.append(_Member(name, command, _outputs(args, pipelines[name], name)))
         return _Supervisor(members).run()
 
 
 def with_name(path: str, sensor: str) -> str:
-    """The file that one sensor's process writes where the command line names `path` for all of them."""
-    if path == "-":
+    """The file that one sensor's process writes where the command line names `path` for all of them.
+
+    Standard output and devices are the same for all.
+
+    Raises
+    ------
+    ConfigError : it is a folder.
+    """
+    if path == "-" or _is_device(path):
         return path
-    if PLACEHOLDER in path:
-        return path.replace(PLACEHOLDER, sensor)
-    whole = Path(path)
-    return str(whole.with_name(f"{whole.stem}-{sensor}{whole.suffix}"))
+    named = path.replace(PLACEHOLDER, sensor)
+    if named == path and not _is_folder(path):
+        whole = Path(path)
+        named = str(whole.with_name(f"{whole.stem}-{sensor}{whole.suffix}"))
+    if _is_folder(named):
+        example = os.path.join(named, f"{PLACEHOLDER}.json")
+        raise ConfigError(f"required a file, not a folder; each sensor writes its own, as in {example}")
+    return named
+
+
+def _is_folder(path: str) -> bool:
+    return os.path.basename(path) in ("", ".", "..") or os.path.isdir(os.path.expanduser(path))
+
+
+def _is_device(path: str) -> bool:
+    """Whether it is there and neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
+    if path in STREAMS:
+        return True
+    there = _status(path)
+    return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
+
+
+def _status(path: str) -> os.stat_result | None:
+    """What the system knows about a path; None if there is nothing."""
+    try:
+        return os.stat(os.path.expanduser(path))
+    except (OSError, ValueError):
+        return None
 
 
 def _command(args: argparse.Namespace, file: Path, sensor: str, overrides: Sequence[str]) -> list[str]:
@@ -110,55 +147,142 @@ def _command(args: argparse.Namespace, file: Path, sensor: str, overrides: Seque
     return command
 
 
-def _lines(pipeline: Pipeline) -> Iterator[tuple[Node, str]]:
-    """The sinks that write JSON Lines, and where to."""
-    for node in pipeline.sinks:
-        if node.component.name == "jsonl":
-            yield node, str(getattr(node.params, "path", "-"))
-
-
-def _added_sinks(pipeline: Pipeline, sensor: str) -> list[str]:
+def _added_sinks(args: argparse.Namespace, pipeline: Pipeline, sensor: str) -> list[str]:
     """The sinks of `--jsonl` as overrides, so that a later override may change them."""
     return [
-        f"sinks.{node.id}={{use: jsonl, path: {json.dumps(with_name(path, sensor))}}}"
-        for node, path in _lines(pipeline)
-        if str(node.mark).startswith("--jsonl")
+        f"sinks.{node.id}={{use: jsonl, path: {json.dumps(_path_of(node, args, sensor))}}}"
+        for node in pipeline.sinks
+        if _is_added(node, "jsonl")
     ]
 
 
-def _again(command: Sequence[str], pipeline: Pipeline) -> list[str]:
-    """The command that starts a sensor after a failure: what it has written so far must stay."""
-    kept = [word for word in command if word not in ("--overwrite", "--number")]
-    if "record" in command[:4]:
-        kept.append("--number")
-    for node, path in _lines(pipeline):
-        if path != "-":
-            kept += ["--set", f"sinks.{node.id}.overwrite=false", "--set", f"sinks.{node.id}.append=true"]
-    return kept
+def _is_added(node: Node, option: str) -> bool:
+    """Whether this option of the command line added the sink."""
+    return str(node.mark) == f"--{option}"
 
 
-def _refuse_clashes(args: argparse.Namespace, pipelines: Mapping[str, Pipeline]) -> None:
+def _path_of(node: Node, args: argparse.Namespace, sensor: str) -> str:
+    """Where a sink writes in the process of one sensor."""
+    if _is_added(node, "jsonl"):
+        return with_name(args.jsonl, sensor)
+    return str(getattr(node.params, "path", "-"))
+
+
+class _State(NamedTuple):
+    """What tells whether somebody has written to a file."""
+
+    device: int
+    inode: int
+    size: int
+    modified_ns: int
+
+
+def _state(path: str) -> _State | None:
+    """The present state of a regular file; None if there is none."""
+    there = _status(path)
+    if there is None or not stat.S_ISREG(there.st_mode):
+        return None
+    return _State(there.st_dev, there.st_ino, there.st_size, there.st_mtime_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class _Output:
+    """A file that the processes of a sensor write.
+
+    path : the file. before : its state before the first process. guarded : whether the user has not allowed
+    to replace or continue it. keep : options that make a process keep what is in it.
+    """
+
+    path: str
+    before: _State | None
+    guarded: bool
+    keep: tuple[str, ...] = ()
+
+    @property
+    def begun(self) -> bool:
+        """Whether a process has written to it."""
+        return _state(self.path) not in (None, self.before)
+
+    @property
+    def refused(self) -> bool:
+        """Whether a process that is started now may not write to it."""
+        now = _state(self.path)
+        return self.guarded and now is not None and now.size > 0 and not (self.keep and self.begun)
+
+
+def _outputs(args: argparse.Namespace, pipeline: Pipeline, sensor: str) -> list[_Output]:
+    """The files whose content matters when a sensor is started again."""
+    found = []
+    for node in pipeline.sinks:
+        path = _path_of(node, args, sensor)
+        if node.component.name not in ("jsonl", "video") or path == "-":
+            continue
+        guarded = not any(getattr(node.params, name, False) for name in ("overwrite", "append"))
+        keep: tuple[str, ...] = ()
+        if node.component.name == "jsonl":
+            where = f"sinks.{node.id}"
+            keep = ("--set", f"{where}.overwrite=false", "--set", f"{where}.append=true")
+        found.append(_Output(path, _state(path), guarded, keep))
+    recording = getattr(args, "out", None)
+    if recording is not None:
+        path = with_name(str(recording), sensor)
+        found.append(_Output(path, _state(path), not (args.overwrite or args.number), ("--number",)))
+    return found
+
+
+def _again(command: Sequence[str], outputs: Sequence[_Output]) -> list[str]:
+    """The command that starts a sensor after a failure: what it has written so far must stay.
+
+    For a file to which it has not come yet, what the user wants still holds.
+    """
+    added = [word for output in outputs if output.begun for word in output.keep]
+    if "--number" in added:
+        command = [word for word in command if word not in ("--overwrite", "--number")]
+    return [*command, *added]
+
+
+def _option_problems(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
+    """What is wrong with the command line of a run of several sensors."""
     problems = []
     if args.source is not None:
         problems.append(
-            f"--source: the pipeline has {len(pipelines)} sensors, each with its own source; choose one with "
-            f"--sensor {next(iter(pipelines))}, or use --set sensors.NAME.stages.capture.source=..."
+            f"--source: the pipeline has {len(sensors)} sensors, each with its own source; choose one with "
+            f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
         )
+    for option in ("jsonl", "stats", "trace", "out"):
+        path = getattr(args, option, None)
+        try:
+            for sensor in sensors if path is not None else ():
+                with_name(str(path), sensor)
+        except ConfigError as error:
+            problems.append(f"--{option} {path}: {error}")
+    return problems
+
+
+def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
+    """One message for each sink of a pipeline file that would write where another sensor's does.
+
+    pipelines : sensor -> its pipeline.
+    """
+    problems = []
     seen: dict[tuple[str, object], str] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
+            # These get the sensor's name.
+            if _is_added(node, "jsonl") or _is_added(node, "record"):
+                continue
             for key in ("path", "folder"):
                 value = getattr(node.params, key, None)
-                if value is None or value == "-":
+                if value is None or value == "-" or _is_device(str(value)):
                     continue
                 other = seen.setdefault((key, value), sensor)
-                if other != sensor and not str(node.mark).startswith("--"):
+                if other != sensor:
+                    place = f"{node.mark}  " if node.mark.line else f"{node.mark}: "
                     problems.append(
-                        f"{node.mark}  sinks.{node.id}.{key}: {other} and {sensor} would both write {value}; "
+                        f"{place}sinks.{node.id}.{key}: {other} and {sensor} would both write {value}; "
                         f"put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
                     )
-    if problems:
-        raise ConfigError("\n".join(problems))
+    return problems
 
 
 def _relays(pipelines: Mapping[str, Pipeline]) -> dict[str, list[tuple[str, str]]]:
@@ -233,14 +357,18 @@ def _relay(endpoint: str, upstream: Sequence[str], backlog: int, realtime: bool)
 
 @dataclass(slots=True)
 class _Member:
-    """One sensor's process and its history."""
+    """One sensor's process and its history.
+
+    told : signals passed on to the process. code : how the sensor ended for good.
+    """
 
     sensor: str
     command: list[str]
-    again: list[str]
+    outputs: Sequence[_Output]
     process: subprocess.Popen[str] | None = None
     started: float = 0.0
     start_at: float = 0.0
+    told: int = 0
     failures: int = 0
     code: int | None = None
     readers: list[threading.Thread] = field(default_factory=list[threading.Thread])
@@ -252,11 +380,13 @@ class _Supervisor:
     def __init__(self, members: Sequence[_Member]) -> None:
         self._members = members
         self._signals = 0
+        self._refused = False
+        self._unwritten = False
         self._output = threading.Lock()
 
     def run(self) -> int:
         """Until every process has ended for good; the exit code."""
-        with self._passing_signals_on():
+        with self._counting_signals():
             while any(member.code is None for member in self._members):
                 for member in self._members:
                     self._attend(member)
@@ -266,42 +396,69 @@ class _Supervisor:
                 reader.join(5)
         if self._signals > 1:
             return INTERRUPTED
-        return next((m.code for m in self._members if m.code), 0)
+        return next((m.code for m in self._members if m.code), StageError.exit_code if self._unwritten else 0)
+
+    @property
+    def _ends(self) -> int:
+        """How often a process is to be told to end."""
+        return max(self._signals, int(self._refused or self._unwritten))
 
     def _attend(self, member: _Member) -> None:
         if member.code is not None:
             return
         if member.process is None:
-            if self._signals:
+            if self._ends:
                 member.code = 0
             elif time.monotonic() >= member.start_at:
                 self._start(member)
             return
         code = member.process.poll()
         if code is None:
+            if member.told < self._ends:
+                # Not SIGINT, for which a process that is still importing shows a traceback. And one at a
+                # time: two at once may arrive as one.
+                member.process.send_signal(signal.SIGTERM)
+                member.told += 1
             return
         member.process = None
-        if code in (0, 2, INTERRUPTED) or self._signals:
+        if code in (0, 2, INTERRUPTED) or self._ends:
+            member.code = self._last_code(member, code)
+            # The command line or the file is wrong for this sensor, so the whole is: end the others.
+            self._refused |= code == 2
+        else:
+            self._start_again(member, code)
+
+    def _last_code(self, member: _Member, code: int) -> int:
+        """What counts as the exit code of a sensor that is not started again."""
+        if self._ends and self._signals < 2 and code in (-signal.SIGINT, -signal.SIGTERM, INTERRUPTED):
+            # The one signal came before the process could catch it.
+            return 0
+        if code < 0:
+            self._say(member, f"was ended by signal {-code}")
+            return StageError.exit_code
+        return code
+
+    def _start_again(self, member: _Member, code: int) -> None:
+        """Plan the next start after a failure, if there is to be one."""
+        refused = next((output.path for output in member.outputs if output.refused), None)
+        if code == StageError.exit_code and refused is not None:
+            self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
             member.code = code
-            if code == 2:
-                # The command line or the file is wrong for this sensor, so the whole is: end the others.
-                self._send(signal.SIGTERM)
             return
         lasted = time.monotonic() - member.started
         member.failures = 1 if lasted > GOOD_RUN else member.failures + 1
         if member.failures > GIVE_UP_AFTER:
             self._say(member, f"failed {member.failures} times in a row (exit code {code}); given up")
-            member.code = code
+            member.code = self._last_code(member, code)
             return
         pause = min(FIRST_PAUSE * 2 ** (member.failures - 1), LONGEST_PAUSE)
         member.start_at = time.monotonic() + pause
-        member.command = member.again
         self._say(member, f"failed (exit code {code}); starting again in {pause:g} s")
 
     def _start(self, member: _Member) -> None:
         # A session of its own: Ctrl-C on the terminal reaches the supervisor alone, which passes it on once.
         member.process = subprocess.Popen(
-            member.command,
+            _again(member.command, member.outputs),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -322,24 +479,31 @@ class _Supervisor:
         """Pass whole lines on, so that those of two processes do not mix."""
         with stream:
             for line in stream:
-                with self._output:
-                    target.write(prefix + line)
-                    target.flush()
+                self._print(target, prefix + line)
 
     def _say(self, member: _Member, text: str) -> None:
-        with self._output:
-            print(f"tactflow: {member.sensor} {text}", file=sys.stderr)
+        self._print(sys.stderr, f"tactflow: {member.sensor} {text}\n")
 
-    def _send(self, number: int) -> None:
-        for member in self._members:
-            if member.process is not None:
-                member.process.send_signal(number)
+    def _print(self, target: IO[str], text: str) -> None:
+        """Write at once. When the reader has gone away, fall silent; when the disk is full, end the run."""
+        with self._output:
+            try:
+                target.write(text)
+                target.flush()
+            except OSError as error:
+                # What is held back, and what follows, must go somewhere without complaint.
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, target.fileno())
+                os.close(nowhere)
+                if target is sys.stdout and not isinstance(error, BrokenPipeError | ConnectionResetError):
+                    self._unwritten = True
+                    sys.stderr.write(f"tactflow: standard output: {error.strerror}; the run ends\n")
 
     @contextmanager
-    def _passing_signals_on(self) -> Iterator[None]:
-        def handle(number: int, _: FrameType | None) -> None:
+    def _counting_signals(self) -> Iterator[None]:
+        def handle(_number: int, _frame: FrameType | None) -> None:
+            # Nothing else: this may be in the middle of starting a process, which would not be told.
             self._signals += 1
-            self._send(number)
 
         before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
