@@ -114,7 +114,7 @@ class Zmq:
 
     @property
     def live_threads(self) -> Sequence[int]:
-        """Native ids of the threads in which ZeroMQ sends."""
+        """Native ids of the threads in which ZeroMQ sends, once they have named themselves."""
         if self._socket is not None and not self._io_threads:
             self._io_threads = threads_named(ZMQ_SENDS, besides=self._others)
         return self._io_threads

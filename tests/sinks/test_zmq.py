@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -213,6 +214,10 @@ def test_it_names_the_threads_that_zeromq_sends_in(subscribe: Subscribing) -> No
     socket = subscribe("tcp://127.0.0.1:9")
     sink = opened()
     try:
+        # A thread names itself, in its own time.
+        until = time.monotonic() + WAIT / 1000
+        while not sink.live_threads and time.monotonic() < until:
+            time.sleep(0.001)
         (sending,) = sink.live_threads
         assert Path(f"/proc/self/task/{sending}/comm").read_text().startswith("ZMQbg/IO")
     finally:
