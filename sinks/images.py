@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -12,6 +10,7 @@ from pydantic import Field
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.stage import StageParams
+from tactflow.files import expanded
 from tactflow.ports import Picture
 
 
@@ -47,7 +46,7 @@ class Images:
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is written yet."""
         self.params = params
-        self._folder = Path(os.path.expanduser(params.folder))
+        self._folder = expanded(params.folder)
         self.description = str(self._folder)
         self._next = 0
         self._files = 0

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.stage import StageParams
+from tactflow.files import expanded, lead_nowhere
 from tactflow.message import encode_message
 from tactflow.ports import Image
 from tactflow.vision.types import Contact, Flow, Markers
@@ -79,7 +80,7 @@ class Jsonl:
         if self.params.path == "-":
             self._file = sys.stdout.buffer
             return
-        path = Path(os.path.expanduser(self.params.path))
+        path = expanded(self.params.path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._open_file(path)
@@ -182,10 +183,7 @@ class Jsonl:
     def _reader_left(self) -> None:
         log.debug("standard output was closed by its reader")
         self._file = None
-        # Python flushes standard output once more at exit; there it must find somebody who listens.
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
+        lead_nowhere(sys.stdout)
 
 
 def _continue_at(file: BinaryIO, path: Path) -> int:

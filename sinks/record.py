@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import os
 import platform
 import threading
 from collections import deque
@@ -23,6 +22,7 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.rate import SLACK, RateLimit
 from tactflow.engine.stage import StageParams
+from tactflow.files import expanded
 from tactflow.message import encode_message
 from tactflow.ports import Image
 from tactflow.recording import missing_packages
@@ -114,7 +114,7 @@ class Record:
         del directory
         self.params = params
         self.description = params.path
-        self._path = Path(os.path.expanduser(params.path))
+        self._path = expanded(params.path)
         self._trigger = params.trigger or ("start" if params.ring is None else "button")
         self._sensor = sensor
         self._control = control

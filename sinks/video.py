@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 import statistics
 import tempfile
@@ -18,6 +17,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.stage import StageParams
+from tactflow.files import expanded
 from tactflow.ports import Picture
 
 log = logging.getLogger("tactflow")
@@ -73,7 +73,7 @@ class Video:
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is opened yet."""
         self.params = params
-        self._path = Path(os.path.expanduser(params.path))
+        self._path = expanded(params.path)
         self.description = str(self._path)
         self._codec = ""
         self._held: list[tuple[float, Picture]] = []

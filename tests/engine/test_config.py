@@ -363,7 +363,7 @@ def test_two_sinks_do_not_write_the_same_file(second: str, clash: bool, load: Lo
         assert len(load(text).sinks) == 2
 
 
-@pytest.mark.parametrize("path", ["-", "/dev/null"])
+@pytest.mark.parametrize("path", ["-", "/dev/null", r'"a\0b"'])
 def test_what_is_no_file_may_be_written_by_several_sinks(path: str, load: Load) -> None:
     first, second = (f"{name}: {{use: jsonl, path: {path}}}" for name in ("one", "two"))
     assert len(load(with_sinks(first=first, second=second)).sinks) == 2

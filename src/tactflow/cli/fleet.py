@@ -32,6 +32,7 @@ from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.priority import ZMQ_SENDS, Precedence, threads_named
 from tactflow.engine.run import INTERRUPTED
 from tactflow.engine.sensors import PLACEHOLDER
+from tactflow.files import expanded, is_device, lead_nowhere, output, status
 
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 30.0
@@ -97,7 +98,7 @@ def with_name(path: str, sensor: str) -> str:
     ------
     ConfigError : it is a folder.
     """
-    if path == "-" or _is_device(path):
+    if path == "-" or path in STREAMS or is_device(path):
         return path
     named = path.replace(PLACEHOLDER, sensor)
     if named == path and not _is_folder(path):
@@ -110,23 +111,7 @@ def with_name(path: str, sensor: str) -> str:
 
 
 def _is_folder(path: str) -> bool:
-    return os.path.basename(path) in ("", ".", "..") or os.path.isdir(os.path.expanduser(path))
-
-
-def _is_device(path: str) -> bool:
-    """Whether it is there and neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
-    if path in STREAMS:
-        return True
-    there = _status(path)
-    return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
-
-
-def _status(path: str) -> os.stat_result | None:
-    """What the system knows about a path; None if there is nothing."""
-    try:
-        return os.stat(os.path.expanduser(path))
-    except (OSError, ValueError):
-        return None
+    return os.path.basename(path) in ("", ".", "..") or expanded(path).is_dir()
 
 
 def _command(args: argparse.Namespace, file: Path, sensor: str, overrides: Sequence[str]) -> list[str]:
@@ -179,7 +164,7 @@ class _State(NamedTuple):
 
 def _state(path: str) -> _State | None:
     """The present state of a regular file; None if there is none."""
-    there = _status(path)
+    there = status(path)
     if there is None or not stat.S_ISREG(there.st_mode):
         return None
     return _State(there.st_dev, there.st_ino, there.st_size, there.st_mtime_ns)
@@ -265,23 +250,23 @@ def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
     pipelines : sensor -> its pipeline.
     """
     problems = []
-    seen: dict[tuple[str, object], str] = {}
+    seen: dict[tuple[str, str], str] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
             # These get the sensor's name.
             if _is_added(node, "jsonl") or _is_added(node, "record"):
                 continue
-            for key in ("path", "folder"):
-                value = getattr(node.params, key, None)
-                if value is None or value == "-" or _is_device(str(value)):
-                    continue
-                other = seen.setdefault((key, value), sensor)
-                if other != sensor:
-                    place = f"{node.mark}  " if node.mark.line else f"{node.mark}: "
-                    problems.append(
-                        f"{place}sinks.{node.id}.{key}: {other} and {sensor} would both write {value}; "
-                        f"put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
-                    )
+            named = output(node.params)
+            if named is None or named[1] in STREAMS:
+                continue
+            key, value = named
+            other = seen.setdefault(named, sensor)
+            if other != sensor:
+                place = f"{node.mark}  " if node.mark.line else f"{node.mark}: "
+                problems.append(
+                    f"{place}sinks.{node.id}.{key}: {other} and {sensor} would both write {value}; "
+                    f"put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
+                )
     return problems
 
 
@@ -491,10 +476,7 @@ class _Supervisor:
                 target.write(text)
                 target.flush()
             except OSError as error:
-                # What is held back, and what follows, must go somewhere without complaint.
-                nowhere = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(nowhere, target.fileno())
-                os.close(nowhere)
+                lead_nowhere(target)
                 if target is sys.stdout and not isinstance(error, BrokenPipeError | ConnectionResetError):
                     self._unwritten = True
                     sys.stderr.write(f"tactflow: standard output: {error.strerror}; the run ends\n")

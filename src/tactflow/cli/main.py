@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError, TactflowError
+from tactflow.files import lead_nowhere
 
 COMMANDS = {
     "run": "run a pipeline",
@@ -46,9 +47,8 @@ def entry() -> None:
         code = main(sys.argv[1:])
         sys.stdout.flush()
     except OSError as error:
-        # Whoever read our output has left, or the disk is full. The interpreter flushes once more at exit:
-        # that must go nowhere.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # Whoever read our output has left, or the disk is full.
+        lead_nowhere(sys.stdout)
         code = 0
         if not isinstance(error, BrokenPipeError):
             print(

@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
+from tactflow import files
 from tactflow.engine import envelope, sensors, wiring
 from tactflow.engine.complaints import complain
 from tactflow.engine.errors import ConfigError
@@ -220,16 +221,12 @@ def _does_as_much(there: Draft, added: Draft) -> bool:
 
 
 def _written(draft: Draft, params: StageParams | None) -> str | None:
-    """The file or folder that a sink writes; None for a stage, a device and standard output."""
-    if draft.section != "sinks":
+    """The file or folder that a sink writes, however it is spelled; None for what is not one."""
+    named = files.output(params) if draft.section == "sinks" else None
+    # No file has such a name; the sink will say so.
+    if named is None or "\0" in named[1]:
         return None
-    for key in ("path", "folder"):
-        value = getattr(params, key, None)
-        if isinstance(value, str) and value != "-":
-            place = os.path.realpath(os.path.expanduser(value))
-            ordinary = os.path.isfile(place) or os.path.isdir(place) or not os.path.exists(place)
-            return place if ordinary else None
-    return None
+    return os.path.realpath(files.expanded(named[1]))
 
 
 def _drafts(root: Item, section: Section, problems: Problems) -> list[Draft]:

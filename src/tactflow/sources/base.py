@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
+from tactflow.files import expanded
 
 log = logging.getLogger("tactflow")
 
@@ -204,7 +205,7 @@ def find_path(spec: str, directory: Path | None) -> Path:
     SourceError
         If nothing is there; names files whose names are close.
     """
-    path = Path(os.path.expanduser(spec))
+    path = expanded(spec)
     candidates = [path]
     if directory is not None and not path.is_absolute():
         candidates.append(directory / path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
+from tactflow.files import expanded
 from tactflow.sources.base import BgrImage, Normaliser, find_path, log, quiet_opencv
 
 IMAGE_SUFFIXES = frozenset(
@@ -154,9 +154,9 @@ def open_glob(pattern: str, directory: Path | None = None, fps: float | None = N
 
     The pattern is relative to the current directory, or to `directory` if nothing matches there.
     """
-    expanded = str(Path(os.path.expanduser(pattern)))
+    wanted = str(expanded(pattern))
     for base in (None, directory):
-        found = [Path(base or "", name) for name in glob.glob(expanded, root_dir=base, recursive=True)]
+        found = [Path(base or "", name) for name in glob.glob(wanted, root_dir=base, recursive=True)]
         files = sorted((path for path in found if path.is_file()), key=lambda path: natural_key(str(path)))
         if files:
             return ImageFiles(files, pattern, fps)
@@ -315,7 +315,7 @@ def open_recording(
     SourceError
         If it is not there, or not a recording.
     """
-    if glob.has_magic(spec) and not Path(os.path.expanduser(spec)).exists():
+    if glob.has_magic(spec) and not expanded(spec).exists():
         return open_glob(spec, directory, fps)
     path = find_path(spec, directory)
     if path.is_dir():

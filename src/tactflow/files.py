@@ -1,0 +1,49 @@
+"""Files as pipelines and command lines name them."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import IO
+
+
+def expanded(text: str) -> Path:
+    """A path with `~` and `~name` replaced. An unknown name stays: that file is not there, and named so."""
+    return Path(os.path.expanduser(text))
+
+
+def status(text: str) -> os.stat_result | None:
+    """What the system knows about a path; None if there is nothing."""
+    try:
+        return expanded(text).stat()
+    except (OSError, ValueError):
+        return None
+
+
+def is_device(text: str) -> bool:
+    """Whether it is there and neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
+    there = status(text)
+    return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
+
+
+def output(params: object) -> tuple[str, str] | None:
+    """The parameter that says where a sink writes, and its value; None for one that writes no file or folder.
+
+    Standard output and devices are none: several sinks may write to them.
+    """
+    for key in ("path", "folder"):
+        value = getattr(params, key, None)
+        if isinstance(value, str):
+            return None if value == "-" or is_device(value) else (key, value)
+    return None
+
+
+def lead_nowhere(stream: IO[str]) -> None:
+    """Let what is held back in a stream, and what follows, be lost without complaint.
+
+    Python flushes standard output once more at exit: there it must find somebody who listens.
+    """
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
