@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 
 from tactflow.cli.fleet import clash_problems
 from tactflow.cli.options import add_pipeline, load_plan
@@ -12,8 +11,6 @@ from tactflow.engine.config import sensor_names
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan
-
-TITLE = "mistakes in the pipeline"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,34 +22,19 @@ def run(args: argparse.Namespace) -> int:
     """Print one line for each sensor if all is right. Raises ConfigError with every mistake if it is not."""
     names: list[str] = sensor_names(find_pipeline(args.pipeline), args.overrides)
     good: dict[str | None, tuple[Pipeline, Plan]] = {}
-    errors: list[str] = []
+    mistakes: list[str] = []
     for name in names or (None,):
         try:
             good[name] = load_plan(args, name)
         except ConfigError as error:
-            errors.append(str(error))
-    errors += clash_problems({name: pipeline for name, (pipeline, _) in good.items() if name is not None})
-    if errors:
-        raise ConfigError(_all_of(errors))
+            mistakes += error.mistakes
+    mistakes += clash_problems({name: pipeline for name, (pipeline, _) in good.items() if name is not None})
+    if mistakes:
+        # What several sensors have in common is said once.
+        raise ConfigError(*dict.fromkeys(mistakes))
     for name, (pipeline, plan) in good.items():
         print(_summary(pipeline, plan, name))
     return 0
-
-
-def _all_of(errors: Sequence[str]) -> str:
-    """One text of several; what several sensors have in common is said once."""
-    different = list(dict.fromkeys(errors))
-    if len(different) == 1:
-        return different[0]
-    blocks: list[str] = []
-    for line in "\n".join(different).splitlines():
-        if line.startswith("    ") and blocks:
-            # The line of the file with the mistake, and the caret.
-            blocks[-1] += f"\n{line}"
-        elif not line.endswith(TITLE):
-            blocks.append(line)
-    blocks = list(dict.fromkeys(blocks))
-    return "\n".join([f"{len(blocks)} {TITLE}", *blocks])
 
 
 def _summary(pipeline: Pipeline, plan: Plan, sensor: str | None) -> str:

@@ -16,9 +16,17 @@ class TactflowError(Exception):
 
 
 class ConfigError(TactflowError):
-    """The command line or the pipeline file is wrong; nothing was started."""
+    """The command line or the pipeline file is wrong; nothing was started.
+
+    mistakes : each a text for the user; all are reported at once.
+    """
 
     exit_code = 2
+
+    def __init__(self, *mistakes: str) -> None:
+        title = [f"{len(mistakes)} mistakes in the pipeline"] if len(mistakes) > 1 else []
+        super().__init__("\n".join([*title, *mistakes]))
+        self.mistakes = mistakes
 
 
 class StageError(TactflowError):

@@ -103,9 +103,7 @@ class Problems:
         if not self.found:
             return
         found = sorted(self.found, key=lambda item: (item[0].line == 0, item[0].line, item[0].column))
-        blocks = [self._block(mark, message) for mark, message in found]
-        title = [f"{len(blocks)} mistakes in the pipeline"] if len(blocks) > 1 else []
-        raise ConfigError("\n".join(title + blocks))
+        raise ConfigError(*[self._block(mark, message) for mark, message in found])
 
     def _block(self, mark: Mark, message: str) -> str:
         # A place has two blanks after it; an option reads as a sentence.
