@@ -441,7 +441,7 @@ def test_a_live_source_drops_rather_than_lags_and_counts_it(toy_runner: MakeRunn
 class Asked:
     """Stands in for `Precedence` and notes who was given it."""
 
-    def __init__(self, threads: Callable[[], list[int]], realtime: bool, runs: int) -> None:
+    def __init__(self, threads: Callable[[], list[int | None]], realtime: bool, runs: int) -> None:
         self.how = f"{realtime} {runs}"
         self._threads = threads
         self.names: set[str] = set()

@@ -64,10 +64,10 @@ def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipe
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-")))
         relays = _relays(pipelines)
+        realtime = all(pipeline.realtime_priority for pipeline in pipelines.values())
         for endpoint, ids in relays.items():
             upstream = [_private(scratch, name, id_) for name, id_ in ids]
             backlog = sum(getattr(pipelines[name].nodes[id_].params, "backlog", 1) for name, id_ in ids)
-            realtime = all(pipeline.realtime_priority for pipeline in pipelines.values())
             stack.enter_context(_relay(endpoint, upstream, backlog, realtime))
         members = []
         for name in pipelines:
@@ -325,8 +325,12 @@ def _relay(endpoint: str, upstream: Sequence[str], backlog: int, realtime: bool)
 
     thread = threading.Thread(target=pass_on, name="tactflow-relay", daemon=True)
     thread.start()
-    sending = [thread.native_id or 0, *threads_named(ZMQ_SENDS)]
-    precedence = Precedence(lambda: sending, realtime, len(upstream), "messages of all sensors")
+
+    def sending() -> list[int | None]:
+        # ZeroMQ's threads name themselves, in their own time.
+        return [thread.native_id, *threads_named(ZMQ_SENDS)]
+
+    precedence = Precedence(sending, realtime, len(upstream), "messages of all sensors")
     precedence.start()
     print(f"tactflow: publishing {len(upstream)} sensors on {endpoint}", file=sys.stderr)
     try:

@@ -102,14 +102,15 @@ class Precedence:
 
     Parameters
     ----------
-    threads : tells the native ids of the threads that live frames wait for; called twice a second.
+    threads : tells the native ids of the threads that live frames wait for, None for one that has not started
+        yet; called twice a second.
     realtime : whether to ask for real-time priority at all.
     runs : how many runs share this machine evenly. work : what the threads do, for messages.
     """
 
     def __init__(
         self,
-        threads: Callable[[], Collection[int]],
+        threads: Callable[[], Collection[int | None]],
         realtime: bool = True,
         runs: int = 1,
         work: str = "live frames",
@@ -150,7 +151,7 @@ class Precedence:
                 self._end.wait(REVIEW_S)
         except Exception as error:
             log.warning("%s lose precedence: %s: %s", self._work, type(error).__name__, error)
-            self._make("ordinary", self._used)
+            self._step_back(self._used)
 
     def review(self) -> None:
         """Give or take, by what the threads have used since the last review."""
@@ -165,17 +166,19 @@ class Precedence:
         for thread in gone:
             _become_ordinary(thread)
         if self.how == "real-time" and share > self._most:
-            self._make("short slices", used)
+            self._step_back(used)
             self._tell_loss(share)
             self._ask_at = now + self._patience
             self._patience = min(2 * self._patience, MOST_PATIENCE_S)
         elif (
             self._realtime and self.how != "real-time" and share < AGAIN * self._most and now >= self._ask_at
         ):
-            if self._make("real-time", used) and self._ask_at < 0:
+            if self._go_first(used) and self._ask_at < 0:
                 log.info("%s go first: they have real-time priority", self._work)
+        elif new and self.how == "real-time":
+            self._go_first(new)
         elif new:
-            self._make(self.how, new)
+            self._step_back(used)
 
     def _look(self, threads: Collection[int | None]) -> tuple[dict[int, float], set[int]]:
         """Processor seconds of the threads that are to be looked after, and those that were until now."""
@@ -190,19 +193,21 @@ class Precedence:
                 used[thread] = seconds
         return used, set(self._used) - used.keys()
 
-    def _make(self, how: How, threads: Collection[int]) -> bool:
-        """Have threads treated like this, or all of them as near to it as is granted; False if it was not."""
-        if how == "real-time":
-            self._realtime = all(_become_realtime(thread) for thread in threads)
-            if self._realtime:
-                self.how = how
-                return True
-            threads = self._used
+    def _go_first(self, threads: Collection[int]) -> bool:
+        """Give threads real-time priority. Where it is refused none keeps it, nor is it asked for again."""
+        self._realtime = all(_become_realtime(thread) for thread in threads)
+        if self._realtime:
+            self.how = "real-time"
+        else:
+            self._step_back(self._used)
+        return self._realtime
+
+    def _step_back(self, threads: Collection[int]) -> None:
+        """Let threads do without real-time priority, with short slices where those are granted."""
         for thread in threads:
             _become_ordinary(thread)
         granted = [serve_soon(thread) for thread in threads]
         self.how = "short slices" if all(granted) else "ordinary"
-        return self.how == how
 
     def _tell_loss(self, share: float) -> None:
         if self._patience == PATIENCE_S:

@@ -113,8 +113,8 @@ class Runner:
             # Opening may take long: a camera that wakes up, kernels that are compiled.
             self._began = time.perf_counter()
             for name, segment in self._segments.items():
-                body = self._capture_loop if name == self._source_segment else segment.loop
-                thread = threading.Thread(target=body, name=f"tactflow-{name}", daemon=True)
+                target = self._capture_loop if name == self._source_segment else segment.loop
+                thread = threading.Thread(target=target, name=f"tactflow-{name}", daemon=True)
                 self._threads[name] = thread
             for thread in self._threads.values():
                 thread.start()
@@ -290,11 +290,11 @@ class Runner:
                     f"the run was stopped, but did not end in {CLOSE_SECONDS:g} s: {hanging} hangs"
                 )
 
-    def _live_threads(self) -> list[int]:
+    def _live_threads(self) -> list[int | None]:
         """Native ids of the threads that a live frame's results wait for."""
         own = [thread.native_id for name, thread in self._threads.items() if self._segments[name].urgent]
         theirs = [id_ for _, instance in list(self._opened) for id_ in getattr(instance, "live_threads", ())]
-        return [id_ for id_ in (*own, *theirs) if id_ is not None]
+        return [*own, *theirs]
 
     def _no_headway(self) -> bool:
         """Whether no link has delivered anything for a moment: draining a long queue is not hanging."""
