@@ -127,7 +127,8 @@ class Zmq:
         StageError
             If the address is taken or cannot be bound.
         """
-        self._others = threads_named(ZMQ_SENDS)
+        # All there are: those of another context may not have named themselves yet.
+        self._others = threads_named("")
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket = context.socket(zmq.XPUB)
         socket.sndhwm = self.params.backlog
