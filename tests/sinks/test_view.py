@@ -21,6 +21,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
 
 from tactflow.engine.config import load_pipeline
 from tactflow.engine.errors import ConfigError
@@ -30,10 +33,6 @@ from tactflow.message import build_message
 from tactflow.sinks.view import View
 from tactflow.view.address import address, bind, is_loopback
 from tactflow.vision.types import Contact, Markers
-
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Origin
 
 SECRET = "a-secret-of-some-length"
 PATIENCE = 10.0
