@@ -8,8 +8,9 @@ from pydantic import Field
 
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
-from tactflow.vision import compiled, halving, inpaint_kernels
-from tactflow.vision.inpaint import SEED_RADIUS, remove_markers
+from tactflow.vision import compiled, halving
+from tactflow.vision.markers import inpaint_kernels
+from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
 
 
 class Inpaint:
