@@ -114,7 +114,7 @@ class Camera:
             log.warning("%s gives something else than it was asked for: %s", self._name, ", ".join(differs))
 
     def read(self) -> tuple[BgrImage, float] | None:
-        """Wait for the next frame; see `Source.read`. A camera that stops delivering is an error."""
+        """Wait for the next frame; see `FrameReader.read`. A camera that stops delivering is an error."""
         if self._capture is None:
             return None
         there, image = self._capture.read()
@@ -205,7 +205,7 @@ class Stream:
         self.description = f"{self._name}, {self.size[0]} x {self.size[1]}"
 
     def read(self) -> tuple[BgrImage, float] | None:
-        """Wait for the next frame; see `Source.read`. A stream that falls silent has ended."""
+        """Wait for the next frame; see `FrameReader.read`. A stream that falls silent has ended."""
         if self._capture is None:
             return None
         with quiet_opencv():

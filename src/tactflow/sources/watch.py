@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import BgrImage, Source, log
+from tactflow.sources.base import BgrImage, FrameReader, log
 
 BLACK_LEVEL = 4.0
 """Mean grey level at and below which a picture counts as black; a lit gel has 30 and more."""
@@ -60,7 +60,7 @@ class Watch:
 class Arrival(NamedTuple):
     """A frame of a live source.
 
-    image, t : as from `Source.read`; t grows strictly. seq : index among all frames of the source, those
+    image, t : as from `FrameReader.read`; t grows strictly. seq : index among all frames of the source, those
     that nobody took included. connection : grows by one with each reconnection that delivered. captured :
     `time.perf_counter` when it arrived, s.
     """
@@ -73,7 +73,7 @@ class Arrival(NamedTuple):
 
 
 @runtime_checkable
-class LiveSource(Protocol):
+class LiveReader(Protocol):
     """A source whose frames are numbered where they arrive, and that tells how it is."""
 
     @property
@@ -126,7 +126,7 @@ class Watched:
     live = True
     total: int | None = None
 
-    def __init__(self, opener: Callable[[], Source], watch: Watch, name: str) -> None:
+    def __init__(self, opener: Callable[[], FrameReader], watch: Watch, name: str) -> None:
         self._opener = opener
         self._watch = watch
         self._name = name
@@ -170,7 +170,7 @@ class Watched:
         return f"{word} since {_clock(fault.clock)} ({fault.what}{attempts})"
 
     def read(self) -> tuple[BgrImage, float] | None:
-        """The newest frame that was not read yet, and its time; see `Source.read`."""
+        """The newest frame that was not read yet, and its time; see `FrameReader.read`."""
         arrival = self.read_arrival()
         return None if arrival is None else (arrival.image, arrival.t)
 
@@ -241,14 +241,14 @@ class Watched:
 
     # -- the thread that reads ----------------------------------------------------------------------------
 
-    def _start(self, source: Source | None) -> threading.Thread:
+    def _start(self, source: FrameReader | None) -> threading.Thread:
         self._busy_since, self._opening = time.perf_counter(), False
         name = f"tactflow-read-{self._name}"
         thread = threading.Thread(target=self._work, args=(self._generation, source), name=name, daemon=True)
         thread.start()
         return thread
 
-    def _work(self, generation: int, source: Source | None) -> None:
+    def _work(self, generation: int, source: FrameReader | None) -> None:
         try:
             while self._enter(generation, opening=False):
                 if source is None:
@@ -268,7 +268,7 @@ class Watched:
             self._busy_since, self._opening = time.perf_counter(), opening
             return True
 
-    def _connect(self, generation: int) -> Source | None:
+    def _connect(self, generation: int) -> FrameReader | None:
         """One attempt, when its time has come."""
         with self._changed:
             if generation != self._generation:
@@ -308,7 +308,7 @@ class Watched:
         self._attempts += 1
         self._retry_at = time.perf_counter() + delay
 
-    def _step(self, generation: int, source: Source) -> bool:
+    def _step(self, generation: int, source: FrameReader) -> bool:
         """Read one frame; True if the source is to be opened anew."""
         why = "it ended"
         ended: SourceError | bool = True
