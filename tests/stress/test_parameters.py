@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
+from tactflow.config.registry import names, resolve
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.registry import names, resolve
 from tactflow.vision.change import ChangeProbe
 from tactflow.vision.contact import ContactDetector, chi_square_threshold
 from tactflow.vision.draw import Annotator
