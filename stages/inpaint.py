@@ -8,9 +8,10 @@ from pydantic import Field
 
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
-from tactflow.vision import compiled, inpaint_kernels
+from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
-from tactflow.vision.inpaint import SEED_RADIUS, remove_markers
+from tactflow.vision.markers import inpaint_kernels
+from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
 
 
 class Inpaint:
