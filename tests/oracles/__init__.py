@@ -3,7 +3,7 @@
 A module here holds the oracles of one module of the package: plain functions of numpy and OpenCV, and a list
 `GAINS` with one entry for each kernel:
 
-    from tactflow.vision.hull import measure_region
+    from tactflow.vision.geometry.moments import measure_region
     from tests.oracles.gains import Gain
 
     def plain_measure_region(mask, found): ...    # takes what the kernel takes, fills what it fills

@@ -25,7 +25,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner

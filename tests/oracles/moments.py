@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.hull_kernels import measure_region
+from tactflow.vision.geometry.moments import measure_region
 from tests.oracles.gains import Gain
 
 
