@@ -10,21 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision import (
-    change,
-    inpaint,
-    marker_appearance,
-    marker_mask,
-    markers,
-    seed_contact,
-    tracking,
-)
+from tactflow.vision import seed_contact
+from tactflow.vision.change import probe as change
 from tactflow.vision.contact import background, contact_outline, illumination
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor
-from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.geometry.hull import contact_geometry, regress_line
+from tactflow.vision.markers import detection as markers
+from tactflow.vision.markers import inpaint, template, tracking
+from tactflow.vision.markers import mask as marker_mask
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
 from tactflow.vision.types import Contact, Ellipse, Markers
 from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, SIZE, apart, axis_difference, gel
@@ -220,7 +216,7 @@ def test_single_precision_costs_the_tracker_nothing() -> None:
     def compute() -> Markers:
         return tracking.MarkerTracker(pictures.reference, found).track(pictures.touched)
 
-    single, double = both(compute, tracking, marker_appearance)
+    single, double = both(compute, tracking, template)
     # The bound of the docstring, px; measured 1.5e-7 and 4e-6.
     assert np.abs(single.position - double.position).max() <= 1e-4
     assert np.abs(single.stderr - double.stderr).max() <= 1e-4

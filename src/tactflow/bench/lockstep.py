@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.config.registry import resolve
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue, Ref
-from tactflow.engine.registry import resolve
 from tactflow.engine.run import Runner, RunResult
 from tactflow.engine.stage import Port, Ports, StageParams
 from tactflow.vision.geometry import PixelMapping

@@ -18,8 +18,8 @@ from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_t
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.contact.contact_outline import _solid
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_mask import find_dot, marker_mask
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.mask import find_dot, marker_mask
 
 Image = NDArray[np.uint8]
 

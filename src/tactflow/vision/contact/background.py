@@ -17,7 +17,7 @@ from tactflow.vision import compiled
 from tactflow.vision.contact.background_kernels import relative_change, smooth_cells, weigh_change
 from tactflow.vision.contact.contact_outline import Lengths, lengths_of
 from tactflow.vision.contact.illumination import LightChange, light_change, positions
-from tactflow.vision.halving import halved
+from tactflow.vision.geometry.downsample import halved
 
 Float = NDArray[np.float32]
 

@@ -31,10 +31,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled, halving
+from tactflow.vision import compiled
 from tactflow.vision.contact import background_kernels, contact_outline_kernels
 from tactflow.vision.contact.background import CELL, UntouchedGel
 from tactflow.vision.contact.contact_outline import fill_level, hidden_cells, outline_level
+from tactflow.vision.geometry import downsample
 from tactflow.vision.seed_contact import seed_contact_mask
 
 ContactMethod = Literal["noise", "colour", "seed"]
@@ -157,7 +158,7 @@ class ContactDetector:
         self._creep = creep
         self._distance = distance
         if method == "noise":
-            compiled.load(background_kernels, halving, contact_outline_kernels)
+            compiled.load(background_kernels, downsample, contact_outline_kernels)
         self.reset()
 
     def reset(self) -> None:
