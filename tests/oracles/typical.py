@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tactflow.cli.pipelines import find_pipeline
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.run import Runner
 from tactflow.vision.compiled import Kernel
 
