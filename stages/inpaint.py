@@ -6,13 +6,13 @@ from typing import Literal
 
 from pydantic import Field
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
 from tactflow.vision import compiled, halving, inpaint_kernels
 from tactflow.vision.inpaint import SEED_RADIUS, remove_markers
 
 
-class Inpaint:
+class Inpaint(Stage):
     """Fill the markers from their surroundings (seed function `inpaint`)."""
 
     memory = "pure"

@@ -18,8 +18,8 @@ from pydantic_core import PydanticUndefined
 from tactflow.engine.envelope import is_word
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
+from tactflow.engine.ports import Port, describe_type
 from tactflow.engine.registry import Section, catalogue, did_you_mean, names, resolve
-from tactflow.engine.stage import Port, describe_type
 from tactflow.engine.yamlmap import shown
 
 _LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}

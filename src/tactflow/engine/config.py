@@ -13,11 +13,11 @@ from pydantic import ValidationError
 from tactflow import files
 from tactflow.engine import envelope, sensors, wiring
 from tactflow.engine.complaints import complain
+from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import ErrorAction, FullPolicy, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
 from tactflow.engine.registry import RESERVED, Section, code_place, did_you_mean, resolve
-from tactflow.engine.stage import StageParams
 from tactflow.engine.wiring import Draft
 from tactflow.engine.yamlmap import Entry, Item, Problems, read_value, read_yaml, wrap
 

@@ -8,8 +8,8 @@ from typing import Literal
 
 from tactflow.engine import envelope
 from tactflow.engine.graph import Component, Gate, Mark, Ref
+from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
 from tactflow.engine.registry import Section, catalogue, did_you_mean
-from tactflow.engine.stage import Port, SignalPort, describe_type, mismatch, port_type
 from tactflow.engine.yamlmap import Entry, Item, Problems
 
 

@@ -20,8 +20,8 @@ from tactflow.sources.watch import LiveReader, Watch, Watched
 __all__ = [
     "KINDS",
     "CameraRequest",
-    "LiveReader",
     "FrameReader",
+    "LiveReader",
     "StampedReader",
     "Watch",
     "Watched",
