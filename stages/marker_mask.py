@@ -9,8 +9,10 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask
-from tactflow.vision import compiled, halving, marker_mask_kernels
-from tactflow.vision.marker_mask import Dot, find_dot, marker_mask
+from tactflow.vision import compiled
+from tactflow.vision.geometry import downsample
+from tactflow.vision.markers import mask_kernels
+from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 from tactflow.vision.seed_contact import seed_marker_mask
 
 
@@ -36,7 +38,7 @@ class MarkerMaskStage(Stage):
 
     def __init__(self, params: Params) -> None:
         if params.method == "dog":
-            compiled.load(halving, marker_mask_kernels)
+            compiled.load(downsample, mask_kernels)
         self._params = params
         self._dot: Dot | None = None
         self._looked = False

@@ -11,10 +11,11 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Image
-from tactflow.vision import compiled, marker_appearance_kernels, marker_matching, tracking_kernels
-from tactflow.vision.markers import Detection, detect_markers
+from tactflow.vision import compiled
+from tactflow.vision.markers import matching, template_kernels, tracking_kernels
+from tactflow.vision.markers.detection import Detection, detect_markers
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.seed_tracker import SeedTracker
-from tactflow.vision.tracking import MarkerTracker
 from tactflow.vision.types import Markers
 
 
@@ -50,7 +51,7 @@ class Tracker(Stage):
     def __init__(self, params: Params) -> None:
         self._params = params
         if params.method == "appearance":
-            compiled.load(marker_appearance_kernels, marker_matching, tracking_kernels)
+            compiled.load(template_kernels, matching, tracking_kernels)
         self.reset()
 
     def reset(self) -> None:

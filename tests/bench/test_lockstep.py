@@ -10,7 +10,7 @@ import pytest
 from tactflow.bench.lockstep import LockstepPipeline, Outcome
 from tactflow.bench.pipelines import on_recording, take_turns
 from tactflow.bench.timing import CopyUnit
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 

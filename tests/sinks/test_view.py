@@ -23,7 +23,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner

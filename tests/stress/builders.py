@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent, Frame
 from tactflow.vision.contact import ContactDetector
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_mask import find_dot, marker_mask
-from tactflow.vision.markers import detect_markers
+from tactflow.vision.markers.detection import detect_markers
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.mask import find_dot, marker_mask
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.seed_contact import seed_marker_mask
 from tactflow.vision.seed_tracker import SeedTracker
-from tactflow.vision.tracking import MarkerTracker
 from tactflow.vision.types import Markers
 
 Image = NDArray[np.uint8]

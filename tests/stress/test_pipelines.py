@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.run import Runner, RunResult
 from tests.stress.builders import (
     DOUBLED,

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from tactflow.vision.contact import ContactDetector, chi_square_threshold
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import Preprocessor, find_homography
-from tactflow.vision.hull import contact_geometry, regress_line
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_matching import choose_spots
-from tactflow.vision.markers import detect_markers, neighbour_graph
+from tactflow.vision.geometry.hull import contact_geometry, regress_line
+from tactflow.vision.markers.detection import detect_markers, neighbour_graph
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.matching import choose_spots
 from tactflow.vision.smooth import AlphaBeta, OneEuro
 from tactflow.vision.types import Markers, MarkerStatus
 from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, INPAINTING, assert_defined, axis_difference

@@ -18,8 +18,8 @@ from tactflow.vision import contact, imprint
 from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.imprint import _solid
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_mask import find_dot, marker_mask
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.mask import find_dot, marker_mask
 
 Image = NDArray[np.uint8]
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.vision.markers import NoMarkersError
+from tactflow.vision.markers.detection import NoMarkersError
 from tactflow.vision.seed_contact import seed_marker_mask
 from tactflow.vision.seed_tracker import SeedMatcher, SeedTracker, grid_of, seed_marker_centers
 from tactflow.vision.types import MarkerStatus

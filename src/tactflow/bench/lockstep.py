@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.config.registry import resolve
 from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue, Ref
 from tactflow.engine.ports import Parameter, Port, Ports
-from tactflow.engine.registry import resolve
 from tactflow.engine.run import Runner, RunResult
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Flow, Markers

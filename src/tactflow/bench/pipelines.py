@@ -25,7 +25,7 @@ from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
 from tactflow.vision import compiled
 from tactflow.vision.geometry import PixelMapping
-from tactflow.vision.inpaint import SEED_RADIUS, remove_markers
+from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
 from tactflow.vision.seed_contact import seed_contact_mask, seed_difference, seed_marker_mask
 
 

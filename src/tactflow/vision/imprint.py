@@ -26,7 +26,7 @@ from tactflow.vision.imprint_kernels import (
     settle_level,
     sum_profile,
 )
-from tactflow.vision.marker_mask import halved_mask
+from tactflow.vision.markers.mask import halved_mask
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.markers import NoMarkersError, neighbour_graph
+from tactflow.vision.markers.detection import NoMarkersError, neighbour_graph
 from tactflow.vision.seed_contact import seed_marker_mask
 from tactflow.vision.types import Markers, MarkerStatus
 

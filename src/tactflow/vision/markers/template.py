@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled, marker_appearance_kernels
-from tactflow.vision.marker_appearance_kernels import ALIKE_GAIN, ALIKE_SHARE, LEAST_DIVISOR, LEAST_REST
-from tactflow.vision.markers import to_gray
+from tactflow.vision import compiled
+from tactflow.vision.markers import template_kernels
+from tactflow.vision.markers.detection import to_gray
+from tactflow.vision.markers.template_kernels import ALIKE_GAIN, ALIKE_SHARE, LEAST_DIVISOR, LEAST_REST
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -146,7 +147,7 @@ class MarkerAppearance:
     ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
         position = np.empty((len(marks), 2))
         found = np.empty((3, len(marks)), np.float32)
-        marker_appearance_kernels.measure(
+        template_kernels.measure(
             view,
             np.ascontiguousarray(start),
             marks,

@@ -20,7 +20,7 @@ PIPELINES = [*sorted(ROOT.glob("pipelines/*.yaml")), ROOT / "pipeline.yaml"]
 def validator() -> Draft202012Validator:
     """Of pipeline files."""
     from tactflow.cli.schema import pipeline_schema
-    from tactflow.engine.registry import available
+    from tactflow.config.registry import available
 
     schema = pipeline_schema(available())
     Draft202012Validator.check_schema(schema)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Mark, OnError, Pipeline, Queue, Ref
 

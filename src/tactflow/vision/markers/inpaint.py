@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
-from tactflow.vision.halving import halve_block, halved
-from tactflow.vision.inpaint_kernels import fill_masked, sum_valid, sum_windows
-from tactflow.vision.marker_mask import doubled, halved_mask
+from tactflow.vision.geometry.downsample import halve_block, halved
+from tactflow.vision.markers.inpaint_kernels import fill_masked, sum_valid, sum_windows
+from tactflow.vision.markers.mask import doubled, halved_mask
 
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from tactflow.engine import envelope
+from tactflow.config import envelope
+from tactflow.config.registry import Section, catalogue, did_you_mean
+from tactflow.config.yamlmap import Entry, Item, Problems
 from tactflow.engine.graph import Component, Gate, Mark, Ref
 from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
-from tactflow.engine.registry import Section, catalogue, did_you_mean
-from tactflow.engine.yamlmap import Entry, Item, Problems
 
 
 @dataclass(slots=True)

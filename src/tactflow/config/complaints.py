@@ -9,9 +9,9 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from tactflow.config.registry import closest, did_you_mean
+from tactflow.config.yamlmap import Item, Problems, shown
 from tactflow.engine.graph import Mark
-from tactflow.engine.registry import closest, did_you_mean
-from tactflow.engine.yamlmap import Item, Problems, shown
 
 _EXPECTED = {
     "int_type": "a whole number",

@@ -13,12 +13,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tactflow.cli.main import main
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.plan import make_plan
 
 ROOT = Path(__file__).resolve().parents[2]
-PARTS = ROOT / "tests" / "engine" / "parts.py"
+PARTS = Path(__file__).with_name("parts.py")
 HERE = "§"
 """Stands in a case's text where the mistake must be found; it is taken out before the file is written."""
 

@@ -10,10 +10,10 @@ parameter. `{sensor}` in any text of a sink stands for the sensor's name.
 
 from __future__ import annotations
 
-from tactflow.engine import envelope
+from tactflow.config import envelope
+from tactflow.config.registry import did_you_mean
+from tactflow.config.yamlmap import Entry, Item, Problems
 from tactflow.engine.graph import Mark
-from tactflow.engine.registry import did_you_mean
-from tactflow.engine.yamlmap import Entry, Item, Problems
 
 CHANGEABLE = ("skipping", "opencv_threads", "realtime_priority", "stages", "sinks")
 """What a sensor may change."""

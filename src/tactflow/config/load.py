@@ -11,15 +11,15 @@ from typing import Any, get_args
 from pydantic import ValidationError
 
 from tactflow import files
-from tactflow.engine import envelope, sensors, wiring
-from tactflow.engine.complaints import complain
+from tactflow.config import envelope, sensors, wiring
+from tactflow.config.complaints import complain
+from tactflow.config.registry import RESERVED, Section, code_place, did_you_mean, resolve
+from tactflow.config.wiring import Draft
+from tactflow.config.yamlmap import Entry, Item, Problems, read_value, read_yaml, wrap
 from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import ErrorAction, FullPolicy, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
-from tactflow.engine.registry import RESERVED, Section, code_place, did_you_mean, resolve
-from tactflow.engine.wiring import Draft
-from tactflow.engine.yamlmap import Entry, Item, Problems, read_value, read_yaml, wrap
 
 TOP_LEVEL = ("sensor", "sensors", "skipping", "opencv_threads", "realtime_priority", "stages", "sinks")
 _SECTIONS: tuple[Section, ...] = get_args(Section)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
+from tactflow.config.registry import available, catalogue, closest, did_you_mean, names, resolve
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.registry import available, catalogue, closest, did_you_mean, names, resolve
 
 STAGE = """
 from __future__ import annotations

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled, marker_matching, tracking_kernels
-from tactflow.vision.marker_appearance import MarkerAppearance
-from tactflow.vision.markers import Detection, refine_centers, require_image, to_gray
+from tactflow.vision import compiled
+from tactflow.vision.markers import matching, tracking_kernels
+from tactflow.vision.markers.detection import Detection, refine_centers, require_image, to_gray
+from tactflow.vision.markers.template import MarkerAppearance
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]
@@ -318,7 +319,7 @@ class MarkerTracker:
         unclaimed = ~self._near(spots, position[settled], self._around_mark)
         spots = np.concatenate([spots[unclaimed], own])
         strength = np.concatenate([strength[unclaimed], np.full(len(own), 0.5)])
-        chosen = marker_matching.choose_spots(
+        chosen = matching.choose_spots(
             self._origin,
             self._edges,
             free,

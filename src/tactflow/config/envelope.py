@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from tactflow.engine.registry import did_you_mean
-from tactflow.engine.yamlmap import Entry, Problems
+from tactflow.config.registry import did_you_mean
+from tactflow.config.yamlmap import Entry, Problems
 
 
 def check_keys(entries: Mapping[str, Entry], known: Sequence[str], path: str, problems: Problems) -> None:
