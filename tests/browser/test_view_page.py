@@ -26,7 +26,6 @@ import numpy as np
 import pytest
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: playwright is not installed")
-pytest.importorskip("uvicorn", reason="NO BROWSER TESTS: the extra tactflow[view] is not installed")
 
 from websockets.http11 import Request, Response  # noqa: E402
 from websockets.sync.server import ServerConnection  # noqa: E402
