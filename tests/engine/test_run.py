@@ -139,22 +139,6 @@ def test_switching_skipping_off_opens_every_gate(toy_runner: MakeRunner) -> None
     assert seen(runner, "gated") == list(range(20))
 
 
-@pytest.mark.parametrize(
-    ("gate", "expected"),
-    [
-        ({"hold": 2}, [3, 4, 5, 6, 7, 8, 13, 14, 15, 16, 17, 18]),
-        ({"at_least_every": 4}, [3, 4, 5, 6, 10, 13, 14, 15, 16]),
-        ({"hold": 0}, [3, 4, 5, 6, 13, 14, 15, 16]),
-    ],
-)
-def test_a_gate_holds_and_opens_at_least_every(
-    toy_runner: MakeRunner, gate: dict[str, Any], expected: list[int]
-) -> None:
-    runner = toy_runner({"gated": {"when": {"signal": "active", **gate}}})
-    ran(runner)
-    assert seen(runner, "gated") == expected
-
-
 def test_a_repeating_gate_gives_its_last_value_and_says_why(toy_runner: MakeRunner) -> None:
     runner = toy_runner(
         {"gated": {"when": {"signal": "active", "otherwise": "repeat", "reason": "unchanged"}}}
