@@ -22,11 +22,11 @@ from tactflow.bench.lockstep import LockstepPipeline
 from tactflow.bench.pipelines import on_recording
 from tactflow.bench.scenes import FULL, NOMINAL, render_all
 from tactflow.bench.score import FlowScore
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.sim import Scene
 from tactflow.sim.gel import reached
+from tactflow.vision.contact.inside import outline_depth
 from tactflow.vision.flow import HIDDEN
-from tactflow.vision.outline import outline_depth
 
 Values = NDArray[np.float64]
 

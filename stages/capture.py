@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
-from tactflow.engine.stage import StageParams
-from tactflow.sources import CameraRequest, LiveSource, Source, StampedSource, Watch, open_source
+from tactflow.sources import CameraRequest, FrameReader, LiveReader, StampedReader, Watch, open_source
 from tactflow.sources.files import load_image
 from tactflow.sources.pace import Pace
 
 
-class Capture:
+class Capture(Source):
     """Reads frames and says which of them show the untouched gel.
 
     Recordings are handed over as fast as they are taken, or, with `realtime`, at their own pace and then
@@ -108,7 +108,7 @@ class Capture:
         params: Params,
         sensor: str = "main",
         directory: Path | None = None,
-        opener: Callable[..., Source] = open_source,
+        opener: Callable[..., FrameReader] = open_source,
     ) -> None:
         """Prepare; nothing is opened yet.
 
@@ -125,7 +125,7 @@ class Capture:
         self._sensor = sensor
         self._directory = directory
         self._opener = opener
-        self._source: Source | None = None
+        self._source: FrameReader | None = None
         self._reference_image: NDArray[np.uint8] | None = None
         self._stop = threading.Event()
         self._retake = threading.Event()
@@ -159,23 +159,23 @@ class Capture:
     def stop(self) -> None:
         """End `frames()` soon; wakes it if it waits for the next frame."""
         self._stop.set()
-        if isinstance(self._source, LiveSource):
+        if isinstance(self._source, LiveReader):
             self._source.stop()
 
     @property
     def state(self) -> str:
         """How the source is: `running`, `waiting since ...` or `reconnecting since ...`."""
-        return self._source.state if isinstance(self._source, LiveSource) else "running"
+        return self._source.state if isinstance(self._source, LiveReader) else "running"
 
     @property
     def missed(self) -> int:
         """Frames of a live source that a newer one overtook before they were taken: gaps in `seq`."""
-        return self._source.missed if isinstance(self._source, LiveSource) else 0
+        return self._source.missed if isinstance(self._source, LiveReader) else 0
 
     @property
     def live_threads(self) -> Sequence[int]:
         """Native ids of threads of its own that frames arrive in."""
-        reader = self._source.reader.native_id if isinstance(self._source, LiveSource) else None
+        reader = self._source.reader.native_id if isinstance(self._source, LiveReader) else None
         return [] if reader is None else [reader]
 
     def retake(self) -> None:
@@ -197,10 +197,10 @@ class Capture:
             raise SourceError(f"{self.description}: is not open")
         count = self.params.reference if isinstance(self.params.reference, int) else 1
         pace = Pace(self._stop) if self.params.realtime and not source.live else None
-        if isinstance(source, StampedSource):
+        if isinstance(source, StampedReader):
             yield from self._replay(source, pace, count)
             return
-        if isinstance(source, LiveSource):
+        if isinstance(source, LiveReader):
             yield from self._watch(source, count)
             return
         references = _References(self._retake, count, count if self._reference_image is None else 0)
@@ -223,7 +223,7 @@ class Capture:
             reference, epoch = references.next()
             yield Frame(self._sensor, seq, t, image, time.perf_counter(), reference, epoch)
 
-    def _replay(self, source: StampedSource, pace: Pace | None, count: int) -> Iterator[Frame]:
+    def _replay(self, source: StampedReader, pace: Pace | None, count: int) -> Iterator[Frame]:
         """Frames as they were captured the first time; references that are retaken now come on top."""
         references = _References(self._retake, count, 0)
         while not self._stop.is_set():
@@ -239,7 +239,7 @@ class Capture:
             reference, epoch = stamp.reference or again, stamp.epoch + retaken
             yield Frame(self._sensor, stamp.seq, t, _read_only(image), time.perf_counter(), reference, epoch)
 
-    def _watch(self, source: LiveSource, count: int) -> Iterator[Frame]:
+    def _watch(self, source: LiveReader, count: int) -> Iterator[Frame]:
         """Frames of a source that numbers them where they arrive, and that may go and come back."""
         p = self.params
         shown = self._reference_image is None

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
-from tactflow.vision import compiled, flow, outline_kernels
+from tactflow.vision import compiled
+from tactflow.vision.contact import inside_kernels
+from tactflow.vision.flow import flow_in_mask, in_mask
 from tactflow.vision.types import Flow, Markers
 
 
-class FlowInMask:
+class FlowInMask(Stage):
     """Mean displacement, twist and press of the markers inside the contact."""
 
     memory = "pure"
@@ -28,8 +30,8 @@ class FlowInMask:
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(flow, outline_kernels)
+        compiled.load(in_mask, inside_kernels)
 
     def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside."""
-        return flow.flow_in_mask(markers, contact_mask, dilate=self._params.dilate)
+        return flow_in_mask(markers, contact_mask, dilate=self._params.dilate)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
-from tactflow.engine.stage import StageParams
 from tactflow.ports import ContactMask
-from tactflow.vision import compiled, hull_kernels
-from tactflow.vision.hull import contact_geometry
+from tactflow.vision import compiled
+from tactflow.vision.geometry import moments
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Contact
 
 
-class Hull:
+class Hull(Stage):
     """Hull, area, centroid, direction and ellipse of the contact."""
 
     memory = "pure"
@@ -36,7 +37,7 @@ class Hull:
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(hull_kernels)
+        compiled.load(moments)
 
     def process(self, contact_mask: ContactMask) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""

@@ -7,13 +7,15 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask
-from tactflow.vision import compiled, halving, marker_mask_kernels
-from tactflow.vision.marker_mask import Dot, find_dot, marker_mask
+from tactflow.vision import compiled
+from tactflow.vision.geometry import downsample
+from tactflow.vision.markers import mask_kernels
+from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 
 
-class MarkerMaskStage:
+class MarkerMaskStage(Stage):
     """Mask of the marker dots; the first frame shows how they look."""
 
     memory = "stateful"
@@ -31,7 +33,7 @@ class MarkerMaskStage:
         )
 
     def __init__(self, params: Params) -> None:
-        compiled.load(halving, marker_mask_kernels)
+        compiled.load(downsample, mask_kernels)
         self._params = params
         self._dot: Dot | None = None
         self._looked = False

@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
-from tactflow.vision import compiled, marker_appearance_kernels, marker_matching, tracking_kernels
-from tactflow.vision.markers import Detection, detect_markers
-from tactflow.vision.tracking import MarkerTracker
+from tactflow.vision import compiled
+from tactflow.vision.markers import matching, template_kernels, tracking_kernels
+from tactflow.vision.markers.detection import Detection, detect_markers
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers
 
 
-class Tracker:
+class Tracker(Stage):
     """Follow the marker dots of the reference frame."""
 
     memory = "stateful"
@@ -40,7 +41,7 @@ class Tracker:
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(marker_appearance_kernels, marker_matching, tracking_kernels)
+        compiled.load(template_kernels, matching, tracking_kernels)
         self.reset()
 
     def reset(self) -> None:

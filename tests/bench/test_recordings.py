@@ -16,7 +16,7 @@ from tactflow.bench.recordings import (
 )
 from tactflow.bench.timing import CopyUnit
 from tactflow.cli.pipelines import find_pipeline
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 

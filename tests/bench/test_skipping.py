@@ -10,7 +10,7 @@ import pytest
 from tactflow.bench import skipping
 from tactflow.bench.skipping import Comparison, compare
 from tactflow.cli.main import main
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.sim import open_scene
 from tactflow.sim.export import write_frames
 

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from tactflow.classic import functions
 from tactflow.classic.stages import ConvexHull, Difference, FlowMask, MaskMarker, Tracker
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Absent, Frame
 from tactflow.sim import open_scene
 from tactflow.vision.types import Contact, Markers, MarkerStatus

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.classic.functions import mask_marker
-from tactflow.classic.tracker import GridTracker, Matcher, grid_of, marker_center
-from tactflow.vision.markers import NoMarkersError
+from tactflow.classic.functions import marker_center, mask_marker
+from tactflow.classic.tracker import GridTracker, Matcher, grid_of
+from tactflow.vision.markers.detection import NoMarkersError
 from tactflow.vision.types import MarkerStatus
 from tests.vision.dots import grid, match, render
 

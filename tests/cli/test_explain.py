@@ -13,7 +13,7 @@ import pytest
 from tactflow.cli.main import main
 from tactflow.cli.story import share
 
-PARTS = Path(__file__).resolve().parents[1] / "engine" / "parts.py"
+PARTS = Path(__file__).resolve().parents[1] / "config" / "parts.py"
 TEXT = """\
 stages:
   capture: {use: './parts.py:Source'}

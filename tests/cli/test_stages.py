@@ -9,9 +9,9 @@ import pytest
 
 from tactflow.cli.main import main
 from tactflow.cli.stages import details
-from tactflow.engine.registry import available, resolve
+from tactflow.config.registry import available, resolve
 
-PARTS = Path(__file__).resolve().parents[1] / "engine" / "parts.py"
+PARTS = Path(__file__).resolve().parents[1] / "config" / "parts.py"
 
 
 def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.run import Runner
 
 TOYS = Path(__file__).with_name("toys.py")

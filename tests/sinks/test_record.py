@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.graph import Pipeline

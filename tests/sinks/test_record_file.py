@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
 from tactflow.message import message_schema

@@ -17,7 +17,7 @@ from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.recording.repair import repair
 from tactflow.sinks.record import Record
-from tactflow.sources import StampedSource, open_source
+from tactflow.sources import StampedReader, open_source
 from tactflow.stages.capture import Capture
 
 FPS = 10.0
@@ -94,7 +94,7 @@ def test_a_reference_image_that_was_no_part_of_the_source_comes_first_again(tmp_
 
 def test_a_recording_says_how_long_and_how_fast_it_is(tmp_path: Path) -> None:
     source = open_source(str(record(tmp_path / "a.mcap", frames(range(21)))))
-    assert isinstance(source, StampedSource)
+    assert isinstance(source, StampedReader)
     assert (source.live, source.total, source.size) == (False, 21, (17, 12))
     assert source.fps == pytest.approx(FPS, rel=1e-9)
     assert "21 frames" in source.description

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources import Source, open_source
+from tactflow.sources import FrameReader, open_source
 
 Pixels = NDArray[np.uint8]
 
@@ -72,7 +72,7 @@ KINDS: list[Callable[[Path], str]] = [
 ]
 
 
-def read_all(source: Source) -> list[tuple[Pixels, float]]:
+def read_all(source: FrameReader) -> list[tuple[Pixels, float]]:
     frames = []
     while (item := source.read()) is not None:
         frames.append(item)

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from tactflow.stages.inpaint import Inpaint
-from tactflow.vision.inpaint import InpaintMethod, remove_markers
+from tactflow.vision.markers.inpaint import InpaintMethod, remove_markers
 
 IMAGE = np.random.default_rng(8).integers(0, 256, (40, 30, 3), dtype=np.uint8)
 MASK = np.zeros((40, 30), np.uint8)

@@ -14,7 +14,7 @@ RUN = """
 import sys
 
 from tactflow.cli.pipelines import find_pipeline
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.run import Runner
 from tactflow.vision import compiled, geometry
 

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from tactflow.sim import open_scene
 from tactflow.stages.marker_mask import MarkerMaskStage
-from tactflow.vision.marker_mask import Dot, marker_mask
+from tactflow.vision.markers.mask import Dot, marker_mask
 
 
 def _stage(**params: Any) -> MarkerMaskStage:

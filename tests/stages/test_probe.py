@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Frame
 from tactflow.engine.run import Runner
 from tactflow.stages.probe import Probe

@@ -17,11 +17,11 @@ from tactflow.classic.tracker import GridTracker
 from tactflow.engine.frame import Absent, Frame
 from tactflow.vision.contact import ContactDetector, ContactResult
 from tactflow.vision.flow import flow_in_mask
-from tactflow.vision.hull import contact_geometry
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_mask import find_dot, marker_mask
-from tactflow.vision.markers import detect_markers
-from tactflow.vision.tracking import MarkerTracker
+from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.markers.detection import detect_markers
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.mask import find_dot, marker_mask
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Contact, Flow, Markers
 
 Image = NDArray[np.uint8]

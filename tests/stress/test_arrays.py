@@ -14,9 +14,9 @@ from tactflow.vision.change import ChangeProbe
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import inside_mask
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.hull import contact_geometry
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_mask import Dot, marker_mask
+from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.mask import Dot, marker_mask
 from tactflow.vision.types import Contact, Flow, Markers
 from tests.stress.builders import (
     DIFFERENCES,

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.draw import Annotator
-from tactflow.vision.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Markers
 from tests.stress.builders import FLOWS, HULLS, Image, assert_defined
 

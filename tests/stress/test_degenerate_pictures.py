@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from tactflow.vision.change import ChangeProbe
 from tactflow.vision.draw import Annotator
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_mask import Dot, find_dot, marker_mask
-from tactflow.vision.markers import NoMarkersError, detect_markers
-from tactflow.vision.tracking import MarkerTracker
+from tactflow.vision.markers.detection import NoMarkersError, detect_markers
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers, MarkerStatus
 from tests.stress.builders import (
     DIFFERENCES,

@@ -9,7 +9,7 @@ import pytest
 
 from tactflow.bench.stress import LARGEST_GROWTH, Block, Drift, measure_drift, memory_mb
 from tactflow.cli.bench import frame_count
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tests.stress.builders import DIFFERENCES, TRACKERS, Image, gel
 

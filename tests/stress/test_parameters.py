@@ -14,20 +14,20 @@ import pytest
 from pydantic import BaseModel
 
 from tactflow.classic.tracker import GridTracker
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
+from tactflow.config.registry import names, resolve
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.registry import names, resolve
 from tactflow.vision.change import ChangeProbe
 from tactflow.vision.contact import ContactDetector, chi_square_threshold
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
-from tactflow.vision.hull import contact_geometry
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_mask import Dot, find_dot
-from tactflow.vision.markers import detect_markers
+from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.markers.detection import detect_markers
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.mask import Dot, find_dot
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
-from tactflow.vision.tracking import MarkerTracker
 from tactflow.vision.types import Markers
 from tests.stress.builders import gel
 

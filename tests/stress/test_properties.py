@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from tactflow.vision.contact import chi_square_threshold
 from tactflow.vision.flow import inside_mask
 from tactflow.vision.geometry import Preprocessor, find_homography
-from tactflow.vision.hull import contact_geometry
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_matching import choose_spots
-from tactflow.vision.markers import detect_markers, neighbour_graph
+from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.markers.detection import detect_markers, neighbour_graph
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.matching import choose_spots
 from tactflow.vision.smooth import AlphaBeta, OneEuro
 from tactflow.vision.types import Markers, MarkerStatus
 from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, INPAINTING, assert_defined, axis_difference
@@ -52,7 +52,7 @@ def points(least: int = 1, most: int = 20) -> st.SearchStrategy[NDArray[Any]]:
 
 
 @thorough
-@given(MASKS, st.sampled_from(HULLS), st.floats(0, 50), st.none() | st.floats(0, 50))
+@given(MASKS, st.sampled_from(list(HULLS)), st.floats(0, 50), st.none() | st.floats(0, 50))
 def test_geometry_lies_within_its_mask(
     mask: Any, method: Any, min_area: float, max_gap: float | None
 ) -> None:
@@ -98,7 +98,7 @@ def marker_sets(draw: Any) -> Markers:
 
 
 @thorough
-@given(marker_sets(), MASKS, st.floats(0, 30), st.sampled_from(FLOWS), st.randoms(use_true_random=False))
+@given(marker_sets(), MASKS, st.floats(0, 30), st.sampled_from(list(FLOWS)), st.randoms(use_true_random=False))
 def test_the_flow_is_a_mean_of_displacements_in_any_order(
     markers: Markers, mask: Any, dilate: float, method: Any, random: Any
 ) -> None:
@@ -149,7 +149,7 @@ def test_inpainting_touches_nothing_but_its_mask_and_invents_no_colours(
 
 
 @thorough
-@given(PICTURES, st.sampled_from(DIFFERENCES), st.data())
+@given(PICTURES, st.sampled_from(list(DIFFERENCES)), st.data())
 def test_any_pair_of_pictures_has_a_mask(reference: Any, method: Any, data: Any) -> None:
     image = data.draw(arrays.arrays(np.uint8, reference.shape, elements=st.integers(0, 255)))
     detector = DIFFERENCES[method]()

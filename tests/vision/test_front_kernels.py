@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from tactflow.sim import open_scene
 from tactflow.vision import compiled
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.halving import halved
-from tactflow.vision.inpaint import remove_markers
-from tactflow.vision.marker_mask import Dot, Polarity, find_dot, marker_mask
+from tactflow.vision.geometry.downsample import halved
+from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.mask import Dot, Polarity, find_dot, marker_mask
 
 Image = NDArray[np.uint8]
 SIZES = [(1, 1), (1, 8), (9, 1), (2, 2), (3, 5), (13, 200), (31, 64), (40, 131), (100, 76)]

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
-from tactflow.vision.inpaint import InpaintMethod, remove_markers
-from tactflow.vision.marker_mask import find_dot, marker_mask
+from tactflow.vision.markers.inpaint import InpaintMethod, remove_markers
+from tactflow.vision.markers.mask import find_dot, marker_mask
 
 Image = NDArray[np.uint8]
 METHODS: tuple[InpaintMethod, ...] = get_args(InpaintMethod)

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
-from tactflow.vision.marker_mask import Dot, find_dot, marker_mask
+from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 
 Image = NDArray[np.uint8]
 

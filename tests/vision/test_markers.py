@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.markers import NoMarkersError, detect_markers, neighbour_graph, to_gray
+from tactflow.vision.markers.detection import NoMarkersError, detect_markers, neighbour_graph, to_gray
 from tests.vision.dots import grid, match, rectified, render
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.marker_matching import choose_spots
-from tactflow.vision.markers import Detection, detect_markers, neighbour_graph
-from tactflow.vision.tracking import MarkerTracker
+from tactflow.vision.markers.detection import Detection, detect_markers, neighbour_graph
+from tactflow.vision.markers.matching import choose_spots
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers, MarkerStatus
 from tests.vision.dots import FloatArray, grid, rectified, render
 

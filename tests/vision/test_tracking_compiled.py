@@ -10,11 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.stages.tracker import Tracker
-from tactflow.vision import compiled, marker_appearance_kernels, marker_matching, tracking_kernels
-from tactflow.vision.marker_appearance import MarkerAppearance
-from tactflow.vision.marker_matching import choose_spots
-from tactflow.vision.markers import Detection, detect_markers, neighbour_graph, to_gray
-from tactflow.vision.tracking import MarkerTracker
+from tactflow.vision import compiled
+from tactflow.vision.markers import matching, template_kernels, tracking_kernels
+from tactflow.vision.markers.detection import Detection, detect_markers, neighbour_graph, to_gray
+from tactflow.vision.markers.matching import choose_spots
+from tactflow.vision.markers.template import MarkerAppearance
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers
 from tests.vision.dots import FloatArray, grid, render
 
@@ -276,7 +277,7 @@ def test_marks_that_are_not_there_are_refused(edges: list[list[int]], free: list
 def test_the_stage_has_its_loops_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     loops = [
         loop
-        for module in (marker_appearance_kernels, marker_matching, tracking_kernels)
+        for module in (template_kernels, matching, tracking_kernels)
         for loop in vars(module).values()
         if isinstance(loop, compiled.Kernel)
     ]

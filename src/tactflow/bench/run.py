@@ -30,7 +30,7 @@ from tactflow.bench.scenes import (
 )
 from tactflow.bench.targets import judge
 from tactflow.bench.timing import CopyUnit
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.vision import compiled

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.hull import axis_direction
-from tactflow.vision.inpaint import remove_markers
+from tactflow.vision.geometry.hull import axis_direction
+from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers
 
 MASK_THRESHOLD: Final = 120

@@ -10,22 +10,16 @@ from pydantic import Field
 
 from tactflow.classic.functions import contact_mask, get_convex_hull_area, mask_marker, mean_flow
 from tactflow.classic.tracker import GridTracker
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent, Frame
-from tactflow.engine.stage import StageParams
 from tactflow.ports import ContactMask, Image, MarkerMask, Touching, Unmarked
 from tactflow.vision.types import Contact, Flow, Markers
 
 
-class MaskMarker:
+class MaskMarker(Stage):
     """Mask of dark marker dots, by the script's `mask_marker`."""
 
     memory = "pure"
-
-    class Params(StageParams):
-        """There is nothing to choose."""
-
-    def __init__(self, params: Params) -> None:
-        pass
 
     def process(self, image: Image) -> MarkerMask:
         """255 where a marker covers the gel."""
@@ -39,15 +33,13 @@ class ContactPorts(NamedTuple):
     touching: Touching
 
 
-class Difference:
+class Difference(Stage):
     """Where the gel is brighter than in the last reference frame, by the script's `difference`."""
 
     memory = "stateful"
 
-    class Params(StageParams):
-        """There is nothing to choose."""
-
-    def __init__(self, params: Params) -> None:  # noqa: ARG002 (stages are built from parameters)
+    def __init__(self, params: StageParams) -> None:
+        super().__init__(params)
         self.reset()
 
     def reset(self) -> None:
@@ -62,16 +54,10 @@ class Difference:
         return ContactPorts(mask, bool(mask.any()))
 
 
-class ConvexHull:
+class ConvexHull(Stage):
     """Hull and line of the contact, by the script's `get_convex_hull_area` and what it calls."""
 
     memory = "pure"
-
-    class Params(StageParams):
-        """There is nothing to choose."""
-
-    def __init__(self, params: Params) -> None:
-        pass
 
     def process(self, contact_mask: ContactMask) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
@@ -79,7 +65,7 @@ class ConvexHull:
         return Absent("no_contact") if contact is None else contact
 
 
-class Tracker:
+class Tracker(Stage):
     """Markers of the first frame, found again by the script's `marker_center` and its search `m`.
 
     The search is limited in visits instead of milliseconds: its result does not depend on the machine.
@@ -87,10 +73,8 @@ class Tracker:
 
     memory = "stateful"
 
-    class Params(StageParams):
-        """There is nothing to choose."""
-
-    def __init__(self, params: Params) -> None:  # noqa: ARG002 (stages are built from parameters)
+    def __init__(self, params: StageParams) -> None:
+        super().__init__(params)
         self.reset()
 
     def reset(self) -> None:
@@ -104,7 +88,7 @@ class Tracker:
         return self._tracker.track(image)
 
 
-class FlowMask:
+class FlowMask(Stage):
     """Mean displacement of the markers inside the contact, as the script's `draw_flow_mask` writes it."""
 
     memory = "pure"
@@ -114,9 +98,6 @@ class FlowMask:
 
         dilate: int = Field(8, ge=0, le=1000, description="the contact grows by a square of so many pixels")
 
-    def __init__(self, params: Params) -> None:
-        self._dilate = params.dilate
-
     def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside."""
-        return mean_flow(markers, contact_mask, self._dilate)
+        return mean_flow(markers, contact_mask, self.params.dilate)

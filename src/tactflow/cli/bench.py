@@ -24,7 +24,7 @@ from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
 from tactflow.bench.timing import CopyUnit
 from tactflow.cli.pipelines import find_pipeline, packaged_pipelines
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 
 WORSE = 3

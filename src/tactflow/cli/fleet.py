@@ -27,11 +27,11 @@ from typing import IO, NamedTuple
 
 import zmq
 
+from tactflow.config.sensors import PLACEHOLDER
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.priority import ZMQ_SENDS, Precedence, threads_named
 from tactflow.engine.run import INTERRUPTED
-from tactflow.engine.sensors import PLACEHOLDER
 from tactflow.files import expanded, is_device, lead_nowhere, output, status
 
 FIRST_PAUSE = 1.0

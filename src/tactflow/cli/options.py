@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from tactflow.cli.pipelines import find_pipeline
-from tactflow.engine.config import load_pipeline
+from tactflow.config.load import load_pipeline
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan, make_plan
 

@@ -21,7 +21,7 @@ from tactflow.cli.fleet import run_fleet
 from tactflow.cli.options import add_pipeline
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.cli.story import share
-from tactflow.engine.config import load_pipeline, sensor_names
+from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Progress as RunProgress

@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
         schema = message_schema()
     else:
-        from tactflow.engine.registry import available
+        from tactflow.config.registry import available
 
         schema = pipeline_schema(available())
     print(json.dumps(schema, indent=2))

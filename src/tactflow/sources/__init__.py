@@ -1,6 +1,6 @@
 """What capture opens: simulated sensors, files, folders, cameras, streams.
 
-`open_source("recordings/wedge")` gives a `Source`: call `read()` until it returns None, then `close()`.
+`open_source("recordings/wedge")` gives a `FrameReader`: call `read()` until it returns None, then `close()`.
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ from functools import partial
 from pathlib import Path
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import Source, StampedSource
+from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream, public_address
 from tactflow.sources.files import open_recording
-from tactflow.sources.watch import LiveSource, Watch, Watched
+from tactflow.sources.health import Watch
+from tactflow.sources.watch import LiveReader, Watched
 
 __all__ = [
     "KINDS",
     "CameraRequest",
-    "LiveSource",
-    "Source",
-    "StampedSource",
+    "FrameReader",
+    "LiveReader",
+    "StampedReader",
     "Watch",
     "Watched",
     "open_source",
@@ -45,7 +46,7 @@ def open_source(
     fps: float | None = None,
     camera: CameraRequest | None = None,
     watch: Watch | None = None,
-) -> Source:
+) -> FrameReader:
     """Open a source of frames.
 
     Parameters
@@ -85,6 +86,6 @@ def open_source(
     return open_recording(spec, directory, fps)
 
 
-def _live(opener: Callable[[], Source], watch: Watch | None, name: str) -> Source:
+def _live(opener: Callable[[], FrameReader], watch: Watch | None, name: str) -> FrameReader:
     """The source itself, or watched. One clock serves all connections, so that times never step back."""
     return opener() if watch is None else Watched(opener, watch, name)

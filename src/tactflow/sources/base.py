@@ -23,7 +23,7 @@ log = logging.getLogger("tactflow")
 BgrImage = NDArray[np.uint8]
 
 
-class Source(Protocol):
+class FrameReader(Protocol):
     """Frames, one after the other.
 
     live : the frames come when they want to (cameras, streams); a recording waits until it is read.
@@ -73,14 +73,14 @@ class Stamp(NamedTuple):
 
 
 @runtime_checkable
-class StampedSource(Protocol):
+class StampedReader(Protocol):
     """A source whose frames went through `capture` once before.
 
     Capture then decides nothing by itself: seq, references and epochs are the recorded ones.
     """
 
     def read_stamped(self) -> tuple[BgrImage, float, Stamp] | None:
-        """Like `Source.read`, with the frame's stamp."""
+        """Like `FrameReader.read`, with the frame's stamp."""
         ...
 
 

@@ -107,7 +107,7 @@ class ImageFiles:
         return self._normalise(read_image(path), str(path))
 
     def read(self) -> tuple[BgrImage, float] | None:
-        """The next image and its time; see `Source.read`."""
+        """The next image and its time; see `FrameReader.read`."""
         index = self._index
         if index >= len(self._files):
             return None
@@ -189,7 +189,7 @@ class ArrayFile:
         self.description = f"{path}, {count} frames"
 
     def read(self) -> tuple[BgrImage, float] | None:
-        """The next frame and its time; see `Source.read`."""
+        """The next frame and its time; see `FrameReader.read`."""
         image = next(self._frames, None)
         if image is None:
             return None
@@ -269,7 +269,7 @@ class VideoFile:
         self.description = f"{path}, {self.size[0]} x {self.size[1]} at {self._rate:g} fps"
 
     def read(self) -> tuple[BgrImage, float] | None:
-        """The next frame and its time; see `Source.read`."""
+        """The next frame and its time; see `FrameReader.read`."""
         if self._capture is None:
             return None
         with quiet_opencv():

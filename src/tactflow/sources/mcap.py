@@ -82,12 +82,12 @@ class Recording:
             raise SourceError(f"{self._path}: cannot be read: {error.strerror or error}") from error
 
     def read(self) -> tuple[BgrImage, float] | None:
-        """The next frame and its time; see `Source.read`."""
+        """The next frame and its time; see `FrameReader.read`."""
         item = self.read_stamped()
         return None if item is None else item[:2]
 
     def read_stamped(self) -> tuple[BgrImage, float, Stamp] | None:
-        """The next frame, its time and what else is known of it; see `StampedSource`."""
+        """The next frame, its time and what else is known of it; see `StampedReader`."""
         item, self._first = self._first or self._next(), None
         if item is None:
             return None

@@ -37,7 +37,7 @@ class Simulated:
         self.description = f"{spec}, {self._count} frames at {self._rate:g} fps"
 
     def read(self) -> tuple[BgrImage, float] | None:
-        """Render the next frame; see `Source.read`."""
+        """Render the next frame; see `FrameReader.read`."""
         index = self._index
         if index >= self._count:
             return None

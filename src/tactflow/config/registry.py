@@ -1,0 +1,235 @@
+"""What `use:` can name: built-in stages and sinks, plug-ins, classes in modules and in loose files."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import hashlib
+import importlib
+import inspect
+import pkgutil
+import re
+import sys
+import traceback
+from collections.abc import Iterable, Sequence
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType, TracebackType
+from typing import Any, Literal, get_args
+
+from tactflow.engine.conformance import component, kind_of
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Component
+
+Section = Literal["stages", "sinks"]
+
+RESERVED = frozenset({"use", "in", "when", "segment", "queue", "on_error", "max_rate"})
+"""Keys of a stage or sink that belong to the engine and so cannot be names of parameters."""
+
+
+def resolve(use: str, section: Section, directory: Path) -> Component:
+    """Find the class that `use` names and read its contract.
+
+    use : a built-in name, the name of an installed plug-in, `package.module:Class`, or `./file.py:Class`
+        (`./file.py` alone where the file holds one class).
+    section : "stages" or "sinks", the part of the pipeline file it stands in.
+    directory : folder of the pipeline file, against which file names are resolved.
+
+    Raises
+    ------
+    ConfigError : nothing has that name, two things have it, or the class breaks the contract of stages.
+    """
+    file, separator, name = use.rpartition(":")
+    if not separator and _is_file(use):
+        file, name = use, ""
+    if _is_file(file):
+        found = component(_find_class(_load_file(directory, file), name, section), use, file, RESERVED)
+    elif separator:
+        found = component(_find_class(_load_module(file), name, section), use, f"module {file}", RESERVED)
+    else:
+        found = _named(use, section)
+    if (found.kind == "sink") != (section == "sinks"):
+        right = "sinks" if found.kind == "sink" else "stages"
+        raise ConfigError(f"{use} is a {found.kind}; it belongs under {right}:")
+    return found
+
+
+def available() -> list[Component]:
+    """Every built-in and installed stage and sink that can be loaded, stages first, by name."""
+    return catalogue()[0]
+
+
+def catalogue() -> tuple[list[Component], list[str]]:
+    """Like `available`, and beside it one message for each built-in or plug-in that cannot be used."""
+    components: list[Component] = []
+    problems: list[str] = []
+    sections: tuple[Section, ...] = get_args(Section)
+    for section in sections:
+        for name in names(section):
+            try:
+                components.append(_named(name, section))
+            except ConfigError as error:
+                problems.append(str(error))
+    return components, problems
+
+
+def names(section: Section) -> list[str]:
+    """Names of the built-ins and plug-ins of a section; nothing is imported for it."""
+    return sorted({*_builtins(section), *(entry.name for entry in _entry_points(section))})
+
+
+def closest(word: str, candidates: Iterable[str]) -> str | None:
+    """The candidate a misspelled word most likely means, or None."""
+    lowered = {candidate.lower(): candidate for candidate in candidates}
+    found = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=0.6)
+    return lowered[found[0]] if found else None
+
+
+def did_you_mean(word: str, candidates: Iterable[str], otherwise: str = "known: ") -> str:
+    """`; did you mean X?` for a misspelled word, else a list of what there is."""
+    candidates = list(candidates)
+    guess = closest(word, candidates)
+    if guess is not None:
+        return f"; did you mean {guess}?"
+    return f"; {otherwise}{', '.join(candidates)}" if candidates else ""
+
+
+def _is_file(text: str) -> bool:
+    return text.endswith(".py") or text.startswith(("./", "../", "/"))
+
+
+def _builtins(section: Section) -> list[str]:
+    package = importlib.import_module(f"tactflow.{section}")
+    return [module.name for module in pkgutil.iter_modules(package.__path__) if module.name[0] != "_"]
+
+
+def _entry_points(section: Section) -> Sequence[metadata.EntryPoint]:
+    return _installed(section, tuple(sys.path))
+
+
+@functools.cache
+def _installed(section: Section, path: tuple[str, ...]) -> Sequence[metadata.EntryPoint]:
+    """Entry points of the distributions on a module path; reading them takes longer than all the rest."""
+    points = metadata.entry_points(group=f"tactflow.{section}") if path else ()
+    # A distribution found twice (an editable install and its build folder) is one plug-in.
+    return list({(point.name, point.value): point for point in points}.values())
+
+
+def _named(name: str, section: Section) -> Component:
+    builtin = name in _builtins(section)
+    plugins = [entry for entry in _entry_points(section) if entry.name == name]
+    if builtin + len(plugins) > 1:
+        claims = ["the built-in"] * builtin + [_plugin_origin(entry) for entry in plugins]
+        values = " or ".join(entry.value for entry in plugins)
+        raise ConfigError(
+            f"{name} is claimed by {' and by '.join(claims)}; "
+            f"name the class instead (use: {values}) or uninstall one of them"
+        )
+    if plugins:
+        module, _, attribute = plugins[0].value.partition(":")
+        origin = _plugin_origin(plugins[0])
+        cls = _find_class(_load_module(module.strip(), origin), attribute.strip(), section)
+        return component(cls, name, origin, RESERVED)
+    if builtin:
+        module = f"tactflow.{section}.{name}"
+        return component(_find_class(_load_module(module), "", section), name, "built-in", RESERVED)
+    other: Section = "sinks" if section == "stages" else "stages"
+    if name in names(other):
+        raise ConfigError(f"{name} is under {section}: but belongs under {other}:")
+    raise ConfigError(
+        f"there is no {section[:-1]} called {name or repr(name)}{did_you_mean(name, names(section))}"
+        + ("" if closest(name, names(section)) else "; a class of your own is named as ./file.py:Class")
+    )
+
+
+def _plugin_origin(entry: metadata.EntryPoint) -> str:
+    if entry.dist is None:
+        return f"plug-in {entry.value}"
+    return f"plug-in {entry.dist.name} {entry.dist.version}"
+
+
+def _load_module(name: str, owner: str = "") -> ModuleType:
+    if not re.fullmatch(r"\w+(\.\w+)*", name):
+        raise ConfigError(f"{name!r} is not the name of a module; required package.module:Class")
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and (name == error.name or name.startswith(error.name + ".")):
+            raise ConfigError(
+                f"{owner + ': ' if owner else ''}there is no module {error.name}; "
+                "is it installed in this environment? A loose file is named as ./file.py:Class"
+            ) from None
+        raise ConfigError(_failure(name, error)) from None
+    except (Exception, SystemExit) as error:
+        raise ConfigError(_failure(name, error)) from None
+
+
+def _load_file(directory: Path, file: str) -> ModuleType:
+    """Run a Python file as a module of its own, once for each version of the file."""
+    try:
+        path = (directory / file).resolve()
+        source = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot read {file}: {error.strerror} ({path})") from None
+    except ValueError as error:
+        raise ConfigError(f"cannot read {file!r}: {error}") from None
+    digest = hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:16]
+    name = f"tactflow_file_{path.stem}_{digest}"
+    if name in sys.modules:
+        return sys.modules[name]
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    # Dataclasses and annotations look their module up by name while the file runs.
+    sys.modules[name] = module
+    try:
+        exec(compile(source, str(path), "exec"), module.__dict__)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        raise ConfigError(_failure(file, error, str(path))) from None
+    return module
+
+
+def _failure(what: str, error: BaseException, file: str | None = None) -> str:
+    """One line on why a module cannot be loaded, with the place in the code."""
+    if isinstance(error, SyntaxError):
+        return f"{error.filename}:{error.lineno}: cannot load {what}: {error.msg}"
+    text = f"cannot load {what}: {type(error).__name__}: {error}"
+    place = code_place(error.__traceback__, file)
+    return f"{place}: {text}" if place else text
+
+
+def code_place(trace: TracebackType | None, file: str | None = None) -> str | None:
+    """`file:line` of the last frame of a traceback (in `file` if given) that is not the import system's."""
+    frames = [f for f in traceback.extract_tb(trace) if not f.filename.startswith("<frozen")]
+    frames = [
+        f for f in frames if f.filename != __file__ and not f.filename.endswith("importlib/__init__.py")
+    ]
+    inside = [f for f in frames if f.filename == file]
+    if not frames:
+        return None
+    last = (inside or frames)[-1]
+    return f"{last.filename}:{last.lineno}"
+
+
+def _find_class(module: ModuleType, name: str, section: Section) -> type:
+    """The class called `name`, or the one public stage or sink class that the module defines."""
+    where = module.__file__ or module.__name__
+    here = {
+        key: value
+        for key, value in vars(module).items()
+        if inspect.isclass(value) and value.__module__ == module.__name__ and key[0] != "_"
+    }
+    usable = {key: value for key, value in here.items() if kind_of(value)}
+    if name:
+        found: Any = module
+        for part in name.split("."):
+            found = getattr(found, part, None)
+        if inspect.isclass(found):
+            return found
+        raise ConfigError(f"{where} has no class {name}{did_you_mean(name, usable or here, 'it has ')}")
+    if len(set(usable.values())) == 1:
+        return next(iter(usable.values()))
+    wanted = "Sink" if section == "sinks" else "Stage or Source"
+    if usable:
+        raise ConfigError(f"{where} has several classes ({', '.join(usable)}); name one, as in FILE:Class")
+    raise ConfigError(f"{where} has no public class that inherits from {wanted} of tactflow")

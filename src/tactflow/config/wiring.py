@@ -1,0 +1,267 @@
+"""Connects the inputs and gates of stages and sinks to outputs, and orders them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from tactflow.config import envelope
+from tactflow.config.registry import Section, catalogue, did_you_mean
+from tactflow.config.yamlmap import Entry, Item, Problems
+from tactflow.engine.graph import Component, Gate, Mark, Ref
+from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
+
+
+@dataclass(slots=True)
+class Draft:
+    """A stage or sink of the file before its inputs are connected.
+
+    component : None when `use` could not be resolved; what depends on it is then not judged.
+    inputs, gates : filled by `connect`.
+    edges : every output it takes, with the place that says so.
+    """
+
+    id: str
+    section: Section
+    mark: Mark
+    item: Item
+    component: Component | None = None
+    inputs: dict[str, Ref | None] = field(default_factory=dict)
+    gates: list[Gate] = field(default_factory=list)
+    edges: list[tuple[Ref, Mark]] = field(default_factory=list)
+
+    @property
+    def path(self) -> str:
+        """What messages call it: `stages.hull`."""
+        return f"{self.section}.{self.id}"
+
+    @property
+    def outputs(self) -> dict[str, Port]:
+        """Its output ports by name."""
+        return {port.name: port for port in self.component.ports.outputs} if self.component else {}
+
+
+def connect(drafts: Sequence[Draft], problems: Problems) -> None:
+    """Connect every input and gate by name or as `in:` and `when:` say; mistakes are added to `problems`.
+
+    An input takes the output of its name from the nearest stage above it, in a sink from the last stage that
+    has it.
+    """
+    wiring = _Wiring(drafts, problems)
+    for draft in drafts:
+        if draft.component is not None:
+            wiring.connect_inputs(draft, draft.component)
+            wiring.connect_gates(draft, draft.component)
+
+
+def ordered(drafts: Sequence[Draft], problems: Problems) -> list[Draft]:
+    """Sort so that every output comes before its users, else in the order of the file; reports a cycle."""
+    by_id = {draft.id: draft for draft in drafts}
+    done: dict[str, Draft] = {}
+    chain: list[str] = []
+
+    def visit(draft: Draft) -> None:
+        if draft.id in done:
+            return
+        if draft.id in chain:
+            _report_cycle([by_id[name] for name in chain[chain.index(draft.id) :]], problems)
+            return
+        chain.append(draft.id)
+        for ref, _ in draft.edges:
+            visit(by_id[ref.node])
+        chain.pop()
+        done[draft.id] = draft
+
+    for draft in drafts:
+        visit(draft)
+    return list(done.values())
+
+
+def _report_cycle(members: Sequence[Draft], problems: Problems) -> None:
+    steps = []
+    for user, giver in zip(members, [*members[1:], members[0]], strict=True):
+        steps.append(next((user, ref, mark) for ref, mark in user.edges if ref.node == giver.id))
+    steps.reverse()
+    start = min(range(len(steps)), key=lambda index: (steps[index][2].line, steps[index][2].column))
+    steps = steps[start:] + steps[:start]
+    ring = " -> ".join([steps[0][1].node, *(user.id for user, _, _ in steps)])
+    takes = "; ".join(f"{user.id} takes {ref} ({mark})" for user, ref, mark in steps)
+    problems.add(steps[0][2], f"{steps[0][0].path}: the stages form a cycle, {ring}: {takes}")
+
+
+class _Wiring:
+    def __init__(self, drafts: Sequence[Draft], problems: Problems) -> None:
+        self._problems = problems
+        self._by_id = {draft.id: draft for draft in drafts}
+        self._stages = [draft for draft in drafts if draft.section == "stages"]
+        self._complete = all(draft.component is not None for draft in self._stages)
+
+    def connect_inputs(self, draft: Draft, component: Component) -> None:
+        explicit = self._explicit(draft, component)
+        for port in component.ports.inputs:
+            draft.inputs[port.name] = None
+            mark = draft.mark
+            if port.name in explicit:
+                item = explicit[port.name].item
+                mark = item.mark
+                path = f"{draft.path}.in.{port.name}"
+                if item.content is None:
+                    if not port.optional:
+                        self._problems.add(mark, f"{path}: this input is required; name the output to take")
+                    continue
+                ref = self._reference(item, path, draft)
+            else:
+                path = draft.path
+                ref = self._nearest(port.name, draft)
+                if ref is None and not port.optional and self._complete:
+                    self._problems.add(mark, f"{path}: {self._dangling(port, draft)}")
+            if ref is not None:
+                self._check_type(ref, port, mark, path)
+                draft.inputs[port.name] = ref
+                draft.edges.append((ref, mark))
+
+    def connect_gates(self, draft: Draft, component: Component) -> None:
+        entry = draft.item.entries.get("when")
+        if entry is None or entry.item.content is None:
+            return
+        path = f"{draft.path}.when"
+        if component.kind == "source":
+            self._problems.add(entry.mark, f"{path}: a source cannot be gated; gate the stages behind it")
+            return
+        several = isinstance(entry.item.content, list)
+        for index, item in enumerate(entry.item.content if several else [entry.item]):
+            self._gate(item, f"{path}.{index}" if several else path, draft)
+
+    def _explicit(self, draft: Draft, component: Component) -> Mapping[str, Entry]:
+        entry = draft.item.entries.get("in")
+        if entry is None:
+            return {}
+        path = f"{draft.path}.in"
+        if not entry.item.is_mapping:
+            expected = "expected a mapping of input -> stage.port"
+            self._problems.add(entry.item.mark, f"{path}: {expected}, got {entry.item.words()}")
+            return {}
+        names = [port.name for port in component.ports.inputs]
+        for name, given in entry.item.entries.items():
+            if name not in names:
+                hint = did_you_mean(name, names, "inputs: ") if names else "; a source has no inputs"
+                self._problems.add(given.mark, f"{path}.{name}: {draft.id} has no input {name}{hint}")
+        return entry.item.entries
+
+    def _reference(self, item: Item, path: str, user: Draft, by_port: bool = False) -> Ref | None:
+        """The output that `stage.port`, `stage`, or (with `by_port`) the name of a port means."""
+        text = item.content
+        if not isinstance(text, str):
+            expected = "the name of a signal or stage.port" if by_port else "stage.port"
+            self._problems.add(item.mark, f"{path}: expected {expected}, got {item.words()}")
+            return None
+        stage, dot, port = text.partition(".")
+        if by_port and not dot:
+            ref = self._nearest(text, user)
+            if ref is not None:
+                return ref
+        giver = self._by_id.get(stage)
+        if giver is None:
+            # A signal that nobody gives may be one of a stage that could not be found.
+            if self._complete or dot or not by_port:
+                self._problems.add(item.mark, f"{path}: {self._unknown(text, user, by_port)}")
+        elif giver.section == "sinks":
+            self._problems.add(item.mark, f"{path}: {stage} is a sink and gives nothing")
+        elif giver.component is not None:
+            outputs = list(giver.outputs)
+            if dot and port not in outputs:
+                hint = did_you_mean(port, outputs, "it gives ")
+                self._problems.add(item.mark, f"{path}: {stage} ({giver.mark}) has no output {port!r}{hint}")
+            elif not dot and len(outputs) > 1:
+                refs = ", ".join(f"{stage}.{name}" for name in outputs)
+                self._problems.add(item.mark, f"{path}: {stage} has several outputs; name one of {refs}")
+            else:
+                return Ref(stage, port if dot else outputs[0])
+        return None
+
+    def _unknown(self, text: str, user: Draft, by_port: bool) -> str:
+        stage, dot, _ = text.partition(".")
+        ids = [draft.id for draft in self._stages if draft is not user]
+        if dot:
+            return f"there is no stage {stage!r}{did_you_mean(stage, ids, 'stages: ')}"
+        ports = {name: Ref(draft.id, name) for draft in self._stages for name in draft.outputs}
+        if by_port:
+            signals = [name for name, ref in ports.items() if self._signal(ref) is not None]
+            if text in ports:
+                return f"no stage above gives {text}; {ports[text].node} stands below: write {ports[text]}"
+            return f"there is no signal {text!r}{did_you_mean(text, signals, 'signals: ')}"
+        if text in ports:
+            return f"{text!r} is a port, not a stage; write {ports[text]}"
+        return f"there is no stage {text!r}{did_you_mean(text, ids, 'stages: ')}"
+
+    def _above(self, user: Draft) -> list[Draft]:
+        """The stages an input may take from by name, nearest first."""
+        stages = self._stages if user.section == "sinks" else self._stages[: self._stages.index(user)]
+        return stages[::-1]
+
+    def _nearest(self, port: str, user: Draft) -> Ref | None:
+        return next((Ref(draft.id, port) for draft in self._above(user) if port in draft.outputs), None)
+
+    def _signal(self, ref: Ref) -> SignalPort | None:
+        kind = port_type(self._by_id[ref.node].outputs[ref.port].annotation)
+        return kind if isinstance(kind, SignalPort) else None
+
+    def _check_type(self, ref: Ref, port: Port, mark: Mark, path: str) -> None:
+        giver = self._by_id[ref.node]
+        output = giver.outputs[ref.port]
+        reason = mismatch(output, port)
+        if reason is not None:
+            self._problems.add(
+                mark,
+                f"{path}: the input {port.name} takes {describe_type(port.annotation)}, but {ref} "
+                f"({giver.mark}) gives {describe_type(output.annotation)}: {reason}",
+            )
+
+    def _dangling(self, port: Port, user: Draft) -> str:
+        where = "" if user.section == "sinks" else " above"
+        given = [f"{name} ({draft.id})" for draft in reversed(self._above(user)) for name in draft.outputs]
+        text = f"needs {port.name}, but no stage{where} gives it"
+        below = next((draft for draft in self._stages if port.name in draft.outputs), None)
+        if below is not None and below is not user:
+            text += f"; {below.id} gives it but stands below: move it up, or write in: "
+            return text + f"{{{port.name}: {below.id}.{port.name}}}"
+        text += f"; there are {', '.join(given)}" if given else "; there are none"
+        makers = [c.name for c in catalogue()[0] if port.name in (output.name for output in c.ports.outputs)]
+        return text + (f"; it comes from the stage {' or '.join(makers)}" if makers else "")
+
+    def _gate(self, item: Item, path: str, draft: Draft) -> None:
+        settings = item.entries
+        if isinstance(item.content, dict):
+            known = ["signal", "otherwise", "hold", "at_least_every", "reason"]
+            envelope.check_keys(settings, known, path, self._problems)
+            if "signal" not in settings:
+                self._problems.add(
+                    item.mark, f"{path}: signal is missing; it names the port that opens the gate"
+                )
+                return
+            item, signal_path = settings["signal"].item, f"{path}.signal"
+        else:
+            signal_path = path
+        chosen = envelope.choice(settings, "otherwise", ["absent", "repeat"], path, self._problems)
+        hold = envelope.whole(settings, "hold", 0, path, self._problems)
+        at_least_every = envelope.whole(settings, "at_least_every", 1, path, self._problems)
+        reason = envelope.word(settings, "reason", path, self._problems)
+        ref = self._reference(item, signal_path, draft, by_port=True)
+        if ref is None:
+            return
+        signal = self._signal(ref)
+        if signal is None:
+            giver = self._by_id[ref.node]
+            kind = describe_type(giver.outputs[ref.port].annotation)
+            self._problems.add(
+                item.mark,
+                f"{signal_path}: a gate takes a signal (a bool port such as touching), but {ref} "
+                f"({giver.mark}) gives {kind}",
+            )
+            return
+        otherwise: Literal["absent", "repeat"] = "repeat" if chosen == "repeat" else "absent"
+        if chosen is None:
+            otherwise = signal.otherwise
+        draft.gates.append(Gate(ref, reason or signal.closed, otherwise, hold or 0, at_least_every))
+        draft.edges.append((ref, item.mark))

@@ -1,0 +1,1 @@
+"""The printed markers of a gel: detection, mask, removal and tracking."""

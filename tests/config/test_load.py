@@ -1,0 +1,378 @@
+"""A right pipeline file becomes the graph it describes; overrides change it and keep their provenance."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tactflow.config.load import load_pipeline
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Gate, Mark, OnError, Pipeline, Queue, Ref
+
+PARTS = Path(__file__).with_name("parts.py")
+BODY = """\
+sensor: left
+stages:
+  capture: {use: './parts.py:Source'}
+  prepare:
+    use: ./parts.py:Prepare
+    gamma: 2
+    corners: [[1, 2], [3, 4]]
+  compare: {use: './parts.py:Compare'}
+  outline: {use: './parts.py:Outline', when: touching}
+sinks:
+  out: {use: './parts.py:Publish'}
+"""
+
+Load = Callable[..., Pipeline]
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Load:
+    """Load a pipeline text with parts beside it."""
+    shutil.copy(PARTS, tmp_path / "parts.py")
+
+    def from_text(text: str = BODY, *overrides: str, **options: Any) -> Pipeline:
+        (tmp_path / "p.yaml").write_text(text)
+        return load_pipeline(tmp_path / "p.yaml", overrides, **options)
+
+    return from_text
+
+
+def test_a_file_becomes_nodes_with_parameters_and_marks(load: Load, tmp_path: Path) -> None:
+    pipeline = load()
+    assert list(pipeline.nodes) == ["capture", "prepare", "compare", "outline", "out"]
+    assert (pipeline.sensor, pipeline.skipping, pipeline.opencv_threads) == ("left", True, None)
+    assert pipeline.directory == tmp_path
+    assert pipeline.source.id == "capture"
+    assert [sink.id for sink in pipeline.sinks] == ["out"]
+    prepare = pipeline.nodes["prepare"]
+    assert prepare.params.model_dump(include={"gamma", "corners"}) == {
+        "gamma": 2.0,
+        "corners": [(1.0, 2.0), (3.0, 4.0)],
+    }
+    assert prepare.mark == Mark(str(tmp_path / "p.yaml"), 4, 3)
+    assert pipeline.warnings == []
+
+
+def test_inputs_take_the_output_of_their_name(load: Load) -> None:
+    nodes = load().nodes
+    assert nodes["compare"].inputs == {"image": Ref("prepare", "image"), "frame": Ref("capture", "frame")}
+    assert nodes["outline"].inputs == {"contact_mask": Ref("compare", "contact_mask")}
+    assert nodes["out"].inputs == {"image": Ref("prepare", "image"), "contact": Ref("outline", "contact")}
+
+
+def test_the_nearest_stage_above_wins_and_sinks_take_the_last(load: Load) -> None:
+    nodes = load(BODY.replace("  compare:", "  invert: {use: './parts.py:Invert'}\n  compare:")).nodes
+    assert nodes["invert"].inputs["image"] == Ref("prepare", "image")
+    assert nodes["compare"].inputs["image"] == Ref("invert", "image")
+    last = BODY.replace("sinks:", "  invert: {use: './parts.py:Invert'}\nsinks:")
+    assert load(last).nodes["compare"].inputs["image"] == Ref("prepare", "image")
+    assert load(last).nodes["out"].inputs["image"] == Ref("invert", "image")
+
+
+def test_an_optional_input_nobody_gives_is_none(load: Load) -> None:
+    assert load(BODY, "stages.outline=null").nodes["out"].inputs["contact"] is None
+
+
+def test_in_names_outputs_and_can_take_an_optional_one_away(load: Load) -> None:
+    text = BODY.replace("sinks:", "  invert: {use: './parts.py:Invert'}\nsinks:")
+    for reference, expected in (
+        ("prepare", Ref("prepare", "image")),
+        ("prepare.image", Ref("prepare", "image")),
+    ):
+        assert load(text, f"sinks.out.in.image={reference}").nodes["out"].inputs["image"] == expected
+    assert load(text, "sinks.out.in.image=null").nodes["out"].inputs["image"] is None
+
+
+def test_a_reference_to_a_stage_below_reorders_the_nodes(load: Load) -> None:
+    text = BODY.replace(
+        "  compare:",
+        "  first: {use: './parts.py:Outline', in: {contact_mask: compare.contact_mask}}\n  compare:",
+    )
+    pipeline = load(text)
+    assert list(pipeline.nodes) == ["capture", "prepare", "compare", "first", "outline", "out"]
+
+
+def test_sinks_may_stand_above_stages_in_the_file(load: Load) -> None:
+    head, _, tail = BODY.partition("sinks:")
+    pipeline = load("sinks:" + tail + head)
+    assert list(pipeline.nodes)[-1] == "out"
+
+
+def test_a_stage_with_nothing_after_its_name_has_the_defaults(load: Load) -> None:
+    pipeline = load("stages:\n  capture:\n  preprocess:\nsinks:\n  jsonl:\n")
+    assert pipeline.nodes["preprocess"].component.name == "preprocess"
+    assert pipeline.sensor == "main"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("touching", [Gate(Ref("compare", "touching"), "no_contact")]),
+        ("compare.touching", [Gate(Ref("compare", "touching"), "no_contact")]),
+        (
+            "{signal: touching, otherwise: repeat, hold: 3, at_least_every: 30, reason: rest}",
+            [Gate(Ref("compare", "touching"), "rest", "repeat", 3, 30)],
+        ),
+        (
+            "[touching, {signal: touching, hold: 1}]",
+            [
+                Gate(Ref("compare", "touching"), "no_contact"),
+                Gate(Ref("compare", "touching"), "no_contact", hold=1),
+            ],
+        ),
+        ("null", []),
+    ],
+)
+def test_when_makes_gates(text: str, expected: list[Gate], load: Load) -> None:
+    assert list(load(BODY, f"stages.outline.when={text}").nodes["outline"].gates) == expected
+
+
+@pytest.mark.parametrize(
+    ("override", "attribute", "expected"),
+    [
+        ("segment=heavy", "segment", "heavy"),
+        ("queue={capacity: 4, when_full: drop_oldest}", "queue", Queue(4, "drop_oldest")),
+        ("queue.when_full=latest", "queue", Queue(None, "latest")),
+        ("on_error=disable", "on_error", OnError("disable")),
+        ("on_error={action: skip_frame, budget: 3}", "on_error", OnError("skip_frame", 3)),
+        ("max_rate=12.5", "max_rate", 12.5),
+    ],
+)
+def test_the_engine_keys_of_a_sink(override: str, attribute: str, expected: Any, load: Load) -> None:
+    assert getattr(load(BODY, f"sinks.out.{override}").nodes["out"], attribute) == expected
+
+
+def test_a_viewer_is_disabled_by_an_error_and_other_sinks_stop_the_run(load: Load) -> None:
+    nodes = load(BODY + "  view: {use: './parts.py:Viewer'}\n").nodes
+    assert nodes["view"].on_error == OnError("disable")
+    assert nodes["out"].on_error == OnError("stop")
+
+
+def test_anchors_and_merge_keys_share_settings(load: Load) -> None:
+    text = BODY.replace(
+        "  outline: {use: './parts.py:Outline', when: touching}\n",
+        "  outline: &o {use: './parts.py:Outline', min_area: 7, name: a}\n  again: {<<: *o, min_area: 8}\n",
+    )
+    nodes = load(text).nodes
+    assert nodes["again"].params.model_dump() == {"min_area": 8, "name": "a"}
+    assert nodes["outline"].params.model_dump() == {"min_area": 7, "name": "a"}
+
+
+def test_an_override_of_an_aliased_value_changes_only_the_one_it_names(load: Load) -> None:
+    text = BODY.replace("gamma: 2", "gamma: 2\n    lens: &lens {focal: 3}").replace(
+        "  compare:", "  second: {use: './parts.py:Prepare', lens: *lens}\n  compare:"
+    )
+    nodes = load(text, "stages.second.lens.focal=9").nodes
+    assert nodes["second"].params.model_dump()["lens"]["focal"] == 9
+    assert nodes["prepare"].params.model_dump()["lens"]["focal"] == 3
+
+
+@pytest.mark.parametrize(("text", "value"), [("1e-3", 0.001), ("1.5", 1.5), ("3", 3.0), ("+2E0", 2.0)])
+def test_numbers_are_read_as_people_write_them(text: str, value: float, load: Load) -> None:
+    assert (
+        load(BODY.replace("gamma: 2", f"gamma: {text}")).nodes["prepare"].params.model_dump()["gamma"]
+        == value
+    )
+
+
+def test_a_date_is_text(load: Load) -> None:
+    nodes = load(BODY, "sinks.out.path=2026-11-21").nodes
+    assert nodes["out"].params.model_dump() == {"path": "2026-11-21"}
+
+
+class TestSet:
+    def test_it_replaces_a_value(self, load: Load) -> None:
+        assert load(BODY, "stages.prepare.gamma=3").nodes["prepare"].params.model_dump()["gamma"] == 3
+
+    def test_it_replaces_an_item_of_a_list(self, load: Load) -> None:
+        params = load(BODY, "stages.prepare.corners.1.0=9").nodes["prepare"].params.model_dump()
+        assert params["corners"] == [(1.0, 2.0), (9.0, 4.0)]
+
+    def test_it_reads_the_value_as_yaml(self, load: Load) -> None:
+        params = load(BODY, "stages.prepare.corners=[[5, 6]]").nodes["prepare"].params.model_dump()
+        assert params["corners"] == [(5.0, 6.0)]
+
+    def test_it_creates_a_missing_key_stage_and_sink(self, load: Load) -> None:
+        nodes = load(
+            BODY,
+            "stages.prepare.rotate=90",
+            "stages.extra.use=./parts.py:Invert",
+            "sinks.second.use=./parts.py:Viewer",
+        ).nodes
+        assert nodes["prepare"].params.model_dump()["rotate"] == 90
+        assert nodes["second"].inputs["image"] == Ref("extra", "image")
+
+    def test_null_removes_a_stage_or_sink(self, load: Load) -> None:
+        pipeline = load(BODY, "stages.outline=null", "sinks.out=null")
+        assert list(pipeline.nodes) == ["capture", "prepare", "compare"]
+        assert "there are no sinks" in pipeline.warnings[0]
+
+    def test_a_later_one_wins(self, load: Load) -> None:
+        nodes = load(BODY, "stages.prepare.gamma=3", "stages.prepare.gamma=4").nodes
+        assert nodes["prepare"].params.model_dump()["gamma"] == 4
+
+    def test_it_changes_the_top_level(self, load: Load) -> None:
+        pipeline = load(BODY, "sensor=right", "skipping=false", "opencv_threads=2", "realtime_priority=false")
+        assert (pipeline.sensor, pipeline.skipping, pipeline.opencv_threads) == ("right", False, 2)
+        assert not pipeline.realtime_priority
+
+    def test_a_run_knows_how_many_others_run_beside_it(self, load: Load) -> None:
+        assert load(BODY).runs == 1
+        shared = "sensors: {left: null, right: null, top: null}\n" + BODY.replace("sensor: left\n", "")
+        assert load(shared).runs == 3
+
+    @pytest.mark.parametrize(
+        ("override", "words"),
+        [
+            ("stages.prepare.gamma=x", "stages.prepare.gamma: expected a number, got 'x'"),
+            ("stages.prepare.gama=3", "stages.prepare.gama: unknown parameter; did you mean gamma?"),
+            ("stages.outlin.min_area=3", "there is no stage called outlin"),
+            ("stages.outlin=null", "there is no stage 'outlin' to remove; did you mean outline?"),
+            ("sink.out.path=a", "sink: unknown key; did you mean sinks?"),
+            ("stages.prepare.gamma.x=3", "stages.prepare.gamma is 2, so it has no x"),
+            ("stages.prepare.corners.7=3", "stages.prepare.corners is a list with 2 items"),
+            ("stages.prepare.corners.first=3", "stages.prepare.corners is a list with 2 items"),
+            ("stages.prepare.gamma", "expected a.b.c=VALUE"),
+            ("stages..gamma=3", "expected a.b.c=VALUE"),
+            ("=3", "expected a.b.c=VALUE"),
+            ("stages.prepare.gamma={", "not valid YAML"),
+            ("stages.prepare.gamma=!!python/name:os.system x", "not allowed"),
+            ("stages.outline.when=tuching", "stages.outline.when: there is no signal 'tuching'"),
+            ("sinks.out.in.image=compare.contact_mask", "but compare.contact_mask"),
+            ("sensor=a b", "sensor: expected a word"),
+        ],
+    )
+    def test_its_mistakes_name_the_option(self, override: str, words: str, load: Load) -> None:
+        with pytest.raises(ConfigError) as caught:
+            load(BODY, override)
+        message = str(caught.value)
+        assert message.startswith(f"--set {override}: ")
+        assert words in message
+
+    @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(
+        st.lists(
+            st.sampled_from(["stages", "sinks", "prepare", "out", "corners", "in", "when", "0", "x", ""]),
+            max_size=5,
+        ),
+        st.one_of(
+            st.text(max_size=12),
+            st.sampled_from(["null", "[[", "{a: 1}", "&a [*a]", "touching", "-1", "!!x"]),
+        ),
+    )
+    def test_whatever_it_says_the_pipeline_is_right_or_refused(
+        self, load: Load, keys: list[str], value: str
+    ) -> None:
+        try:
+            load(BODY, f"{'.'.join(keys)}={value}")
+        except ConfigError as error:
+            message = str(error)
+        else:
+            return
+        assert "--set" in message or "p.yaml:" in message
+
+
+class TestOptionsOfTheCommandLine:
+    def test_values_for_the_source_replace_those_of_the_file(self, load: Load) -> None:
+        pipeline = load(BODY, source_values={"source": "film.mp4", "realtime": True})
+        assert pipeline.source.params.model_dump() == {"source": "film.mp4", "realtime": True}
+
+    def test_a_value_the_source_does_not_have_names_the_option(self, load: Load) -> None:
+        with pytest.raises(
+            ConfigError, match=r"^--frame-rate: stages\.capture\.frame_rate: unknown parameter"
+        ):
+            load(BODY, source_values={"frame_rate": 3})
+
+    def test_values_for_any_stage_replace_those_of_the_file(self, load: Load) -> None:
+        nodes = load(BODY, extra_stage_values={"prepare": {"gamma": 4}}).nodes
+        assert nodes["prepare"].params.model_dump()["gamma"] == 4
+
+    def test_a_value_for_a_stage_that_is_not_there_is_an_error(self, load: Load) -> None:
+        with pytest.raises(
+            ConfigError, match=r"^--gamma: there is no stage 'prepar'; did you mean prepare\?"
+        ):
+            load(BODY, extra_stage_values={"prepar": {"gamma": 4}})
+
+    def test_an_added_sink_gets_an_id_that_is_free(self, load: Load) -> None:
+        text = BODY.replace("  out:", "  jsonl:")
+        nodes = load(text, extra_sinks={"--jsonl": {"path": "-"}}).nodes
+        assert nodes["jsonl"].component.name == "./parts.py:Publish"
+        assert nodes["jsonl_2"].component.name == "jsonl"
+        assert nodes["jsonl_2"].mark == Mark("--jsonl", 0, 0)
+
+    def test_a_mistake_in_an_added_sink_names_the_option(self, load: Load) -> None:
+        with pytest.raises(ConfigError, match=r"^--jsonl: sinks\.jsonl\.path: expected text, got 3"):
+            load(BODY, extra_sinks={"--jsonl": {"path": 3}})
+
+
+def test_no_sinks_are_a_warning_with_its_place(load: Load, tmp_path: Path) -> None:
+    head, _, _ = BODY.partition("sinks:")
+    assert load(head).warnings == [
+        f"{tmp_path / 'p.yaml'}:1:1  there are no sinks, so nothing will be computed"
+    ]
+    assert load(head + "sinks: {}\n").warnings[0].startswith(f"{tmp_path / 'p.yaml'}:10:1  ")
+
+
+def test_a_stage_that_cannot_be_found_does_not_cause_further_complaints(load: Load) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(BODY.replace("parts.py:Compare", "parts.py:Compar"))
+    assert str(caught.value).count("p.yaml:") == 1
+
+
+def test_a_validator_that_breaks_is_reported_without_a_traceback(load: Load, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        PARTS.read_text().replace('raise ValueError("size needs corners")', "return {}[self.size]")
+    )
+    with pytest.raises(
+        ConfigError, match=r"stages\.prepare: the parameters fail: KeyError: \(3, 4\) \(.*own\.py:\d+\)"
+    ):
+        load(
+            BODY.replace("parts.py:Prepare", "own.py:Prepare"),
+            "stages.prepare.corners=[]",
+            "stages.prepare.size=[3, 4]",
+        )
+
+
+def with_sinks(first: str, second: str = "") -> str:
+    """The body with other sinks."""
+    return BODY.replace("out: {use: './parts.py:Publish'}", f"{first}\n  {second}")
+
+
+@pytest.mark.parametrize(
+    ("second", "clash"),
+    [
+        ("again: {use: jsonl, path: out/../out/a.jsonl}", True),
+        ("more: {use: jsonl, path: ./out/a.jsonl, detail: true}", True),
+        ("again: {use: jsonl, path: out/b.jsonl}", False),
+    ],
+)
+def test_two_sinks_do_not_write_the_same_file(second: str, clash: bool, load: Load) -> None:
+    text = with_sinks(first="lines: {use: jsonl, path: out/a.jsonl}", second=second)
+    if clash:
+        with pytest.raises(ConfigError, match=r"lines \(.*p.yaml:11:3\) writes .*/out/a.jsonl already"):
+            load(text)
+    else:
+        assert len(load(text).sinks) == 2
+
+
+@pytest.mark.parametrize("path", ["-", "/dev/null", r'"a\0b"'])
+def test_what_is_no_file_may_be_written_by_several_sinks(path: str, load: Load) -> None:
+    first, second = (f"{name}: {{use: jsonl, path: {path}}}" for name in ("one", "two"))
+    assert len(load(with_sinks(first=first, second=second)).sinks) == 2
+
+
+def test_an_option_adds_no_second_sink_for_a_file_that_is_written_already(load: Load) -> None:
+    lines = "lines: {use: jsonl, path: out/a.jsonl, detail: true}"
+    option = {"--jsonl": {"use": "jsonl", "path": "out/a.jsonl"}}
+    kept = load(with_sinks(first=lines, second=""), extra_sinks=option)
+    assert [sink.id for sink in kept.sinks] == ["lines"]
+    with pytest.raises(ConfigError, match=r"--jsonl: .* writes .* already"):
+        load(with_sinks(first=lines[:-1] + ", max_rate: 5}", second=""), extra_sinks=option)

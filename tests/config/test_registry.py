@@ -1,0 +1,229 @@
+"""`use:` finds built-ins, plug-ins, classes in modules and in loose files, and says what it cannot find."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tactflow.config.load import load_pipeline
+from tactflow.config.registry import available, catalogue, closest, did_you_mean, names, resolve
+from tactflow.engine.errors import ConfigError
+
+STAGE = """
+from __future__ import annotations
+
+from tactflow.engine.contract import Stage, StageParams
+from tactflow.ports import Image
+from tactflow.vision.types import Contact
+
+
+class {name}(Stage):
+    memory = "pure"
+
+    def __init__(self, params: StageParams) -> None: ...
+
+    def process(self, image: Image) -> Contact: ...
+"""
+
+Install = Callable[..., str]
+_numbers = itertools.count()
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Install a distribution with one plug-in in a folder of its own; returns the name of its module."""
+    added: list[str] = []
+
+    def make(distribution: str, entry: str, body: str | None = None, section: str = "stages") -> str:
+        module = f"plug_{next(_numbers)}"
+        folder = tmp_path / distribution
+        info = folder / f"{distribution}-2.1.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 2.1\n")
+        (info / "entry_points.txt").write_text(f"[tactflow.{section}]\n{entry} = {module}:Plug\n")
+        (folder / f"{module}.py").write_text(STAGE.format(name="Plug") if body is None else body)
+        monkeypatch.syspath_prepend(str(folder))
+        importlib.invalidate_caches()
+        added.append(module)
+        return module
+
+    yield make
+    for module in added:
+        sys.modules.pop(module, None)
+
+
+def test_a_built_in_is_found_by_the_name_of_its_module(tmp_path: Path) -> None:
+    capture = resolve("capture", "stages", tmp_path)
+    assert (capture.kind, capture.origin, capture.memory) == ("source", "built-in", "pure")
+    assert capture.cls.__module__ == "tactflow.stages.capture"
+
+
+def test_the_sink_zmq_does_not_hide_the_library_zmq(tmp_path: Path) -> None:
+    sink = resolve("zmq", "sinks", tmp_path)
+    assert sink.cls.__module__ == "tactflow.sinks.zmq"
+    assert hasattr(importlib.import_module("zmq"), "Context")
+
+
+def test_every_built_in_can_be_used() -> None:
+    components, problems = catalogue()
+    assert problems == []
+    assert {c.name for c in components if c.origin == "built-in"} == {*names("stages"), *names("sinks")}
+
+
+def test_a_plug_in_is_found_by_the_name_of_its_entry_point(install: Install, tmp_path: Path) -> None:
+    module = install("gel-tools", "edges")
+    component = resolve("edges", "stages", tmp_path)
+    assert component.origin == "plug-in gel-tools 2.1"
+    assert component.cls.__module__ == module
+    assert "edges" in [c.name for c in available()]
+
+
+def test_a_plug_in_with_the_name_of_a_built_in_is_an_error_that_names_both(
+    install: Install, tmp_path: Path
+) -> None:
+    module = install("gel-tools", "hull")
+    with pytest.raises(ConfigError) as caught:
+        resolve("hull", "stages", tmp_path)
+    message = str(caught.value)
+    assert "hull is claimed by the built-in and by plug-in gel-tools 2.1" in message
+    assert f"use: {module}:Plug" in message
+    assert resolve(f"{module}:Plug", "stages", tmp_path).kind == "stage"
+
+
+def test_two_plug_ins_with_one_name_are_an_error_that_names_both(install: Install, tmp_path: Path) -> None:
+    install("gel-tools", "edges")
+    install("other-tools", "edges")
+    with pytest.raises(ConfigError) as caught:
+        resolve("edges", "stages", tmp_path)
+    assert "plug-in gel-tools 2.1" in str(caught.value)
+    assert "plug-in other-tools 2.1" in str(caught.value)
+
+
+def test_a_clash_leaves_the_other_names_usable(install: Install) -> None:
+    install("gel-tools", "hull")
+    components, problems = catalogue()
+    assert "capture" in [c.name for c in components]
+    assert "hull" not in [c.name for c in components]
+    assert len(problems) == 1
+    assert "hull is claimed by" in problems[0]
+
+
+def test_a_plug_in_that_cannot_be_imported_is_reported_with_its_line(
+    install: Install, tmp_path: Path
+) -> None:
+    module = install("gel-tools", "edges", "\nimport no_such_thing\n")
+    with pytest.raises(ConfigError, match=rf"{module}\.py:2: .*No module named 'no_such_thing'"):
+        resolve("edges", "stages", tmp_path)
+
+
+def test_a_plug_in_whose_module_is_gone_is_named(install: Install, tmp_path: Path) -> None:
+    module = install("gel-tools", "edges")
+    (tmp_path / "gel-tools" / f"{module}.py").unlink()
+    importlib.invalidate_caches()
+    with pytest.raises(ConfigError, match=f"plug-in gel-tools 2.1: there is no module {module}"):
+        resolve("edges", "stages", tmp_path)
+
+
+def test_a_loose_file_is_relative_to_the_pipeline_not_to_the_current_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "mine" / "edges.py").write_text(STAGE.format(name="Edges"))
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    component = resolve("./edges.py:Edges", "stages", tmp_path / "mine")
+    assert component.cls.__name__ == "Edges"
+    assert component.name == "./edges.py:Edges"
+
+
+def test_a_loose_file_with_one_class_needs_no_class_name(tmp_path: Path) -> None:
+    (tmp_path / "edges.py").write_text(STAGE.format(name="Edges"))
+    assert resolve("./edges.py", "stages", tmp_path).cls.__name__ == "Edges"
+
+
+def test_two_loose_files_of_one_name_do_not_share_a_module(tmp_path: Path) -> None:
+    for folder, name in (("a", "First"), ("b", "Second")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "edges.py").write_text(STAGE.format(name=name))
+    first = resolve("./a/edges.py", "stages", tmp_path).cls
+    second = resolve("./b/edges.py", "stages", tmp_path).cls
+    assert (first.__name__, second.__name__) == ("First", "Second")
+    assert first.__module__ != second.__module__
+
+
+def test_a_loose_file_is_run_once_and_again_when_it_has_changed(tmp_path: Path) -> None:
+    path = tmp_path / "edges.py"
+    path.write_text(STAGE.format(name="Edges"))
+    first = resolve("./edges.py", "stages", tmp_path).cls
+    assert resolve("./edges.py", "stages", tmp_path).cls is first
+    path.write_text(STAGE.format(name="Edges") + "    version = 2\n")
+    second = resolve("./edges.py", "stages", tmp_path).cls
+    assert second is not first
+    assert second.__dict__["version"] == 2
+
+
+def test_a_class_imported_into_a_loose_file_does_not_count_as_its_own(tmp_path: Path) -> None:
+    (tmp_path / "edges.py").write_text(
+        "from tactflow.stages.hull import Hull\n"
+        + STAGE.format(name="Edges").replace("from __future__ import annotations", "")
+    )
+    assert resolve("./edges.py", "stages", tmp_path).cls.__name__ == "Edges"
+
+
+def test_nothing_is_written_beside_a_loose_file(tmp_path: Path) -> None:
+    (tmp_path / "edges.py").write_text(STAGE.format(name="Edges"))
+    resolve("./edges.py", "stages", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["edges.py"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            "def __init__(self, params: StageParams)",
+            "def __init__(self)",
+            "must be built from its parameters",
+        ),
+        (
+            '    memory = "pure"\n',
+            '    memory = "none"\n',
+            "memory: required 'pure' or .* got 'none'",
+        ),
+        ('    memory = "pure"\n', '    memory = "pure"\n    Params = dict\n', "must be a subclass of"),
+        (
+            '    memory = "pure"\n',
+            '    memory = "pure"\n    class Params(StageParams):\n        queue: int = 3\n',
+            "Params.queue: that name is a key of the pipeline file",
+        ),
+    ],
+)
+def test_a_class_that_breaks_the_contract_is_refused_with_its_line(
+    old: str, new: str, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "edges.py").write_text(STAGE.format(name="Edges").replace(old, new))
+    with pytest.raises(ConfigError, match=rf"edges\.py:\d+: Edges.*{words}"):
+        resolve("./edges.py", "stages", tmp_path)
+
+
+def test_a_stage_in_a_loose_file_replaces_a_built_in_one(tmp_path: Path) -> None:
+    (tmp_path / "edges.py").write_text(STAGE.format(name="Edges"))
+    (tmp_path / "pipeline.yaml").write_text(
+        "stages:\n  capture:\n  preprocess:\n  hull: {use: ./edges.py:Edges}\nsinks:\n  jsonl:\n"
+    )
+    pipeline = load_pipeline(tmp_path / "pipeline.yaml")
+    assert pipeline.nodes["hull"].component.cls.__name__ == "Edges"
+    assert str(pipeline.nodes["jsonl"].inputs["contact"]) == "hull.contact"
+
+
+def test_a_misspelled_word_gets_a_suggestion_only_if_one_is_near() -> None:
+    assert closest("min_aera", ["min_area", "method"]) == "min_area"
+    assert closest("HULL", ["hull"]) == "hull"
+    assert closest("teleport", ["min_area", "method"]) is None
+    assert did_you_mean("hul", ["hull", "capture"]) == "; did you mean hull?"
+    assert did_you_mean("zzz", ["hull", "capture"]) == "; known: hull, capture"
+    assert did_you_mean("zzz", []) == ""
