@@ -98,7 +98,9 @@ def marker_sets(draw: Any) -> Markers:
 
 
 @thorough
-@given(marker_sets(), MASKS, st.floats(0, 30), st.sampled_from(list(FLOWS)), st.randoms(use_true_random=False))
+@given(
+    marker_sets(), MASKS, st.floats(0, 30), st.sampled_from(list(FLOWS)), st.randoms(use_true_random=False)
+)
 def test_the_flow_is_a_mean_of_displacements_in_any_order(
     markers: Markers, mask: Any, dilate: float, method: Any, random: Any
 ) -> None:
