@@ -7,6 +7,8 @@ import stat
 from pathlib import Path
 from typing import IO
 
+from tactflow.engine.contract import Output
+
 
 def expanded(text: str) -> Path:
     """A path with `~` and `~name` replaced. An unknown name stays: that file is not there, and named so."""
@@ -25,6 +27,14 @@ def is_device(text: str) -> bool:
     """Whether it is there and neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
     there = status(text)
     return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
+
+
+def declared_file(text: str, parameter: str = "path") -> list[Output]:
+    """What a sink declares that writes to the file its parameter names: nothing for `-` and devices.
+
+    Several sinks may write to those.
+    """
+    return [] if text == "-" or is_device(text) else [Output(expanded(text), "file", parameter)]
 
 
 def output(params: object) -> tuple[str, str] | None:
