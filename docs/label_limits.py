@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tactflow.bench.recordings import RECTIFY
 from tactflow.vision.contact import ContactDetector
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import find_dot, marker_mask
 

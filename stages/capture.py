@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
-from tactflow.sources import CameraRequest, LiveReader, FrameReader, StampedReader, Watch, open_source
+from tactflow.sources import CameraRequest, FrameReader, LiveReader, StampedReader, Watch, open_source
 from tactflow.sources.files import load_image
 from tactflow.sources.pace import Pace
 

@@ -8,7 +8,8 @@ from pydantic import Field
 
 from tactflow.engine.stage import StageParams
 from tactflow.ports import ContactMask
-from tactflow.vision import compiled, flow, outline_kernels
+from tactflow.vision import compiled, outline_kernels
+from tactflow.vision.flow import flow_in_mask, in_mask
 from tactflow.vision.types import Flow, Markers
 
 
@@ -34,9 +35,9 @@ class FlowInMask:
     def __init__(self, params: Params) -> None:
         self._params = params
         if params.method == "mean":
-            compiled.load(flow, outline_kernels)
+            compiled.load(in_mask, outline_kernels)
 
     def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside."""
         params = self._params
-        return flow.flow_in_mask(markers, contact_mask, dilate=params.dilate, method=params.method)
+        return flow_in_mask(markers, contact_mask, dilate=params.dilate, method=params.method)

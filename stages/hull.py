@@ -9,8 +9,9 @@ from pydantic import Field
 from tactflow.engine.frame import Absent
 from tactflow.engine.stage import StageParams
 from tactflow.ports import ContactMask
-from tactflow.vision import compiled, hull_kernels
-from tactflow.vision.hull import contact_geometry
+from tactflow.vision import compiled
+from tactflow.vision.geometry import moments
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Contact
 
 
@@ -45,7 +46,7 @@ class Hull:
     def __init__(self, params: Params) -> None:
         self._params = params
         if params.method == "moments":
-            compiled.load(hull_kernels)
+            compiled.load(moments)
 
     def process(self, contact_mask: ContactMask) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""

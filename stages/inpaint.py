@@ -8,7 +8,8 @@ from pydantic import Field
 
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
-from tactflow.vision import compiled, halving
+from tactflow.vision import compiled
+from tactflow.vision.geometry import downsample
 from tactflow.vision.markers import inpaint_kernels
 from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
 
@@ -28,7 +29,7 @@ class Inpaint:
 
     def __init__(self, params: Params) -> None:
         if params.method == "normalized":
-            compiled.load(halving, inpaint_kernels)
+            compiled.load(downsample, inpaint_kernels)
         self._params = params
 
     def process(self, image: Image, marker_mask: MarkerMask) -> Unmarked:

@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
-from tactflow.vision import compiled, halving
-from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
+from tactflow.vision import compiled
+from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, downsample, find_homography
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 Row = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -75,7 +75,7 @@ class Preprocess:
 
     def __init__(self, params: Params) -> None:
         if params.method == "area":
-            compiled.load(halving)
+            compiled.load(downsample)
         self._params = params
         self._preprocessor: Preprocessor | None = None
 

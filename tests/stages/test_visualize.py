@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from tactflow.engine.stage import read_ports
 from tactflow.stages.visualize import Visualize
-from tactflow.vision.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Flow, Markers
 
 IMAGE = np.full((120, 160, 3), 90, np.uint8)

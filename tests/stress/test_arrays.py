@@ -15,7 +15,7 @@ from tactflow.vision.contact import ContactDetector
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.geometry.hull import contact_geometry, regress_line
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, marker_mask
 from tactflow.vision.types import Contact, Flow, Markers

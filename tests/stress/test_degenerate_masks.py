@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask
-from tactflow.vision.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Markers
 from tests.stress.builders import FLOWS, HULLS, Image, assert_defined
 

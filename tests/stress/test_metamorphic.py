@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tactflow.vision.change import ChangeProbe
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry import Method, Preprocessor
-from tactflow.vision.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.types import Markers
 from tests.stress.builders import (

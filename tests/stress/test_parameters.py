@@ -21,7 +21,7 @@ from tactflow.vision.contact import ContactDetector, chi_square_threshold
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
-from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.geometry.hull import contact_geometry, regress_line
 from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, find_dot

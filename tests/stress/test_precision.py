@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision import (
-    change,
     comparison,
     contact,
     imprint,
@@ -23,10 +22,11 @@ from tactflow.vision import (
     seed_contact,
     tracking,
 )
+from tactflow.vision.change import probe as change
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor
-from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.geometry.hull import contact_geometry, regress_line
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
 from tactflow.vision.types import Contact, Ellipse, Markers
 from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, SIZE, apart, axis_difference, gel

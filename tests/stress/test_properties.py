@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tactflow.vision.contact import ContactDetector, chi_square_threshold
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import Preprocessor, find_homography
-from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.geometry.hull import contact_geometry, regress_line
 from tactflow.vision.markers.detection import detect_markers, neighbour_graph
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.matching import choose_spots

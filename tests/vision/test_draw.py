@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.draw import Annotator, draw_arrows, draw_ellipse, draw_polygon
 from tactflow.vision.flow import flow_in_mask
-from tactflow.vision.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
 
 GRAY = np.full((240, 320, 3), 100, np.uint8)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tactflow.sim import open_scene
 from tactflow.vision import compiled
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.halving import halved
+from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, Polarity, find_dot, marker_mask
 

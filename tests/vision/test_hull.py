@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
-from tactflow.vision.hull import contact_geometry, regress_line
+from tactflow.vision.geometry.hull import contact_geometry, regress_line
 from tactflow.vision.types import Contact
 
 Mask = NDArray[np.uint8]

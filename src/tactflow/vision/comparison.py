@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision import compiled
 from tactflow.vision.comparison_kernels import relative_change, smooth_cells, weigh_change
-from tactflow.vision.halving import halved
+from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.imprint import Lengths, lengths_of
 from tactflow.vision.light import LightChange, light_change, positions
 

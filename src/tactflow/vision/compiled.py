@@ -32,7 +32,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
@@ -130,6 +130,38 @@ def kernel(signature: str, *, reorder: bool = False) -> Callable[[Callable[P, R]
 
     def wrap(function: Callable[P, R]) -> Kernel[P, R]:
         return Kernel(function, signature, reorder)
+
+    return wrap
+
+
+class Inlined(Generic[P, R]):
+    """A helper of kernels in the same file: numba puts its body where it is called."""
+
+    def __init__(self, function: Callable[P, R], reorder: bool) -> None:
+        self.plain = function
+        self._reorder = reorder
+        self.__doc__ = function.__doc__
+        self.__name__ = function.__name__
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Run as Python, uncompiled."""
+        return self.plain(*args, **kwargs)
+
+    @cached_property
+    def _numba_type_(self) -> Any:
+        """What numba asks of a global that it does not know; asked for only while a kernel is compiled."""
+        numba: Any = import_module("numba")
+        fastmath = _REASSOCIATED if self._reorder else False
+        return numba.types.Dispatcher(
+            numba.njit(error_model="numpy", fastmath=fastmath, forceinline=True)(self.plain)
+        )
+
+
+def inlined(*, reorder: bool = False) -> Callable[[Callable[P, R]], Inlined[P, R]]:
+    """Decorator of a part of a kernel; see `Inlined`. `reorder` as for `kernel`, and to be as there."""
+
+    def wrap(function: Callable[P, R]) -> Inlined[P, R]:
+        return Inlined(function, reorder)
 
     return wrap
 

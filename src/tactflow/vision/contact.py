@@ -31,8 +31,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import comparison_kernels, compiled, halving, imprint_kernels
+from tactflow.vision import comparison_kernels, compiled, imprint_kernels
 from tactflow.vision.comparison import CELL, UntouchedGel
+from tactflow.vision.geometry import downsample
 from tactflow.vision.imprint import fill_level, hidden_cells, outline_level
 from tactflow.vision.seed_contact import seed_contact_mask
 
@@ -156,7 +157,7 @@ class ContactDetector:
         self._creep = creep
         self._distance = distance
         if method == "noise":
-            compiled.load(comparison_kernels, halving, imprint_kernels)
+            compiled.load(comparison_kernels, downsample, imprint_kernels)
         self.reset()
 
     def reset(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
-from tactflow.vision.halving import halve_block, halved
+from tactflow.vision.geometry.downsample import halve_block, halved
 from tactflow.vision.markers.inpaint_kernels import fill_masked, sum_valid, sum_windows
 from tactflow.vision.markers.mask import doubled, halved_mask
 

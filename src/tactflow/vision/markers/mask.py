@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
-from tactflow.vision.halving import halve_block, halved
+from tactflow.vision.geometry.downsample import halve_block, halved
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers
 from tactflow.vision.markers.mask_kernels import contrast_with_circle, cover_spots
 

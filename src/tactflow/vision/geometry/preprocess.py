@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactflow.vision.halving import halved
+from tactflow.vision.geometry.downsample import halved
 
 Method = Literal["area", "pyramid"]
 FloatArray = NDArray[np.float64]

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactflow.vision import compiled, hull_kernels
+from tactflow.vision import compiled
+from tactflow.vision.geometry import moments
 from tactflow.vision.types import Contact, Ellipse
 
 Method = Literal["moments", "seed"]
@@ -202,7 +203,7 @@ def _measured(mask: NDArray[np.uint8]) -> tuple[list[int], list[int]]:
     """Bounding box (left, top, width, height) of the non-zero pixels, and `_pixel_sums` inside of it."""
     if compiled.active():
         found = np.empty(10, np.int64)
-        hull_kernels.measure_region(np.ascontiguousarray(mask), found)
+        moments.measure_region(np.ascontiguousarray(mask), found)
         numbers: list[int] = found.tolist()
         return numbers[:4], numbers[4:]
     left, top, width, height = box = cv2.boundingRect(mask)
