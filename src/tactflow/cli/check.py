@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from tactflow.cli.fleet import clash_problems
 from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.config.load import sensor_names
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan
+from tactflow.fleet.sinks import clash_problems
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

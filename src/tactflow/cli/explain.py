@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tactflow.cli.options import add_pipeline, load_plan
-from tactflow.cli.story import Story, milliseconds, saving
+from tactflow.cli.node_summary import NodeSummary, milliseconds, saving
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
@@ -151,9 +151,9 @@ def _run_line(statistics: Mapping[str, Any]) -> str:
 def _saving(pipeline: Pipeline, statistics: Mapping[str, Any]) -> Iterator[str]:
     """What skipping saved in all stages together, and how that is counted."""
     stages = [node.id for node in pipeline.nodes.values() if node.component.kind == "stage"]
-    stories = [Story.of(entry) for id_, entry in statistics["stages"].items() if id_ in stages]
-    saved = sum(story.saved_ms or 0.0 for story in stories)
-    spent = sum(story.spent_ms for story in stories)
+    summaries = [NodeSummary.of(entry) for id_, entry in statistics["stages"].items() if id_ in stages]
+    saved = sum(summary.saved_ms or 0.0 for summary in summaries)
+    spent = sum(summary.spent_ms for summary in summaries)
     if statistics["frames"] and saved + spent > 0:
         yield f"all stages: {saving(saved, saved + spent, statistics['frames'])}"
         yield "            (saved = frames skipped x mean time of a run; of = that + the time spent)"
@@ -163,12 +163,12 @@ def _cost(node: Node, statistics: Mapping[str, Any]) -> str:
     entry = {**statistics.get("sinks", {}), **statistics["stages"]}.get(node.id)
     if entry is None:
         return "not part of that run"
-    story = Story.of(entry)
+    summary = NodeSummary.of(entry)
     if node.component.kind != "sink":
-        return story.told()
+        return summary.told()
     # A sink in its own thread only gets the frames that it asked for.
-    times = "once" if story.runs == 1 else f"{story.runs} times"
-    cost = f", {milliseconds(story.mean_ms)} each (p99 {milliseconds(story.p99_ms)})" if story.runs else ""
+    times = "once" if summary.runs == 1 else f"{summary.runs} times"
+    cost = f", {milliseconds(summary.mean_ms)} each (p99 {milliseconds(summary.p99_ms)})" if summary.runs else ""
     return f"written {times} in {statistics['frames']} frames{cost}"
 
 
