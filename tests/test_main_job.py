@@ -203,7 +203,7 @@ from tactflow.ports import Image
 
 class Slow:
     memory = "pure"
-    class Params(__import__("tactflow.engine.stage", fromlist=["StageParams"]).StageParams):
+    class Params(__import__("tactflow.engine.contract", fromlist=["StageParams"]).StageParams):
         pass
     def __init__(self, params): pass
     def process(self, image: Image) -> Image:

@@ -335,7 +335,7 @@ def test_without_a_record_sink_the_button_says_so(watched: Run, open_page: Calla
 
 
 RECORDER = """
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import StageParams
 from tactflow.ports import Image
 
 class Recorder:

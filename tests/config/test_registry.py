@@ -17,7 +17,7 @@ from tactflow.engine.errors import ConfigError
 STAGE = """
 from __future__ import annotations
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import StageParams
 from tactflow.ports import Image
 from tactflow.vision.types import Contact
 

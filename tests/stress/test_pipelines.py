@@ -36,7 +36,7 @@ FOLLOWING = ("default", "markerless")
 COLLECT = '''
 from typing import ClassVar
 from tactflow.engine.frame import Tick
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import StageParams
 from tactflow.ports import ContactMask, Image
 from tactflow.vision.types import Contact, Flow, Markers
 
