@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import cv2
 from pydantic import Field
 
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.files import expanded
@@ -51,6 +52,11 @@ class Images(Sink):
         self._next = 0
         self._files = 0
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
+
+    @classmethod
+    def outputs(cls, params: Images.Params) -> Sequence[Output]:
+        """The folder."""
+        return (Output(expanded(params.folder), "folder", "folder", refuses_existing=not params.overwrite),)
 
     def open(self) -> None:
         """Create the folder.

@@ -9,12 +9,13 @@ import os
 import stat
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO, Literal
 
 from pydantic import Field, model_validator
 
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.files import expanded, lead_nowhere
@@ -68,6 +69,19 @@ class Jsonl(Sink):
         self._flushed = 0.0
         self._complete: int | None = None
         self._lines = 0
+
+    @classmethod
+    def outputs(cls, params: Jsonl.Params) -> Sequence[Output]:
+        """The file, or none for standard output."""
+        if params.path == "-":
+            return ()
+        keeps = not (params.overwrite or params.append)
+        return (Output(expanded(params.path), "file", "path", refuses_existing=keeps),)
+
+    @classmethod
+    def on_restart(cls, params: Jsonl.Params) -> Jsonl.Params:
+        """It continues its file."""
+        return params.changed(overwrite=False, append=True)
 
     def open(self) -> None:
         """Open or create the file, and its folder.

@@ -7,7 +7,7 @@ import logging
 import platform
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -17,7 +17,7 @@ import yaml
 from pydantic import Field, model_validator
 
 from tactflow import __version__
-from tactflow.engine.contract import Recorder, StageParams
+from tactflow.engine.contract import Output, Recorder, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
@@ -132,6 +132,16 @@ class Record(Recorder):
         self._touched = 0.0
         self._previews = RateLimit(params.preview) if params.preview else None
         self._counts = {"frames": 0, "files": 0, "bytes": 0}
+
+    @classmethod
+    def outputs(cls, params: Record.Params) -> Sequence[Output]:
+        """The file, or the one whose name the numbered files carry."""
+        return (Output(expanded(params.path), "file", "path", refuses_existing=_refuses(params)),)
+
+    @classmethod
+    def on_restart(cls, params: Record.Params) -> Record.Params:
+        """It goes on in another file, beside the one that it has begun."""
+        return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
         """Begin the file, if recording starts with the run.
@@ -393,3 +403,9 @@ class Record(Recorder):
             except (OSError, UnicodeDecodeError) as error:
                 log.debug("%s: not recorded: %s", pipeline.file, error)
         return About(self._sensor, facts, texts)
+
+
+def _refuses(params: Record.Params) -> bool:
+    """Whether a file that is there already ends the run: only that of a recording from the start."""
+    at_start = params.trigger == "start" or (params.trigger is None and params.ring is None)
+    return at_start and not params.overwrite

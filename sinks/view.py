@@ -117,6 +117,11 @@ class View(Sink):
         self._due = float("-inf")
         self._encoded = 0
 
+    @classmethod
+    def among(cls, params: View.Params, folder: Path) -> View.Params:
+        """Its page shows a tab for each of the others."""
+        return params.changed(neighbours=str(folder))
+
     def open(self) -> None:
         """Serve the page; afterwards `description` is its address, or None if it cannot be served."""
         missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]

@@ -13,7 +13,7 @@ import orjson
 import zmq
 from pydantic import Field
 
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
@@ -111,6 +111,16 @@ class Zmq(Sink):
         self._stats_thread: threading.Thread | None = None
         self._others: list[int] = []
         self._io_threads: list[int] = []
+
+    @classmethod
+    def publishes(cls, params: Zmq.Params) -> Publication:
+        """At its endpoint."""
+        return Publication(params.endpoint, params.backlog)
+
+    @classmethod
+    def publish_at(cls, params: Zmq.Params, address: str) -> Zmq.Params:
+        """With another endpoint."""
+        return params.changed(endpoint=address)
 
     @property
     def live_threads(self) -> Sequence[int]:

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.cli.node_summary import NodeSummary, milliseconds, saving
+from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
@@ -168,7 +168,9 @@ def _cost(node: Node, statistics: Mapping[str, Any]) -> str:
         return summary.told()
     # A sink in its own thread only gets the frames that it asked for.
     times = "once" if summary.runs == 1 else f"{summary.runs} times"
-    cost = f", {milliseconds(summary.mean_ms)} each (p99 {milliseconds(summary.p99_ms)})" if summary.runs else ""
+    cost = (
+        f", {milliseconds(summary.mean_ms)} each (p99 {milliseconds(summary.p99_ms)})" if summary.runs else ""
+    )
     return f"written {times} in {statistics['frames']} frames{cost}"
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from tactflow.cli.explain import read_statistics
-from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.cli.node_summary import NodeSummary, milliseconds, share
+from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.plan import Plan
 

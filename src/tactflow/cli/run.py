@@ -7,7 +7,7 @@ import json
 import logging
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -132,7 +132,9 @@ def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
     """The sink of `--jsonl`."""
     if args.jsonl is None:
         return {}
-    return {"--jsonl": {"use": "jsonl", "path": args.jsonl if sensor is None else with_name(args.jsonl, sensor)}}
+    return {
+        "--jsonl": {"use": "jsonl", "path": args.jsonl if sensor is None else with_name(args.jsonl, sensor)}
+    }
 
 
 def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks) -> Pipeline:

@@ -13,7 +13,7 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.priority import ZMQ_SENDS, Precedence, threads_named
 
 SEND_BUFFER = 32_768
-"""Kernel send buffer per subscriber, bytes: that of the ZeroMQ sink. A large one holds seconds of messages."""
+"""Kernel send buffer per subscriber, bytes, as in the ZeroMQ sink. Large ones hold seconds of messages."""
 LINGER_MS = 500
 """Time to deliver the last messages at the end. Chosen by hand."""
 POLL_MS = 100
@@ -49,9 +49,7 @@ def relay(address: str, upstream: Sequence[str], backlog: int, realtime: bool) -
     for publisher in upstream:
         back.connect(publisher)
     stop = threading.Event()
-    thread = threading.Thread(
-        target=_pass_on, args=(front, back, stop), name="tactflow-relay", daemon=True
-    )
+    thread = threading.Thread(target=_pass_on, args=(front, back, stop), name="tactflow-relay", daemon=True)
     thread.start()
 
     def sending() -> list[int | None]:

@@ -12,7 +12,15 @@ from pathlib import Path
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.fleet.relay import relay
-from tactflow.fleet.sinks import Shared, WatchedSink, added, changes, clash_problems, shared_addresses
+from tactflow.fleet.sinks import (
+    Shared,
+    WatchedSink,
+    added,
+    changes,
+    clash_problems,
+    shared_addresses,
+    sink_class,
+)
 from tactflow.fleet.supervisor import Member, Supervisor
 
 
@@ -83,9 +91,9 @@ def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scr
     relayed = {node.id for one in shared for name, node in one.sinks if name == sensor}
     settings = []
     for node in pipeline.sinks:
-        params = node.component.cls.among(node.params, scratch)
+        params = sink_class(node).among(node.params, scratch)
         if node.id in relayed:
-            params = node.component.cls.publish_at(params, _private(scratch, sensor, node))
+            params = sink_class(node).publish_at(params, _private(scratch, sensor, node))
         settings += changes(node, params)
     return settings
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tactflow.config.sensors import PLACEHOLDER
-from tactflow.engine.contract import Output, StageParams
+from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.files import is_device, status
 from tactflow.fleet.names import STREAMS
@@ -55,12 +55,19 @@ class WatchedSink:
     @property
     def _params(self) -> StageParams:
         begun = any(_state(path) not in (None, before) for path, before in self._before.items())
-        return self._node.component.cls.on_restart(self._node.params) if begun else self._node.params
+        return sink_class(self._node).on_restart(self._node.params) if begun else self._node.params
+
+
+def sink_class(node: Node) -> type[Sink]:
+    """The class of a sink."""
+    cls = node.component.cls
+    assert issubclass(cls, Sink)
+    return cls
 
 
 def written_files(node: Node, params: StageParams) -> Sequence[Output]:
     """The files and folders that a sink declares with these parameters, without devices and streams."""
-    declared: Sequence[Output] = node.component.cls.outputs(params)
+    declared: Sequence[Output] = sink_class(node).outputs(params)
     return [
         output for output in declared if str(output.path) not in STREAMS and not is_device(str(output.path))
     ]
@@ -116,7 +123,7 @@ def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
     found: dict[str, Shared] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
-            publication = node.component.cls.publishes(node.params)
+            publication = sink_class(node).publishes(node.params)
             if publication is not None:
                 address = publication.address
                 before = found.get(address, Shared(address, (), 0))
