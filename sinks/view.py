@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import logging
 import threading
 import time
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
     from tactflow.view.server import Server
 
 log = logging.getLogger("tactflow")
-
-NEEDED = ("starlette", "uvicorn", "websockets")
 
 STATUS_LETTERS = np.array([ord(name[0]) for name in STATUS_NAMES], np.uint8)
 """The first letter of the word for each value of `MarkerStatus`."""
@@ -124,14 +121,6 @@ class View(Sink):
 
     def open(self) -> None:
         """Serve the page; afterwards `description` is its address, or None if it cannot be served."""
-        missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-        if missing:
-            log.warning(
-                "view: not shown, because there is no %s: pip install 'tactflow[view]'; "
-                "--set sinks.view=null leaves the view out",
-                " and no ".join(missing),
-            )
-            return
         p = self.params
         try:
             from tactflow.view.hub import Hub

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 import zmq
 
-from tactflow.fleet import supervisor
-from tactflow.fleet.names import with_name
 from tactflow.cli.main import main
 from tactflow.engine.errors import ConfigError
+from tactflow.fleet import supervisor
+from tactflow.fleet.names import with_name
 
 GRAPH = """
 opencv_threads: 1

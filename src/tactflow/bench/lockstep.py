@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.config.registry import resolve
-from tactflow.engine.contract import StageParams
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue, Ref
@@ -51,11 +51,11 @@ class Outcome:
     wall: float
 
 
-class Collect:
+class Collect(Sink):
     """A sink that keeps the last values for the bench."""
 
     def __init__(self, params: StageParams) -> None:
-        self.params = params
+        super().__init__(params)
         self.last: dict[str, Any] = {}
 
     def write(self, **values: Any) -> None:
