@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
-from tactflow.cli.explain import read_statistics
 from tactflow.cli.node_summary import NodeSummary, milliseconds, share
-from tactflow.cli.options import add_pipeline, load_plan
+from tactflow.cli.options import add_pipeline_and_stats, load_with_stats
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.plan import Plan
 
@@ -18,17 +16,12 @@ _COSTLY = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `graph`."""
-    add_pipeline(parser)
-    parser.add_argument(
-        "--stats", metavar="run.json", help="statistics of a run (tactflow run --stats), shown on the nodes"
-    )
+    add_pipeline_and_stats(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the flowchart."""
-    statistics = None if args.stats is None else read_statistics(Path(args.stats))
-    pipeline, plan = load_plan(args)
-    print("\n".join(mermaid(pipeline, plan, statistics)))
+    print("\n".join(mermaid(*load_with_stats(args))))
     return 0
 
 
