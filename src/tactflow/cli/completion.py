@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     for action in _actions(parser):
         if action.metavar in _COMPLETED and action.choices is None:
             action.complete = _COMPLETED[action.metavar]  # type: ignore[attr-defined]
-    print(shtab.complete(parser, args.shell, preamble=_PREAMBLE))
+    print(shtab.complete(parser, args.shell, preamble=_PREAMBLE.get(args.shell, "")))
     return 0
 
 

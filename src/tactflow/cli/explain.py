@@ -8,6 +8,7 @@ from typing import Any
 
 from tactflow.cli.node_summary import NodeSummary, milliseconds, saving
 from tactflow.cli.options import add_pipeline_and_stats, load_with_stats
+from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
 
@@ -82,7 +83,8 @@ def _facts(
 
 def _demand(node: Node) -> str:
     rate = "" if node.max_rate is None else f", at most {node.max_rate:g} times a second"
-    own = "; it says for each frame whether it wants it" if hasattr(node.component.cls, "wants") else ""
+    asks = getattr(node.component.cls, "wants", None) is not Sink.wants
+    own = "; it says for each frame whether it wants it" if asks else ""
     return rate + own
 
 

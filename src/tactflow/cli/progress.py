@@ -36,7 +36,7 @@ def progress_display(
         task = display.add_task(runner.pipeline.sensor, total=None, rate=0.0, dropped=0)
 
         def update(now: RunProgress) -> None:
-            total = runner.max_frames or getattr(runner.source, "total", None)
+            total = runner.max_frames or (runner.source.total if runner.source else None)
             rate = now.frames / now.elapsed_s if now.elapsed_s > 0 else 0.0
             display.update(task, completed=now.frames, total=total, rate=rate, dropped=now.dropped)
 
@@ -104,7 +104,7 @@ def summary(result: RunResult, runner: Runner) -> str:
     if latency["p50"] is not None:
         lines.append(f"latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")
     for name, node in runner.nodes.items():
-        target = getattr(node.instance, "description", None)
+        target = node.instance.description
         if node.is_sink and target:
             lines.append(f"{name}: {target}")
     return "\n".join(lines)
