@@ -16,6 +16,7 @@ from typing import Any
 from rich.console import Console
 from rich.logging import RichHandler
 
+from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.cli.progress import progress_display, summary, with_statistics
@@ -73,6 +74,9 @@ def run(args: argparse.Namespace, extra_sinks: Callable[[str | None], Sinks] = l
     extra_sinks : gives the sinks that a command adds for one of several sensors, or for None, the only one.
     """
     file = find_pipeline(args.pipeline)
+    if args.sensor is None:
+        # Else it was said already by the process that starts one for each sensor.
+        warn_of_conflict()
     several = sensor_names(file, args.overrides) if args.sensor is None else []
     if len(several) > 1:
         return _run_all(args, file, several, extra_sinks)
