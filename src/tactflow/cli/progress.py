@@ -104,7 +104,6 @@ def summary(result: RunResult, runner: Runner) -> str:
     if latency["p50"] is not None:
         lines.append(f"latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")
     for name, node in runner.nodes.items():
-        target = node.instance.description
-        if node.is_sink and target:
-            lines.append(f"{name}: {target}")
+        if node.sink is not None and node.sink.description:
+            lines.append(f"{name}: {node.sink.description}")
     return "\n".join(lines)

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 import zmq
 
 from tactflow.engine.errors import StageError
-from tactflow.engine.priority import ZMQ_SENDS, Precedence, threads_named
 
 SEND_BUFFER = 32_768
 """Kernel send buffer per subscriber, bytes, as in the ZeroMQ sink. Large ones hold seconds of messages."""
@@ -21,11 +20,10 @@ POLL_MS = 100
 
 
 @contextmanager
-def relay(address: str, upstream: Sequence[str], backlog: int, realtime: bool) -> Iterator[None]:
+def relay(address: str, upstream: Sequence[str], backlog: int) -> Iterator[None]:
     """Bind `address` and pass on what the upstream publishers send, while the block lasts.
 
     upstream : addresses of the publishers. backlog : messages that may wait for each subscriber.
-    realtime : whether to ask for real-time priority.
 
     Raises
     ------
@@ -43,8 +41,8 @@ def relay(address: str, upstream: Sequence[str], backlog: int, realtime: bool) -
     except zmq.ZMQError as error:
         context.destroy(linger=0)
         raise StageError(
-            f"{address} cannot be bound: {error.strerror}; end what publishes there, or choose another "
-            "address (--set sinks.zmq.endpoint=tcp://127.0.0.1:5557)"
+            f"{address} cannot be bound: {error.strerror}; end what publishes there, or give the sinks "
+            "another address, such as tcp://127.0.0.1:5557"
         ) from error
     for publisher in upstream:
         back.connect(publisher)
@@ -52,17 +50,10 @@ def relay(address: str, upstream: Sequence[str], backlog: int, realtime: bool) -
     thread = threading.Thread(target=_pass_on, args=(front, back, stop), name="tactflow-relay", daemon=True)
     thread.start()
 
-    def sending() -> list[int | None]:
-        # ZeroMQ's threads name themselves, in their own time.
-        return [thread.native_id, *threads_named(ZMQ_SENDS)]
-
-    precedence = Precedence(sending, realtime, len(upstream), "messages of all sensors")
-    precedence.start()
     print(f"tactflow: publishing {len(upstream)} sensors on {address}", file=sys.stderr)
     try:
         yield
     finally:
-        precedence.stop()
         stop.set()
         thread.join(5)
         front.close()

@@ -56,12 +56,11 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
     if problems:
         raise ConfigError("\n".join(problems))
     shared = shared_addresses(pipelines)
-    realtime = all(pipeline.realtime_priority for pipeline in pipelines.values())
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-")))
         for one in shared:
             upstream = [_private(scratch, sensor, node) for sensor, node in one.sinks]
-            stack.enter_context(relay(one.address, upstream, one.backlog, realtime))
+            stack.enter_context(relay(one.address, upstream, one.backlog))
         members = [
             Member(
                 sensor,
