@@ -52,9 +52,9 @@ class Images(Sink):
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
 
     @classmethod
-    def outputs(cls, params: Params) -> Sequence[Output]:
+    def outputs(cls, params: Images.Params) -> Sequence[Output]:
         """The folder."""
-        return [Output(expanded(params.folder), "folder", "folder")]
+        return (Output(expanded(params.folder), "folder", "folder", refuses_existing=not params.overwrite),)
 
     def open(self) -> None:
         """Create the folder.

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import declared_file, expanded, lead_nowhere
+from tactflow.files import expanded, lead_nowhere
 from tactflow.message import Results, encode_message
 
 log = logging.getLogger("tactflow")
@@ -64,13 +64,16 @@ class Jsonl(Sink):
         self._lines = 0
 
     @classmethod
-    def outputs(cls, params: Params) -> Sequence[Output]:
-        """The file."""
-        return declared_file(params.path)
+    def outputs(cls, params: Jsonl.Params) -> Sequence[Output]:
+        """The file, or none for standard output."""
+        if params.path == "-":
+            return ()
+        keeps = not (params.overwrite or params.append)
+        return (Output(expanded(params.path), "file", "path", refuses_existing=keeps),)
 
     @classmethod
-    def on_restart(cls, params: Params) -> Params:
-        """Continue the file."""
+    def on_restart(cls, params: Jsonl.Params) -> Jsonl.Params:
+        """It continues its file."""
         return params.changed(overwrite=False, append=True)
 
     def open(self) -> None:

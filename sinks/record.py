@@ -22,7 +22,7 @@ from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.rate import SLACK, RateLimit
-from tactflow.files import declared_file, expanded
+from tactflow.files import expanded
 from tactflow.message import Results, encode_message
 from tactflow.ports import Image
 from tactflow.recording import missing_packages
@@ -124,9 +124,14 @@ class Record(Recorder):
         self._counts = {"frames": 0, "files": 0, "bytes": 0}
 
     @classmethod
-    def outputs(cls, params: Params) -> Sequence[Output]:
-        """The file, where recording begins with the run; later ones get names of their own."""
-        return declared_file(params.path)
+    def outputs(cls, params: Record.Params) -> Sequence[Output]:
+        """The file, or the one whose name the numbered files carry."""
+        return (Output(expanded(params.path), "file", "path", refuses_existing=_refuses(params)),)
+
+    @classmethod
+    def on_restart(cls, params: Record.Params) -> Record.Params:
+        """It goes on in another file, beside the one that it has begun."""
+        return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
         """Begin the file, if recording starts with the run.
@@ -374,3 +379,9 @@ class Record(Recorder):
             except (OSError, UnicodeDecodeError) as error:
                 log.debug("%s: not recorded: %s", pipeline.file, error)
         return About(self._sensor, facts, texts)
+
+
+def _refuses(params: Record.Params) -> bool:
+    """Whether a file that is there already ends the run: only that of a recording from the start."""
+    at_start = params.trigger == "start" or (params.trigger is None and params.ring is None)
+    return at_start and not params.overwrite

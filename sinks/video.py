@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import declared_file, expanded
+from tactflow.files import expanded
 from tactflow.ports import Picture
 
 log = logging.getLogger("tactflow")
@@ -81,9 +81,9 @@ class Video(Sink):
         self._frames = 0
 
     @classmethod
-    def outputs(cls, params: Params) -> Sequence[Output]:
+    def outputs(cls, params: Video.Params) -> Sequence[Output]:
         """The file."""
-        return declared_file(params.path)
+        return (Output(expanded(params.path), "file", "path", refuses_existing=not params.overwrite),)
 
     def open(self) -> None:
         """Choose the codec and create the folder; the file itself follows with the first frames.

@@ -107,8 +107,8 @@ class View(Sink):
         self._encoded = 0
 
     @classmethod
-    def among(cls, params: Params, folder: Path) -> Params:
-        """The pages of all sensors show a tab for each other."""
+    def among(cls, params: View.Params, folder: Path) -> View.Params:
+        """Its page shows a tab for each of the others."""
         return params.changed(neighbours=str(folder))
 
     def open(self) -> None:

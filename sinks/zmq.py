@@ -98,13 +98,13 @@ class Zmq(Sink):
         self._stats_thread: threading.Thread | None = None
 
     @classmethod
-    def publishes(cls, params: Params) -> Publication:
+    def publishes(cls, params: Zmq.Params) -> Publication:
         """At its endpoint."""
         return Publication(params.endpoint, params.backlog)
 
     @classmethod
-    def publish_at(cls, params: Params, address: str) -> Params:
-        """The same at another endpoint."""
+    def publish_at(cls, params: Zmq.Params, address: str) -> Zmq.Params:
+        """With another endpoint."""
         return params.changed(endpoint=address)
 
     def open(self) -> None:

@@ -7,8 +7,6 @@ import stat
 from pathlib import Path
 from typing import IO
 
-from tactflow.engine.contract import Output
-
 
 def expanded(text: str) -> Path:
     """A path with `~` and `~name` replaced. An unknown name stays: that file is not there, and named so."""
@@ -27,26 +25,6 @@ def is_device(text: str) -> bool:
     """Whether it is there and neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
     there = status(text)
     return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
-
-
-def declared_file(text: str, parameter: str = "path") -> list[Output]:
-    """What a sink declares that writes to the file its parameter names: nothing for `-` and devices.
-
-    Several sinks may write to those.
-    """
-    return [] if text == "-" or is_device(text) else [Output(expanded(text), "file", parameter)]
-
-
-def output(params: object) -> tuple[str, str] | None:
-    """The parameter that says where a sink writes, and its value; None for one that writes no file or folder.
-
-    Standard output and devices are none: several sinks may write to them.
-    """
-    for key in ("path", "folder"):
-        value = getattr(params, key, None)
-        if isinstance(value, str):
-            return None if value == "-" or is_device(value) else (key, value)
-    return None
 
 
 def lead_nowhere(stream: IO[str]) -> None:
