@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tactflow.engine.stage import read_ports
+from tactflow.engine.ports import read_ports
 from tactflow.stages.flow_in_mask import FlowInMask
 from tactflow.vision.types import Flow, Markers
 
@@ -35,10 +35,6 @@ def test_the_mean_is_over_the_markers_inside_the_dilated_contact() -> None:
     assert flow.rotation == pytest.approx(0, abs=1e-9)
     assert run(dilate=0).count == 2
     assert run(dilate=100).count == 5
-
-
-def test_the_seed_method_cuts_displacements_to_whole_pixels() -> None:
-    assert run(method="seed").mean == (1.0, 0.0)
 
 
 @pytest.mark.parametrize("params", [{"dilate": -1}, {"method": "median"}, {"dilation": 3}], ids=str)

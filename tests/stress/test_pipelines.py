@@ -29,23 +29,20 @@ from tests.stress.builders import (
 )
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PIPELINES = ("default", "seed", "markerless")
+PIPELINES = ("default", "classic", "markerless")
 FOLLOWING = ("default", "markerless")
-"""Pipelines whose stages scale and turn; the seed's have half-pixel shifts and kernels of a fixed size."""
+"""Pipelines whose stages scale and turn; the script's have half-pixel shifts and kernels of a fixed size."""
 
 COLLECT = '''
 from typing import ClassVar
 from tactflow.engine.frame import Tick
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Sink
 from tactflow.ports import ContactMask, Image
 from tactflow.vision.types import Contact, Flow, Markers
 
-class Collect:
+class Collect(Sink):
     """Keeps what each frame gave."""
-    memory = "pure"
     rows: ClassVar[list] = []
-    class Params(StageParams):
-        """None."""
     def __init__(self, params): Collect.rows.clear()
     def write(
         self, tick: Tick, image: Image | None, contact: Contact | None, flow: Flow | None,

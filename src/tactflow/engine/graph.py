@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from tactflow.engine.stage import Memory, Ports, StageParams
+from tactflow.engine.contract import Memory, StageParams
+from tactflow.engine.ports import Ports
 
 Kind = Literal["source", "stage", "sink"]
 FullPolicy = Literal["block", "latest", "drop_oldest"]
@@ -123,7 +124,7 @@ class Pipeline:
     nodes: Mapping[str, Node]
     skipping: bool = True
     opencv_threads: int | None = None
-    realtime_priority: bool = True
+    realtime_priority: bool = False
     runs: int = 1
     warnings: Sequence[str] = field(default_factory=list[str])
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
