@@ -9,8 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from tactflow.vision import compiled
+from tactflow.vision.compiled import Kernel
 
 
 class _Double:
@@ -37,15 +39,19 @@ OPENCV = _Double(cv2, CV_32F=cv2.CV_64F, batchDistance=_distances)
 def in_double(*modules: ModuleType) -> Iterator[None]:
     """Inside the `with` block the functions of these modules compute in float64 where they use float32.
 
-    Compiled kernels have fixed types, and are not used.
+    Compiled kernels have fixed types: those of these modules run as the Python code that they are.
     """
-    before = [(module, module.np, module.cv2) for module in modules if hasattr(module, "cv2")]
-    try:
+    names = {module.__name__ for module in modules}
+    call = Kernel.__call__
+
+    def plain(self: Kernel[..., Any], *args: Any) -> Any:
+        return self.plain(*args) if self.plain.__module__ in names else call(self, *args)
+
+    with pytest.MonkeyPatch.context() as patch:
         for module in modules:
-            module.np = NUMPY  # type: ignore[attr-defined]
-            module.cv2 = OPENCV  # type: ignore[attr-defined]
+            for name, double in (("np", NUMPY), ("cv2", OPENCV)):
+                if hasattr(module, name):
+                    patch.setattr(module, name, double)
+        patch.setattr(Kernel, "__call__", plain)
         with compiled.switched(False):
             yield
-    finally:
-        for module, numpy, opencv in before:
-            module.np, module.cv2 = numpy, opencv  # type: ignore[attr-defined]
