@@ -21,14 +21,14 @@ from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.clock import ManualClock
+from tests.clock import PATIENCE, ManualClock
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 CONTACT = Contact(5123.5, (150.2, 201.7), -12.31, 0.218, np.zeros((3, 2)), None)
 FLOW = Flow((1.214, -0.33), 9)
 MARKERS = Markers(np.zeros((3, 2)), np.zeros((3, 2)), np.array([0, 0, 2], np.uint8), np.zeros(3))
-LONG = 30.0
-"""s; only a broken test waits so long."""
+LONG = PATIENCE
+"""How long a test waits for what must happen, s."""
 
 
 class Publisher:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -18,11 +17,12 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Markers
+from tests.clock import PATIENCE, until
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 MANY = Markers(np.zeros((140, 2)), np.full((140, 2), 1 / 3), np.zeros(140, np.uint8), np.zeros(140))
-WAIT = 10_000
-"""ms; only a broken test waits so long."""
+WAIT = round(PATIENCE * 1000)
+"""How long a test waits for what must happen, ms."""
 
 
 def tick(seq: int, sensor: str = "main") -> Tick:
@@ -160,7 +160,7 @@ def test_a_subscriber_that_never_reads_neither_blocks_the_run_nor_its_end(subscr
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
-    assert done.wait(60)
+    assert done.wait(PATIENCE)
     assert sink.counters()["serialised"] == 2000
 
 
@@ -215,9 +215,7 @@ def test_it_names_the_threads_that_zeromq_sends_in(subscribe: Subscribing) -> No
     sink = opened()
     try:
         # A thread names itself, in its own time.
-        until = time.monotonic() + WAIT / 1000
-        while not sink.live_threads and time.monotonic() < until:
-            time.sleep(0.001)
+        until(lambda: sink.live_threads)
         (sending,) = sink.live_threads
         assert Path(f"/proc/self/task/{sending}/comm").read_text().startswith("ZMQbg/IO")
     finally:
