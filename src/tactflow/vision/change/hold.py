@@ -22,7 +22,7 @@ class ChangeHold:
     number of frames is *held*: they are worked on without a further change.
 
     - A change begins a hold, in either state. The changed frame becomes the probe's anchor.
-    - While frames are held, only the last `_COMPARED` of them are compared with the anchor, so that what moves
+    - Of the frames that are held, only the last `_COMPARED` are compared with the anchor, so that what moves
       too slowly for one frame adds up. After the last one the scene rests, if that frame is calm; if not, it
       is in doubt and taken for a change.
     - At rest, a frame is worked on if it is a reference frame, or if `at_least_every` frames have passed

@@ -15,7 +15,8 @@ from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 HIDDEN: Final = 2.5
 """Distance from a marker's border, px, up to which the marker bends the outline of the region: its mask is
-larger than the marker, and the outline is smoothed after that. Chosen by hand."""
+larger than the marker, and the outline is smoothed after that. Chosen by hand; with it, the bridged
+outline is off by 0.6 px at markers (docs/flow-limits.md)."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
 _LOST: Final = int(MarkerStatus.LOST)
 

@@ -51,7 +51,9 @@ def fit_similarity(origin: FloatArray, position: FloatArray, chosen: NDArray[np.
 
 
 @kernel("void(float64[:, ::1], float64[:, ::1], int64[::1], float64[::1])")
-def sum_similarity(origin: FloatArray, position: FloatArray, chosen: NDArray[np.intp], sums: FloatArray) -> None:
+def sum_similarity(
+    origin: FloatArray, position: FloatArray, chosen: NDArray[np.intp], sums: FloatArray
+) -> None:
     """Set `sums` (7,) to the fields of `Similarity`, in their order."""
     count = chosen.size
     at_x = at_y = mean_x = mean_y = 0.0
