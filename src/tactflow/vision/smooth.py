@@ -73,8 +73,8 @@ class AlphaBeta:
     """The alpha-beta filter: a constant-velocity Kalman filter in its steady state.
 
     alpha : (0, 1], fraction of the innovation that corrects the value; lower is steadier and slower.
-    beta : [0, 2), fraction of it that corrects the velocity; None takes alpha^2 / (2 - alpha), the choice with
-        least variance and overshoot together (Benedict and Bordner, 1962).
+    beta : [0, 2), fraction of it that corrects the velocity; None takes alpha^2 / (2 - alpha), the choice
+        with least variance and overshoot together (Benedict and Bordner, 1962).
     period : as for `OneEuro`.
 
     >>> smooth = AlphaBeta(alpha=0.5)

@@ -79,8 +79,7 @@ def _near_mask(
     begin, end = _clip(upper, height), _clip(upper + 1, height)
     first, last = _clip(x[:, None] - half, width), _clip(x[:, None] + half + 1, width)
     found = sums[end, last] - sums[begin, last] - sums[end, first] + sums[begin, first]
-    near: NDArray[np.bool_] = found.any(axis=1)
-    return near
+    return np.asarray(found.any(axis=1))
 
 
 def _clip(values: NDArray[np.intp], high: int) -> NDArray[np.intp]:

@@ -70,7 +70,7 @@ def contact_geometry(
     roi: NDArray[Any] = mask[box.top : box.top + box.height, box.left : box.left + box.width]
     contours: Contours
     contours, _ = cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(box.left, box.top))
-    if len(contours) > 1 or moments.count < min_area:
+    if len(contours) > 1 or moments.pixels < min_area:
         kept = _select(contours, box, min_area, max_gap)
         if not kept:
             return None
@@ -97,7 +97,7 @@ def _describe(contours: Contours, moments: Moments, box: Box, min_confidence: fl
     polygon = cv2.convexHull(outline)
     # Whole numbers: no cancellation, a vertical bar is exactly vertical.
     xx, xy, yy = moments.central()
-    count = moments.count
+    count = moments.pixels
     spread = math.hypot(xx - yy, 2 * xy)
     square = float(count) * count
     major = (xx + yy + spread) / (2 * square)

@@ -24,10 +24,10 @@ class Box(NamedTuple):
 class Moments(NamedTuple):
     """Sums over the pixels of a region, relative to some pixel; whole numbers, so exact.
 
-    count : number of pixels. x, y : sums of the coordinates, px. xx, xy, yy : sums of their products, px^2.
+    pixels : how many. x, y : sums of the coordinates, px. xx, xy, yy : sums of their products, px^2.
     """
 
-    count: int
+    pixels: int
     x: int
     y: int
     xx: int
@@ -60,7 +60,7 @@ def region_moments(mask: NDArray[np.uint8]) -> tuple[Box, Moments]:
     >>> mask = np.zeros((5, 8), np.uint8)
     >>> mask[2, 3:6] = 255
     >>> region_moments(mask)
-    (Box(left=3, top=2, width=3, height=1), Moments(count=3, x=3, y=0, xx=5, xy=0, yy=0))
+    (Box(left=3, top=2, width=3, height=1), Moments(pixels=3, x=3, y=0, xx=5, xy=0, yy=0))
     """
     found = np.empty(10, np.int64)
     measure_region(np.ascontiguousarray(mask), found)
