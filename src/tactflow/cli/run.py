@@ -208,7 +208,7 @@ def _progress_display(
         task = display.add_task(runner.pipeline.sensor, total=None, rate=0.0, dropped=0)
 
         def update(now: RunProgress) -> None:
-            total = runner.max_frames or getattr(runner.source, "total", None)
+            total = runner.max_frames or (runner.source.total if runner.source else None)
             rate = now.frames / now.elapsed_s if now.elapsed_s > 0 else 0.0
             display.update(task, completed=now.frames, total=total, rate=rate, dropped=now.dropped)
 
@@ -276,7 +276,6 @@ def _summary(result: RunResult, runner: Runner) -> str:
     if latency["p50"] is not None:
         lines.append(f"latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")
     for name, node in runner.nodes.items():
-        target = getattr(node.instance, "description", None)
-        if node.is_sink and target:
-            lines.append(f"{name}: {target}")
+        if node.sink is not None and node.sink.description:
+            lines.append(f"{name}: {node.sink.description}")
     return "\n".join(lines)
