@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import sys
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -15,9 +13,10 @@ import zmq
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Markers
-from tests.clock import PATIENCE, until
+from tests.clock import PATIENCE
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 MANY = Markers(np.zeros((140, 2)), np.full((140, 2), 1 / 3), np.zeros(140, np.uint8), np.zeros(140))
@@ -37,7 +36,7 @@ def opened(**params: Any) -> Zmq:
 
 def write(sink: Zmq, seqs: range) -> None:
     for seq in seqs:
-        sink.write(tick(seq), IMAGE, None, None, MANY)
+        sink.write(tick(seq), Results(IMAGE, None, None, MANY))
 
 
 def wait_until_wanted(sink: Zmq) -> None:
@@ -208,22 +207,6 @@ def test_closing_delivers_the_last_messages(subscribe: Subscribing) -> None:
         socket.close()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="threads are found by their names on Linux only")
-def test_it_names_the_threads_that_zeromq_sends_in(subscribe: Subscribing) -> None:
-    # One of another context, which is not meant.
-    socket = subscribe("tcp://127.0.0.1:9")
-    sink = opened()
-    try:
-        # A thread names itself, in its own time.
-        until(lambda: sink.live_threads)
-        (sending,) = sink.live_threads
-        assert Path(f"/proc/self/task/{sending}/comm").read_text().startswith("ZMQbg/IO")
-    finally:
-        sink.close()
-        socket.close()
-    assert not Path(f"/proc/self/task/{sending}").exists()
-
-
 def test_an_address_in_use_is_an_error_that_says_what_to_try() -> None:
     first = opened()
     second = Zmq(Zmq.Params(endpoint=first.endpoint))
@@ -294,7 +277,7 @@ def test_the_sensor_names_the_topic(subscribe: Subscribing) -> None:
     sink.open()
     socket = subscribe(sink.endpoint, b"tactflow.thumb")
     wait_until_wanted(sink)
-    sink.write(tick(4, "thumb"), IMAGE, None, None, None)
+    sink.write(tick(4, "thumb"), Results(IMAGE, None, None, None))
     topic, message = receive(socket)
     assert topic == b"tactflow.thumb"
     assert message["sensor"] == "thumb"

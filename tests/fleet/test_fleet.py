@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 import zmq
 
-from tactflow.cli import fleet
-from tactflow.cli.fleet import with_name
 from tactflow.cli.main import main
 from tactflow.engine.errors import ConfigError
+from tactflow.fleet import supervisor
+from tactflow.fleet.names import with_name
 from tests.clock import PATIENCE, until
 
 GRAPH = """
@@ -86,7 +86,7 @@ def test_all_sensors_publish_at_one_address(folder: Path) -> None:
         port = finder.bind_to_random_port("tcp://127.0.0.1")
         finder.unbind(f"tcp://127.0.0.1:{port}")
         socket.linger = 0
-        socket.rcvtimeo = 20_000
+        socket.rcvtimeo = round(PATIENCE * 1000)
         socket.subscribe("tactflow.")
         socket.connect(f"tcp://127.0.0.1:{port}")
         process = subprocess.Popen(
@@ -282,7 +282,7 @@ def test_a_sensor_that_the_system_kills_has_failed(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(fleet, "GIVE_UP_AFTER", 0)
+    monkeypatch.setattr(supervisor, "GIVE_UP_AFTER", 0)
     waiting(folder, "\n    os.kill(os.getpid(), signal.SIGKILL)\n")
     assert main(["run"]) == 3
     assert "left failed 1 times in a row (exit code -9); given up" in capfd.readouterr().err

@@ -12,11 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.types import Flow, Markers, MarkerStatus
-
-pytestmark = pytest.mark.usefixtures("each_way")
 
 GRID = np.stack(np.meshgrid(np.arange(10, 200, 15.0), np.arange(10, 160, 15.0)), axis=-1).reshape(-1, 2)
 EVERYWHERE = np.full((160, 200), 255, np.uint8)
@@ -222,67 +219,13 @@ def test_inside_is_the_same_as_looking_up_the_distance(
     np.testing.assert_array_equal(inside_mask(points, mask, dilate), expected)
 
 
-def test_with_numba_and_without_it_the_flow_is_the_same() -> None:
-    with compiled.switched(True):
-        if not compiled.active():
-            pytest.skip('numba is not here: pip install "tactflow[fast]"')
-    rng = np.random.default_rng(5)
-    for count in [1, 2, 3, 4, 5, 9, 40] * 6:
-        origin = rng.uniform(5, 150, (count, 2))
-        if rng.random() < 0.2:
-            origin[:, 1] = origin[:, 0]
-        position = origin + rng.normal(0, 2, (count, 2))
-        given = markers(position, np.asfortranarray(origin), rng.choice(3, count, p=[0.7, 0.2, 0.1]))
-        found = []
-        for on in (True, False):
-            with compiled.switched(on):
-                found.append(flow_in_mask(given, EVERYWHERE, dilate=9))
-        fast, slow = found
-        assert (fast.count, fast.rotation is None) == (slow.count, slow.rotation is None)
-        if slow.mean is None:
-            assert fast.mean is None
-            continue
-        # Derived: sums of 40 numbers of up to 2e2 px in doubles, in another order; squares of them.
-        assert fast.mean == pytest.approx(slow.mean, abs=1e-12)
-        assert fast.stderr == pytest.approx(slow.stderr, abs=1e-10)
-        assert fast.rotation == pytest.approx(slow.rotation, abs=1e-9)
-        assert fast.divergence == pytest.approx(slow.divergence, abs=1e-11)
-        assert fast.residual == pytest.approx(slow.residual, abs=1e-10)
-
-
 def test_the_inputs_stay_as_they_are() -> None:
     given = moved(2.0)
     mask = EVERYWHERE.copy()
     kept = given.position.copy()
     flow_in_mask(given, mask, dilate=3)
-    flow_in_mask(given, mask, dilate=3, method="seed")
     np.testing.assert_array_equal(given.position, kept)
     np.testing.assert_array_equal(mask, EVERYWHERE)
-
-
-@pytest.mark.parametrize("dilate", [0, 7])
-def test_the_seed_method_is_the_original_loop(dilate: int) -> None:
-    rng = np.random.default_rng(2)
-    position = GRID + rng.normal(0, 3, GRID.shape)
-    position[0] = (-4.0, 500.0)
-    mask = np.zeros((160, 200), np.uint8)
-    cv2.ellipse(mask, (90, 80), (60, 30), 20, 0, 360, 255, -1)
-    status = rng.integers(0, 3, len(GRID)).astype(np.uint8)
-    grown = cv2.dilate(mask, np.ones((2 * dilate + 1, 2 * dilate + 1), np.uint8))
-    change, counter = [0, 0], 0
-    for (ox, oy), (cx, cy) in zip(GRID, position, strict=True):
-        if 0 <= int(cx) < 200 and 0 <= int(cy) < 160 and grown[int(cy), int(cx)] == 255:
-            change[0] += int(cx - ox)
-            change[1] += int(cy - oy)
-            counter += 1
-    flow = flow_in_mask(markers(position, status=status), mask, dilate=dilate, method="seed")
-    assert flow.count == counter > 10
-    assert flow.mean == pytest.approx((change[0] / counter, change[1] / counter), abs=1e-12)
-    assert flow.rotation is None
-
-
-def test_the_seed_method_without_contact_has_no_flow() -> None:
-    assert flow_in_mask(moved(), np.zeros((160, 200), np.uint8), dilate=5, method="seed") == Flow(None, 0)
 
 
 @pytest.mark.parametrize(
@@ -298,8 +241,3 @@ def test_the_seed_method_without_contact_has_no_flow() -> None:
 def test_bad_input_is_refused_with_a_reason(mask: Any, dilate: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         flow_in_mask(moved(), mask, dilate=dilate)
-
-
-def test_an_unknown_method_is_refused() -> None:
-    with pytest.raises(ValueError, match="'mean' or 'seed', got 'median'"):
-        flow_in_mask(moved(), EVERYWHERE, method="median")  # type: ignore[arg-type]
