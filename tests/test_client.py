@@ -19,6 +19,7 @@ from tactflow.cli import listen
 from tactflow.client import Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
 from tests.clock import PATIENCE, ManualClock
@@ -48,7 +49,9 @@ class Publisher:
     def send(self, *seqs: int, contact: Contact | None = None) -> None:
         for seq in seqs:
             flow = None if contact is None else FLOW
-            self.sink.write(Tick(Frame(self.sensor, seq, seq / 10, IMAGE)), IMAGE, contact, flow, MARKERS)
+            self.sink.write(
+                Tick(Frame(self.sensor, seq, seq / 10, IMAGE)), Results(IMAGE, contact, flow, MARKERS)
+            )
 
 
 @pytest.fixture
@@ -182,7 +185,7 @@ def test_a_subscriber_may_start_before_the_publisher_and_survives_its_restart() 
         sink = Zmq(Zmq.Params(endpoint=endpoint, wait_for_subscriber=LONG))
         sink.open()
         for seq in seqs:
-            sink.write(Tick(Frame("main", seq, 0.0, IMAGE)), IMAGE, None, None, None)
+            sink.write(Tick(Frame("main", seq, 0.0, IMAGE)), Results(IMAGE))
         sink.close()
 
     with Subscriber(endpoint, timeout=LONG) as messages:
