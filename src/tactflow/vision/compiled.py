@@ -262,7 +262,9 @@ def _start_workers(kernels: Sequence[Kernel[..., Any]]) -> list[subprocess.Popen
     if sys.platform == "win32" or not sys.executable or len(kernels) < _LEAST_SHARED:
         # There are no claims on Windows.
         return []
-    processors = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    processors = os.cpu_count() or 1
+    if sys.platform == "linux":
+        processors = len(os.sched_getaffinity(0))
     order = {"path": sys.path, "kernels": [(kernel.plain.__module__, kernel.name) for kernel in kernels]}
     # In sessions of their own, so that Ctrl-C does not reach them: this process ends them.
     return [

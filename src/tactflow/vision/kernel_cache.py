@@ -18,11 +18,8 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from zlib import crc32
-
-if sys.platform != "win32":
-    import fcntl
 
 logger = logging.getLogger("tactflow")
 
@@ -57,27 +54,36 @@ def claimed(folder: str | None, name: str, wait: bool) -> Iterator[bool]:
     folder : of the cache; None: there is none, and nothing to agree upon.
     wait : until the process that has claimed it is done, rather than give up.
     """
-    if sys.platform == "win32":
-        yield True
-        return
-    if folder is None:
-        yield True
-        return
     try:
-        lock = open(Path(folder) / LOCK, "ab")  # noqa: SIM115 (closed below)
+        lock = None if folder is None else open(Path(folder) / LOCK, "ab")  # noqa: SIM115 (closed below)
     except OSError:
+        lock = None
+    if lock is None:
         yield True
         return
     with lock:
+        yield _lock(lock, crc32(name.encode()), wait)
+
+
+if sys.platform == "win32":
+
+    def _lock(_file: IO[bytes], _byte: int, _wait: bool) -> bool:
+        """Nothing is locked on Windows: processes that start together compile the same."""
+        return True
+
+else:
+    import fcntl
+
+    def _lock(file: IO[bytes], byte: int, wait: bool) -> bool:
+        """Lock one byte of a file until it is closed; False where another process has it."""
         try:
-            fcntl.lockf(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, crc32(name.encode()))
+            fcntl.lockf(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, byte)
         except BlockingIOError:
-            yield False
-            return
+            return False
         except OSError:
             # A file system without locks.
             pass
-        yield True
+        return True
 
 
 @cache
