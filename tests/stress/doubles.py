@@ -33,6 +33,7 @@ def _distances(first: Any, second: Any, *rest: Any) -> Any:
 
 NUMPY = _Double(np, float32=np.float64)
 OPENCV = _Double(cv2, CV_32F=cv2.CV_64F, batchDistance=_distances)
+DOUBLES = {"np": NUMPY, "cv2": OPENCV}
 
 
 @contextmanager
@@ -49,7 +50,7 @@ def in_double(*modules: ModuleType) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         for module in modules:
-            for name, double in (("np", NUMPY), ("cv2", OPENCV)):
+            for name, double in DOUBLES.items():
                 if hasattr(module, name):
                     patch.setattr(module, name, double)
         patch.setattr(Kernel, "__call__", plain)

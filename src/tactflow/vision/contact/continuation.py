@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import inlined, kernel
+from tactflow.vision.compiled import helper, kernel
 
 Mask = NDArray[np.uint8]
 Whole = NDArray[np.int32]
@@ -52,14 +52,14 @@ def continued(outline: Whole, hidden: Mask) -> Whole | None:
     return outline if count < 0 else line[:count] if count else None
 
 
-@inlined()
+@helper
 def _point(outline: Whole, index: int) -> tuple[float, float]:
     """A point of a closed outline, whose indices go round."""
     here = index % len(outline)
     return float(outline[here, 0]), float(outline[here, 1])
 
 
-@inlined()
+@helper
 def _directions(
     x0: float, y0: float, x1: float, y1: float, ax: float, ay: float, bx: float, by: float
 ) -> tuple[float, float, float, float]:
@@ -83,7 +83,7 @@ def _directions(
     return chord_x, chord_y, chord_x, chord_y
 
 
-@inlined()
+@helper
 def _lay_cubic(
     x0: float, y0: float, x1: float, y1: float, ax: float, ay: float, bx: float, by: float, line: Whole
 ) -> None:

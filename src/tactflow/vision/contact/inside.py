@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import inlined, kernel
+from tactflow.vision.compiled import helper, kernel
 
 FloatArray = NDArray[np.float64]
 Outline = NDArray[np.int32]
@@ -117,7 +117,7 @@ def outline_depth(points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, 
     return depth
 
 
-@inlined()
+@helper
 def _bridge(x: float, y: float, outline: Outline, ends: tuple[int, int], side: float, unit: float) -> float:
     """Signed distance of a point from the bridge over a gap in a closed outline, px, positive inside.
 
@@ -163,7 +163,7 @@ def _bridge(x: float, y: float, outline: Outline, ends: tuple[int, int], side: f
     return float(-2 * a / (math.sqrt(slope) + root) * unit)
 
 
-@inlined()
+@helper
 def _first_seen(x: float, y: float, outline: Outline, hidden: float) -> int:
     """Index of the first point of an outline that is out of a marker's reach; its length if there is none."""
     for index in range(len(outline)):
