@@ -91,7 +91,11 @@ class ContactResult:
 
 
 def chi_square_threshold(probability: float) -> float:
-    """Value that a chi-square variable with three degrees of freedom exceeds with a probability in (0, 1)."""
+    """Value that a chi-square variable with three degrees of freedom exceeds with a probability in (0, 1).
+
+    >>> round(chi_square_threshold(0.05), 3)
+    7.815
+    """
     if not 0 < probability < 1:
         raise ValueError(f"required a probability in (0, 1), got {probability}")
     low, high = 0.0, 1500.0
@@ -129,6 +133,17 @@ class ContactDetector:
     Raises
     ------
     ValueError : a parameter out of its range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> gel = np.full((64, 48, 3), 120, np.uint8)
+    >>> pressed = gel.copy()
+    >>> pressed[20:40, 20:40] = 180
+    >>> detector = ContactDetector()
+    >>> detector.add_reference(gel)
+    >>> detector.detect(gel).touching, detector.detect(pressed).touching
+    (False, True)
     """
 
     def __init__(
