@@ -13,7 +13,7 @@ from tactflow.vision import compiled
 RUN = """
 import sys
 
-from tactflow.cli.pipelines import find_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.config.load import load_pipeline
 from tactflow.engine.run import Runner
 from tactflow.vision import compiled, geometry
