@@ -19,15 +19,13 @@ def modules() -> list[str]:
 
 
 @pytest.mark.parametrize("name", modules())
-def test_the_examples_of_a_module_run(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_examples_of_a_module_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = importlib.import_module(name)
     monkeypatch.chdir(tmp_path)
     flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
     assert doctest.testmod(module, optionflags=flags).failed == 0
 
 
-@pytest.mark.parametrize("name", [name for name in tactflow.__all__ if name[0].islower()])
-def test_every_public_function_has_an_example(name: str) -> None:
+@pytest.mark.parametrize("name", tactflow.__all__)
+def test_everything_public_has_an_example(name: str) -> None:
     assert ">>>" in (getattr(tactflow, name).__doc__ or "")

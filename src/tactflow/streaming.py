@@ -38,6 +38,10 @@ class Result:
     skipped : port -> why it was not computed in this frame: `unchanged` repeats the last value.
     image : (H, W, 3) uint8 BGR, the processed frame. frame : the raw one. Both None unless asked for, because
         a list of results would hold them all in memory.
+
+    >>> result = next(stream(source="sim:press", max_frames=1))
+    >>> result.seq, result.contact, len(result.markers.position)
+    (0, None, 80)
     """
 
     sensor: str
