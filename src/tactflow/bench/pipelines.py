@@ -24,7 +24,6 @@ from tactflow.classic.functions import contact_mask, difference, inpaint, mask_m
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
-from tactflow.vision import compiled
 from tactflow.vision.geometry import PixelMapping
 
 
@@ -102,8 +101,6 @@ class Times:
     stages: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
-PLAIN = "default-plain"
-"""Name under which the default pipeline runs without compiled kernels, where they would be used."""
 ORIGINAL = "original script"
 """The yardstick plus what the script repeats in every frame without need."""
 
@@ -197,8 +194,7 @@ def take_turns(
                 for name in list(active):
                     try:
                         # A pipeline waits outside of its turn, so that this acts on no other.
-                        with compiled.switched(compiled.active() and name != PLAIN):
-                            outcomes = running[name].block(block)
+                        outcomes = running[name].block(block)
                     except TactflowError as error:
                         failures[name] = str(error)
                         active.remove(name)

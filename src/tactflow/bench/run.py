@@ -16,12 +16,11 @@ import numpy as np
 from tactflow.bench import recordings
 from tactflow.bench.methods import CLASSIC, measure_methods
 from tactflow.bench.pictures import draw
-from tactflow.bench.pipelines import PLAIN, Worst, growth, measure_pipelines, peak_memory_mb
+from tactflow.bench.pipelines import Worst, growth, measure_pipelines, peak_memory_mb
 from tactflow.bench.results import Measurement, Result
 from tactflow.bench.scenes import (
     FULL,
     FULL_STAGES,
-    NOMINAL,
     QUICK,
     QUICK_STAGES,
     Case,
@@ -97,7 +96,7 @@ def machine() -> dict[str, str]:
         "Python": platform.python_version(),
         "OpenCV": cv2.__version__,
         "numpy": np.__version__,
-        "numba": compiled.numba_version() or "not used",
+        "numba": compiled.numba_version(),
     }
 
 
@@ -133,7 +132,6 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
     bare = {name: recordings.without_markers(loaded[name]) for name in (DEFAULT, CLASSIC)}
     if MARKERLESS in loaded:
         bare = {MARKERLESS: loaded[MARKERLESS], CLASSIC: bare[CLASSIC]}
-    compared = not plan.quick and compiled.active()
     total = sum(case.frames for case in whole) + 7 * len(alone) + (1 if plan.quick else 60)
     if plan.memory:
         total += 20 * len(general)
@@ -156,8 +154,6 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
         for rendered in render_all(whole, scratch):
             doing = f"pipelines on {rendered.case.label}"
             suited = general if len(rendered.scene.layout.rest) else bare
-            if compared and rendered.case.label in NOMINAL:
-                suited = {**suited, PLAIN: loaded[DEFAULT]}
             worst = _keeper(plan.pictures, rendered.case.label)
             result.measurements += measure_pipelines(suited, rendered, scratch, unit, step, worst)
         for rendered in render_all(alone, scratch):

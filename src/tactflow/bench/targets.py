@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from statistics import median
 
-from tactflow.bench.pipelines import ORIGINAL, PLAIN
+from tactflow.bench.pipelines import ORIGINAL
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import RECORDING, Measurement, Result, Target
 from tactflow.bench.scenes import NOMINAL
@@ -35,7 +35,6 @@ def judge(result: Result, default: str, growth: float | None, *, wedge: str, mar
     return [
         _time("frame with contact", nominal, script, "contact", 13, 60, copies),
         _time("frame without contact", nominal, script, "idle", 5, 150, copies),
-        *_without_numba(result, script, copies),
         _worst(
             "marker displacement: RMS; 99th percentile",
             nominal,
@@ -82,17 +81,6 @@ def judge(result: Result, default: str, growth: float | None, *, wedge: str, mar
         ),
         _tracker_time(result, wedge),
         _recording(result, markerless, "wedge_grasp", [("force_right", 98.0)]),
-    ]
-
-
-def _without_numba(result: Result, script: Mapping[str, Measurement], copies: str) -> list[Target]:
-    """What the default pipeline takes where numba is not installed; nothing if that was not measured."""
-    measured = result.of("pipeline", PLAIN)
-    kinds = {"contact": ("frame with contact", 13, 60), "idle": ("frame without contact", 5, 150)}
-    return [
-        _time(f"{title}, without numba", measured, script, kind, most, faster, copies)
-        for kind, (title, most, faster) in kinds.items()
-        if measured
     ]
 
 
