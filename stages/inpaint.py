@@ -10,12 +10,12 @@ from tactflow.engine.stage import StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
-from tactflow.vision.markers import inpaint_kernels
-from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
+from tactflow.vision.markers import inpaint
+from tactflow.vision.markers.inpaint import RADIUS, remove_markers
 
 
 class Inpaint:
-    """Fill the markers from their surroundings (seed function `inpaint`)."""
+    """Fill the markers from their surroundings."""
 
     memory = "pure"
 
@@ -25,11 +25,11 @@ class Inpaint:
         method: Literal["normalized", "telea", "ns", "none"] = Field(
             "normalized", description="normalized averages the gel around; telea and ns are OpenCV's, slow"
         )
-        radius: float = Field(SEED_RADIUS, gt=0, le=100, description="neighbourhood, processed px")
+        radius: float = Field(RADIUS, gt=0, le=100, description="neighbourhood, processed px")
 
     def __init__(self, params: Params) -> None:
         if params.method == "normalized":
-            compiled.load(downsample, inpaint_kernels)
+            compiled.load(downsample, inpaint)
         self._params = params
 
     def process(self, image: Image, marker_mask: MarkerMask) -> Unmarked:

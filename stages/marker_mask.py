@@ -11,7 +11,7 @@ from tactflow.engine.stage import StageParams
 from tactflow.ports import Image, MarkerMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
-from tactflow.vision.markers import mask_kernels
+from tactflow.vision.markers import mask
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 from tactflow.vision.seed_contact import seed_marker_mask
 
@@ -38,7 +38,7 @@ class MarkerMaskStage:
 
     def __init__(self, params: Params) -> None:
         if params.method == "dog":
-            compiled.load(downsample, mask_kernels)
+            compiled.load(downsample, mask)
         self._params = params
         self._dot: Dot | None = None
         self._looked = False

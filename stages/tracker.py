@@ -12,7 +12,7 @@ from tactflow.engine.frame import Frame
 from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
 from tactflow.vision import compiled
-from tactflow.vision.markers import matching, template_kernels, tracking_kernels
+from tactflow.vision.markers import field, matching, spots, template, tracking
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.seed_tracker import SeedTracker
@@ -51,7 +51,7 @@ class Tracker:
     def __init__(self, params: Params) -> None:
         self._params = params
         if params.method == "appearance":
-            compiled.load(template_kernels, matching, tracking_kernels)
+            compiled.load(template, tracking, field, spots, matching)
         self.reset()
 
     def reset(self) -> None:

@@ -25,7 +25,7 @@ from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
 from tactflow.vision import compiled
 from tactflow.vision.geometry import PixelMapping
-from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
+from tactflow.vision.markers.inpaint import RADIUS, remove_markers
 from tactflow.vision.seed_contact import seed_contact_mask, seed_difference, seed_marker_mask
 
 
@@ -139,7 +139,7 @@ class OriginalRepeats:
 
     @staticmethod
     def _remove(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return remove_markers(image, seed_marker_mask(image), method="telea", radius=SEED_RADIUS)
+        return remove_markers(image, seed_marker_mask(image), method="telea", radius=RADIUS)
 
     def _repeat(self, image: NDArray[np.uint8]) -> None:
         assert self._reference is not None

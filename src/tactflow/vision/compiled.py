@@ -152,9 +152,9 @@ class Inlined(Generic[P, R]):
         """What numba asks of a global that it does not know; asked for only while a kernel is compiled."""
         numba: Any = import_module("numba")
         fastmath = _REASSOCIATED if self._reorder else False
-        return numba.types.Dispatcher(
-            numba.njit(error_model="numpy", fastmath=fastmath, forceinline=True)(self.plain)
-        )
+        # Kept here: numba's type does not keep it.
+        self._dispatcher = numba.njit(error_model="numpy", fastmath=fastmath, forceinline=True)(self.plain)
+        return numba.types.Dispatcher(self._dispatcher)
 
 
 def inlined(*, reorder: bool = False) -> Callable[[Callable[P, R]], Inlined[P, R]]:
