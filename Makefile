@@ -1,5 +1,6 @@
 # make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
 # make test         lint, types, tests
+# make kernels      measures what compiling gains, and writes docs/kernels.md
 # make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
 VENV := .venv
@@ -9,7 +10,7 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test lint types system-deps clean
+.PHONY: run test lint types kernels system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -24,14 +25,17 @@ lint: $(VENV)/.installed-test
 types: $(VENV)/.installed-test
 	$(PY) -m mypy
 
+kernels: $(VENV)/.installed-test
+	$(PY) -m tests.oracles
+
 $(VENV)/bin/python:
 	python3 -m venv $(VENV)
 
-$(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) install --constraint constraints.txt --editable ".[view,record,fast]"
+$(VENV)/.installed: pyproject.toml setup.py constraints.txt | $(VENV)/bin/python
+	$(PIP) install --constraint constraints.txt --editable ".[all]"
 	@touch $@
 
-$(VENV)/.installed-test: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/.installed-test: pyproject.toml setup.py constraints.txt | $(VENV)/bin/python
 	$(PIP) install --constraint constraints.txt --editable ".[test]"
 	@touch $@ $(VENV)/.installed
 

@@ -25,8 +25,8 @@ from tactflow.bench.score import FlowScore
 from tactflow.config.load import load_pipeline
 from tactflow.sim import Scene
 from tactflow.sim.gel import reached
+from tactflow.vision.contact.inside import outline_depth
 from tactflow.vision.flow import HIDDEN
-from tactflow.vision.outline import outline_depth
 
 Values = NDArray[np.float64]
 

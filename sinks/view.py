@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import logging
 import threading
 import time
@@ -17,9 +16,9 @@ import orjson
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
-from tactflow.engine.stage import StageParams
 from tactflow.message import STATUS_NAMES, encode_message
 from tactflow.ports import Image
 from tactflow.view.address import Neighbours, address, bind, is_loopback
@@ -31,13 +30,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("tactflow")
 
-NEEDED = ("starlette", "uvicorn", "websockets")
-
 STATUS_LETTERS = np.array([ord(name[0]) for name in STATUS_NAMES], np.uint8)
 """The first letter of the word for each value of `MarkerStatus`."""
 
 
-class View:
+class View(Sink):
     """Serves a page that draws the results over the processed frame, and can pause and end the run.
 
     While no page is open, or none is ready for another frame, nothing is wanted and nothing is encoded. A
@@ -119,14 +116,6 @@ class View:
 
     def open(self) -> None:
         """Serve the page; afterwards `description` is its address, or None if it cannot be served."""
-        missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-        if missing:
-            log.warning(
-                "view: not shown, because there is no %s: pip install 'tactflow[view]'; "
-                "--set sinks.view=null leaves the view out",
-                " and no ".join(missing),
-            )
-            return
         p = self.params
         try:
             from tactflow.view.hub import Hub

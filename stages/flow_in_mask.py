@@ -6,14 +6,15 @@ from typing import Literal
 
 from pydantic import Field
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
-from tactflow.vision import compiled, outline_kernels
+from tactflow.vision import compiled
+from tactflow.vision.contact import inside_kernels
 from tactflow.vision.flow import flow_in_mask, in_mask
 from tactflow.vision.types import Flow, Markers
 
 
-class FlowInMask:
+class FlowInMask(Stage):
     """Mean displacement, twist and press of the markers inside the contact (seed's `draw_flow_mask`)."""
 
     memory = "pure"
@@ -35,7 +36,7 @@ class FlowInMask:
     def __init__(self, params: Params) -> None:
         self._params = params
         if params.method == "mean":
-            compiled.load(in_mask, outline_kernels)
+            compiled.load(in_mask, inside_kernels)
 
     def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside."""

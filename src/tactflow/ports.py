@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.engine.stage import ArrayPort, SignalPort
+from tactflow.engine.ports import ArrayPort, SignalPort
 
 Image = Annotated[NDArray[np.uint8], ArrayPort("image", ("H", "W", 3), "uint8", "grey levels, BGR")]
 """The processed frame."""

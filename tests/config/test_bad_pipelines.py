@@ -168,12 +168,12 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "not a module name": (HEAD + "  a: {use: §'a b:C'}\n" + SINK, ["'a b' is not the name of a module"]),
     "something that is no stage": (
         HEAD + "  a: {use: §'collections:OrderedDict'}\n" + SINK,
-        ["OrderedDict must have exactly one of process()"],
+        ["OrderedDict must inherit from Source or Stage or Sink of tactflow"],
     ),
     "function instead of a class": (HEAD + "  a: {use: §'os.path:join'}\n" + SINK, ["has no class join"]),
     "stage and sink in one class": (
         HEAD + "  a: {use: §'./parts.py:Both'}\n" + SINK,
-        ["must have exactly one of"],
+        ["Both: a sink has no process()", "a class is one of stage, sink and source"],
     ),
     "undeclared memory": (
         PREPARE + "  a: {use: §'./parts.py:Forgetful'}\n" + SINK,
@@ -569,7 +569,10 @@ def test_a_file_that_cannot_be_read(
         ("import no_such_thing\n", r"own\.py:1: cannot load \./own\.py: ModuleNotFoundError"),
         ("x = 1\ny = x / 0\n", r"own\.py:2: cannot load \./own\.py: ZeroDivisionError"),
         ("raise SystemExit(5)\n", r"own\.py:1: cannot load \./own\.py: SystemExit"),
-        ("class _A:\n    def process(self): ...\n", r"own\.py has no public class with process\(\)"),
+        (
+            "class _A:\n    def process(self): ...\n",
+            r"own\.py has no public class that inherits from Stage",
+        ),
     ],
 )
 def test_a_mistake_in_an_own_file_is_shown_with_its_line(

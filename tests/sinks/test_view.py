@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import importlib.util
 import json
 import logging
 import socket
@@ -22,6 +21,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
 
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
@@ -31,11 +33,6 @@ from tactflow.message import build_message
 from tactflow.sinks.view import View
 from tactflow.view.address import address, bind, is_loopback
 from tactflow.vision.types import Contact, Markers
-
-pytest.importorskip("uvicorn", reason="the extra tactflow[view] is not installed")
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Origin
 
 SECRET = "a-secret-of-some-length"
 PATIENCE = 10.0
@@ -675,23 +672,7 @@ def test_an_address_that_is_not_ours_disables_the_view_only(
     assert sink.description is None
 
 
-def test_without_the_extra_there_is_one_warning_and_no_view(
-    monkeypatch: pytest.MonkeyPatch, view: Callable[..., View], caplog: pytest.LogCaptureFixture
-) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        "tactflow.sinks.view.importlib.util.find_spec",
-        lambda name: None if name == "uvicorn" else found(name),
-    )
-    sink = view()
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert "pip install 'tactflow[view]'" in caplog.text
-    assert not sink.wants()
-    sink.write(tick(), picture(), None, None, None)
-    assert sink.counters() == {"encoded": 0}
-
-
-def test_an_extra_that_cannot_be_imported_disables_the_view_only(
+def test_a_package_that_cannot_be_imported_disables_the_view_only(
     monkeypatch: pytest.MonkeyPatch, view: Callable[..., View], caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setitem(sys.modules, "tactflow.view.server", None)

@@ -9,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
+from tests.clock import ManualClock
 
 PERIOD = 0.01
-"""Time between the scripted device's frames, s."""
+"""Time between the scripted device's frames on its clock, s."""
+REAL_PERIOD = 0.001
+"""What reading a frame really takes, s, so that other threads get on meanwhile."""
 
 
 class Flaky:
@@ -20,26 +23,40 @@ class Flaky:
     good: noisy frames. black: black frames, not all the same. frozen: one frame again and again. gone:
     reading and opening fail. ends: reading says that it is the end; opening works. hangs: reading does not
     return until `free` is set; opening works. other_size: gone, and what then can be opened has another size.
+
+    Time passes on `clock` while the newest connection is read, and nowhere else.
     """
 
     def __init__(self, does: str = "good") -> None:
         self.does = does
+        self.clock = ManualClock(pause=REAL_PERIOD)
         self.free = threading.Event()
         self.opened = 0
         self.closed = 0
+        self.stamp = 1000.0
+        self.newest: Connection | None = None
         self.rng = np.random.default_rng(1)
-        self.clock = 1000.0
-        self.step = 0.01
         self.last = self.noisy()
+        self._heals_in = 0
+
+    def fail(self, does: str, openings: int) -> None:
+        """Begin to do this, and be good again with that many attempts to open it."""
+        self._heals_in = openings
+        self.does = does
 
     def noisy(self, level: int = 90) -> NDArray[np.uint8]:
         return self.rng.integers(level, level + 20, (48, 64, 3), np.uint8)
 
     def open(self, *_: object, **__: object) -> Connection:
+        if self._heals_in > 0:
+            self._heals_in -= 1
+            if self._heals_in == 0:
+                self.does = "good"
         if self.does == "gone":
             raise SourceError("flaky: nothing is plugged in")
         self.opened += 1
-        return Connection(self)
+        self.newest = Connection(self)
+        return self.newest
 
 
 class Connection:
@@ -52,15 +69,17 @@ class Connection:
     def __init__(self, device: Flaky) -> None:
         self.device = device
         self.size: tuple[int, int] | None = (32, 24) if device.does == "other_size" else (64, 48)
-        self.first = device.opened == 1
         self.description = "flaky, 64 x 48"
 
     def read(self) -> tuple[NDArray[np.uint8], float] | None:
         device = self.device
-        time.sleep(PERIOD)
+        time.sleep(REAL_PERIOD)
+        device.clock.advance(PERIOD)
         does = device.does
         if does == "hangs":
-            device.free.wait()
+            while not device.free.wait(REAL_PERIOD):
+                if device.newest is self:
+                    device.clock.advance(PERIOD)
             return None
         if does in ("gone", "other_size"):
             raise SourceError("flaky: delivers no more frames")
@@ -68,9 +87,9 @@ class Connection:
             return None
         if does == "good":
             device.last = device.noisy()
-        device.clock += device.step
+        device.stamp += PERIOD
         image = device.noisy(level=0) // 10 if does == "black" else device.last.copy()
-        return image, device.clock
+        return image, device.stamp
 
     def close(self) -> None:
         self.device.closed += 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,12 +11,11 @@ import pytest
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
-from tactflow.sources.watch import Arrival, Watch, Watched
+from tactflow.sources import Watch, Watched
+from tactflow.sources.watch import Arrival
 from tactflow.stages.capture import Capture
+from tests.clock import PATIENCE, until
 from tests.sources.flaky import Flaky
-
-PATIENCE = 20.0
-"""s; how long a test waits for what must happen."""
 
 QUICK = {
     "no_frame_timeout": None,
@@ -28,6 +26,7 @@ QUICK = {
     "first_retry": 0.01,
     "last_retry": 0.04,
 }
+"""Short times on the device's clock, s: they bound nothing that really happens."""
 
 
 @pytest.fixture
@@ -43,13 +42,23 @@ def watched(device: Flaky) -> Iterator[Callable[..., Watched]]:
     opened: list[Watched] = []
 
     def watch(**settings: Any) -> Watched:
-        opened.append(Watched(device.open, Watch(**{**QUICK, **settings}), "flaky"))
+        opened.append(Watched(device.open, Watch(**{**QUICK, **settings}), "flaky", device.clock))
         return opened[-1]
 
     yield watch
     device.free.set()
     for source in opened:
         source.close()
+
+
+def capture_of(device: Flaky, **params: Any) -> Capture:
+    """A capture of the device, watched with short times."""
+
+    def opener(*_: object, watch: Watch, **__: object) -> Watched:
+        settings = {**QUICK, "no_frame_timeout": watch.no_frame_timeout}
+        return Watched(device.open, Watch(**settings), "flaky", device.clock)
+
+    return Capture(Capture.Params.model_validate({"source": "0", **params}), opener=opener)
 
 
 def take(source: Watched, count: int = 5) -> list[Arrival]:
@@ -59,10 +68,7 @@ def take(source: Watched, count: int = 5) -> list[Arrival]:
 
 
 def await_log(caplog: pytest.LogCaptureFixture, text: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while text not in caplog.text:
-        assert time.monotonic() < deadline, f"never said {text!r}: {caplog.text}"
-        time.sleep(0.01)
+    until(lambda: text in caplog.text, lambda: f"never said {text!r}: {caplog.text}")
 
 
 def read_beside(source: Watched) -> tuple[threading.Thread, list[Arrival]]:
@@ -102,7 +108,6 @@ def test_each_fault_is_reported_once_and_so_is_its_end(
     assert source.state == "running"
     device.does = does
     # Frames go on until the fault shows; then the read waits.
-    deadline = time.monotonic() + PATIENCE
     last = before[-1]
     stop = threading.Event()
 
@@ -115,14 +120,10 @@ def test_each_fault_is_reported_once_and_so_is_its_end(
     thread.start()
     try:
         await_log(caplog, says)
-        while not source.state.startswith("reconnecting since"):
-            assert time.monotonic() < deadline, source.state
-            time.sleep(0.01)
+        until(lambda: source.state.startswith("reconnecting since"), lambda: source.state)
         device.does = "good"
         await_log(caplog, "is back after")
-        while last.connection == 0:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        until(lambda: last.connection > 0)
         assert source.state == "running"
     finally:
         stop.set()
@@ -139,13 +140,11 @@ def test_seq_and_time_grow_across_reconnections_even_if_the_devices_clock_does_n
     source = watched()
     arrivals = take(source)
     for _ in range(3):
-        device.does = "ends"
-        device.clock = 0.0
-        thread, seen = read_beside(source)
-        time.sleep(0.05)
-        device.does = "good"
-        thread.join(PATIENCE)
-        arrivals += seen + take(source)
+        device.stamp = 0.0
+        device.fail("ends", openings=2)
+        connection = arrivals[-1].connection
+        while arrivals[-1].connection == connection:
+            arrivals += take(source)
     assert [a.seq for a in arrivals] == sorted({a.seq for a in arrivals})
     assert [a.t for a in arrivals] == sorted({a.t for a in arrivals})
     assert [a.connection for a in arrivals] == sorted(a.connection for a in arrivals)
@@ -157,22 +156,21 @@ def test_a_reader_that_is_slow_gets_the_newest_frame_and_a_gap_in_seq(
 ) -> None:
     source = watched()
     first = take(source, 1)[0]
-    while source.missed < 5:
-        time.sleep(0.01)
+    until(lambda: source.missed >= 5)
     second = take(source, 1)[0]
     assert second.seq - first.seq >= 6
 
 
 def test_capture_tells_how_many_frames_nobody_took(device: Flaky) -> None:
     capture = Capture(
-        Capture.Params(source="0"), opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky")
+        Capture.Params(source="0"),
+        opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky", device.clock),
     )
     capture.open()
     frames = capture.frames()
     seqs = [next(frames).seq]
     for wanted in (3, 6, 9):
-        while capture.missed < wanted:
-            time.sleep(0.01)
+        until(lambda wanted=wanted: capture.missed >= wanted)
         before = capture.missed
         seqs.append(next(frames).seq)
         # Of the frames up to this one, those that were not taken are gaps; more may have come meanwhile.
@@ -261,7 +259,8 @@ def test_stopping_ends_a_read_that_waits(does: str, device: Flaky, watched: Call
         ended.set()
 
     threading.Thread(target=run).start()
-    time.sleep(0.05)
+    if does != "good":
+        until(lambda: source.state != "running")
     source.stop()
     assert ended.wait(PATIENCE)
 
@@ -271,31 +270,27 @@ def test_every_connection_is_closed_again(device: Flaky, watched: Callable[..., 
     take(source)
     device.does = "hangs"
     thread, _ = read_beside(source)
-    while device.opened < 3:
-        time.sleep(0.01)
+    until(lambda: device.opened >= 3)
     device.does = "good"
     thread.join(PATIENCE)
     device.free.set()
     source.close()
-    deadline = time.monotonic() + PATIENCE
-    while device.closed < device.opened:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until(lambda: device.closed == device.opened)
 
 
 def test_capture_names_the_thread_that_frames_arrive_in_now(device: Flaky) -> None:
     capture = Capture(
-        Capture.Params(source="0"), opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky")
+        Capture.Params(source="0"),
+        opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky", device.clock),
     )
     assert capture.live_threads == []
     capture.open()
     frames = capture.frames()
-    assert next(frames).seq == 0
+    next(frames)
     (first,) = capture.live_threads
     names = {thread.native_id: thread.name for thread in threading.enumerate()}
     assert names[first] == "tactflow-read-flaky"
-    device.does = "hangs"
-    threading.Timer(0.5, setattr, (device, "does", "good")).start()
+    device.fail("hangs", openings=2)
     while capture.live_threads == [first]:
         next(frames)
     assert len(capture.live_threads) == 1, "the reader that hangs is not waited for any more"
@@ -308,22 +303,13 @@ def test_capture_names_the_thread_that_frames_arrive_in_now(device: Flaky) -> No
 def test_capture_keeps_or_retakes_the_reference_after_a_reconnection(
     on_reconnect: str, device: Flaky
 ) -> None:
-    def opener(*_: object, watch: Watch, **__: object) -> Watched:
-        # Only the fault that is made here shall be one: on a busy machine, silence comes by itself.
-        patient = {**QUICK, "silent_after": PATIENCE, "hang_after": PATIENCE}
-        return Watched(device.open, Watch(**{**patient, "no_frame_timeout": watch.no_frame_timeout}), "flaky")
-
-    params = Capture.Params.model_validate(
-        {"source": "0", "on_reconnect": on_reconnect, "reference": 2, "skip": 3}
-    )
-    capture = Capture(params, opener=opener)
+    capture = capture_of(device, on_reconnect=on_reconnect, reference=2, skip=3)
     capture.open()
     frames: list[Frame] = []
     for frame in capture.frames():
         frames.append(frame)
         if len(frames) == 5:
-            device.does = "ends"
-            threading.Timer(0.1, setattr, (device, "does", "good")).start()
+            device.fail("ends", openings=2)
         if len(frames) == 10:
             capture.stop()
     capture.close()

@@ -14,8 +14,9 @@ import pytest
 from pydantic import ValidationError
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources import pace as pace_module
+from tactflow.sources.pace import GRACE, Pace
 from tactflow.stages.capture import Capture
+from tests.clock import PATIENCE, ManualClock
 
 
 @pytest.fixture
@@ -130,108 +131,77 @@ def test_a_recording_is_live_only_when_played_at_its_own_pace(recording: str) ->
     assert capture(recording, realtime=True).live
 
 
-class _Clock:
-    """A clock that advances only when somebody waits, and while a frame is being read."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.waits: list[float] = []
-
-    def perf_counter(self) -> float:
-        return self.now
-
-    def wait(self, seconds: float) -> bool:
-        self.waits.append(seconds)
-        self.now += seconds
-        return False
-
-
 @pytest.mark.parametrize("reading", [0.0, 0.007, 0.099])
-def test_delays_do_not_add_up_at_the_recordings_own_pace(
-    reading: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = _Clock()
-    monkeypatch.setattr(pace_module.time, "perf_counter", clock.perf_counter)
-    stop = threading.Event()
-    monkeypatch.setattr(stop, "wait", clock.wait)
-    pace = pace_module.Pace(stop)
+def test_delays_do_not_add_up_at_the_recordings_own_pace(reading: float) -> None:
+    clock = ManualClock()
+    pace = Pace(threading.Event(), clock)
     shown = []
     for index in range(1000):
-        clock.now += reading
+        clock.advance(reading)
         assert pace.wait_for(index / 10.0)
-        shown.append(clock.now)
+        shown.append(clock.now())
     # 1e-9 s: rounding of the clock's doubles only; any drift would be at least 1000 x 0.007 s.
     np.testing.assert_allclose(np.array(shown) - shown[0], np.arange(1000) / 10.0, atol=1e-9)
 
 
-def test_after_a_long_interruption_the_recording_continues_instead_of_rushing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    clock = _Clock()
-    monkeypatch.setattr(pace_module.time, "perf_counter", clock.perf_counter)
-    stop = threading.Event()
-    monkeypatch.setattr(stop, "wait", clock.wait)
-    pace = pace_module.Pace(stop)
+def test_after_a_long_interruption_the_recording_continues_instead_of_rushing() -> None:
+    clock = ManualClock()
+    pace = Pace(threading.Event(), clock)
     pace.wait_for(0.0)
-    clock.now += 3600.0
+    clock.advance(3600.0)
     pace.wait_for(0.1)
-    resumed = clock.now
+    resumed = clock.now()
     pace.wait_for(0.2)
     # 1e-9 s: rounding.
-    assert clock.now - resumed == pytest.approx(0.1, abs=1e-9)
+    assert clock.now() - resumed == pytest.approx(0.1, abs=1e-9)
 
 
-def _played(
-    monkeypatch: pytest.MonkeyPatch, times: list[float], reading: list[float]
-) -> tuple[list[float], list[float]]:
+def _played(times: list[float], reading: list[float]) -> tuple[list[float], list[float]]:
     """When reading of each frame began, and when it was shown; nothing but reading and waiting takes time."""
-    clock = _Clock()
-    monkeypatch.setattr(pace_module.time, "perf_counter", clock.perf_counter)
-    stop = threading.Event()
-    monkeypatch.setattr(stop, "wait", clock.wait)
-    pace = pace_module.Pace(stop)
+    clock = ManualClock()
+    pace = Pace(threading.Event(), clock)
     begun, shown = [], []
     for t, duration in zip(times, reading, strict=True):
         assert pace.wait_to_read()
-        begun.append(clock.now)
-        clock.now += duration
+        begun.append(clock.now())
+        clock.advance(duration)
         assert pace.wait_for(t)
-        shown.append(clock.now)
+        shown.append(clock.now())
     return begun, shown
 
 
 @pytest.mark.parametrize("reading", [0.0, 0.004, 0.011])
-def test_a_frame_is_read_just_before_it_is_due(reading: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_is_read_just_before_it_is_due(reading: float) -> None:
     times = [index / 60 for index in range(200)]
-    begun, shown = _played(monkeypatch, times, [reading] * 200)
+    begun, shown = _played(times, [reading] * 200)
     np.testing.assert_allclose(np.array(shown) - shown[0], times, atol=1e-9)
     early = np.array(shown[2:]) - begun[2:]
     # What reading takes, a quarter of it and a millisecond: or, where that leaves less than a rest for the
     # work on the last frame, what is left.
-    rest = min(pace_module.GRACE / 60, (1 / 60 - reading) / 2)
+    rest = min(GRACE / 60, (1 / 60 - reading) / 2)
     np.testing.assert_allclose(early, min(1.25 * reading + 0.001, 1 / 60 - rest), atol=1e-9)
 
 
-def test_a_read_that_suddenly_takes_longer_makes_few_frames_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_that_suddenly_takes_longer_makes_few_frames_late() -> None:
     times = [index / 60 for index in range(200)]
-    _, shown = _played(monkeypatch, times, [0.002] * 100 + [0.010] * 100)
+    _, shown = _played(times, [0.002] * 100 + [0.010] * 100)
     late = np.array(shown) - shown[0] - times
     # The first was begun 1.25 x 2 + 1 ms before it was due; the next one after a rest.
     first = 0.010 - 0.0035
-    second = first + pace_module.GRACE / 60 + 0.010 - 1 / 60
+    second = first + GRACE / 60 + 0.010 - 1 / 60
     np.testing.assert_allclose(late[99:103], [0, first, second, 0], atol=1e-9)
     assert np.count_nonzero(late > 1e-9) == 2
 
 
-def test_reading_that_cannot_keep_up_is_not_slowed_down(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_that_cannot_keep_up_is_not_slowed_down() -> None:
     times = [index / 60 for index in range(100)]
-    begun, shown = _played(monkeypatch, times, [0.020] * 100)
+    begun, shown = _played(times, [0.020] * 100)
     np.testing.assert_allclose(begun[2:], shown[1:-1], atol=1e-9)
 
 
-def test_behind_a_gap_of_dropped_frames_the_next_one_is_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_behind_a_gap_of_dropped_frames_the_next_one_is_in_time() -> None:
     times = [*(index / 60 for index in range(30)), *(2 + index / 60 for index in range(30))]
-    _, shown = _played(monkeypatch, times, [0.003] * 60)
+    _, shown = _played(times, [0.003] * 60)
     np.testing.assert_allclose(np.array(shown) - shown[0], times, atol=1e-9)
 
 
@@ -248,9 +218,9 @@ def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(recording: str) 
 
     thread = threading.Thread(target=run)
     thread.start()
-    assert first.wait(10)
+    assert first.wait(PATIENCE)
     stage.stop()
-    thread.join(10)
+    thread.join(PATIENCE)
     assert not thread.is_alive()
     assert len(frames) == 1
 

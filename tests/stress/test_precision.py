@@ -10,23 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision import (
-    comparison,
-    contact,
-    imprint,
-    inpaint,
-    light,
-    marker_appearance,
-    marker_mask,
-    markers,
-    seed_contact,
-    tracking,
-)
+from tactflow.vision import seed_contact
 from tactflow.vision.change import probe as change
+from tactflow.vision.contact import background, contact_outline, illumination
+from tactflow.vision.contact import detector as contact
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor
 from tactflow.vision.geometry.hull import contact_geometry, regress_line
+from tactflow.vision.markers import detection as markers
+from tactflow.vision.markers import inpaint, template, tracking
+from tactflow.vision.markers import mask as marker_mask
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
 from tactflow.vision.types import Contact, Ellipse, Markers
 from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, SIZE, apart, axis_difference, gel
@@ -142,10 +136,10 @@ def test_results_a_million_pixels_away_are_drawn_without_overflow() -> None:
 def both(compute: Callable[[], Any], *modules: Any) -> tuple[Any, Any]:
     """The result in single precision, and in double precision."""
     single = compute()
-    light.positions.cache_clear()
+    illumination.positions.cache_clear()
     with in_double(*modules):
         double = compute()
-    light.positions.cache_clear()
+    illumination.positions.cache_clear()
     return single, double
 
 
@@ -158,7 +152,7 @@ def test_single_precision_costs_the_contact_nothing(method: str) -> None:
         detector.add_reference(pictures.reference)
         return detector.detect(pictures.touched)
 
-    single, double = both(compute, contact, comparison, light, imprint)
+    single, double = both(compute, contact, background, illumination, contact_outline)
     # The bound of the docstring; measured 0 px and 1.4e-7.
     assert apart(single.mask, double.mask) <= 1
     assert single.strength == pytest.approx(double.strength, rel=1e-5)
@@ -176,7 +170,9 @@ def test_single_precision_costs_the_outline_nothing(kind: str) -> None:
         answer = np.stack([slope * np.cos(turn + phase) for phase in (0, 2.1, 4.2)], axis=-1)
     answer += np.random.default_rng(0).normal(0, 0.003, answer.shape)
     inside = (away < 26).astype(np.uint8)
-    single, double = both(lambda: imprint.imprint(answer.astype(imprint.np.float32), inside), imprint)
+    single, double = both(
+        lambda: contact_outline.imprint(answer.astype(contact_outline.np.float32), inside), contact_outline
+    )
     assert (single > 0).any()
     assert double.dtype == np.float64
     # The bound of the docstring.
@@ -185,14 +181,14 @@ def test_single_precision_costs_the_outline_nothing(kind: str) -> None:
 
 def test_single_precision_costs_the_fit_of_the_light_nothing() -> None:
     untouched, touched = (
-        comparison._smoothed(comparison._cells(picture)[1])
+        background._smoothed(background._cells(picture)[1])
         for picture in (gel(dots=False).reference, gel(dots=False).touched)
     )
 
     def compute() -> NDArray[Any]:
-        return light.LightChange(untouched, np.full_like(untouched, 0.25)).fit(touched)
+        return illumination.LightChange(untouched, np.full_like(untouched, 0.25)).fit(touched)
 
-    single, double = both(compute, light)
+    single, double = both(compute, illumination)
     assert double.dtype == np.float64
     # The bound of the docstring, grey levels; measured 2.4e-6.
     assert np.abs(single - double).max() <= 1e-3
@@ -220,7 +216,7 @@ def test_single_precision_costs_the_tracker_nothing() -> None:
     def compute() -> Markers:
         return tracking.MarkerTracker(pictures.reference, found).track(pictures.touched)
 
-    single, double = both(compute, tracking, marker_appearance)
+    single, double = both(compute, tracking, template)
     # The bound of the docstring, px; measured 1.5e-7 and 4e-6.
     assert np.abs(single.position - double.position).max() <= 1e-4
     assert np.abs(single.stderr - double.stderr).max() <= 1e-4

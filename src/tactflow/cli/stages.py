@@ -20,7 +20,7 @@ from tactflow.config.registry import Section, catalogue, did_you_mean, names, re
 from tactflow.config.yamlmap import shown
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
-from tactflow.engine.stage import Port, describe_type
+from tactflow.engine.ports import Port, describe_type
 
 _LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 

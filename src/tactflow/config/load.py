@@ -16,10 +16,10 @@ from tactflow.config.complaints import complain
 from tactflow.config.registry import RESERVED, Section, code_place, did_you_mean, resolve
 from tactflow.config.wiring import Draft
 from tactflow.config.yamlmap import Entry, Item, Problems, read_value, read_yaml, wrap
+from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import ErrorAction, FullPolicy, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
-from tactflow.engine.stage import StageParams
 
 TOP_LEVEL = ("sensor", "sensors", "skipping", "opencv_threads", "realtime_priority", "stages", "sinks")
 _SECTIONS: tuple[Section, ...] = get_args(Section)

@@ -10,7 +10,7 @@ from tactflow.config import envelope
 from tactflow.config.registry import Section, catalogue, did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems
 from tactflow.engine.graph import Component, Gate, Mark, Ref
-from tactflow.engine.stage import Port, SignalPort, describe_type, mismatch, port_type
+from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
 
 
 @dataclass(slots=True)

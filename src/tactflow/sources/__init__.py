@@ -15,7 +15,8 @@ from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream, public_address
 from tactflow.sources.files import open_recording
-from tactflow.sources.watch import LiveReader, Watch, Watched
+from tactflow.sources.health import Watch
+from tactflow.sources.watch import LiveReader, Watched
 
 __all__ = [
     "KINDS",

@@ -5,12 +5,13 @@ from __future__ import annotations
 import glob
 import os
 import re
-import time
+import sys
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 import cv2
 
+from tactflow.clock import SYSTEM, Clock
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import BgrImage, Normaliser, log, quiet_opencv
 
@@ -31,11 +32,13 @@ class CameraRequest:
 class ArrivalClock:
     """Unix time that never steps back: the system's clock at the start plus a monotonic clock."""
 
-    def __init__(self) -> None:
-        self._offset = time.time() - time.perf_counter()
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self._clock = clock
+        self._offset = clock.unix() - clock.now()
 
     def now(self) -> float:
-        return self._offset + time.perf_counter()
+        """Unix time, s."""
+        return self._offset + self._clock.now()
 
 
 class Camera:
@@ -66,7 +69,7 @@ class Camera:
         self._name = f"camera {device}"
         # OpenCV reads this once, at its first camera.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(self.READ_TIMEOUT))
-        backend = cv2.CAP_V4L2 if os.name == "posix" and os.uname().sysname == "Linux" else cv2.CAP_ANY
+        backend = cv2.CAP_V4L2 if sys.platform == "linux" else cv2.CAP_ANY
         with quiet_opencv():
             if device.isdecimal():
                 self._capture: cv2.VideoCapture | None = cv2.VideoCapture(int(device), backend)

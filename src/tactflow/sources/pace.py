@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-import time
+
+from tactflow.clock import SYSTEM, Clock
 
 LEAD = 1.25
 """Times as long as reading a frame took of late is set aside for reading the next."""
@@ -31,10 +32,12 @@ class Pace:
     Parameters
     ----------
     stop : ends every wait at once.
+    clock : tells the time, and lets it pass.
     """
 
-    def __init__(self, stop: threading.Event) -> None:
+    def __init__(self, stop: threading.Event, clock: Clock = SYSTEM) -> None:
         self._stop = stop
+        self._clock = clock
         self._start: float | None = None
         self._last: float | None = None
         self._interval = math.inf
@@ -43,20 +46,20 @@ class Pace:
 
     def wait_to_read(self) -> bool:
         """Wait until it is time to read the next frame; False if stopped meanwhile."""
-        now = time.perf_counter()
+        now = self._clock.now()
         wait = 0.0
         if self._start is not None and self._last is not None and self._interval < math.inf:
             due = self._start + self._last + self._interval
             rest = min(GRACE * self._interval, (self._interval - self._slowest) / 2)
             wait = max(due - LEAD * self._slowest - SPARE - now, rest)
-        if wait > 0 and self._stop.wait(wait):
+        if wait > 0 and self._clock.sleep(wait, self._stop):
             return False
-        self._reading = time.perf_counter()
+        self._reading = self._clock.now()
         return not self._stop.is_set()
 
     def wait_for(self, t: float) -> bool:
         """Wait until time t of the recording, s; False if stopped meanwhile."""
-        now = time.perf_counter()
+        now = self._clock.now()
         if self._reading is not None:
             self._slowest = max(now - self._reading, FORGET * self._slowest)
             self._reading = None
@@ -69,4 +72,4 @@ class Pace:
         wait = self._start + t - now
         if wait < -MAX_BACKLOG:
             self._start = now - t
-        return not (self._stop.wait(wait) if wait > 0 else self._stop.is_set())
+        return not self._clock.sleep(max(wait, 0.0), self._stop)

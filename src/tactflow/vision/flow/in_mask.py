@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision import compiled
 from tactflow.vision.compiled import kernel
-from tactflow.vision.outline import inside_outline
+from tactflow.vision.contact.inside import inside_outline
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 Method = Literal["mean", "seed"]
@@ -36,8 +36,8 @@ def flow_in_mask(
     dilate : px; a marker is inside if its *current* centre lies at most this far outside of the region. More
         takes in more markers (a steadier mean), also such as move less because they lie outside the contact.
         Where the markers' radius is known, the region's outline is bridged below each of them
-        (`tactflow.vision.outline`) and the distance counts to a fraction of a pixel; otherwise it is that
-        between the pixel that a centre falls on and the nearest pixel of the mask.
+        (`tactflow.vision.contact.inside`) and the distance counts to a fraction of a pixel; otherwise it is
+        that between the pixel that a centre falls on and the nearest pixel of the mask.
     method : "mean" uses tracked and inferred markers with equal weight, since the mean is one over the
         contact's area and not over how well each marker is seen; but a single tracked marker stands alone,
         since an inferred one has its motion from neighbours, which are then outside and move otherwise.

@@ -153,6 +153,7 @@ class MarkerTemplates:
             self._real,
             position,
             found,
+            np.empty(1, np.int64),
         )
         return Alignment(position, found[0], found[1], found[2])
 
@@ -324,9 +325,9 @@ def fit_template(weight: Float32Array, product: Float32Array, patch: Float32Arra
 
 
 @kernel(
-    "int64(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], float32[:, :, ::1],"
+    "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], float32[:, :, ::1],"
     "float32[:, :, ::1], float32[::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1],"
-    "float32[:, ::1])",
+    "float32[:, ::1], int64[::1])",
     reorder=True,
 )
 def align_marks(
@@ -341,14 +342,16 @@ def align_marks(
     real: FloatArray,
     position: FloatArray,
     found: Float32Array,
-) -> int:
+    touched: IntArray,
+) -> None:
     """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
 
     image : (H, W, 3) BGR or (H, W, 1) grey. start : (n, 2). marks : (n,), of those in `weights`.
     weights : (phases^2 N, 6, P), `gram` and `variance` alike, as `MarkerTemplates` holds them.
     disc : (2, p) dx and dy of the pixels of a patch, p <= P; the other weights are zero.
     whole : reach of a patch, phases per axis, rounds after the first step. real : radius, px, length of a
-    step that calls for another, px, and the sampling error, px. The number returned means nothing.
+    step that calls for another, px, and the sampling error, px.
+    touched : (1,), takes a number without meaning: what goes nowhere would not be read.
     """
     height, width, channels = image.shape
     reach, phases, rounds = whole[0], whole[1], whole[2]
@@ -359,7 +362,7 @@ def align_marks(
     for p in range(len(offsets)):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
     words, patch = np.empty(len(offsets), np.int32), np.zeros(weights.shape[2], np.float32)
-    touched = touch_patches(flat, image.shape, start, reach)
+    touched[0] = touch_patches(flat, image.shape, start, reach)
     for n in range(len(marks)):
         x, y = start[n, 0], start[n, 1]
         seen_left = seen_top = -1
@@ -388,4 +391,3 @@ def align_marks(
         position[n, 0], position[n, 1] = x, y
         found[0, n], found[1, n] = gain, r_squared
         found[2, n] = np.sqrt(rest * variance[which] / (safe * safe) + sampling)
-    return touched

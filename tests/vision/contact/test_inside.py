@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
+from tactflow.vision.contact.inside import inside_outline, outline_depth
 from tactflow.vision.flow import flow_in_mask, inside_mask
-from tactflow.vision.outline import inside_outline, outline_depth
 from tactflow.vision.types import Markers
 
 pytestmark = pytest.mark.usefixtures("each_way")

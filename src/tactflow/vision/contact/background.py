@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
-from tactflow.vision.comparison_kernels import relative_change, smooth_cells, weigh_change
+from tactflow.vision.contact.background_kernels import relative_change, smooth_cells, weigh_change
+from tactflow.vision.contact.contact_outline import Lengths, lengths_of
+from tactflow.vision.contact.illumination import LightChange, light_change, positions
 from tactflow.vision.geometry.downsample import halved
-from tactflow.vision.imprint import Lengths, lengths_of
-from tactflow.vision.light import LightChange, light_change, positions
 
 Float = NDArray[np.float32]
 

@@ -31,10 +31,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import comparison_kernels, compiled, imprint_kernels
-from tactflow.vision.comparison import CELL, UntouchedGel
+from tactflow.vision import compiled
+from tactflow.vision.contact import background_kernels, contact_outline_kernels
+from tactflow.vision.contact.background import CELL, UntouchedGel
+from tactflow.vision.contact.contact_outline import fill_level, hidden_cells, outline_level
 from tactflow.vision.geometry import downsample
-from tactflow.vision.imprint import fill_level, hidden_cells, outline_level
 from tactflow.vision.seed_contact import seed_contact_mask
 
 ContactMethod = Literal["noise", "colour", "seed"]
@@ -157,7 +158,7 @@ class ContactDetector:
         self._creep = creep
         self._distance = distance
         if method == "noise":
-            compiled.load(comparison_kernels, downsample, imprint_kernels)
+            compiled.load(background_kernels, downsample, contact_outline_kernels)
         self.reset()
 
     def reset(self) -> None:
@@ -332,7 +333,7 @@ def _closed_changes(square: Float, weak: float) -> NDArray[np.uint8]:
     """(h, w) uint8: 1 where a squared deviation is above `weak`, after closing by 3 x 3 cells, else 0."""
     if compiled.active():
         closed = np.empty(square.shape, np.uint8)
-        comparison_kernels.close_changes(square, weak, closed)
+        background_kernels.close_changes(square, weak, closed)
         return closed
     above = (square > weak).view(np.uint8)
     return np.asarray(cv2.morphologyEx(above, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)

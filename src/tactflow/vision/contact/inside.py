@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled, outline_kernels
-from tactflow.vision.outline_kernels import ALONG, RIDGE, SIDE, TIE
+from tactflow.vision import compiled
+from tactflow.vision.contact import inside_kernels
+from tactflow.vision.contact.inside_kernels import ALONG, RIDGE, SIDE, TIE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -78,7 +79,7 @@ def outline_depth(points: NDArray[Any], mask: NDArray[np.uint8], hidden: float, 
     outlines = [np.asarray(line[::step, 0], np.int32) for line, step in zip(lines, steps, strict=True)]
     if compiled.active():
         depth = np.empty(len(points))
-        outline_kernels.outline_depths(
+        inside_kernels.outline_depths(
             np.ascontiguousarray(points, np.float64),
             np.ascontiguousarray(mask),
             np.concatenate(outlines) if len(outlines) > 1 else np.ascontiguousarray(outlines[0]),

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tactflow.vision import comparison, compiled, imprint
-from tactflow.vision.comparison import CELL, Change, UntouchedGel
-from tactflow.vision.contact import ContactDetector, _closed_changes
+from tactflow.vision import compiled
+from tactflow.vision.contact import background, contact_outline
+from tactflow.vision.contact.background import CELL, Change, UntouchedGel
+from tactflow.vision.contact.detector import ContactDetector, _closed_changes
 
 Image = NDArray[np.uint8]
 
@@ -109,7 +110,7 @@ def test_both_ways_halve_a_window_of_a_mask_alike(
     found = []
     for on in (True, False):
         with compiled.switched(on):
-            found.append(imprint.hidden_cells(mask.astype(np.uint8), CELL * top, CELL * left, inside))
+            found.append(contact_outline.hidden_cells(mask.astype(np.uint8), CELL * top, CELL * left, inside))
     assert np.array_equal(*found)
 
 
@@ -127,7 +128,7 @@ def test_both_ways_fill_a_level_set_alike(
     for on in (True, False):
         masks.append(before.copy())
         with compiled.switched(on):
-            imprint.fill_level(level, top, left, masks[-1])
+            contact_outline.fill_level(level, top, left, masks[-1])
     assert np.array_equal(*masks)
 
 
@@ -188,5 +189,5 @@ def test_a_frame_that_must_not_be_written_is_compared() -> None:
 
 def test_the_kernels_of_the_comparison_do_not_wait_for_the_first_frame() -> None:
     ContactDetector()
-    assert comparison.smooth_cells._compiled is not None
-    assert imprint.continue_outline._compiled is not None
+    assert background.smooth_cells._compiled is not None
+    assert contact_outline.continue_outline._compiled is not None

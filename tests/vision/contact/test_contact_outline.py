@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.contact import ContactDetector
-from tactflow.vision.imprint import fill, imprint
+from tactflow.vision.contact.contact_outline import fill, imprint
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
-from tactflow.vision.imprint_kernels import (
+from tactflow.vision.contact.contact_outline_kernels import (
     cap_change,
     continue_outline,
     halve_window,

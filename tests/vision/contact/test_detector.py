@@ -14,10 +14,10 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
-from tactflow.vision import contact, imprint
-from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
+from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold, contact_outline
+from tactflow.vision.contact import detector as contact
+from tactflow.vision.contact.contact_outline import _solid
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.imprint import _solid
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import find_dot, marker_mask
 
@@ -497,7 +497,7 @@ def test_looking_closely_only_around_a_contact_gives_what_looking_everywhere_giv
     scene: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The profile across the rim is taken from every line of a small region, but some of a large one.
-    monkeypatch.setattr(imprint, "_ENOUGH", 10**9)
+    monkeypatch.setattr(contact_outline, "_ENOUGH", 10**9)
     around, everywhere = _Sensor(scene, 90), _Sensor(scene, 90)
     windows = contact._blobs
 

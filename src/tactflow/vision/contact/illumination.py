@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.comparison_kernels import coarse_excess, fit_light
+from tactflow.vision.contact.background_kernels import coarse_excess, fit_light
 
 Float = NDArray[np.float32]
 
