@@ -6,7 +6,6 @@ import errno
 import logging
 import threading
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import orjson
@@ -17,7 +16,6 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.engine.priority import ZMQ_SENDS, threads_named
 from tactflow.message import encode_message
 from tactflow.ports import Image
 from tactflow.vision.types import Contact, Flow, Markers
@@ -109,15 +107,6 @@ class Zmq(Sink):
         self._stats_wanted = False
         self._closing = threading.Event()
         self._stats_thread: threading.Thread | None = None
-        self._others: list[int] = []
-        self._io_threads: list[int] = []
-
-    @property
-    def live_threads(self) -> Sequence[int]:
-        """Native ids of the threads in which ZeroMQ sends, once they have named themselves."""
-        if self._socket is not None and not self._io_threads:
-            self._io_threads = threads_named(ZMQ_SENDS, besides=self._others)
-        return self._io_threads
 
     def open(self) -> None:
         """Bind the socket; afterwards `endpoint` is the real address.
@@ -127,8 +116,6 @@ class Zmq(Sink):
         StageError
             If the address is taken or cannot be bound.
         """
-        # All there are: those of another context may not have named themselves yet.
-        self._others = threads_named("")
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket = context.socket(zmq.XPUB)
         socket.sndhwm = self.params.backlog

@@ -30,7 +30,6 @@ import zmq
 from tactflow.config.sensors import PLACEHOLDER
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.engine.priority import ZMQ_SENDS, Precedence, threads_named
 from tactflow.engine.run import INTERRUPTED
 from tactflow.files import expanded, is_device, lead_nowhere, output, status
 
@@ -64,11 +63,10 @@ def run_fleet(args: argparse.Namespace, file: Path, pipelines: Mapping[str, Pipe
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-")))
         relays = _relays(pipelines)
-        realtime = all(pipeline.realtime_priority for pipeline in pipelines.values())
         for endpoint, ids in relays.items():
             upstream = [_private(scratch, name, id_) for name, id_ in ids]
             backlog = sum(getattr(pipelines[name].nodes[id_].params, "backlog", 1) for name, id_ in ids)
-            stack.enter_context(_relay(endpoint, upstream, backlog, realtime))
+            stack.enter_context(_relay(endpoint, upstream, backlog))
         members = []
         for name in pipelines:
             private = [
@@ -286,10 +284,10 @@ def _private(scratch: Path, sensor: str, id_: str) -> str:
 
 
 @contextmanager
-def _relay(endpoint: str, upstream: Sequence[str], backlog: int, realtime: bool) -> Iterator[None]:
+def _relay(endpoint: str, upstream: Sequence[str], backlog: int) -> Iterator[None]:
     """Bind `endpoint` and pass on what the upstream publishers send, while the block lasts.
 
-    backlog : messages that may wait for each subscriber. realtime : whether to ask for real-time priority.
+    backlog : messages that may wait for each subscriber.
     """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     front, back = context.socket(zmq.XPUB), context.socket(zmq.XSUB)
@@ -325,18 +323,10 @@ def _relay(endpoint: str, upstream: Sequence[str], backlog: int, realtime: bool)
 
     thread = threading.Thread(target=pass_on, name="tactflow-relay", daemon=True)
     thread.start()
-
-    def sending() -> list[int | None]:
-        # ZeroMQ's threads name themselves, in their own time.
-        return [thread.native_id, *threads_named(ZMQ_SENDS)]
-
-    precedence = Precedence(sending, realtime, len(upstream), "messages of all sensors")
-    precedence.start()
     print(f"tactflow: publishing {len(upstream)} sensors on {endpoint}", file=sys.stderr)
     try:
         yield
     finally:
-        precedence.stop()
         stop.set()
         thread.join(5)
         front.close()

@@ -18,6 +18,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from tactflow.cli.fleet import run_fleet
+from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.cli.story import share
@@ -72,6 +73,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started."""
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     file = find_pipeline(args.pipeline)
+    if args.sensor is None:
+        # Else it was said already by the process that starts one for each sensor.
+        warn_of_conflict()
     several = sensor_names(file, args.overrides) if args.sensor is None else []
     if len(several) > 1:
         return run_fleet(args, file, {name: _load(args, file, name) for name in several})
@@ -204,7 +208,7 @@ def _progress_display(
         task = display.add_task(runner.pipeline.sensor, total=None, rate=0.0, dropped=0)
 
         def update(now: RunProgress) -> None:
-            total = runner.max_frames or getattr(runner.source, "total", None)
+            total = runner.max_frames or (runner.source.total if runner.source else None)
             rate = now.frames / now.elapsed_s if now.elapsed_s > 0 else 0.0
             display.update(task, completed=now.frames, total=total, rate=rate, dropped=now.dropped)
 
@@ -272,7 +276,6 @@ def _summary(result: RunResult, runner: Runner) -> str:
     if latency["p50"] is not None:
         lines.append(f"latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")
     for name, node in runner.nodes.items():
-        target = getattr(node.instance, "description", None)
-        if node.is_sink and target:
-            lines.append(f"{name}: {target}")
+        if node.sink is not None and node.sink.description:
+            lines.append(f"{name}: {node.sink.description}")
     return "\n".join(lines)

@@ -77,7 +77,7 @@ def load_pipeline(
         nodes=nodes,
         skipping=_flag(root.entries, "skipping", True, problems),
         opencv_threads=envelope.whole(root.entries, "opencv_threads", 0, "", problems),
-        realtime_priority=_flag(root.entries, "realtime_priority", True, problems),
+        realtime_priority=_flag(root.entries, "realtime_priority", False, problems),
         runs=runs,
         warnings=_warnings(root, drafts),
         settings=_settings(root, name, drafts),

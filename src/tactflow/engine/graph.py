@@ -124,7 +124,7 @@ class Pipeline:
     nodes: Mapping[str, Node]
     skipping: bool = True
     opencv_threads: int | None = None
-    realtime_priority: bool = True
+    realtime_priority: bool = False
     runs: int = 1
     warnings: Sequence[str] = field(default_factory=list[str])
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])

@@ -112,10 +112,6 @@ def marker_mask(image: Bytes, dot: Dot) -> Bytes:
     ------
     ValueError : the image is not of that kind.
 
-    References
-    ----------
-    Function `mask_marker` of the original script, with another outer scale.
-
     Examples
     --------
     >>> import cv2
