@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tactflow.cli.main import main
-from tactflow.cli.story import share
+from tactflow.cli.node_summary import share
 
 PARTS = Path(__file__).resolve().parents[1] / "config" / "parts.py"
 TEXT = """\

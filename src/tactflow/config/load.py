@@ -10,16 +10,16 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from tactflow import files
 from tactflow.config import envelope, sensors, wiring
 from tactflow.config.complaints import complain
 from tactflow.config.registry import RESERVED, Section, code_place, did_you_mean, resolve
 from tactflow.config.wiring import Draft
 from tactflow.config.yamlmap import Entry, Item, Problems, read_value, read_yaml, wrap
-from tactflow.engine.contract import StageParams
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import ErrorAction, FullPolicy, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
+from tactflow.files import is_device
 
 TOP_LEVEL = ("sensor", "sensors", "skipping", "opencv_threads", "realtime_priority", "stages", "sinks")
 _SECTIONS: tuple[Section, ...] = get_args(Section)
@@ -222,11 +222,13 @@ def _does_as_much(there: Draft, added: Draft) -> bool:
 
 def _written(draft: Draft, params: StageParams | None) -> str | None:
     """The file or folder that a sink writes, however it is spelled; None for what is not one."""
-    named = files.output(params) if draft.section == "sinks" else None
-    # No file has such a name; the sink will say so.
-    if named is None or "\0" in named[1]:
-        return None
-    return os.path.realpath(files.expanded(named[1]))
+    cls = draft.component.cls if draft.component else None
+    declared = cls.outputs(params) if cls is not None and issubclass(cls, Sink) and params is not None else ()
+    for output in declared:
+        # No file has a name with NUL; the sink will say so.
+        if "\0" not in str(output.path) and not is_device(str(output.path)):
+            return os.path.realpath(output.path)
+    return None
 
 
 def _drafts(root: Item, section: Section, problems: Problems) -> list[Draft]:
