@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import inlined, kernel
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.geometry.downsample import halve_block
 
 Bytes = NDArray[np.uint8]
@@ -215,7 +215,7 @@ def sum_valid(
         masked[y] = count
 
 
-@inlined()
+@helper
 def mirror_margins(cells: Float, reach: int, rows: Places, columns: Places) -> None:
     """Fill the margins of `cells` with the cells of which they are the mirror image."""
     section = columns.size

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import inlined, kernel
+from tactflow.vision.compiled import helper, kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -137,7 +137,7 @@ def choose_spots(
     return chosen
 
 
-@inlined()
+@helper
 def link_cost(change_x: float, change_y: float, span_x: float, span_y: float, scale: float) -> float:
     """Cost of a difference of displacements of neighbours that are `span` apart; scale : 1 / span^2."""
     squared_strain = (change_x * change_x + change_y * change_y) * scale
@@ -147,7 +147,7 @@ def link_cost(change_x: float, change_y: float, span_x: float, span_y: float, sc
     return cost
 
 
-@inlined()
+@helper
 def nearest_spots(
     expected: FloatArray, spots: FloatArray, farthest: float, label: IntArray, away: FloatArray
 ) -> int:
@@ -177,7 +177,7 @@ def nearest_spots(
     return labels
 
 
-@inlined()
+@helper
 def add_inlier_links(
     origin: FloatArray,
     edges: IntArray,
@@ -206,7 +206,7 @@ def add_inlier_links(
             unary[n, labels] += MISSING_LINK_COST
 
 
-@inlined()
+@helper
 def own_best_is_smooth(
     origin: FloatArray,
     edges: IntArray,
@@ -296,7 +296,7 @@ def unary_costs(
     return 0 if smooth else labels
 
 
-@inlined()
+@helper
 def link_costs(
     origin: FloatArray,
     edges: IntArray,
@@ -334,7 +334,7 @@ def link_costs(
         link += 2
 
 
-@inlined()
+@helper
 def pass_messages(
     belief: FloatArray,
     source: IntArray,
@@ -363,7 +363,7 @@ def pass_messages(
             total[target[link], m] += fresh[m]
 
 
-@inlined()
+@helper
 def assign_spots(
     belief: FloatArray, choice: IntArray, label: IntArray, owner: IntArray, chosen: IntArray
 ) -> None:

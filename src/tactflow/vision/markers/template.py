@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import inlined, kernel
+from tactflow.vision.compiled import helper, kernel
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -230,7 +230,7 @@ def _lanczos(fraction: FloatArray) -> FloatArray:
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float64)
 
 
-@inlined(reorder=True)
+@helper
 def touch_patches(flat: NDArray[np.uint8], shape: Any, start: FloatArray, reach: int) -> int:
     """Read the ends of all rows of all patches, which brings them into the cache; a number without meaning.
 
@@ -249,7 +249,7 @@ def touch_patches(flat: NDArray[np.uint8], shape: Any, start: FloatArray, reach:
     return touched
 
 
-@inlined(reorder=True)
+@helper
 def read_patch(
     flat: NDArray[np.uint8],
     shape: Any,
@@ -288,7 +288,7 @@ def read_patch(
             words[p] |= np.int32(flat[i + two]) << two_bytes
 
 
-@inlined(reorder=True)
+@helper
 def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Float32Array) -> None:
     """Grey levels as OpenCV makes them of BGR, less 128: far from zero, sums of squares would lose digits."""
     blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
@@ -304,7 +304,7 @@ def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Float32Array
             patch[p] = np.float32(words[p] - middle)
 
 
-@inlined(reorder=True)
+@helper
 def fit_template(weight: Float32Array, product: Float32Array, patch: Float32Array) -> Any:
     """Gain, shift x and y times gain, and the explained and the unexplained sum of squares of a patch."""
     gain = shift_x = shift_y = light = slope_x = slope_y = contrast = np.float32(0.0)

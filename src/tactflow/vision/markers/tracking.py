@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import inlined, kernel
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.markers.detection import Detection, refine_centers, require_image, to_gray
 from tactflow.vision.markers.field import DisplacementField
 from tactflow.vision.markers.interpolation import Interpolator
@@ -337,7 +337,7 @@ def _lengths(vectors: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)), np.float64)
 
 
-@inlined()
+@helper
 def trusted(gain: Any, r_squared: Any) -> Any:
     """Whether a mark is seen, from how its template fits; of numbers or arrays."""
     return (gain > LEAST_GAIN) & (gain < MOST_GAIN) & (r_squared > LEAST_R_SQUARED)
