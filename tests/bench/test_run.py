@@ -128,7 +128,7 @@ def test_the_command_writes_results_and_fails_when_something_got_worse(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tactflow.cli.bench.run_bench", lambda _plan, _progress: result)
-    files = ["--json", "b.json", "--html", "b.html", "--errors", "e.json"]
+    files = ["--json", "b.json", "--html", "b.html", "--write-baseline", "e.json"]
     assert main(["bench", "--quick", *files]) == 0
     out, err = capsys.readouterr()
     assert "Whole pipelines" in out

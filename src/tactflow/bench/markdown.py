@@ -7,9 +7,10 @@ from pathlib import Path
 from statistics import median
 
 from tactflow.bench.methods import CLASSIC
+from tactflow.bench.pareto import limit_of
 from tactflow.bench.pipelines import ORIGINAL
-from tactflow.bench.quantities import QUANTITIES
-from tactflow.bench.report import PRIMARY, TITLES, format_number, limit_of
+from tactflow.bench.quantities import QUANTITIES, format_number
+from tactflow.bench.report import PRIMARY, TITLES
 from tactflow.bench.results import RECORDING, Measurement, Result
 
 BEGIN = "<!-- tables of tactflow bench: written by --markdown -->"

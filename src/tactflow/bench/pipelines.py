@@ -105,6 +105,7 @@ ORIGINAL = "original script"
 """The yardstick plus what the script repeats in every frame without need."""
 
 _REPEATS_EVERY = 5
+"""Frames from one to the next on which the repeats are timed: one takes as long as the rest of the script."""
 
 
 class OriginalRepeats:
@@ -193,7 +194,6 @@ def take_turns(
                 longest = 0
                 for name in list(active):
                     try:
-                        # A pipeline waits outside of its turn, so that this acts on no other.
                         outcomes = running[name].block(block)
                     except TactflowError as error:
                         failures[name] = str(error)
