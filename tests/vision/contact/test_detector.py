@@ -96,7 +96,7 @@ def test_noise_is_measured_in_the_reference_frames() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.5, 2.0, 5.0])
-def test_the_imprint_of_a_ball_is_found_with_its_middle(noise: float) -> None:
+def test_the_contact_of_a_ball_is_found_with_its_middle(noise: float) -> None:
     gel = _gel()
     center, radius = (61.0, 83.0), 24.0
     result = _detector(_noisy(gel, 1, noise)).detect(_noisy(_pressed(gel, center, radius), 2, noise))
@@ -560,7 +560,7 @@ def test_real_presses_of_a_ball_are_all_found_where_the_labels_say(shared_data: 
         growth.append(math.sqrt(x.size / math.pi) - float(label["radius"]))
     distance = np.hypot(*(np.array(errors) - np.median(errors, axis=0)).T)
     # Measured over all 200: 2.1 px median, 5.1 px at the 95th percentile, against labels that scatter by
-    # about 2 px themselves; the imprint's radius is 2.8 px above the label's in the median.
+    # about 2 px themselves; the outline's radius is 2.8 px above the label's in the median.
     assert np.median(distance) < 2.6
     assert np.percentile(distance, 95) < 6.5
     assert abs(np.median(growth)) < 5
