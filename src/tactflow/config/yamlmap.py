@@ -91,12 +91,11 @@ class Problems:
     """
 
     lines: dict[str, list[str]] = field(default_factory=dict)
-    found: list[tuple[Mark, str]] = field(default_factory=list)
+    found: dict[tuple[Mark, str], None] = field(default_factory=dict)
 
     def add(self, mark: Mark, message: str) -> None:
-        """Record one mistake."""
-        if (mark, message) not in self.found:
-            self.found.append((mark, message))
+        """Record one mistake; one that is known already is not told twice."""
+        self.found[mark, message] = None
 
     def raise_if_any(self) -> None:
         """Raise a ConfigError that holds every mistake, in the order of the file."""
