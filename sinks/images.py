@@ -7,14 +7,14 @@ from typing import Literal
 import cv2
 from pydantic import Field
 
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.engine.stage import StageParams
 from tactflow.files import expanded
 from tactflow.ports import Picture
 
 
-class Images:
+class Images(Sink):
     """Writes pictures to `folder/frame-000036.png`, numbered by the frame's `seq`.
 
     The picture comes from the port `annotated`. `in: {annotated: inpaint.unmarked}` writes another port

@@ -14,9 +14,9 @@ from typing import BinaryIO, Literal
 
 from pydantic import Field, model_validator
 
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.engine.stage import StageParams
 from tactflow.files import expanded, lead_nowhere
 from tactflow.message import encode_message
 from tactflow.ports import Image
@@ -25,7 +25,7 @@ from tactflow.vision.types import Contact, Flow, Markers
 log = logging.getLogger("tactflow")
 
 
-class Jsonl:
+class Jsonl(Sink):
     """Writes result messages to a file or to standard output, complete lines only.
 
     Lines reach a file at least every `flush` seconds of frames and at the end, and standard output at once.

@@ -17,11 +17,11 @@ import yaml
 from pydantic import Field, model_validator
 
 from tactflow import __version__
+from tactflow.engine.contract import Recorder, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.rate import SLACK, RateLimit
-from tactflow.engine.stage import StageParams
 from tactflow.files import expanded
 from tactflow.message import encode_message
 from tactflow.ports import Image
@@ -40,7 +40,7 @@ BACKLOG_SHARE = 4
 """Frames from memory that are written per new frame, so that saving them never holds up the run."""
 
 
-class Record:
+class Record(Recorder):
     """Records to a file from the start, when told to, or when something touches the gel.
 
     With `ring`, the last seconds are kept in memory, compressed, and become the beginning of the file. A

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.engine.stage import StageParams
 from tactflow.files import expanded
 from tactflow.ports import Picture
 
@@ -30,7 +30,7 @@ MIN_FREE_BYTES = 16 << 20
 FRAMES_BETWEEN_DISK_CHECKS = 50
 
 
-class Video:
+class Video(Sink):
     """Writes annotated frames to a video file; its extension chooses the codec.
 
     The file plays at the pace at which the frames were captured: without `fps`, the rate is the median of

@@ -16,9 +16,9 @@ import orjson
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
-from tactflow.engine.stage import StageParams
 from tactflow.message import STATUS_NAMES, encode_message
 from tactflow.ports import Image
 from tactflow.view.address import Neighbours, address, bind, is_loopback
@@ -34,7 +34,7 @@ STATUS_LETTERS = np.array([ord(name[0]) for name in STATUS_NAMES], np.uint8)
 """The first letter of the word for each value of `MarkerStatus`."""
 
 
-class View:
+class View(Sink):
     """Serves a page that draws the results over the processed frame, and can pause and end the run.
 
     While no page is open, or none is ready for another frame, nothing is wanted and nothing is encoded. A

@@ -13,11 +13,11 @@ import orjson
 import zmq
 from pydantic import Field
 
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.priority import ZMQ_SENDS, threads_named
-from tactflow.engine.stage import StageParams
 from tactflow.message import encode_message
 from tactflow.ports import Image
 from tactflow.vision.types import Contact, Flow, Markers
@@ -27,7 +27,7 @@ log = logging.getLogger("tactflow")
 STATS_TOPIC = b"tactflow.stats "
 
 
-class Zmq:
+class Zmq(Sink):
     """Publishes one message per frame: `tactflow.<sensor>`, a space, the JSON of `tactflow.frame/1`.
 
     Knows who listens: while nobody has subscribed to this sensor, nothing is wanted and nothing encoded.

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
-from tactflow.engine.stage import StageParams
 from tactflow.sources import CameraRequest, FrameReader, LiveReader, StampedReader, Watch, open_source
 from tactflow.sources.files import load_image
 from tactflow.sources.pace import Pace
 
 
-class Capture:
+class Capture(Source):
     """Reads frames and says which of them show the untouched gel.
 
     Recordings are handed over as fast as they are taken, or, with `realtime`, at their own pace and then

@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 
 from pydantic import Field
 
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.engine.stage import StageParams
 from tactflow.ports import ContactMask, MarkerMask, Touching, Unmarked
 from tactflow.vision.contact import ContactDetector
 
@@ -19,7 +19,7 @@ class ContactPorts(NamedTuple):
     touching: Touching
 
 
-class Difference:
+class Difference(Stage):
     """Compare the unmarked frame with the untouched gel (seed function `difference`).
 
     All frames marked as reference are learned from (`seed` and `colour`: the last one); the first frame

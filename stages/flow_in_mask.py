@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
 from tactflow.vision import compiled
 from tactflow.vision.contact import inside_kernels
@@ -14,7 +14,7 @@ from tactflow.vision.flow import flow_in_mask, in_mask
 from tactflow.vision.types import Flow, Markers
 
 
-class FlowInMask:
+class FlowInMask(Stage):
     """Mean displacement, twist and press of the markers inside the contact (seed's `draw_flow_mask`)."""
 
     memory = "pure"

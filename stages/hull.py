@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
-from tactflow.engine.stage import StageParams
 from tactflow.ports import ContactMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import moments
@@ -15,7 +15,7 @@ from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Contact
 
 
-class Hull:
+class Hull(Stage):
     """Hull, area, centroid, direction and ellipse of the contact.
 
     Seed functions `get_all_contour`, `get_convex_hull_area` and `regress_line`.

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
@@ -14,7 +14,7 @@ from tactflow.vision.markers import inpaint_kernels
 from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
 
 
-class Inpaint:
+class Inpaint(Stage):
     """Fill the markers from their surroundings (seed function `inpaint`)."""
 
     memory = "pure"

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
@@ -16,7 +16,7 @@ from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 from tactflow.vision.seed_contact import seed_marker_mask
 
 
-class MarkerMaskStage:
+class MarkerMaskStage(Stage):
     """Mask of the marker dots (seed function `mask_marker`); the first frame shows how they look."""
 
     memory = "stateful"

@@ -6,8 +6,8 @@ from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
 from tactflow.vision import compiled
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, downsample, find_homography
@@ -53,7 +53,7 @@ class Preprocessed(NamedTuple):
     mapping: PixelMapping
 
 
-class Preprocess:
+class Preprocess(Stage):
     """Straighten, cut, turn and shrink the frame in one pass (seed function `get_processed_frame`)."""
 
     memory = "pure"

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from pydantic import Field
 
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.engine.stage import StageParams
 from tactflow.ports import Changed
 from tactflow.vision.change import ChangeProbe
 
@@ -21,7 +21,7 @@ class ProbePorts(NamedTuple):
     changed: Changed
 
 
-class Probe:
+class Probe(Stage):
     """Looks at samples of the raw frame, so that stages with `when: changed` repeat their results."""
 
     memory = "stateful"
@@ -100,7 +100,7 @@ class Probe:
         One that is faint and ends a short rest is a slow motion: it is held for twice as long as the last
         one, to see more of it.
         """
-        hold = self.params.hold
+        hold: int = self.params.hold
         if not faint or self._rest >= 2 * self._span:
             return hold
         return self._span if self._rest == 0 else min(2 * self._span, max(hold, self.params.at_least_every))

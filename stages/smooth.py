@@ -6,13 +6,13 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent, Frame
-from tactflow.engine.stage import StageParams
 from tactflow.vision.smooth import ContactSmoother
 from tactflow.vision.types import Contact
 
 
-class Smooth:
+class Smooth(Stage):
     """Filter the contact's centre and angle over time; hull, area and ellipse stay as measured."""
 
     memory = "stateful"

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.engine.stage import StageParams
 from tactflow.ports import Image
 from tactflow.vision import compiled
 from tactflow.vision.markers import matching, template_kernels, tracking_kernels
@@ -19,7 +19,7 @@ from tactflow.vision.seed_tracker import SeedTracker
 from tactflow.vision.types import Markers
 
 
-class Tracker:
+class Tracker(Stage):
     """Follow the marker dots of the reference frame.
 
     Seed functions `marker_center`, `m.init`, `m.run` and `m.get_flow`.

@@ -6,13 +6,13 @@ from typing import Literal
 
 from pydantic import Field
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Image, Picture
 from tactflow.vision.draw import Annotator
 from tactflow.vision.types import Contact, Flow, Markers
 
 
-class Visualize:
+class Visualize(Stage):
     """Draw contact, markers and flow (seed functions `draw_flow`, `draw_flow_mask`, `regress_line`)."""
 
     memory = "pure"

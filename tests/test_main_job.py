@@ -199,13 +199,11 @@ def test_one_signal_drains_and_finalises(number: int, tmp_path: Path) -> None:
 
 SLOW = """
 import time
+from tactflow.engine.contract import Stage
 from tactflow.ports import Image
 
-class Slow:
+class Slow(Stage):
     memory = "pure"
-    class Params(__import__("tactflow.engine.stage", fromlist=["StageParams"]).StageParams):
-        pass
-    def __init__(self, params): pass
     def process(self, image: Image) -> Image:
         time.sleep(60)
         return image

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.engine.stage import ArrayPort, SignalPort
+from tactflow.engine.ports import ArrayPort, SignalPort
 
 Image = Annotated[NDArray[np.uint8], ArrayPort("image", ("H", "W", 3), "uint8", "grey levels, BGR")]
 """The processed frame."""
@@ -33,3 +33,6 @@ Touching = Annotated[bool, SignalPort("touching", closed="no_contact")]
 
 Changed = Annotated[bool, SignalPort("changed", closed="unchanged", otherwise="repeat")]
 """True when the frame differs from the last one that was worked on by more than the sensor's noise."""
+
+Held = Annotated[bool, SignalPort("held", closed=None)]
+"""Another signal, held true for longer."""

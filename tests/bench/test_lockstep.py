@@ -16,11 +16,12 @@ from tactflow.engine.graph import Pipeline
 
 STAGES = '''
 import numpy as np
+from tactflow.engine.contract import Stage
 from tactflow.engine.frame import Absent, Frame
 from tactflow.ports import ContactMask
 from tactflow.vision.types import Contact
 
-class Mean:
+class Mean(Stage):
     """A contact whose area is the mean of the frame; none in black frames."""
     memory = "pure"
     def __init__(self, params): ...
@@ -127,11 +128,12 @@ def test_what_came_before_a_failure_in_the_middle_of_a_block_is_kept(
 def test_a_frames_time_is_its_own_and_not_that_of_its_block(tmp_path: Path) -> None:
     source = """
 import time
+from tactflow.engine.contract import Stage
 from tactflow.engine.frame import Frame
 from tactflow.vision.types import Contact
 import numpy as np
 
-class Sleeps:
+class Sleeps(Stage):
     memory = "pure"
     def __init__(self, params): ...
     def process(self, frame: Frame) -> Contact:

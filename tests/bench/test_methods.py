@@ -11,8 +11,8 @@ from tactflow.bench.scenes import FULL, FULL_STAGES, NOMINAL, QUICK, QUICK_STAGE
 from tactflow.bench.timing import CopyUnit
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.config.load import load_pipeline
+from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.stage import StageParams
 from tactflow.sim import scene_names
 from tactflow.vision.geometry import PixelMapping, Preprocessor
 

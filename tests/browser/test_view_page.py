@@ -334,18 +334,21 @@ def test_without_a_record_sink_the_button_says_so(watched: Run, open_page: Calla
 
 
 RECORDER = """
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Recorder
 from tactflow.ports import Image
 
-class Recorder:
-    def __init__(self, params: StageParams) -> None:
-        self.recording = False
+class Switch(Recorder):
+    on = False
+
+    @property
+    def recording(self) -> bool:
+        return self.on
 
     def start_recording(self) -> None:
-        self.recording = True
+        self.on = True
 
     def stop_recording(self) -> None:
-        self.recording = False
+        self.on = False
 
     def write(self, image: Image) -> None:
         pass
@@ -358,7 +361,7 @@ def test_the_record_button_starts_and_stops_a_record_sink(
     (tmp_path / "recorder.py").write_text(RECORDER)
     (tmp_path / "pipeline.yaml").write_text(
         f"stages:\n  capture: {{source: '{ENDLESS}', realtime: true}}\n  preprocess: {{downsample: 2}}\n"
-        "sinks:\n  view: {}\n  recorder: {use: './recorder.py:Recorder'}\n"
+        "sinks:\n  view: {}\n  recorder: {use: './recorder.py:Switch'}\n"
     )
     page = open_page(run(cwd=tmp_path).url)
     watch(page)

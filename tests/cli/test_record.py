@@ -65,7 +65,8 @@ def test_replay_is_equal_across_a_new_reference(tmp_path: Path) -> None:
     sink = tmp_path / "again.py"
     sink.write_text(
         "from tactflow.engine.frame import Tick\n"
-        "class Again:\n"
+        "from tactflow.engine.contract import Sink\n"
+        "class Again(Sink):\n"
         "    def __init__(self, params, control=None):\n"
         "        self.control = control\n"
         "    def write(self, tick: Tick) -> None:\n"
@@ -139,7 +140,8 @@ sinks:
 FAILS_ONCE = """
 from pathlib import Path
 from tactflow.engine.frame import Tick
-class FailsOnce:
+from tactflow.engine.contract import Sink
+class FailsOnce(Sink):
     def __init__(self, params, sensor="main"):
         self.done = Path("failed")
         self.here = sensor == "left" and not self.done.exists()

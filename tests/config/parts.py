@@ -11,15 +11,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from tactflow.engine import contract
+from tactflow.engine.contract import Sink, Stage, StageParams
 from tactflow.engine.frame import Absent, Frame, Tick
-from tactflow.engine.stage import StageParams
 from tactflow.ports import ContactMask, Image, Touching
 from tactflow.vision.types import Contact, Flow
 
 ZERO = np.zeros((0, 2))
 
 
-class Source:
+class Source(contract.Source):
     class Params(StageParams):
         source: str | int = Field("sim:press", description="where frames come from")
         realtime: bool = Field(False, description="at its own pace")
@@ -50,7 +51,7 @@ class Turn(BaseModel):
     angle: float = Field(description="degrees")
 
 
-class Prepare:
+class Prepare(Stage):
     memory = "pure"
 
     class Params(StageParams):
@@ -75,7 +76,7 @@ class Prepare:
         return frame.image
 
 
-class Invert:
+class Invert(Stage):
     memory = "pure"
 
     def __init__(self, params: StageParams) -> None:
@@ -90,7 +91,7 @@ class Masks(NamedTuple):
     touching: Touching
 
 
-class Compare:
+class Compare(Stage):
     memory = "stateful"
 
     class Params(StageParams):
@@ -103,7 +104,7 @@ class Compare:
         return Masks(image[:, :, 0], frame.seq > 0)
 
 
-class Outline:
+class Outline(Stage):
     memory = "pure"
 
     class Params(StageParams):
@@ -121,7 +122,7 @@ class Outline:
         )
 
 
-class Refine:
+class Refine(Stage):
     memory = "pure"
 
     def __init__(self, params: StageParams) -> None:
@@ -131,7 +132,7 @@ class Refine:
         return contact if flow is None else Contact(float(flow.count), contact.center, None, None, ZERO, None)
 
 
-class Needy:
+class Needy(Stage):
     memory = "pure"
 
     class Params(StageParams):
@@ -144,7 +145,7 @@ class Needy:
         return Flow(None, int(image[0, 0, 0]))
 
 
-class Publish:
+class Publish(Sink):
     class Params(StageParams):
         path: str = Field("out", description="file")
 
@@ -155,7 +156,7 @@ class Publish:
         pass
 
 
-class Require:
+class Require(Sink):
     def __init__(self, params: StageParams) -> None:
         self.params = params
 
@@ -163,7 +164,7 @@ class Require:
         pass
 
 
-class Viewer:
+class Viewer(Sink):
     observer = True
 
     def __init__(self, params: StageParams) -> None:
@@ -173,7 +174,7 @@ class Viewer:
         pass
 
 
-class Forgetful:
+class Forgetful(Stage):
     def __init__(self, params: StageParams) -> None:
         self.params = params
 
@@ -181,7 +182,7 @@ class Forgetful:
         raise NotImplementedError
 
 
-class Bare:
+class Bare(Stage):
     memory = "pure"
 
     def __init__(self, params: StageParams) -> None:
@@ -191,7 +192,7 @@ class Bare:
         raise NotImplementedError
 
 
-class Both:
+class Both(Sink):
     memory = "pure"
 
     def __init__(self, params: StageParams) -> None:

@@ -70,7 +70,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
         ["stagse: unknown key", "did you mean stages?"],
     ),
     "unknown top-level key": (HEAD + SINK + "§colour: red\n", ["colour: unknown key", "sensor, sensors"]),
-    "no stages": ("§sensor: main\n", ["stages is missing"]),
+    "no stages": ("§sensor: main\n", ["stages: required, but not given", "id -> stage"]),
     "stages that are a list": (
         "stages:\n  §- capture\n" + SINK,
         ["stages: expected a mapping", "got a list"],
@@ -168,12 +168,12 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "not a module name": (HEAD + "  a: {use: §'a b:C'}\n" + SINK, ["'a b' is not the name of a module"]),
     "something that is no stage": (
         HEAD + "  a: {use: §'collections:OrderedDict'}\n" + SINK,
-        ["OrderedDict must have exactly one of process()"],
+        ["OrderedDict must inherit from Source or Stage or Sink of tactflow"],
     ),
     "function instead of a class": (HEAD + "  a: {use: §'os.path:join'}\n" + SINK, ["has no class join"]),
     "stage and sink in one class": (
         HEAD + "  a: {use: §'./parts.py:Both'}\n" + SINK,
-        ["must have exactly one of"],
+        ["Both: a sink has no process()", "a class is one of stage, sink and source"],
     ),
     "undeclared memory": (
         PREPARE + "  a: {use: §'./parts.py:Forgetful'}\n" + SINK,
@@ -238,7 +238,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
     ),
     "misspelled choice": (
         HEAD + "  p: {use: './parts.py:Prepare', method: §pyramide}\n" + SINK,
-        ["expected 'area' or 'pyramid', got 'pyramide'; did you mean pyramid?"],
+        ["expected area or pyramid, got 'pyramide'; did you mean pyramid?"],
     ),
     "scalar for a list": (
         HEAD + "  p: {use: './parts.py:Prepare', corners: §3}\n" + SINK,
@@ -403,20 +403,24 @@ CASES: dict[str, tuple[str, list[str]]] = {
         ["a source cannot be gated"],
     ),
     "gate without a signal": (
-        COMPARE + "  o: {use: './parts.py:Outline', when: §{hold: 3}}\n" + SINK,
-        ["stages.o.when: signal is missing"],
+        COMPARE + "  o: {use: './parts.py:Outline', when: §{otherwise: repeat}}\n" + SINK,
+        ["stages.o.when.signal: required, but not given", "bool port"],
     ),
     "gate that is a number": (
         COMPARE + "  o: {use: './parts.py:Outline', when: §5}\n" + SINK,
         ["when: expected the name of a signal", "got 5"],
     ),
     "unknown gate setting": (
-        COMPARE + "  o: {use: './parts.py:Outline', when: {signal: touching, §holds: 3}}\n" + SINK,
-        ["when.holds: unknown key; did you mean hold?"],
+        COMPARE + "  o: {use: './parts.py:Outline', when: {signal: touching, §otherwize: repeat}}\n" + SINK,
+        ["when.otherwize: unknown key; did you mean otherwise?"],
     ),
-    "negative hold": (
-        COMPARE + "  o: {use: './parts.py:Outline', when: {signal: touching, hold: §-3}}\n" + SINK,
-        ["when.hold: expected a whole number >= 0, got -3"],
+    "gate with a memory": (
+        COMPARE + "  o: {use: './parts.py:Outline', when: {signal: touching, §hold: 3}}\n" + SINK,
+        ["when.hold: unknown key; a gate has no memory", "the stage hold", "{use: hold, hold: 3"],
+    ),
+    "gate that opens now and then": (
+        COMPARE + "  o: {use: './parts.py:Outline', when: [{signal: touching, §at_least_every: 9}]}\n" + SINK,
+        ["when.0.at_least_every: unknown key; a gate has no memory", "{use: hold, at_least_every: 3"],
     ),
     "bad gate in a list": (
         COMPARE + "  o: {use: './parts.py:Outline', when: [touching, §nothing]}\n" + SINK,
@@ -569,7 +573,10 @@ def test_a_file_that_cannot_be_read(
         ("import no_such_thing\n", r"own\.py:1: cannot load \./own\.py: ModuleNotFoundError"),
         ("x = 1\ny = x / 0\n", r"own\.py:2: cannot load \./own\.py: ZeroDivisionError"),
         ("raise SystemExit(5)\n", r"own\.py:1: cannot load \./own\.py: SystemExit"),
-        ("class _A:\n    def process(self): ...\n", r"own\.py has no public class with process\(\)"),
+        (
+            "class _A:\n    def process(self): ...\n",
+            r"own\.py has no public class that inherits from Stage",
+        ),
     ],
 )
 def test_a_mistake_in_an_own_file_is_shown_with_its_line(

@@ -17,12 +17,12 @@ from tactflow.engine.errors import ConfigError
 STAGE = """
 from __future__ import annotations
 
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image
 from tactflow.vision.types import Contact
 
 
-class {name}:
+class {name}(Stage):
     memory = "pure"
 
     def __init__(self, params: StageParams) -> None: ...
@@ -189,7 +189,11 @@ def test_nothing_is_written_beside_a_loose_file(tmp_path: Path) -> None:
             "def __init__(self)",
             "must be built from its parameters",
         ),
-        ('    memory = "pure"\n', '    memory = "none"\n', "must declare memory .* got 'none'"),
+        (
+            '    memory = "pure"\n',
+            '    memory = "none"\n',
+            "memory: required 'pure' or .* got 'none'",
+        ),
         ('    memory = "pure"\n', '    memory = "pure"\n    Params = dict\n', "must be a subclass of"),
         (
             '    memory = "pure"\n',

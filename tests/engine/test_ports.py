@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Absent, Frame, Tick
-from tactflow.engine.stage import ArrayPort, Port, SignalPort, describe_type, mismatch, port_type, read_ports
+from tactflow.engine.ports import ArrayPort, Port, SignalPort, describe_type, mismatch, port_type, read_ports
 from tactflow.ports import ContactMask, Image, Picture, Touching
 from tactflow.vision.types import Contact, Flow, Markers
 
@@ -66,7 +66,7 @@ def test_parameters_are_input_ports_and_none_makes_them_optional() -> None:
     ]
     assert port_type(ports.inputs[0].annotation).name == "image"
     assert ports.inputs[1].annotation is Contact
-    assert not ports.takes_tick
+    assert all(parameter.ports for parameter in ports.parameters)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_sink_may_take_the_tick() -> None:
         def write(self, tick: Tick, contact: Contact | None) -> None: ...
 
     ports = read_ports(Sink, "write")
-    assert ports.takes_tick
+    assert [parameter.name for parameter in ports.parameters] == ["tick", "contact"]
     assert [port.name for port in ports.inputs] == ["contact"]
     assert ports.outputs == ()
 
@@ -127,7 +127,7 @@ def test_a_source_gives_the_port_frame(annotation: Any) -> None:
 
     Source.frames.__annotations__["return"] = annotation
     ports = read_ports(Source, "frames")
-    assert ports.inputs == ()
+    assert ports.inputs == []
     assert ports.outputs == (Port("frame", Frame),)
 
 

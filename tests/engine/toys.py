@@ -13,8 +13,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.engine import contract
+from tactflow.engine.contract import Sink, Stage, StageParams
 from tactflow.engine.frame import Absent, Frame, Tick
-from tactflow.engine.stage import ArrayPort, SignalPort, StageParams
+from tactflow.engine.ports import ArrayPort, SignalPort
 
 Grid = Annotated[NDArray[np.uint8], ArrayPort("grid", ("H", "W"), "uint8", "1")]
 Active = Annotated[bool, SignalPort("active", closed="idle")]
@@ -25,7 +27,7 @@ class Number:
     value: float
 
 
-class Ramp:
+class Ramp(contract.Source):
     """A source whose frame i shows the number i everywhere."""
 
     class Params(StageParams):
@@ -43,10 +45,16 @@ class Ramp:
     def __init__(self, params: Params, sensor: str) -> None:
         self.params, self.sensor = params, sensor
         self.live = params.realtime
-        self.missed = params.overtaken
-        self.live_threads = [] if params.reader is None else [params.reader]
         self.stopped = threading.Event()
         self.closed = 0
+
+    @property
+    def missed(self) -> int:
+        return self.params.overtaken
+
+    @property
+    def live_threads(self) -> list[int]:
+        return [] if self.params.reader is None else [self.params.reader]
 
     def open(self) -> None:
         if self.params.refuse:
@@ -111,7 +119,7 @@ class LevelPorts(NamedTuple):
     grid: Grid
 
 
-class Level(Counted):
+class Level(Counted, Stage):
     def process(self, frame: Frame) -> LevelPorts:
         self.saw(frame.seq)
         return LevelPorts(Number(float(frame.seq)), frame.image[:, :, 0].copy())
@@ -121,7 +129,7 @@ class ActivePorts(NamedTuple):
     active: Active
 
 
-class Pulse(Counted):
+class Pulse(Counted, Stage):
     """True in frames 3 to 6 of every ten."""
 
     def process(self, frame: Frame) -> ActivePorts:
@@ -129,7 +137,7 @@ class Pulse(Counted):
         return ActivePorts(3 <= frame.seq % 10 <= 6)
 
 
-class Even(Counted):
+class Even(Counted, Stage):
     """True in every second frame."""
 
     def process(self, frame: Frame) -> ActivePorts:
@@ -141,7 +149,7 @@ class HeavyPorts(NamedTuple):
     heavy: Number
 
 
-class Heavy(Counted):
+class Heavy(Counted, Stage):
     def process(self, level: Number) -> HeavyPorts:
         self.saw(int(level.value))
         return HeavyPorts(Number(level.value**2))
@@ -151,7 +159,7 @@ class GatedPorts(NamedTuple):
     gated: Number
 
 
-class Gated(Counted):
+class Gated(Counted, Stage):
     def process(self, heavy: Number) -> GatedPorts:
         self.saw(int(heavy.value**0.5))
         return GatedPorts(Number(heavy.value + 0.5))
@@ -161,7 +169,7 @@ class TotalPorts(NamedTuple):
     total: Number
 
 
-class Total(Counted):
+class Total(Counted, Stage):
     memory = "stateful"
     value = 0.0
 
@@ -179,13 +187,13 @@ class JoinPorts(NamedTuple):
     joined: Number
 
 
-class Join(Counted):
+class Join(Counted, Stage):
     def process(self, level: Number, total: Number, gated: Number | None) -> JoinPorts:
         self.saw(int(level.value))
         return JoinPorts(Number(level.value + 1000 * total.value + (gated.value if gated else -7.0)))
 
 
-class Rare(Counted):
+class Rare(Counted, Stage):
     """Gives nothing in every third frame."""
 
     def process(self, level: Number) -> Number | Absent:
@@ -193,14 +201,14 @@ class Rare(Counted):
         return Absent("third") if level.value % 3 == 0 else level
 
 
-class ByName(Counted):
+class ByName(Counted, Stage):
     """Takes its inputs by name only."""
 
     def process(self, *, level: Number, total: Number) -> Number:
         return Number(level.value - total.value)
 
 
-class Turned(Counted):
+class Turned(Counted, Stage):
     """Its function is wrapped in one that takes everything by name, and shows the inner one's annotations."""
 
     @staticmethod
@@ -216,14 +224,14 @@ class Turned(Counted):
         return Number(level.value - total.value)
 
 
-class LateTick(Counted):
+class LateTick(Counted, Sink):
     """A sink that asks for the tick behind its inputs."""
 
     def write(self, number: Number | None, total: Number, tick: Tick) -> None:
         self.rows = [*getattr(self, "rows", []), (tick.frame.seq, number and number.value, total.value)]
 
 
-class Quitter(Counted):
+class Quitter(Counted, Stage):
     """Ends the program where it should only complain."""
 
     def __init__(self, params: Counted.Params) -> None:
@@ -234,7 +242,7 @@ class Quitter(Counted):
         return level
 
 
-class Vandal(Counted):
+class Vandal(Counted, Stage):
     """Writes into its input, which a stage must not do."""
 
     def process(self, grid: Grid) -> Number:
@@ -242,14 +250,14 @@ class Vandal(Counted):
         return Number(0.0)
 
 
-class BadShape(Counted):
+class BadShape(Counted, Stage):
     def process(
         self, grid: Grid
     ) -> Annotated[NDArray[np.uint8], ArrayPort("half", ("H", "W"), "uint8", "1")]:
         return grid[:2].copy()
 
 
-class Collect(Counted):
+class Collect(Counted, Sink):
     """A sink that keeps what it gets."""
 
     wanted = True
@@ -279,7 +287,7 @@ class Archive(Collect):
     when_live = "block"
 
 
-class FrameArchive(Counted):
+class FrameArchive(Counted, Sink):
     threaded = True
     when_live = "block"
 
@@ -293,7 +301,7 @@ class Onlooker(Collect):
     observer = True
 
 
-class OnlyLevel(Counted):
+class OnlyLevel(Counted, Sink):
     """A sink that asks for little."""
 
     def write(self, tick: Tick, level: Number) -> None:  # noqa: ARG002 (the port must be asked for)

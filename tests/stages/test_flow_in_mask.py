@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tactflow.engine.stage import read_ports
+from tactflow.engine.ports import read_ports
 from tactflow.stages.flow_in_mask import FlowInMask
 from tactflow.vision.types import Flow, Markers
 

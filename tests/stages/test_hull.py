@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from tactflow.engine.frame import Absent
-from tactflow.engine.stage import read_ports
+from tactflow.engine.ports import read_ports
 from tactflow.stages.hull import Hull
 from tactflow.vision.types import Contact
 

@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from tactflow.engine.frame import Frame
-from tactflow.engine.stage import read_ports
+from tactflow.engine.ports import read_ports
 from tactflow.stages.preprocess import Preprocess
 
 WEDGE = {

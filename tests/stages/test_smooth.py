@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from tactflow.engine.frame import Absent, Frame
-from tactflow.engine.stage import read_ports
+from tactflow.engine.ports import read_ports
 from tactflow.stages.smooth import Smooth
 from tactflow.vision.types import Contact
 

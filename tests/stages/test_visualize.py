@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from tactflow.engine.stage import read_ports
+from tactflow.engine.ports import read_ports
 from tactflow.stages.visualize import Visualize
 from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Flow, Markers

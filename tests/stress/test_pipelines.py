@@ -36,16 +36,13 @@ FOLLOWING = ("default", "markerless")
 COLLECT = '''
 from typing import ClassVar
 from tactflow.engine.frame import Tick
-from tactflow.engine.stage import StageParams
+from tactflow.engine.contract import Sink
 from tactflow.ports import ContactMask, Image
 from tactflow.vision.types import Contact, Flow, Markers
 
-class Collect:
+class Collect(Sink):
     """Keeps what each frame gave."""
-    memory = "pure"
     rows: ClassVar[list] = []
-    class Params(StageParams):
-        """None."""
     def __init__(self, params): Collect.rows.clear()
     def write(
         self, tick: Tick, image: Image | None, contact: Contact | None, flow: Flow | None,

@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.config.registry import resolve
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue, Ref
+from tactflow.engine.ports import Parameter, Port, Ports
 from tactflow.engine.run import Runner, RunResult
-from tactflow.engine.stage import Port, Ports, StageParams
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Flow, Markers
 
@@ -50,11 +51,11 @@ class Outcome:
     wall: float
 
 
-class Collect:
+class Collect(Sink):
     """A sink that keeps the last values for the bench."""
 
     def __init__(self, params: StageParams) -> None:
-        self.params = params
+        super().__init__(params)
         self.last: dict[str, Any] = {}
 
     def write(self, **values: Any) -> None:
@@ -274,7 +275,9 @@ def _rewired(pipeline: Pipeline, jsonl: Path | None, turns: _Turns) -> Pipeline:
         kind="sink",
         cls=Collect,
         params=StageParams,
-        ports=Ports([Port(name, annotation, optional=True) for name, annotation in wanted.items()], []),
+        ports=Ports(
+            [Parameter(name, [Port(name, kind, optional=True)]) for name, kind in wanted.items()], []
+        ),
         memory="pure",
         origin="bench",
     )

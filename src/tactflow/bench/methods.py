@@ -20,10 +20,10 @@ from tactflow.bench.results import Measurement
 from tactflow.bench.scenes import Rendered
 from tactflow.bench.score import ContactScore, DetectionScore, FlowScore, MarkerScore, RemovalScore
 from tactflow.bench.timing import CopyUnit, Samples, interleaved
+from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.stage import StageParams
 from tactflow.sim import Truth
 from tactflow.vision.geometry import PixelMapping
 

@@ -8,7 +8,8 @@ of any other block: marker error, lost markers, CPU time of a frame, and the mem
 from __future__ import annotations
 
 import math
-import os
+import mmap
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -214,11 +215,16 @@ def _endless(pipeline: Pipeline, pictures: Sequence[NDArray[np.uint8]], total: i
 
 
 def memory_mb() -> float:
-    """What the process holds in memory now, MB; where the system does not say, its largest so far."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except (OSError, IndexError, ValueError):
+    """What the process holds in memory now, MB: on macOS its largest so far, on Windows NaN."""
+    if sys.platform == "linux":
+        return memory_of(Path("/proc/self/statm").read_text())
+    if sys.platform == "darwin":
         import resource
 
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return math.nan
+
+
+def memory_of(statm: str) -> float:
+    """Memory of a process, MB, from what Linux says in `/proc/PID/statm`: its second number, in pages."""
+    return int(statm.split()[1]) * mmap.PAGESIZE / 2**20

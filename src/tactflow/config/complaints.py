@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -49,8 +50,10 @@ _EXPECTED = {
     "too_long": "at most {max_length} items",
 }
 
+_QUOTED = re.compile("'([A-Za-z_][A-Za-z0-9_-]*)'")
 
 _MANY = 1000
+"""Mistakes in a member of a union that was not meant at all; more than a member that was meant may have."""
 
 
 @dataclass(slots=True)
@@ -83,8 +86,8 @@ def complain(
     """Report each error of a validation at its own value.
 
     model : what was validated. item : the mapping it was read from. path : its name, "" for a whole file.
-    noun : what a key of the mapping is called. other_keys : keys that may stand beside those of the model, for
-    suggestions. advice : unknown key -> what to say about it in place of a suggestion.
+    noun : what a key of the mapping is called. other_keys : keys that may stand beside those of the model.
+    advice : unknown key -> what to say about it in place of a suggestion.
     """
     found = [(detail, _spot(item, path, detail)) for detail in error.errors(include_url=False)]
     # A union of scalars reports one error per member; together they are one mistake.
@@ -163,7 +166,9 @@ def _words(members: Sequence[tuple[ErrorDetails, _Spot]]) -> str:
         if kind == "expected":
             expected.append(detail["msg"])
         elif kind in _EXPECTED:
-            expected.append(_EXPECTED[kind].format_map(_Numbers(context)))
+            words = _EXPECTED[kind].format_map(_Numbers(context))
+            # Choices are written as in YAML.
+            expected.append(_QUOTED.sub(r"\1", words) if kind in ("literal_error", "enum") else words)
         else:
             message = detail["msg"]
             return f"{message[0].lower()}{message[1:]}, got {_got(members[0])}"

@@ -72,7 +72,7 @@ def load_pipeline(
     _check_needs(drafts, problems)
     problems.raise_if_any()
     assert file is not None, "what is wrong with it was raised"
-    entries = {**file.stages, **(file.sinks or {})}
+    entries: dict[str, Entry] = {**file.stages, **file.sinks}
     pipeline = Pipeline(
         file=str(path),
         directory=path.parent,
@@ -269,9 +269,8 @@ def _check_needs(drafts: Sequence[Draft], problems: Problems) -> None:
                 )
 
 
-def _node(draft: Draft, entry: Entry | None) -> Node:
-    """The node that a right draft describes. entry : None for an id with nothing behind it."""
-    entry = entry or Entry()
+def _node(draft: Draft, entry: Entry) -> Node:
+    """The node that a right draft describes."""
     assert draft.component is not None, "a stage without one was reported"
     assert draft.params is not None, "parameters that are wrong were reported"
     entries = draft.item.entries
@@ -289,7 +288,7 @@ def _node(draft: Draft, entry: Entry | None) -> Node:
         mark=draft.mark,
         gates=tuple(gates),
         segment=entry.segment,
-        queue=Queue(entry.queue.capacity, entry.queue.when_full) if entry.queue else Queue(),
+        queue=Queue(entry.queue.capacity, entry.queue.when_full),
         on_error=OnError(entry.on_error.action, entry.on_error.budget)
         if entry.on_error
         else OnError("disable" if observer else "stop"),

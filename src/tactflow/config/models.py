@@ -27,7 +27,7 @@ from tactflow.engine.graph import ErrorAction, FullPolicy
 STATISTICS = "stats"
 """The topic of a run's statistics, so that no sensor may have this name."""
 
-_WORD = "^[A-Za-z0-9_-]+$"
+WORD = "^[A-Za-z0-9_-]+$"
 
 
 def is_word(text: str) -> bool:
@@ -36,7 +36,7 @@ def is_word(text: str) -> bool:
     >>> is_word("marker_mask"), is_word("left hand")
     (True, False)
     """
-    return re.fullmatch(_WORD[1:-1], text) is not None
+    return re.fullmatch(WORD[1:-1], text) is not None
 
 
 def _says(words: LiteralString) -> WrapValidator:
@@ -55,9 +55,14 @@ def _fails_with(mistake: ValueError) -> WrapValidator:
 
 
 def _mapping(words: LiteralString) -> BeforeValidator:
-    """Report what is no mapping as "expected a mapping ..."; its parts are reported by themselves."""
+    """Report what is no mapping as "expected a mapping ..."; its parts are reported by themselves.
+
+    A key with nothing after it is an empty mapping.
+    """
 
     def check(value: Any) -> Any:
+        if value is None:
+            return {}
         if not isinstance(value, dict):
             raise PydanticCustomError("expected", words)
         return value
@@ -71,18 +76,16 @@ def _free(name: str) -> str:
     return name
 
 
-Word = Annotated[
-    str, StringConstraints(pattern=_WORD), _says("a word of letters, digits, _ and -")
-]
+Word = Annotated[str, StringConstraints(pattern=WORD), _says("a word of letters, digits, _ and -")]
 Id = Annotated[
     str,
-    StringConstraints(pattern=_WORD),
+    StringConstraints(pattern=WORD),
     _fails_with(ValueError("an id is a word of letters, digits, _ and -")),
 ]
 Sensor = Annotated[Word, AfterValidator(_free)]
 SensorKey = Annotated[
     str,
-    StringConstraints(pattern=_WORD),
+    StringConstraints(pattern=WORD),
     _fails_with(ValueError("a name is a word of letters, digits, _ and -")),
     AfterValidator(_free),
 ]
@@ -150,8 +153,8 @@ class Entry(Part):
 
     model_config = ConfigDict(extra="allow")
 
-    inputs: Annotated[dict[str, Output | None], _mapping("a mapping of input -> stage.port")] | None = Field(
-        None,
+    inputs: Annotated[dict[str, Output | None], _mapping("a mapping of input -> stage.port")] = Field(
+        {},
         alias="in",
         description="input -> the output it takes, as stage.port, or as stage where that has one output; "
         "null: an optional input takes nothing; by default the nearest output of its name above",
@@ -163,37 +166,34 @@ class Entry(Part):
     segment: Word | None = Field(
         None, description="the segment it runs in, one thread each; null: the planner's choice"
     )
-    queue: Annotated[Queue, _mapping("a mapping, as in {capacity: 4, when_full: block}")] | None = Field(
-        None, description="the queue in front of its segment"
+    queue: Annotated[Queue, _mapping("a mapping, as in {capacity: 4, when_full: block}")] = Field(
+        {}, validate_default=True, description="the queue in front of its segment"
     )
     on_error: Annotated[
         OnError | None, BeforeValidator(_on_error, json_schema_input_type=ErrorAction | OnError | None)
     ] = Field(
-        None, description="what happens when it fails: an action, or action and budget; null: stop, for a "
-        "viewer disable"
+        None,
+        description="what happens when it fails: an action, or action and budget; null: stop, for a "
+        "viewer disable",
     )
 
 
 _USE = (
-    "which {}: a built-in, a plug-in, package.module:Class or ./file.py:Class; by default the one that is called "
-    "like the id"
+    "which {}: a built-in, a plug-in, package.module:Class or ./file.py:Class; by default the one that is "
+    "called like the id"
 )
 
 
 class StageEntry(Entry):
     """A stage of a pipeline, beside its parameters."""
 
-    use: Annotated[str, _says("the name of a stage")] = Field(
-        "", description=_USE.format("stage")
-    )
+    use: Annotated[str, _says("the name of a stage")] = Field("", description=_USE.format("stage"))
 
 
 class SinkEntry(Entry):
     """A sink of a pipeline, beside its parameters."""
 
-    use: Annotated[str, _says("the name of a sink")] = Field(
-        "", description=_USE.format("sink")
-    )
+    use: Annotated[str, _says("the name of a sink")] = Field("", description=_USE.format("sink"))
     max_rate: Rate | None = Field(None, description="frames it is given a second at most, Hz; null: all")
 
 
@@ -207,18 +207,30 @@ class Changes(Part):
     sinks: Any = None
 
 
-_SETTINGS = _mapping("a mapping of settings, as in {use: hull}")
+_Stages = Annotated[
+    dict[Id, Annotated[StageEntry, _mapping("a mapping of settings, as in {use: hull}")]],
+    _mapping("a mapping of id -> stage"),
+]
+_Sinks = Annotated[
+    dict[Id, Annotated[SinkEntry, _mapping("a mapping of settings, as in {use: jsonl}")]],
+    _mapping("a mapping of id -> sink"),
+]
+_Sensors = Annotated[
+    dict[
+        SensorKey, Annotated[Changes, _mapping("a mapping of changes, as in {stages: {capture: ...}}")] | None
+    ],
+    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
+    _mapping("a mapping of name -> changes, as in {left: {stages: ...}}"),
+]
 
 
 class PipelineFile(Part):
     """A pipeline file."""
 
     sensor: Sensor | None = Field("main", description="the sensor's name in results and topics; null: main")
-    sensors: Annotated[
-        dict[SensorKey, Annotated[Changes, _mapping("a mapping of changes, as in {stages: {capture: ...}}")] | None],
-        Field(min_length=1),
-        _mapping("a mapping of name -> changes, as in {left: {stages: ...}}"),
-    ] | None = Field(None, description="name -> changes to this file, for several sensors with the same graph")
+    sensors: _Sensors = Field(
+        {}, description="name -> changes to this file, for several sensors with the same graph"
+    )
     skipping: bool = Field(True, description="false runs every stage in every frame")
     opencv_threads: Count | None = Field(
         None, description="threads of OpenCV; 1: none beside the caller's; null: OpenCV's choice"
@@ -226,12 +238,8 @@ class PipelineFile(Part):
     realtime_priority: bool = Field(
         False, description="true asks the system to run the threads of live frames before all else"
     )
-    stages: Annotated[
-        dict[Id, Annotated[StageEntry, _SETTINGS] | None], _mapping("a mapping of id -> stage")
-    ] = Field(description="id -> stage, in order; the source of frames is one of them")
-    sinks: Annotated[
-        dict[Id, Annotated[SinkEntry, _SETTINGS] | None], _mapping("a mapping of id -> sink")
-    ] | None = Field(None, description="id -> sink")
+    stages: _Stages = Field(description="id -> stage, in order; the source of frames is one of them")
+    sinks: _Sinks = Field({}, description="id -> sink")
 
 
 RESERVED = frozenset(field.alias or name for name, field in SinkEntry.model_fields.items())

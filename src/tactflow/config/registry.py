@@ -17,16 +17,12 @@ from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any, Literal, get_args
 
+from tactflow.config.models import RESERVED
+from tactflow.engine.conformance import component, kind_of
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Component, Kind
-from tactflow.engine.stage import Memory, StageParams, read_ports
+from tactflow.engine.graph import Component
 
 Section = Literal["stages", "sinks"]
-
-RESERVED = frozenset({"use", "in", "when", "segment", "queue", "on_error", "max_rate"})
-"""Keys of a stage or sink that belong to the engine and so cannot be names of parameters."""
-
-_METHODS: dict[str, Kind] = {"process": "stage", "frames": "source", "write": "sink"}
 
 
 def resolve(use: str, section: Section, directory: Path) -> Component:
@@ -45,15 +41,15 @@ def resolve(use: str, section: Section, directory: Path) -> Component:
     if not separator and _is_file(use):
         file, name = use, ""
     if _is_file(file):
-        component = _component(_find_class(_load_file(directory, file), name, section), use, file)
+        found = component(_find_class(_load_file(directory, file), name, section), use, file, RESERVED)
     elif separator:
-        component = _component(_find_class(_load_module(file), name, section), use, f"module {file}")
+        found = component(_find_class(_load_module(file), name, section), use, f"module {file}", RESERVED)
     else:
-        component = _named(use, section)
-    if (component.kind == "sink") != (section == "sinks"):
-        right = "sinks" if component.kind == "sink" else "stages"
-        raise ConfigError(f"{use} is a {component.kind}; it belongs under {right}:")
-    return component
+        found = _named(use, section)
+    if (found.kind == "sink") != (section == "sinks"):
+        right = "sinks" if found.kind == "sink" else "stages"
+        raise ConfigError(f"{use} is a {found.kind}; it belongs under {right}:")
+    return found
 
 
 def available() -> list[Component]:
@@ -131,10 +127,10 @@ def _named(name: str, section: Section) -> Component:
         module, _, attribute = plugins[0].value.partition(":")
         origin = _plugin_origin(plugins[0])
         cls = _find_class(_load_module(module.strip(), origin), attribute.strip(), section)
-        return _component(cls, name, origin)
+        return component(cls, name, origin, RESERVED)
     if builtin:
         module = f"tactflow.{section}.{name}"
-        return _component(_find_class(_load_module(module), "", section), name, "built-in")
+        return component(_find_class(_load_module(module), "", section), name, "built-in", RESERVED)
     other: Section = "sinks" if section == "stages" else "stages"
     if name in names(other):
         raise ConfigError(f"{name} is under {section}: but belongs under {other}:")
@@ -221,7 +217,7 @@ def _find_class(module: ModuleType, name: str, section: Section) -> type:
         for key, value in vars(module).items()
         if inspect.isclass(value) and value.__module__ == module.__name__ and key[0] != "_"
     }
-    usable = {key: value for key, value in here.items() if _kinds(value)}
+    usable = {key: value for key, value in here.items() if kind_of(value)}
     if name:
         found: Any = module
         for part in name.split("."):
@@ -231,58 +227,7 @@ def _find_class(module: ModuleType, name: str, section: Section) -> type:
         raise ConfigError(f"{where} has no class {name}{did_you_mean(name, usable or here, 'it has ')}")
     if len(set(usable.values())) == 1:
         return next(iter(usable.values()))
-    wanted = "write()" if section == "sinks" else "process() or frames()"
+    wanted = "Sink" if section == "sinks" else "Stage or Source"
     if usable:
         raise ConfigError(f"{where} has several classes ({', '.join(usable)}); name one, as in FILE:Class")
-    raise ConfigError(f"{where} has no public class with {wanted}")
-
-
-def _kinds(cls: type) -> list[Kind]:
-    return [kind for method, kind in _METHODS.items() if callable(getattr(cls, method, None))]
-
-
-def _component(cls: type, name: str, origin: str) -> Component:
-    kinds = _kinds(cls)
-    if len(kinds) != 1:
-        methods = ", ".join(f"{method}() for a {kind}" for method, kind in _METHODS.items())
-        raise _broken(cls, f" must have exactly one of {methods}")
-    params = getattr(cls, "Params", StageParams)
-    if not (inspect.isclass(params) and issubclass(params, StageParams)):
-        raise _broken(cls, ".Params must be a subclass of tactflow.engine.stage.StageParams")
-    for key, field in params.model_fields.items():
-        if (field.alias or key) in RESERVED:
-            raise _broken(cls, f".Params.{key}: that name is a key of the pipeline file")
-    try:
-        signature = inspect.signature(cls)
-        signature.bind(
-            None, **{word: None for word in ("sensor", "directory") if word in signature.parameters}
-        )
-    except (TypeError, ValueError):
-        raise _broken(cls, " must be built from its parameters: __init__(self, params)") from None
-    method = next(method for method, kind in _METHODS.items() if kind == kinds[0])
-    return Component(name, kinds[0], cls, params, read_ports(cls, method), _memory(cls, kinds[0]), origin)
-
-
-def _memory(cls: type, kind: Kind) -> Memory:
-    if kind != "stage":
-        return "pure"
-    memory: Any = getattr(cls, "memory", None)
-    choices: Sequence[Memory] = get_args(Memory)
-    for choice in choices:
-        if memory == choice:
-            return choice
-    came = "nothing" if memory is None else repr(memory)
-    raise _broken(
-        cls,
-        ' must declare memory = "pure" (its outputs depend on its inputs alone) or memory = "stateful", '
-        f"got {came}",
-    )
-
-
-def _broken(cls: type, problem: str) -> ConfigError:
-    """The error for a class that breaks the contract, with the place of the class."""
-    try:
-        place = f"{inspect.getsourcefile(cls)}:{inspect.getsourcelines(cls)[1]}"
-    except (OSError, TypeError):
-        place = cls.__module__
-    return ConfigError(f"{place}: {cls.__name__}{problem}")
+    raise ConfigError(f"{where} has no public class that inherits from {wanted} of tactflow")

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 from tactflow.config.registry import Section, catalogue, did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems
+from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Component, Mark, Ref
-from tactflow.engine.stage import Port, SignalPort, StageParams, describe_type, mismatch, port_type
+from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
 
 
 @dataclass(slots=True)

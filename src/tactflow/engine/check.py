@@ -9,7 +9,7 @@ import numpy as np
 
 from tactflow.engine.frame import Absent
 from tactflow.engine.graph import Node
-from tactflow.engine.stage import ArrayPort, Port, SignalPort, port_type
+from tactflow.engine.ports import ArrayPort, Port, SignalPort, port_type
 
 
 class ArrayCheck:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from tactflow.engine.stage import Memory, Ports, StageParams
+from tactflow.engine.contract import Memory, StageParams
+from tactflow.engine.ports import Ports
 
 Kind = Literal["source", "stage", "sink"]
 FullPolicy = Literal["block", "latest", "drop_oldest"]

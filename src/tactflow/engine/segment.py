@@ -21,8 +21,8 @@ from tactflow.engine.frame import Absent, Frame, Tick
 from tactflow.engine.graph import Gate, Node
 from tactflow.engine.link import Link
 from tactflow.engine.plan import Plan
+from tactflow.engine.ports import Port, SignalPort, port_type
 from tactflow.engine.rate import RateLimit
-from tactflow.engine.stage import Port, SignalPort, port_type
 from tactflow.engine.stats import Durations, NodeStats, SignalStats
 from tactflow.engine.trace import Track
 
@@ -173,7 +173,7 @@ class RunningNode:
         self.disabled = False
         self.wants: Callable[[], bool] | None = getattr(instance, "wants", None)
         self.takes_references = bool(getattr(instance, "takes_references", False))
-        self.takes_tick = component.ports.takes_tick
+        self.takes_tick = any(not parameter.ports for parameter in component.ports.parameters)
         self.reuses = skipping and not self.stateful and not self.is_sink
         self.remembers = self.repeats or self.reuses
         self.last: Sequence[Any] | None = None

@@ -14,14 +14,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+if sys.platform == "linux":
+    from fcntl import ioctl
+else:
+
+    def ioctl(*_: object) -> int:
+        """Stands in for Linux's call."""
+        raise OSError(LINUX_ONLY)
+
+
+LINUX_ONLY = "its driver can only be asked on Linux"
 VIDIOC_QUERYCAP = 0x80685600
 VIDIOC_ENUM_FMT = 0xC0405602
 VIDIOC_ENUM_FRAMESIZES = 0xC02C564A
+"""Requests to a driver, as `linux/videodev2.h` defines them."""
 CAN_CAPTURE = 0x1
 CAN_CAPTURE_MANY_PLANES = 0x1000
 HAS_DEVICE_CAPS = 0x80000000
+"""Bits of its answer, from the same file."""
+BUFFER_CAPTURE = 1
+BUFFER_CAPTURE_MANY_PLANES = 9
+"""Kinds of buffers that pictures come in, from the same file."""
+DISCRETE_SIZES = 1
+"""A driver that lists sizes one by one, not as a range."""
+CAPABILITY_BYTES = 104
+FORMAT_BYTES = 64
+FRAME_SIZE_BYTES = 44
+"""Lengths of the structures `v4l2_capability`, `v4l2_fmtdesc` and `v4l2_frmsizeenum`."""
 MAX_ENTRIES = 64
-"""A driver that lists for ever is not listened to for longer."""
+"""Entries of a list after which a driver is not listened to any more. Chosen by hand."""
 
 
 class Abilities(NamedTuple):
@@ -96,22 +117,20 @@ def ask_driver(device: Path) -> Abilities:
     OSError
         If the device cannot be opened, or is none of V4L2.
     """
-    if not sys.platform.startswith("linux"):
-        raise OSError("its driver can only be asked on Linux")
-    from fcntl import ioctl
-
+    if sys.platform != "linux":
+        raise OSError(LINUX_ONLY)
     handle = os.open(device, os.O_RDWR | os.O_NONBLOCK)
     try:
-        reply = bytearray(104)
+        reply = bytearray(CAPABILITY_BYTES)
         ioctl(handle, VIDIOC_QUERYCAP, reply)
         name = _text(reply[16:48])
         whole, own = struct.unpack_from("=II", reply, 84)
         can = own if whole & HAS_DEVICE_CAPS else whole
         pictures = bool(can & (CAN_CAPTURE | CAN_CAPTURE_MANY_PLANES))
-        kind = 1 if can & CAN_CAPTURE else 9
+        kind = BUFFER_CAPTURE if can & CAN_CAPTURE else BUFFER_CAPTURE_MANY_PLANES
         formats: dict[str, list[tuple[int, int]]] = {}
         for index in range(MAX_ENTRIES if pictures else 0):
-            entry = bytearray(struct.pack("=II", index, kind).ljust(64, b"\0"))
+            entry = bytearray(struct.pack("=II", index, kind).ljust(FORMAT_BYTES, b"\0"))
             try:
                 ioctl(handle, VIDIOC_ENUM_FMT, entry)
             except OSError:
@@ -124,17 +143,15 @@ def ask_driver(device: Path) -> Abilities:
 
 
 def _sizes(handle: int, code: bytes) -> list[tuple[int, int]]:
-    from fcntl import ioctl
-
     sizes: list[tuple[int, int]] = []
     for index in range(MAX_ENTRIES):
-        entry = bytearray((struct.pack("=I", index) + code).ljust(44, b"\0"))
+        entry = bytearray((struct.pack("=I", index) + code).ljust(FRAME_SIZE_BYTES, b"\0"))
         try:
             ioctl(handle, VIDIOC_ENUM_FRAMESIZES, entry)
         except OSError:
             break
         kind, width, height = struct.unpack_from("=III", entry, 8)
-        if kind != 1:
+        if kind != DISCRETE_SIZES:
             break
         if (width, height) not in sizes:
             sizes.append((width, height))

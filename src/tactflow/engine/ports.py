@@ -1,29 +1,7 @@
-"""The contract of stages and sinks, and the port types read from their annotations.
+"""Ports: what a stage or sink takes and gives, read from the annotations of its method.
 
-A stage is a plain class::
-
-    class Invert:
-        \"\"\"Swap dark and bright.\"\"\"
-
-        memory = "pure"                      # or "stateful"
-
-        class Params(StageParams):
-            strength: float = Field(1.0, ge=0, le=1, description="0 keeps the image, 1 inverts it")
-
-        def __init__(self, params: Params) -> None: ...
-        def process(self, image: Image) -> Image: ...
-
-Its input ports are the parameters of `process`; `X | None` marks an input that may be absent. Its output
-ports come from the return annotation: one port named after its type, or one port per field of a
-NamedTuple. `process` may return `Absent("reason")` instead. Optional methods: `open()`, `close()`, and for
-stateful stages `reset()` (forget everything; a new reference follows).
-
-A pure stage's outputs depend on its inputs alone. A stateful stage sees every accepted frame, in order.
-What a stage returns it must not change later; what it receives it must not change at all.
-
-A source stage has `frames()`, an iterator of `Frame`, instead of `process`. A sink has `write`, which
-returns nothing and may also take a `Tick`. Either may have `live_threads`, the native ids of threads of its
-own that live results wait for: they are run first, as the run's own are (see `tactflow.engine.priority`).
+Each parameter of `process` or `write` is an input port, or a NamedTuple of input ports. The return annotation
+of `process` gives the output ports: one named after its type, or one per field of a NamedTuple.
 """
 
 from __future__ import annotations
@@ -31,27 +9,14 @@ from __future__ import annotations
 import inspect
 import re
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Absent, Frame, Tick
-
-Memory = Literal["pure", "stateful"]
-
-
-class StageParams(BaseModel):
-    """Base of every stage's and sink's parameters: frozen, unknown keys refused, finite numbers only."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
-
-    def needed_inputs(self) -> Mapping[str, str]:
-        """Optional inputs that these settings cannot do without: port -> the parameter that needs it."""
-        return {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +38,12 @@ class SignalPort:
     """Type of a boolean port that can gate stages.
 
     closed : the reason given while it is False. otherwise : what a gated stage's outputs are then, unless its
-    `when:` says something else: "absent", or "repeat" for the last ones again.
+    `when:` says something else: "absent", or "repeat" for the last ones again. closed None: both are those of
+    the signal that the stage itself takes, for a stage that only holds another's signal.
     """
 
     name: str
-    closed: str
+    closed: str | None
     otherwise: Literal["absent", "repeat"] = "absent"
 
 
@@ -94,12 +60,32 @@ class Port:
 
 
 @dataclass(frozen=True, slots=True)
-class Ports:
-    """The ports of a stage or sink class, read from its annotations."""
+class Parameter:
+    """One parameter of a stage's `process` or a sink's `write`.
 
-    inputs: Sequence[Port]
+    ports : the input ports that it stands for; none for the tick. group : the NamedTuple that takes them
+    together; None where the one port is the parameter itself.
+    """
+
+    name: str
+    ports: Sequence[Port]
+    group: type | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """The ports of a stage or sink class, read from its annotations.
+
+    parameters : what its method takes, in order. outputs : what it gives.
+    """
+
+    parameters: Sequence[Parameter]
     outputs: Sequence[Port]
-    takes_tick: bool = False
+
+    @property
+    def inputs(self) -> list[Port]:
+        """Every input port, in the order of the parameters."""
+        return [port for parameter in self.parameters for port in parameter.ports]
 
 
 def read_ports(cls: type, method: str) -> Ports:
@@ -185,28 +171,56 @@ def _ports(function: Callable[..., Any], method: str) -> Ports:
                 f"a source has no inputs, but {parameters[0].name} is one; settings belong in Params"
             )
         return Ports((), (_source_port(hints.get("return")),))
-    takes_tick = False
-    inputs: list[Port] = []
-    for parameter in parameters:
-        if hints.get(parameter.name) is Tick:
-            takes_tick = _check_tick(parameter.name, method)
-        else:
-            inputs.append(_input_port(parameter, hints.get(parameter.name)))
+    found = [_parameter(parameter, hints.get(parameter.name), method) for parameter in parameters]
+    _check_names(found)
     if method == "process":
-        if not inputs:
+        if not any(parameter.ports for parameter in found):
             raise _PortError("a stage needs at least one input; a source has frames() instead")
-        return Ports(tuple(inputs), _output_ports(hints.get("return", inspect.Parameter.empty)))
+        return Ports(found, _output_ports(hints.get("return", inspect.Parameter.empty)))
     if hints.get("return", type(None)) is not type(None):
         raise _PortError("a sink returns nothing; annotate it with -> None")
-    return Ports(tuple(inputs), (), takes_tick)
+    return Ports(found, ())
 
 
-def _check_tick(name: str, method: str) -> bool:
+def _parameter(parameter: inspect.Parameter, annotation: Any, method: str) -> Parameter:
+    name = parameter.name
+    if parameter.kind not in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
+        raise _PortError(f"{name}: a port cannot be positional-only, *args or **kwargs; name each input")
+    if annotation is Tick:
+        _check_tick(name, method)
+        return Parameter(name, ())
+    if _is_group(annotation):
+        return Parameter(name, _field_inputs(annotation), annotation)
+    return Parameter(name, (_input_port(parameter, annotation),))
+
+
+def _check_tick(name: str, method: str) -> None:
     if method != "write":
         raise _PortError("only a sink may take a Tick; a stage can take the port frame: Frame")
     if name != "tick":
         raise _PortError(f"the parameter that takes the Tick must be called tick, not {name}")
-    return True
+
+
+def _is_group(annotation: Any) -> bool:
+    return inspect.isclass(annotation) and issubclass(annotation, tuple) and hasattr(annotation, "_fields")
+
+
+def _field_inputs(group: type) -> tuple[Port, ...]:
+    ports = []
+    for name, annotation in _field_hints(group).items():
+        members = _members(annotation)
+        types_ = tuple(member for member in members if member is not type(None))
+        for member in types_:
+            _check_array(f"{group.__name__}.{name}", member)
+        ports.append(Port(name, Union[types_], len(types_) < len(members)))  # noqa: UP007 (built at run time)
+    return tuple(ports)
+
+
+def _check_names(parameters: Sequence[Parameter]) -> None:
+    names = [port.name for parameter in parameters for port in parameter.ports]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise _PortError(f"two parameters take the port {twice}; one of them is enough")
 
 
 def _source_port(annotation: Any) -> Port:
@@ -219,8 +233,6 @@ def _source_port(annotation: Any) -> Port:
 
 def _input_port(parameter: inspect.Parameter, annotation: Any) -> Port:
     name = parameter.name
-    if parameter.kind not in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
-        raise _PortError(f"{name}: a port cannot be positional-only, *args or **kwargs; name each input")
     if annotation is None:
         raise _PortError(f"parameter {name} has no annotation; an input needs a type, as in {name}: Image")
     members = _members(annotation)
@@ -243,7 +255,7 @@ def _output_ports(annotation: Any) -> tuple[Port, ...]:
             "no return annotation; it says which outputs the stage has, as in -> Contact | Absent"
         )
     result, optional = _single_type(annotation, "the return annotation")
-    if inspect.isclass(result) and issubclass(result, tuple) and hasattr(result, "_fields"):
+    if _is_group(result):
         return _field_ports(result, optional)
     spec = port_type(result)
     if isinstance(spec, ArrayPort | SignalPort):
@@ -257,16 +269,19 @@ def _output_ports(annotation: Any) -> tuple[Port, ...]:
     return (Port(_snake_case(result.__name__), result, optional),)
 
 
-def _field_ports(result: type, all_optional: bool) -> tuple[Port, ...]:
+def _field_hints(group: type) -> dict[str, Any]:
     try:
-        hints = get_type_hints(result, include_extras=True)
+        return get_type_hints(group, include_extras=True)
     except NameError as error:
         raise _PortError(
-            f"the fields of {result.__name__} use {error.name}, which is not known when the program runs; "
+            f"the fields of {group.__name__} use {error.name}, which is not known when the program runs; "
             "import it at the top of the file"
         ) from None
+
+
+def _field_ports(result: type, all_optional: bool) -> tuple[Port, ...]:
     ports = []
-    for name, annotation in hints.items():
+    for name, annotation in _field_hints(result).items():
         field, optional = _single_type(annotation, f"{result.__name__}.{name}")
         _check_array(f"{result.__name__}.{name}", field)
         ports.append(Port(name, field, optional or all_optional))

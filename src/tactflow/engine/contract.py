@@ -1,0 +1,250 @@
+"""What a stage, a sink and a source are: the classes that a pipeline is built of inherit from these.
+
+This file is the reference. Each class attribute below may be set and each method overridden; everything has
+the default that stands here. When a pipeline is loaded, every class is checked against it: a wrong value, a
+missing method or a misspelt name is an error with its place (see `tactflow.engine.conformance`).
+
+A stage that swaps dark and bright::
+
+    class Invert(Stage):
+        memory = "pure"
+
+        class Params(StageParams):
+            strength: float = Field(1.0, ge=0, le=1, description="0 keeps the image, 1 inverts it")
+
+        def process(self, image: Image) -> Image:
+            return np.uint8(self.params.strength * 255) - image
+
+All three kinds are built from their parameters, `Invert(Invert.Params(strength=1))`, and can be called
+without the engine. A constructor that takes more than `params` is given, by name, what it asks for:
+
+    sensor : str              name of the sensor
+    directory : Path          folder of the pipeline file, against which relative paths are read
+    skipping : bool           whether the run may skip work
+    control : Control         handle on the run, see `tactflow.engine.control`
+
+For each run, `open()` is called once before the first frame, and `close()` once at the end for every
+part whose `open()` was started, also after an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict
+
+from tactflow.engine.frame import Frame
+
+Memory = Literal["pure", "stateful"]
+WhenLive = Literal["block", "latest"]
+
+
+class StageParams(BaseModel):
+    """Base of all parameters: frozen, unknown keys refused, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+    def needed_inputs(self) -> Mapping[str, str]:
+        """Optional inputs that these settings cannot do without: port -> the parameter that needs it."""
+        return {}
+
+    def changed(self, **values: Any) -> Self:
+        """A copy with other values; they are not validated again."""
+        return self.model_copy(update=values)
+
+
+class Part:
+    """What stages, sinks and sources have in common."""
+
+    Params: ClassVar[type[StageParams]] = StageParams
+    """The parameters that stand in the pipeline file; an inner class."""
+
+    description: str | None = None
+    """For people: what it reads or where it writes. May be set by the constructor or by `open`."""
+
+    def __init__(self, params: Any) -> None:
+        """Prepare, and keep the parameters; nothing is opened yet.
+
+        params : of the class's own `Params`.
+        """
+        self.params = params
+
+    def open(self) -> None:
+        """Take what the run needs: files, sockets, devices.
+
+        Raises
+        ------
+        TactflowError : what is wrong, and what to do. Nothing has been captured then.
+        """
+
+    def close(self) -> None:
+        """Give it back. Called once after `open` was started, in the reverse order of opening."""
+
+    @property
+    def live_threads(self) -> Sequence[int]:
+        """Native ids of threads of its own that live results wait for: they share the run's priority."""
+        return ()
+
+
+class Stage(Part):
+    """Computes outputs from inputs, frame by frame.
+
+    Its ports are read from the annotations of `process`, which every stage defines:
+
+    - an input for each parameter, named like it; `X | None` marks an input that may be absent. A parameter
+      annotated with a NamedTuple stands for one input per field.
+    - one output named after the type returned, or one for each field of a NamedTuple. `process` may return
+      `Absent("reason")` instead; `None` is `Absent("none")`.
+
+    What a stage returns it must not change later; what it receives it must not change at all.
+    """
+
+    memory: ClassVar[Memory]
+    """Required. "pure": the outputs depend on the inputs alone, so the stage may be left out of a frame that
+    nobody asks for, and results may be reused. "stateful": it sees every accepted frame, in order."""
+
+    def reset(self) -> None:
+        """Forget everything: a new reference follows (`Frame.epoch` has grown)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """A file or folder that a sink writes. parameter : the one that names it."""
+
+    path: Path
+    kind: Literal["file", "folder"]
+    parameter: str
+
+
+@dataclass(frozen=True, slots=True)
+class Publication:
+    """An address at which a sink publishes. backlog : messages that may wait there for each subscriber."""
+
+    address: str
+    backlog: int
+
+
+class Sink(Part):
+    """Takes results out of the run.
+
+    Its inputs are read from the annotations of `write`, which every sink defines and which returns nothing;
+    as for a stage, and a parameter `tick: Tick` is given the frame and the reasons of what is missing.
+    """
+
+    threaded: ClassVar[bool] = False
+    """Whether it runs in a thread of its own: for one that is slow or may have to wait."""
+
+    when_live: ClassVar[WhenLive] = "block"
+    """What happens in a live run while it is busy. "block": every frame waits for it, nothing is lost
+    (files). "latest": it gets the newest frame when it is ready again (messages, pictures)."""
+
+    queue_capacity: ClassVar[int] = 4
+    """Frames that may wait in front of its thread."""
+
+    observer: ClassVar[bool] = False
+    """Whether it only looks on: it does not count in the latency, and an error disables it instead of ending
+    the run."""
+
+    takes_references: ClassVar[bool] = False
+    """Whether it gets every reference frame even while it wants nothing, and a reference image that is not
+    part of the source (`Frame.seq` -1)."""
+
+    def wants(self) -> bool:
+        """Whether the next frame is of interest. What no sink wants is not computed.
+
+        Asked once a frame, by the capturing thread, before `write` is called in the sink's own: it must be
+        quick and safe to call from any thread.
+        """
+        return True
+
+    def counters(self) -> Mapping[str, int]:
+        """What it has done, for the statistics: name -> number. From any thread."""
+        return {}
+
+    @classmethod
+    def outputs(cls, params: Any) -> Sequence[Output]:  # noqa: ARG003 (for sinks that write files)
+        """The files and folders that a sink with these parameters writes; not standard output, no devices.
+
+        Two sinks that write the same file are refused, and a run of several sensors watches over them.
+        """
+        return ()
+
+    @classmethod
+    def on_restart(cls, params: Any) -> StageParams:
+        """The parameters with which it goes on when its sensor is started again in the same run.
+
+        For a sink that can continue its file. The others keep their parameters.
+        """
+        kept: StageParams = params
+        return kept
+
+    @classmethod
+    def publishes(cls, params: Any) -> Publication | None:  # noqa: ARG003 (for sinks that publish)
+        """Where it publishes messages over ZeroMQ that a relay of several sensors can pass on, or None."""
+        return None
+
+    @classmethod
+    def publish_at(cls, params: Any, address: str) -> StageParams:
+        """The same parameters, publishing at another address; only asked of a sink that `publishes`."""
+        raise NotImplementedError(f"{cls.__name__} publishes nowhere")
+
+    @classmethod
+    def among(cls, params: Any, folder: Path) -> StageParams:  # noqa: ARG003 (for sinks with neighbours)
+        """The same parameters for one of several sensors that run side by side.
+
+        folder : theirs alone, for what they tell each other; removed at the end.
+        """
+        kept: StageParams = params
+        return kept
+
+
+class Recorder(Sink):
+    """A sink that can be told to record. All of this may be called from any thread."""
+
+    @property
+    def recording(self) -> bool:
+        """Whether it is recording."""
+        return False
+
+    def start_recording(self) -> None:
+        """Begin a recording; nothing if it is recording. Raises StageError if that is not possible."""
+
+    def stop_recording(self) -> None:
+        """Finish the recording; nothing if there is none."""
+
+
+class Source(Part):
+    """Where frames come from: the first stage of a pipeline.
+
+    It defines `frames(self) -> Iterator[Frame]`, an iterator that ends where the source ends.
+    `live` and `total` are known once it is open.
+    """
+
+    live: bool = False
+    """Whether frames come by themselves, at their own pace: then those that come too fast are dropped."""
+
+    total: int | None = None
+    """How many frames there will be, where that is known."""
+
+    @property
+    def missed(self) -> int:
+        """Frames that a newer one overtook before they were taken; each leaves a gap in `Frame.seq`."""
+        return 0
+
+    @property
+    def state(self) -> str:
+        """In words, for people: `running`, `reconnecting since 3 s`."""
+        return "running"
+
+    def frames(self) -> Iterator[Frame]:
+        """Every frame, in order, until the end or `stop`."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """End `frames` soon, also where it waits for the next frame. From any thread."""
+
+    def retake(self) -> None:
+        """Take the next frames as a new reference, in a new epoch. From any thread."""

@@ -1,0 +1,152 @@
+"""The lens of a camera: from distorted to undistorted pixels and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+_DISTORTION_LENGTHS: Final = (4, 5, 8, 12, 14)
+"""Numbers of coefficients that OpenCV's polynomial model knows."""
+_STEP: Final = 1e-3
+"""Half step of the central differences in `Lens.undistort`, px. Derived: float64 rounds a coordinate of
+1e3 px by 1e-13 px, so a slope over 2e-3 px is good to 1e-10."""
+_CONVERGED: Final = 1e-10
+"""Largest error at which Newton's method ends, px. Chosen by hand, a thousand roundings of a coordinate."""
+_MOST_STEPS: Final = 60
+"""Steps after which Newton's method ends in any case. Chosen by hand."""
+_SINGULAR: Final = 1e-9
+"""Smallest determinant of a Jacobian that is divided by, 1. Chosen by hand."""
+_ON_AXIS: Final = 1e-12
+"""Distance from the optical axis, normalised, below which a fisheye lens bends nothing. Chosen by hand."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lens:
+    """A camera's intrinsic calibration, as `cv2.calibrateCamera` or `cv2.fisheye.calibrate` give it.
+
+    camera_matrix : (3, 3) float64, px.
+    distortion : (4 | 5 | 8 | 12 | 14,) float64 for the polynomial model, (4,) for the fisheye model.
+    fisheye : which of the two models.
+
+    >>> lens = Lens(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), np.array([-0.2, 0, 0, 0]))
+    >>> lens.distort(np.array([[0.0, 0.0]])).round(2)
+    array([[40.96, 30.72]])
+    >>> lens.undistort(np.array([[40.96, 30.72]])).round(6)
+    array([[0., 0.]])
+    """
+
+    camera_matrix: FloatArray
+    distortion: FloatArray
+    fisheye: bool = False
+
+    def distort(self, points: FloatArray) -> FloatArray:
+        """Where the lens puts points of the undistorted frame: (N, 2) float64 px -> (N, 2) float64 px."""
+        if len(points) == 0:
+            return points.copy()
+        matrix = self.camera_matrix
+        normalised = np.empty((len(points), 2))
+        normalised[:, 1] = (points[:, 1] - matrix[1, 2]) / matrix[1, 1]
+        normalised[:, 0] = (points[:, 0] - matrix[0, 2] - matrix[0, 1] * normalised[:, 1]) / matrix[0, 0]
+        if self.fisheye:
+            return _equidistant(normalised, self.distortion) @ matrix[:2, :2].T + matrix[:2, 2]
+        rays = np.column_stack([normalised, np.ones(len(points))])
+        nothing = np.zeros(3)
+        # projectPoints ignores a camera matrix's skew: it gets the identity, and the matrix is applied here.
+        projected, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), nothing, nothing, np.eye(3), self.distortion)
+        bent = np.asarray(projected, dtype=np.float64).reshape(-1, 2)
+        return bent @ matrix[:2, :2].T + matrix[:2, 2]
+
+    def undistort(self, points: FloatArray) -> FloatArray:
+        """Inverse of `distort`: (N, 2) float64 px -> (N, 2) float64 px.
+
+        Damped Newton's method with a numerical Jacobian: `cv2.undistortPoints` stops after five fixed-point
+        steps, which leaves tenths of a pixel for strong distortion. A point that no undistorted point maps to
+        ends at the nearest place the iteration came to.
+        """
+        guess = points.copy()
+        if len(points) == 0:
+            return guess
+        error = self.distort(guess) - points
+        size = np.hypot(error[:, 0], error[:, 1])
+        damping = np.ones(len(points))
+        for _ in range(_MOST_STEPS):
+            if float(size.max()) < _CONVERGED:
+                break
+            trial = guess - damping[:, None] * self._newton_step(guess, error)
+            trial_error = self.distort(trial) - points
+            trial_size = np.hypot(trial_error[:, 0], trial_error[:, 1])
+            better = trial_size < size
+            guess[better], error[better], size[better] = (
+                trial[better],
+                trial_error[better],
+                trial_size[better],
+            )
+            damping = np.where(better, np.minimum(1.0, 2 * damping), damping / 2)
+        return guess
+
+    def _newton_step(self, guess: FloatArray, error: FloatArray) -> FloatArray:
+        """The inverse of the Jacobian of `distort` at (N, 2) `guess`, times (N, 2) `error`; px."""
+        right_step, down_step = np.diag([_STEP, _STEP])
+        right = (self.distort(guess + right_step) - self.distort(guess - right_step)) / (2 * _STEP)
+        down = (self.distort(guess + down_step) - self.distort(guess - down_step)) / (2 * _STEP)
+        determinant = right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0]
+        determinant = np.where(np.abs(determinant) < _SINGULAR, _SINGULAR, determinant)
+        return np.column_stack(
+            [
+                (down[:, 1] * error[:, 0] - down[:, 0] * error[:, 1]) / determinant,
+                (right[:, 0] * error[:, 1] - right[:, 1] * error[:, 0]) / determinant,
+            ]
+        )
+
+
+def _equidistant(normalised: FloatArray, distortion: FloatArray) -> FloatArray:
+    """Kannala and Brandt's (2006) equidistant model with four coefficients, on normalised points."""
+    radius = np.hypot(normalised[:, 0], normalised[:, 1])
+    theta = np.arctan(radius)
+    squared = theta * theta
+    k1, k2, k3, k4 = distortion
+    bent = theta * (1 + squared * (k1 + squared * (k2 + squared * (k3 + squared * k4))))
+    scale: FloatArray = np.divide(bent, radius, out=np.ones_like(radius), where=radius > _ON_AXIS)
+    return normalised * scale[:, None]
+
+
+def check_lens(camera_matrix: ArrayLike | None, distortion: ArrayLike | None, fisheye: bool) -> Lens | None:
+    """The lens of a calibration, or None where neither matrix nor coefficients are given.
+
+    camera_matrix : (3, 3), px. distortion : 4, 5, 8, 12 or 14 coefficients; fisheye: 4.
+    Raises ValueError where only one of them is given, or where they do not have these forms.
+
+    >>> check_lens([[500, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.2, 0.1, 0, 0], fisheye=False).distortion
+    array([-0.2,  0.1,  0. ,  0. ])
+    >>> check_lens(None, None, fisheye=False) is None
+    True
+    """
+    if camera_matrix is None and distortion is None:
+        if fisheye:
+            raise ValueError("required camera_matrix and distortion with fisheye, got neither")
+        return None
+    if camera_matrix is None or distortion is None:
+        missing = "camera_matrix" if camera_matrix is None else "distortion"
+        raise ValueError(f"required both camera_matrix and distortion, got no {missing}")
+    matrix = np.array(camera_matrix, dtype=np.float64)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise ValueError(f"required a finite 3 x 3 camera_matrix, got shape {matrix.shape}")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise ValueError(f"required focal lengths > 0 px, got {matrix[0, 0]:g}, {matrix[1, 1]:g}")
+    if matrix[1, 0] or not np.array_equal(matrix[2], [0.0, 0.0, 1.0]):
+        raise ValueError("required camera_matrix [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], got another form")
+    coefficients = np.array(distortion, dtype=np.float64).ravel()
+    lengths = (4,) if fisheye else _DISTORTION_LENGTHS
+    if len(coefficients) not in lengths:
+        wanted = " or ".join(map(str, lengths))
+        model = "fisheye" if fisheye else "polynomial"
+        raise ValueError(f"required {wanted} {model} distortion coefficients, got {len(coefficients)}")
+    if not np.isfinite(coefficients).all():
+        raise ValueError(f"required finite distortion coefficients, got {coefficients.tolist()}")
+    return Lens(matrix, coefficients, fisheye)
