@@ -5,13 +5,12 @@
 ...     for message in messages:
 ...         print(message["seq"], message["contact"])
 
-Nothing here needs OpenCV, or tactflow itself: the same few lines work over plain ZeroMQ in any language.
+Nothing here needs OpenCV or the rest of tactflow: the same few lines work over plain ZeroMQ in any language.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Any
@@ -19,11 +18,18 @@ from typing import Any
 import orjson
 import zmq
 
+from tactflow.clock import SYSTEM, Clock
+
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Where tactflow publishes unless its pipeline says otherwise."""
 
 LONGEST_WAIT = 3600.0
 """ZeroMQ counts in milliseconds and not for ever; longer waits are made of several of these, s."""
+
+FIRST_RETRY_MS = 50
+LAST_RETRY_MS = 250
+"""Time between attempts to connect again, which doubles from the first to the last: after a pause of the
+publisher, be back within a quarter of a second. Chosen by hand, ms."""
 
 STATISTICS = b"tactflow.stats"
 """Topic of a run's statistics, which no sensor may be called after."""
@@ -42,6 +48,7 @@ class Subscriber:
     latest : keep only the newest message: for control loops, which want the present and not what is waiting.
         Otherwise every message waits until it is read.
     timeout : s without any message after which waiting ends in a TimeoutError; None waits for ever.
+    clock : tells when the timeout is over.
 
     Attributes
     ----------
@@ -61,8 +68,10 @@ class Subscriber:
         sensor: str | None = None,
         latest: bool = False,
         timeout: float | None = None,
+        clock: Clock = SYSTEM,
     ) -> None:
         self.endpoint = endpoint
+        self._clock = clock
         self.timeout = timeout
         self.lost = 0
         self.received = 0
@@ -71,9 +80,8 @@ class Subscriber:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.linger = 0
-        # After a pause of the publisher, be back within a quarter of a second, and keep trying.
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 250)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, FIRST_RETRY_MS)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, LAST_RETRY_MS)
         if latest:
             self._socket.setsockopt(zmq.CONFLATE, 1)
         else:
@@ -102,9 +110,9 @@ class Subscriber:
 
     def receive_json(self) -> bytes:
         """The next message as it was sent, JSON in UTF-8; not counted in `lost`. Raises as `receive`."""
-        deadline = None if self.timeout is None else time.monotonic() + self.timeout
+        deadline = None if self.timeout is None else self._clock.now() + self.timeout
         while True:
-            left = math.inf if deadline is None else deadline - time.monotonic()
+            left = math.inf if deadline is None else deadline - self._clock.now()
             if not self._socket.poll(max(math.ceil(min(left, LONGEST_WAIT) * 1000), 0)):
                 if left <= LONGEST_WAIT:
                     raise TimeoutError(self._silence())

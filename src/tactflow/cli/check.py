@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from tactflow.cli.fleet import clash_problems
+from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.config.load import sensor_names
@@ -20,6 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print one line for each sensor if all is right. Raises ConfigError with every mistake if it is not."""
+    warn_of_conflict()
     names: list[str] = sensor_names(find_pipeline(args.pipeline), args.overrides)
     good: dict[str | None, tuple[Pipeline, Plan]] = {}
     mistakes: list[str] = []

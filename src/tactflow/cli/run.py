@@ -18,6 +18,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from tactflow.cli.fleet import run_fleet
+from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.cli.story import share
@@ -72,6 +73,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started."""
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     file = find_pipeline(args.pipeline)
+    if args.sensor is None:
+        # Else it was said already by the process that starts one for each sensor.
+        warn_of_conflict()
     several = sensor_names(file, args.overrides) if args.sensor is None else []
     if len(several) > 1:
         return run_fleet(args, file, {name: _load(args, file, name) for name in several})

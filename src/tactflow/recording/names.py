@@ -8,7 +8,14 @@ from pathlib import Path
 
 
 def next_name(path: Path) -> Path:
-    """The first numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ..."""
+    """The first numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ...
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     Path(folder, "press-007.mcap").touch()
+    ...     print(next_name(Path(folder, "press.mcap")).name)
+    press-008.mcap
+    """
     taken = 0
     pattern = re.compile(re.escape(path.stem) + r"-(\d+)" + re.escape(path.suffix))
     if path.parent.is_dir():

@@ -33,6 +33,9 @@ def encode(fields: Iterable[tuple[int, Value]]) -> bytes:
     """One message. Integers are written as varints, floats as doubles.
 
     fields : (number, value) in the order they are to be written; a number may come several times.
+
+    >>> decode(encode([(1, 300), (2, 0.5)]))
+    {1: 300, 2: 0.5}
     """
     parts: list[bytes | memoryview] = []
     for number, value in fields:
@@ -84,12 +87,20 @@ def decode(data: bytes | memoryview) -> dict[int, int | float | memoryview]:
 
 
 def zigzag(number: int) -> int:
-    """A signed integer as `sint64` stores it: 0, -1, 1, -2, ... become 0, 1, 2, 3, ..."""
+    """A signed integer as `sint64` stores it: 0, -1, 1, -2, ... become 0, 1, 2, 3, ...
+
+    >>> [zigzag(number) for number in (0, -1, 1, -2)]
+    [0, 1, 2, 3]
+    """
     return number * 2 if number >= 0 else -number * 2 - 1
 
 
 def unzigzag(number: int) -> int:
-    """The inverse of `zigzag`."""
+    """The inverse of `zigzag`.
+
+    >>> unzigzag(zigzag(-12))
+    -12
+    """
     return number >> 1 if number & 1 == 0 else -(number >> 1) - 1
 
 

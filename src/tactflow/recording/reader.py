@@ -33,7 +33,7 @@ class Contents:
     """What a recording holds.
 
     finished : it has an index. frame_topic, reference_topic : channels. frames : how many, references
-    included; None if not known. start, end : ns; None if not known. topics : all channels.
+    included; None if not known. start, end : ns; None if not known.
     """
 
     finished: bool

@@ -12,6 +12,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from tactflow.recording.reader import DAMAGE, MAGIC, NotARecordingError
+from tactflow.recording.writer import NEVER
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -
         if source.read(len(MAGIC)) != MAGIC:
             raise NotARecordingError("is not an MCAP file")
         source.seek(0)
-        copy = _Copy(Writer(target, chunk_size=1 << 62, compression=CompressionType.NONE))
+        copy = _Copy(Writer(target, chunk_size=NEVER, compression=CompressionType.NONE))
         whole = len(MAGIC)
         try:
             for record in StreamReader(source, emit_chunks=True, validate_crcs=True).records:

@@ -17,8 +17,10 @@ from tactflow.message import message_schema
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
 from tactflow.recording.schemas import PICTURE_DESCRIPTOR, PICTURE_TYPE, RESULT_TYPE, plain_schema
 
-_NEVER = 1 << 62
-"""Chunks are ended by hand."""
+NEVER = 1 << 62
+"""Size at which a chunk would end by itself, bytes: they are ended by hand."""
+_OVERHEAD = 200
+"""About what an entry takes in memory beside its data, bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +42,7 @@ class Entry:
     @property
     def size(self) -> int:
         """Bytes of memory, about."""
-        return len(self.frame) + len(self.message or b"") + len(self.picture or b"") + 200
+        return len(self.frame) + len(self.message or b"") + len(self.picture or b"") + _OVERHEAD
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,22 @@ class RecordingWriter:
     ------
     OSError
         If the file is there already (FileExistsError) or cannot be written.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from tempfile import TemporaryDirectory
+    >>> from tactflow.engine.frame import Frame
+    >>> from tactflow.recording.frames import FrameCoder
+    >>> from tactflow.recording.reader import look_into
+    >>> packed = FrameCoder().encode(Frame("main", 0, 0.0, np.zeros((6, 8, 3), np.uint8)))
+    >>> with TemporaryDirectory() as folder:
+    ...     writer = RecordingWriter(Path(folder, "press.mcap"), About("main"))
+    ...     writer.write(Entry(time=0, seq=0, reference=True, epoch=0, frame=packed))
+    ...     writer.finish()
+    ...     contents = look_into(Path(folder, "press.mcap"))
+    >>> contents.finished, contents.frames, contents.frame_topic
+    (True, 1, '/main/frames')
     """
 
     def __init__(self, path: Path, about: About, *, overwrite: bool = False) -> None:
@@ -79,7 +97,7 @@ class RecordingWriter:
         self._file = _WholeRecords(path, overwrite=overwrite)
         try:
             self._writer = Writer(
-                cast("IO[bytes]", self._file), chunk_size=_NEVER, compression=CompressionType.NONE
+                cast("IO[bytes]", self._file), chunk_size=NEVER, compression=CompressionType.NONE
             )
             self._writer.start(profile="", library="tactflow")
             self._describe(about)

@@ -63,6 +63,22 @@ def open_source(
     ------
     SourceError
         If it cannot be opened; the message says what to try.
+
+    Examples
+    --------
+    >>> reader = open_source("sim:press?frames=2")
+    >>> reader.size, reader.total, reader.live
+    ((800, 600), 2, False)
+    >>> image, t = reader.read()
+    >>> image.shape, image.dtype, t
+    ((600, 800, 3), dtype('uint8'), 0.0)
+    >>> reader.close()
+
+    A wrong name says what there is:
+
+    >>> open_source("ftp://camera")
+    Traceback (most recent call last):
+    tactflow.engine.errors.SourceError: ftp://camera: unknown kind of source ftp://; required one of: ...
     """
     spec = spec.strip()
     if not spec:

@@ -20,6 +20,11 @@ from tactflow.files import expanded
 
 log = logging.getLogger("tactflow")
 
+SPARSE_PEAK = 4096
+"""A 16-bit frame without a value from here on comes from a sensor with 12 bits or fewer, grey levels."""
+FEWEST_BITS = 10
+"""Sensors whose pixels are stored in 16 bits have at least so many."""
+
 BgrImage = NDArray[np.uint8]
 
 
@@ -89,6 +94,10 @@ class Normaliser:
 
     Gray, BGRA and 16-bit frames are converted, with one note in the log per kind of conversion.
 
+    >>> bgr = Normaliser("example")(np.full((2, 2), 65535, np.uint16))
+    >>> bgr.shape, bgr.dtype, int(bgr.max())
+    ((2, 2, 3), dtype('uint8'), 255)
+
     Parameters
     ----------
     name : what the source is called in notes and errors.
@@ -125,14 +134,14 @@ class Normaliser:
         if image.dtype == np.uint16:
             if self._note("16 bit", "16-bit values are scaled to 8 bit (divided by 257)") and image.size:
                 peak = int(image.max())
-                if 0 < peak < 4096:
+                if 0 < peak < SPARSE_PEAK:
                     log.warning(
                         "%s: no value above %d: a sensor with %d bits in a 16-bit file? It will be dark; "
                         "multiply the values by %d beforehand",
                         where,
                         peak,
-                        max(peak.bit_length(), 10),
-                        1 << (16 - max(peak.bit_length(), 10)),
+                        max(peak.bit_length(), FEWEST_BITS),
+                        1 << (16 - max(peak.bit_length(), FEWEST_BITS)),
                     )
             image = cv2.convertScaleAbs(image, alpha=255.0 / 65535.0)
         elif image.dtype != np.uint8:
@@ -168,6 +177,16 @@ def quiet_opencv() -> Iterator[None]:
         _silence.end()
 
 
+SILENT = 0
+"""OpenCV's log level at which it says nothing."""
+
+
+def _set_log_level(level: int) -> int:
+    """Set OpenCV's log level; returns the one before. OpenCV 5 keeps the function elsewhere than 4."""
+    change = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
+    return int(change(level))
+
+
 class _Silence:
     """OpenCV's one log level, silent while any thread wants it silent."""
 
@@ -179,14 +198,14 @@ class _Silence:
     def begin(self) -> None:
         with self._lock:
             if self._wanted == 0:
-                self._level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+                self._level = _set_log_level(SILENT)
             self._wanted += 1
 
     def end(self) -> None:
         with self._lock:
             self._wanted -= 1
             if self._wanted == 0:
-                cv2.utils.logging.setLogLevel(self._level)
+                _set_log_level(self._level)
 
 
 _silence = _Silence()

@@ -19,11 +19,19 @@ from tactflow.sources.base import BgrImage, Normaliser, find_path, log, quiet_op
 IMAGE_SUFFIXES = frozenset(
     [".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"]
 )
+"""Kinds of files that are taken for images."""
 DEFAULT_FPS = 30.0
+"""Rate of images, arrays and videos that do not know their own, frames per second. Chosen by hand."""
+LARGEST_FPS = 1e4
+"""A video file that claims a higher rate, frames per second, does not know its own. Chosen by hand."""
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sorting key for which cal-2 comes before cal-10, and upper case does not matter."""
+    """Sorting key for which cal-2 comes before cal-10, and upper case does not matter.
+
+    >>> sorted(["cal-10.png", "cal-2.png", "CAL-1.png"], key=natural_key)
+    ['CAL-1.png', 'cal-2.png', 'cal-10.png']
+    """
     return [
         (0, int(part), part) if part.isdecimal() else (1, 0, part.casefold())
         for part in re.split(r"(\d+)", name)
@@ -168,6 +176,16 @@ class ArrayFile:
 
     Frames of a BGR array are views of the file, not copies.
 
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "press.npy")
+    ...     np.save(path, np.zeros((5, 48, 64), np.uint8))
+    ...     reader = ArrayFile(path, fps=10)
+    ...     first, second = reader.read(), reader.read()
+    >>> second[0].shape, second[1]
+    ((48, 64, 3), 0.1)
+
     Parameters
     ----------
     path : the file.
@@ -253,7 +271,7 @@ class VideoFile:
                 "an .mp4 or .avi that was not closed properly cannot be opened either"
             )
         said = self._capture.get(cv2.CAP_PROP_FPS)
-        self._rate = said if 0 < said < 1e4 else fps or DEFAULT_FPS
+        self._rate = said if 0 < said < LARGEST_FPS else fps or DEFAULT_FPS
         self.fps: float | None = self._rate
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.total: int | None = count if count > 0 else None

@@ -8,19 +8,19 @@ import threading
 from tactflow.clock import SYSTEM, Clock
 
 LEAD = 1.25
-"""Times as long as reading a frame took of late is set aside for reading the next."""
+"""Times as long as reading a frame took of late is set aside for reading the next. Chosen by hand."""
 SPARE = 0.001
-"""Time that is set aside beside that, s: what it takes to wake up."""
+"""Time that is set aside beside that: what it takes to wake up. Chosen by hand, s."""
 FORGET = 0.9
-"""What is left of a slow read after each frame."""
+"""What is left of a slow read after each frame, as a factor. Chosen by hand."""
 
 GRACE = 0.2
 """Part of the time between frames for which the next one is not read, even if reading is late: else one late
-frame makes all that follow late."""
+frame makes all that follow late. Chosen by hand."""
 
 MAX_BACKLOG = 0.5
 """A recording that falls further behind than this, s, continues from there: a laptop was asleep, or the
-process was halted, and rushing through what was missed would help nobody."""
+process was halted, and rushing through what was missed would help nobody. Chosen by hand."""
 
 
 class Pace:
@@ -33,6 +33,13 @@ class Pace:
     ----------
     stop : ends every wait at once.
     clock : tells the time, and lets it pass.
+
+    Examples
+    --------
+    >>> from threading import Event
+    >>> pace = Pace(Event())
+    >>> pace.wait_to_read(), pace.wait_for(0.0)
+    (True, True)
     """
 
     def __init__(self, stop: threading.Event, clock: Clock = SYSTEM) -> None:

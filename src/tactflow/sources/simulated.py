@@ -17,6 +17,12 @@ class Simulated:
     ------
     SourceError
         If there is no scene of that name, or it does not have that parameter.
+
+    Examples
+    --------
+    >>> reader = Simulated("sim:idle?frames=2")
+    >>> reader.description
+    'sim:idle?frames=2, 2 frames at 60 fps'
     """
 
     live = False

@@ -79,6 +79,17 @@ class Watched:
     ------
     SourceError
         If the source cannot be opened.
+
+    Examples
+    --------
+    Any reader can stand for a camera:
+
+    >>> from tactflow.sources.simulated import Simulated
+    >>> source = Watched(lambda: Simulated("sim:idle?frames=100"), Watch(), "example")
+    >>> image, t = source.read()
+    >>> image.shape, source.state
+    ((600, 800, 3), 'running')
+    >>> source.close()
     """
 
     live = True
