@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import cv2
 from pydantic import Field
 
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.files import expanded
@@ -22,8 +23,6 @@ class Images(Sink):
     """
 
     threaded = True
-    when_live = "block"
-    observer = False
 
     class Params(StageParams):
         """Where to write, what kind of file, and how many."""
@@ -45,12 +44,17 @@ class Images(Sink):
 
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is written yet."""
-        self.params = params
+        super().__init__(params)
         self._folder = expanded(params.folder)
         self.description = str(self._folder)
         self._next = 0
         self._files = 0
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
+
+    @classmethod
+    def outputs(cls, params: Images.Params) -> Sequence[Output]:
+        """The folder."""
+        return (Output(expanded(params.folder), "folder", "folder", refuses_existing=not params.overwrite),)
 
     def open(self) -> None:
         """Create the folder.

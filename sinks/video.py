@@ -6,6 +6,7 @@ import logging
 import shutil
 import statistics
 import tempfile
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.files import expanded
@@ -40,8 +41,6 @@ class Video(Sink):
     """
 
     threaded = True
-    when_live = "block"
-    observer = False
 
     class Params(StageParams):
         """Where to write, and how."""
@@ -72,7 +71,7 @@ class Video(Sink):
 
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is opened yet."""
-        self.params = params
+        super().__init__(params)
         self._path = expanded(params.path)
         self.description = str(self._path)
         self._codec = ""
@@ -80,6 +79,11 @@ class Video(Sink):
         self._writer: cv2.VideoWriter | None = None
         self._size: tuple[int, int] | None = None
         self._frames = 0
+
+    @classmethod
+    def outputs(cls, params: Video.Params) -> Sequence[Output]:
+        """The file."""
+        return (Output(expanded(params.path), "file", "path", refuses_existing=not params.overwrite),)
 
     def open(self) -> None:
         """Choose the codec and create the folder; the file itself follows with the first frames.

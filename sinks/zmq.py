@@ -6,21 +6,16 @@ import errno
 import logging
 import threading
 import time
-from collections.abc import Sequence
-from pathlib import Path
 
 import orjson
 import zmq
 from pydantic import Field
 
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.engine.priority import ZMQ_SENDS, threads_named
-from tactflow.message import encode_message
-from tactflow.ports import Image
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.message import Results, encode_message
 
 log = logging.getLogger("tactflow")
 
@@ -40,7 +35,6 @@ class Zmq(Sink):
 
     threaded = True
     when_live = "latest"
-    observer = False
 
     class Params(StageParams):
         """Where to publish, and how much may wait for a slow subscriber."""
@@ -78,13 +72,7 @@ class Zmq(Sink):
             description="time between two messages of statistics (topic tactflow.stats), s; 0: none",
         )
 
-    def __init__(
-        self,
-        params: Params,
-        sensor: str = "main",
-        directory: Path | None = None,
-        control: Control | None = None,
-    ) -> None:
+    def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is bound yet.
 
         Parameters
@@ -92,8 +80,7 @@ class Zmq(Sink):
         sensor : names the topic.
         control : the run, asked for its statistics; None: there are none to publish.
         """
-        del directory
-        self.params = params
+        super().__init__(params)
         self.endpoint = params.endpoint
         self.description = params.endpoint
         self._sensor = sensor
@@ -109,15 +96,16 @@ class Zmq(Sink):
         self._stats_wanted = False
         self._closing = threading.Event()
         self._stats_thread: threading.Thread | None = None
-        self._others: list[int] = []
-        self._io_threads: list[int] = []
 
-    @property
-    def live_threads(self) -> Sequence[int]:
-        """Native ids of the threads in which ZeroMQ sends, once they have named themselves."""
-        if self._socket is not None and not self._io_threads:
-            self._io_threads = threads_named(ZMQ_SENDS, besides=self._others)
-        return self._io_threads
+    @classmethod
+    def publishes(cls, params: Zmq.Params) -> Publication:
+        """At its endpoint."""
+        return Publication(params.endpoint, params.backlog)
+
+    @classmethod
+    def publish_at(cls, params: Zmq.Params, address: str) -> Zmq.Params:
+        """With another endpoint."""
+        return params.changed(endpoint=address)
 
     def open(self) -> None:
         """Bind the socket; afterwards `endpoint` is the real address.
@@ -127,8 +115,6 @@ class Zmq(Sink):
         StageError
             If the address is taken or cannot be bound.
         """
-        # All there are: those of another context may not have named themselves yet.
-        self._others = threads_named("")
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket = context.socket(zmq.XPUB)
         socket.sndhwm = self.params.backlog
@@ -171,18 +157,11 @@ class Zmq(Sink):
         """serialised : messages encoded. subscriptions : distinct ones now."""
         return {"serialised": self._serialised, "subscriptions": len(self._subscriptions)}
 
-    def write(
-        self,
-        tick: Tick,
-        image: Image | None,
-        contact: Contact | None,
-        flow: Flow | None,
-        markers: Markers | None,
-    ) -> None:
+    def write(self, tick: Tick, results: Results) -> None:
         """Send one message to whoever has subscribed; never waits."""
         if not self.wants():
             return
-        body = encode_message(tick, image, contact, flow, markers, detail=self.params.detail)
+        body = encode_message(tick, results, detail=self.params.detail)
         self._serialised += 1
         with self._lock:
             if self._socket is not None:

@@ -20,9 +20,9 @@ class ContactPorts(NamedTuple):
 
 
 class Difference(Stage):
-    """Compare the unmarked frame with the untouched gel (seed function `difference`).
+    """Compare the unmarked frame with the untouched gel.
 
-    All frames marked as reference are learned from (`seed` and `colour`: the last one); the first frame
+    All frames marked as reference are learned from (`colour`: from the last one); the first frame
     serves where there is none.
     """
 
@@ -31,10 +31,10 @@ class Difference(Stage):
     class Params(StageParams):
         """method : how contact is told from no contact. The others belong to one method each."""
 
-        method: Literal["noise", "colour", "seed"] = Field(
+        method: Literal["noise", "colour"] = Field(
             "noise",
             description="noise tests against the sensor's own noise, for gels that answer with brightness or "
-            "colour; colour is a plain distance of colours; seed is the original rule",
+            "colour; colour is a plain distance of colours",
         )
         false_alarms: float = Field(
             1e-6, gt=0, lt=1, description="noise: frames of the untouched gel called contact, per frame"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
@@ -15,12 +13,12 @@ from tactflow.vision.types import Flow, Markers
 
 
 class FlowInMask(Stage):
-    """Mean displacement, twist and press of the markers inside the contact (seed's `draw_flow_mask`)."""
+    """Mean displacement, twist and press of the markers inside the contact."""
 
     memory = "pure"
 
     class Params(StageParams):
-        """Which markers count as inside, and how they are averaged."""
+        """Which markers count as inside."""
 
         dilate: float = Field(
             0.3,
@@ -29,16 +27,11 @@ class FlowInMask(Stage):
             description="markers whose centre is up to this far outside the contact's outline count too, px; "
             "more markers make the mean steadier and mix in gel that moves less",
         )
-        method: Literal["mean", "seed"] = Field(
-            "mean", description="seed: the original's whole-pixel displacements and square dilation"
-        )
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        if params.method == "mean":
-            compiled.load(in_mask, inside_kernels)
+        compiled.load(in_mask, inside_kernels)
 
     def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside."""
-        params = self._params
-        return flow_in_mask(markers, contact_mask, dilate=params.dilate, method=params.method)
+        return flow_in_mask(markers, contact_mask, dilate=self._params.dilate)

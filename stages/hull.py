@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
@@ -16,10 +14,7 @@ from tactflow.vision.types import Contact
 
 
 class Hull(Stage):
-    """Hull, area, centroid, direction and ellipse of the contact.
-
-    Seed functions `get_all_contour`, `get_convex_hull_area` and `regress_line`.
-    """
+    """Hull, area, centroid, direction and ellipse of the contact."""
 
     memory = "pure"
 
@@ -39,14 +34,10 @@ class Hull(Stage):
             description="regions less elongated than this get no direction, 1: 0.3 is an axis ratio of 1.36, "
             "which 5 % of 200 real presses of a ball exceed, since light makes a mask lopsided",
         )
-        method: Literal["moments", "seed"] = Field(
-            "moments", description="seed: the original's line through the hull's vertices, all blobs together"
-        )
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        if params.method == "moments":
-            compiled.load(moments)
+        compiled.load(moments)
 
     def process(self, contact_mask: ContactMask) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
@@ -56,6 +47,5 @@ class Hull(Stage):
             min_area=params.min_area,
             max_gap=params.max_gap,
             min_confidence=params.min_confidence,
-            method=params.method,
         )
         return Absent("no_contact") if contact is None else contact

@@ -11,11 +11,11 @@ from tactflow.ports import Image, MarkerMask, Unmarked
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
 from tactflow.vision.markers import inpaint_kernels
-from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
+from tactflow.vision.markers.inpaint import RADIUS, remove_markers
 
 
 class Inpaint(Stage):
-    """Fill the markers from their surroundings (seed function `inpaint`)."""
+    """Fill the markers from their surroundings."""
 
     memory = "pure"
 
@@ -25,7 +25,7 @@ class Inpaint(Stage):
         method: Literal["normalized", "telea", "ns", "none"] = Field(
             "normalized", description="normalized averages the gel around; telea and ns are OpenCV's, slow"
         )
-        radius: float = Field(SEED_RADIUS, gt=0, le=100, description="neighbourhood, processed px")
+        radius: float = Field(RADIUS, gt=0, le=100, description="neighbourhood, processed px")
 
     def __init__(self, params: Params) -> None:
         if params.method == "normalized":

@@ -13,20 +13,16 @@ from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
 from tactflow.vision.markers import mask_kernels
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
-from tactflow.vision.seed_contact import seed_marker_mask
 
 
 class MarkerMaskStage(Stage):
-    """Mask of the marker dots (seed function `mask_marker`); the first frame shows how they look."""
+    """Mask of the marker dots; the first frame shows how they look."""
 
     memory = "stateful"
 
     class Params(StageParams):
-        """method : how markers are found. dot, polarity, contrast : what they look like (`dog` only)."""
+        """What the dots look like."""
 
-        method: Literal["dog", "seed"] = Field(
-            "dog", description="dog scales with the dots; seed is the original rule, for dark dots"
-        )
         dot: Literal["auto"] | Annotated[float, Field(ge=1, le=100)] = Field(
             "auto", description="radius of a dot, processed px, 1 to 100; auto finds it in the first frame"
         )
@@ -37,8 +33,7 @@ class MarkerMaskStage(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        if params.method == "dog":
-            compiled.load(downsample, mask_kernels)
+        compiled.load(downsample, mask_kernels)
         self._params = params
         self._dot: Dot | None = None
         self._looked = False
@@ -49,8 +44,6 @@ class MarkerMaskStage(Stage):
 
     def process(self, image: Image) -> MarkerMask:
         """255 where a marker covers the gel; all 0 where the first frame showed no markers."""
-        if self._params.method == "seed":
-            return seed_marker_mask(image)
         if not self._looked:
             self._dot, self._looked = self._look(image), True
         if self._dot is None:

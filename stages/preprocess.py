@@ -54,7 +54,7 @@ class Preprocessed(NamedTuple):
 
 
 class Preprocess(Stage):
-    """Straighten, cut, turn and shrink the frame in one pass (seed function `get_processed_frame`)."""
+    """Straighten, cut, turn and shrink the frame in one pass."""
 
     memory = "pure"
 

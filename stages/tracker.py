@@ -15,26 +15,17 @@ from tactflow.vision import compiled
 from tactflow.vision.markers import matching, template_kernels, tracking_kernels
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.tracking import MarkerTracker
-from tactflow.vision.seed_tracker import SeedTracker
 from tactflow.vision.types import Markers
 
 
 class Tracker(Stage):
-    """Follow the marker dots of the reference frame.
-
-    Seed functions `marker_center`, `m.init`, `m.run` and `m.get_flow`.
-    """
+    """Follow the marker dots of the reference frame."""
 
     memory = "stateful"
 
     class Params(StageParams):
         """What the marks look like, and how far they may go."""
 
-        method: Literal["appearance", "seed"] = Field(
-            "appearance",
-            description="appearance: each mark against its own look, identities by the whole field; "
-            "seed: the original's contour centres and depth-first search, limited in visits",
-        )
         dot: float | None = Field(
             None, ge=1, le=200, description="radius of a mark, processed px; null finds it"
         )
@@ -50,15 +41,14 @@ class Tracker(Stage):
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        if params.method == "appearance":
-            compiled.load(template_kernels, matching, tracking_kernels)
+        compiled.load(template_kernels, matching, tracking_kernels)
         self.reset()
 
     def reset(self) -> None:
         """Forget the reference; a new one follows."""
         self._references: list[NDArray[np.uint8]] = []
         self._detection: Detection | None = None
-        self._tracker: MarkerTracker | SeedTracker | None = None
+        self._tracker: MarkerTracker | None = None
 
     def process(self, image: Image, frame: Frame) -> Markers:
         """Position, status and standard error of every marker; the first frame serves as reference."""
@@ -73,9 +63,7 @@ class Tracker(Stage):
             self._references = self._references[:1]
         return self._tracker.track(image)
 
-    def _first_tracker(self, image: NDArray[np.uint8]) -> MarkerTracker | SeedTracker:
-        if self._params.method == "seed":
-            return SeedTracker(image)
+    def _first_tracker(self, image: NDArray[np.uint8]) -> MarkerTracker:
         self._detection = detect_markers(image, dot_radius=self._params.dot, polarity=self._params.polarity)
         return self._tracker_of([image], self._detection)
 

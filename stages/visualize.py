@@ -13,7 +13,7 @@ from tactflow.vision.types import Contact, Flow, Markers
 
 
 class Visualize(Stage):
-    """Draw contact, markers and flow (seed functions `draw_flow`, `draw_flow_mask`, `regress_line`)."""
+    """Draw contact, markers and flow."""
 
     memory = "pure"
 

@@ -27,18 +27,6 @@ def is_device(text: str) -> bool:
     return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
 
 
-def output(params: object) -> tuple[str, str] | None:
-    """The parameter that says where a sink writes, and its value; None for one that writes no file or folder.
-
-    Standard output and devices are none: several sinks may write to them.
-    """
-    for key in ("path", "folder"):
-        value = getattr(params, key, None)
-        if isinstance(value, str):
-            return None if value == "-" or is_device(value) else (key, value)
-    return None
-
-
 def lead_nowhere(stream: IO[str]) -> None:
     """Let what is held back in a stream, and what follows, be lost without complaint.
 

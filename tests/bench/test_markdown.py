@@ -13,14 +13,16 @@ from tactflow.bench.results import Measurement, Result, Target
 @pytest.fixture
 def result() -> Result:
     made = Result(quick=True, copy_ms=0.1, touch_ms=0.05)
-    for method, milliseconds, rms in (("default", 1.5, 0.01), ("seed", 50.0, 0.3), (ORIGINAL, 100.0, 0.3)):
+    for method, milliseconds, rms in (("default", 1.5, 0.01), ("classic", 50.0, 0.3), (ORIGINAL, 100.0, 0.3)):
         measurement = Measurement("pipeline", method, "press", errors={"displacement_rms": rms})
         measurement.time["contact"] = {"cpu_ms_p50": milliseconds}
         made.measurements.append(measurement)
     made.measurements.append(
         Measurement("inpaint", "ns", "press", copies={"idle": 9}, errors={"inpaint_mae": 1.5})
     )
-    made.measurements.append(Measurement("pipeline", "seed", "data:wedge_roll", failure="no markers\nmore"))
+    made.measurements.append(
+        Measurement("pipeline", "classic", "data:wedge_roll", failure="no markers\nmore")
+    )
     made.targets.append(Target("markers", "<= 0.03 px", "0.01", True, "press"))
     return made
 
@@ -41,7 +43,7 @@ def test_methods_promises_and_failures_are_listed(result: Result) -> None:
     text = markdown(result, "default")
     assert "| markers | ≤ 0.03 px | 0.01 | met | press |" in text
     assert "| `ns` | - | 9 | 1.5 (1.5) |" in text
-    assert "| wedge_roll | `seed` | - | no markers |" in text
+    assert "| wedge_roll | `classic` | - | no markers |" in text
 
 
 def test_an_existing_page_keeps_its_own_text(result: Result, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ class Without(StageParams):
 
 @pytest.fixture(scope="module")
 def pipelines() -> dict[str, Pipeline]:
-    return {name: load_pipeline(find_pipeline(name)) for name in ("default", "seed")}
+    return {name: load_pipeline(find_pipeline(name)) for name in ("default", "classic")}
 
 
 def test_methods_are_read_from_the_parameter_of_that_name() -> None:
@@ -35,13 +35,13 @@ def test_methods_are_read_from_the_parameter_of_that_name() -> None:
     assert methods_of(Without) == []
 
 
-def test_every_method_of_a_stage_is_an_alternative_and_the_seeds_is_the_yardstick(
+def test_every_method_of_a_stage_is_an_alternative_and_the_scripts_is_the_yardstick(
     pipelines: dict[str, Pipeline],
 ) -> None:
     ways = alternatives(pipelines, "inpaint")
     assert ways.keys() >= {"telea", "ns", "none"}
     assert [name for name, way in ways.items() if way.yardstick] == ["telea"]
-    assert ways["telea"].params == pipelines["seed"].nodes["inpaint"].params
+    assert ways["telea"].params == pipelines["classic"].nodes["inpaint"].params
 
 
 def test_a_scenes_name_tells_its_settings_apart() -> None:
@@ -102,6 +102,6 @@ def test_every_method_gets_a_time_and_the_errors_of_its_stage(
     assert not [m.failure for m in found if m.failure]
     assert by_key["inpaint/telea/bright_cable"].faster["contact"] == 1
     assert by_key["inpaint/telea/bright_cable"].errors["inpaint_mae"] > 0
-    assert by_key["hull/moments/bright_cable"].errors["center_error"] == pytest.approx(0, abs=1e-9)
+    assert by_key["hull/default/bright_cable"].errors["center_error"] == pytest.approx(0, abs=1e-9)
     assert {"tracker", "hull", "inpaint", "marker_mask", "difference"} <= {m.group for m in found}
     assert all(m.copies for m in found)

@@ -18,7 +18,7 @@ from tactflow.cli.pipelines import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.vision import compiled
 
-FILES = {name: find_pipeline(name) for name in ("default", "seed")}
+FILES = {name: find_pipeline(name) for name in ("default", "classic")}
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def result() -> Result:
 
 def test_every_pipeline_is_measured_on_every_scene_with_markers(result: Result) -> None:
     found = {m.method: m for m in result.of("pipeline") if m.scene == "bright_cable"}
-    assert found.keys() == {"default", "seed", ORIGINAL}
+    assert found.keys() == {"default", "classic", ORIGINAL}
     assert not [m.failure for m in found.values() if m.failure]
     for m in found.values():
         assert {"displacement_rms", "wrong_percent", "false_contacts", "missed_contacts"} <= m.errors.keys()
@@ -47,11 +47,11 @@ def test_every_pipeline_is_measured_on_every_scene_with_markers(result: Result) 
     assert found["default"].limits["displacement_rms"] < found["default"].errors["displacement_rms"]
 
 
-def test_the_script_costs_more_than_the_seed_pipeline_and_says_the_same(result: Result) -> None:
+def test_the_script_costs_more_than_the_classic_pipeline_and_says_the_same(result: Result) -> None:
     found = {m.method: m for m in result.of("pipeline") if m.scene == "bright_cable"}
-    assert found[ORIGINAL].errors == found["seed"].errors
+    assert found[ORIGINAL].errors == found["classic"].errors
     # It does everything twice that costs most; half of that would already be a quarter more.
-    assert found[ORIGINAL].copies["contact"] > 1.25 * found["seed"].copies["contact"]
+    assert found[ORIGINAL].copies["contact"] > 1.25 * found["classic"].copies["contact"]
 
 
 def test_a_gel_without_markers_is_measured_without_a_tracker(result: Result) -> None:
@@ -173,7 +173,7 @@ def test_pictures_show_the_worst_frame_of_every_pipeline(tmp_path: Path) -> None
     )
     run_bench(plan)
     names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
-    assert names == ["bright_cable-default.png", "bright_cable-seed.png"]
+    assert names == ["bright_cable-classic.png", "bright_cable-default.png"]
     picture = cv2.imread(str(tmp_path / "pictures" / names[0]))
     assert picture is not None
     assert picture.shape == (2 * 400 + 24, 2 * 300, 3)

@@ -124,13 +124,13 @@ def test_without_a_name_the_pipeline_in_the_current_directory_is_taken_else_the_
     assert capsys.readouterr().out == "pipeline.yaml: OK (1 stage, 1 sink, 2 segments)\n"
 
 
-@pytest.mark.parametrize("name", ["seed", "seed.yaml", "pipelines/seed.yaml"])
+@pytest.mark.parametrize("name", ["classic", "classic.yaml", "pipelines/classic.yaml"])
 def test_a_packaged_pipeline_is_found_by_its_name(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["check", name]) == 0
-    assert "seed.yaml: OK" in capsys.readouterr().out
+    assert "classic.yaml: OK" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -139,22 +139,6 @@ def test_switching_skipping_off_opens_every_gate(toy_runner: MakeRunner) -> None
     assert seen(runner, "gated") == list(range(20))
 
 
-@pytest.mark.parametrize(
-    ("gate", "expected"),
-    [
-        ({"hold": 2}, [3, 4, 5, 6, 7, 8, 13, 14, 15, 16, 17, 18]),
-        ({"at_least_every": 4}, [3, 4, 5, 6, 10, 13, 14, 15, 16]),
-        ({"hold": 0}, [3, 4, 5, 6, 13, 14, 15, 16]),
-    ],
-)
-def test_a_gate_holds_and_opens_at_least_every(
-    toy_runner: MakeRunner, gate: dict[str, Any], expected: list[int]
-) -> None:
-    runner = toy_runner({"gated": {"when": {"signal": "active", **gate}}})
-    ran(runner)
-    assert seen(runner, "gated") == expected
-
-
 def test_a_repeating_gate_gives_its_last_value_and_says_why(toy_runner: MakeRunner) -> None:
     runner = toy_runner(
         {"gated": {"when": {"signal": "active", "otherwise": "repeat", "reason": "unchanged"}}}
@@ -438,33 +422,22 @@ def test_a_live_source_drops_rather_than_lags_and_counts_it(toy_runner: MakeRunn
     assert link["drops"] + link["delivered"] == link["offered"] == 300
 
 
-class Asked:
-    """Stands in for `Precedence` and notes who was given it."""
-
-    def __init__(self, threads: Callable[[], list[int | None]], realtime: bool, runs: int) -> None:
-        self.how = f"{realtime} {runs}"
-        self._threads = threads
-        self.names: set[str] = set()
-        self.stopped = False
-
-    def start(self) -> None:
-        names = {thread.native_id: thread.name for thread in threading.enumerate()}
-        self.names = {names.get(id_, str(id_)) for id_ in self._threads()}
-
-    def stop(self) -> None:
-        self.stopped = True
-
-
-def test_live_threads_that_somebody_waits_for_get_precedence(
-    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("refused", "priority"), [(None, "real-time"), ("no right", "ordinary")])
+def test_threads_that_live_frames_wait_for_go_first_where_that_is_asked_for(
+    refused: str | None,
+    priority: str,
+    toy_runner: MakeRunner,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    given: list[Asked] = []
+    given: list[set[str]] = []
 
-    def make(*args: Any) -> Asked:
-        given.append(Asked(*args))
-        return given[-1]
+    def ask(threads: list[int]) -> str | None:
+        names = {thread.native_id: thread.name for thread in threading.enumerate()}
+        given.append({names.get(id_, str(id_)) for id_ in threads})
+        return refused
 
-    monkeypatch.setattr(run, "Precedence", make)
+    monkeypatch.setattr(run, "ask_for_realtime", ask)
     sinks = {
         "out": {"use": "Collect"},
         "far": {"use": "ThreadedCollect"},
@@ -472,16 +445,19 @@ def test_live_threads_that_somebody_waits_for_get_precedence(
         "eyes": {"use": "Onlooker"},
     }
     live = {"capture": {"realtime": True, "pause": 0.01, "reader": 4711}}
-    assert ran(toy_runner(live, sinks, realtime_priority=False)).stats["priority"] == "False 1"
-    asked = given.pop()
-    assert asked.names == {"tactflow-capture", "tactflow-compute", "tactflow-far", "4711"}
-    assert asked.stopped
-    # A sink that keeps results, in the thread that captures.
-    kept = {"out": {"use": "FrameArchive", "segment": "capture"}}
-    ran(toy_runner(live, kept))
-    assert "tactflow-capture" in given.pop().names
-    assert ran(toy_runner({}, sinks)).stats["priority"] == "ordinary"
-    assert not given, "a recording that waits needs none"
+    with caplog.at_level("INFO", logger="tactflow"):
+        result = ran(toy_runner(live, sinks, realtime_priority=True))
+    assert result.stats["priority"] == priority
+    assert given == [{"tactflow-capture", "tactflow-compute", "tactflow-far", "4711"}]
+    assert ("go first" if refused is None else "not granted: no right") in caplog.text
+
+
+def test_nobody_goes_first_unasked_or_on_a_recording(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "ask_for_realtime", lambda threads: pytest.fail(f"asked for {threads}"))
+    ran(toy_runner({"capture": {"realtime": True}}))
+    ran(toy_runner(realtime_priority=True))
 
 
 def test_frames_that_one_branch_dropped_are_dropped_at_the_join(toy_runner: MakeRunner) -> None:

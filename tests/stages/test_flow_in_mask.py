@@ -37,10 +37,6 @@ def test_the_mean_is_over_the_markers_inside_the_dilated_contact() -> None:
     assert run(dilate=100).count == 5
 
 
-def test_the_seed_method_cuts_displacements_to_whole_pixels() -> None:
-    assert run(method="seed").mean == (1.0, 0.0)
-
-
 @pytest.mark.parametrize("params", [{"dilate": -1}, {"method": "median"}, {"dilation": 3}], ids=str)
 def test_wrong_parameters_are_refused(params: Any) -> None:
     with pytest.raises(ValidationError):

@@ -49,7 +49,7 @@ def test_what_is_smaller_than_min_area_is_no_contact() -> None:
     assert isinstance(run(bar(), min_area=500), Contact)
 
 
-def test_max_gap_and_method_reach_the_geometry() -> None:
+def test_max_gap_reaches_the_geometry() -> None:
     mask = bar()
     mask[20:30, 80:85] = 255
     near, far = run(mask.copy(), max_gap=5), run(mask.copy())
@@ -57,10 +57,6 @@ def test_max_gap_and_method_reach_the_geometry() -> None:
     assert isinstance(far, Contact)
     assert near.hull[:, 0].max() == 59
     assert far.hull[:, 0].max() == 84
-    seed = run(bar(), method="seed")
-    assert isinstance(seed, Contact)
-    # The hull of pixel centres, as the original measured it.
-    assert seed.area == 49 * 9
 
 
 def test_a_stubby_contact_has_no_direction_unless_asked_for() -> None:

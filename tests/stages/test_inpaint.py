@@ -22,7 +22,7 @@ def test_stage_gives_what_the_function_gives(method: InpaintMethod) -> None:
     assert np.array_equal(stage.process(IMAGE, MASK), remove_markers(IMAGE, MASK, method=method, radius=3))
 
 
-def test_default_is_the_fast_method_at_the_seeds_radius() -> None:
+def test_default_is_the_fast_method_with_a_radius_of_7_px() -> None:
     stage = Inpaint(Inpaint.Params())
     assert np.array_equal(
         stage.process(IMAGE, MASK), remove_markers(IMAGE, MASK, method="normalized", radius=7)

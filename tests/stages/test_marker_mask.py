@@ -11,7 +11,6 @@ from pydantic import ValidationError
 from tactflow.sim import open_scene
 from tactflow.stages.marker_mask import MarkerMaskStage
 from tactflow.vision.markers.mask import Dot, marker_mask
-from tactflow.vision.seed_contact import seed_marker_mask
 
 
 def _stage(**params: Any) -> MarkerMaskStage:
@@ -40,11 +39,6 @@ def test_given_values_replace_what_would_be_found() -> None:
     frame = open_scene("idle?frames=2").frame(0)
     mask = _stage(dot=9.0, polarity="dark", contrast=30.0).process(frame)
     assert np.array_equal(mask, marker_mask(frame, Dot(9.0, "dark", 30.0)))
-
-
-def test_seed_method_is_the_seed_function() -> None:
-    frame = open_scene("idle?frames=2").frame(0)
-    assert np.array_equal(_stage(method="seed").process(frame), seed_marker_mask(frame))
 
 
 def test_each_mask_is_fresh() -> None:

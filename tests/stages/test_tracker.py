@@ -62,20 +62,13 @@ def test_reset_takes_a_new_reference() -> None:
     assert np.abs(markers.displacement).max() < 0.08
 
 
-def test_the_seed_method_follows_too() -> None:
-    stage = Tracker(Tracker.Params(method="seed"))
-    feed(stage, picture((0, 0), noise=0), 0, reference=True)
-    markers = feed(stage, picture((3, 2), noise=0), 1)
-    np.testing.assert_allclose(markers.displacement, np.tile([3.0, 2.0], (36, 1)), atol=1.0)
-
-
 def test_no_markers_is_an_error_that_names_the_markerless_pipeline() -> None:
     with pytest.raises(ValueError, match=r"0 markers found: .* pipelines/markerless\.yaml"):
         feed(Tracker(Tracker.Params()), np.full((200, 200, 3), 90, np.uint8), 0)
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"dot": 0.2}, {"polarity": "red"}, {"max_displacement": 0}, {"methd": "seed"}]
+    "wrong", [{"dot": 0.2}, {"polarity": "red"}, {"max_displacement": 0}, {"polrity": "dark"}]
 )
 def test_wrong_parameters_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):

@@ -12,15 +12,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.classic import functions as classic
+from tactflow.classic.tracker import GridTracker
 from tactflow.engine.frame import Absent, Frame
-from tactflow.vision.contact import ContactDetector
+from tactflow.vision.contact import ContactDetector, ContactResult
+from tactflow.vision.flow import flow_in_mask
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import find_dot, marker_mask
 from tactflow.vision.markers.tracking import MarkerTracker
-from tactflow.vision.seed_contact import seed_marker_mask
-from tactflow.vision.seed_tracker import SeedTracker
-from tactflow.vision.types import Markers
+from tactflow.vision.types import Contact, Flow, Markers
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float64]
@@ -207,24 +209,54 @@ def dog_mask(reference: Image, image: Image) -> Image:
 
 MARKER_MASKS: Mapping[str, Callable[[Image, Image], Image]] = {
     "dog": dog_mask,
-    "seed": lambda _reference, image: seed_marker_mask(image),
+    "classic": lambda _reference, image: classic.mask_marker(image),
 }
 INPAINTING = ("normalized", "telea", "ns", "none")
-DIFFERENCES = ("noise", "colour", "seed")
-HULLS = ("moments", "seed")
-FLOWS = ("mean", "seed")
+HULLS: Mapping[str, Callable[..., Contact | None]] = {
+    "moments": contact_geometry,
+    "classic": lambda mask, **_: classic.get_convex_hull_area(mask),
+}
+FLOWS: Mapping[str, Callable[..., Flow]] = {
+    "mean": flow_in_mask,
+    "classic": lambda markers, mask, dilate=0.0: classic.mean_flow(markers, mask, round(dilate)),
+}
 
 
-def contact_mask(method: Any, reference: Image, image: Image) -> Image:
+class ClassicDetector:
+    """The original script's comparison, used like a `ContactDetector`."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self._reference: Image | None = None
+
+    def add_reference(self, image: Image) -> None:
+        self._reference = image.copy()
+
+    def detect(self, image: Image) -> ContactResult:
+        assert self._reference is not None
+        mask = classic.contact_mask(image, self._reference)
+        return ContactResult(mask, bool(mask.any()))
+
+
+DIFFERENCES: Mapping[str, Callable[[], ContactDetector | ClassicDetector]] = {
+    "noise": ContactDetector,
+    "colour": partial(ContactDetector, "colour"),
+    "classic": ClassicDetector,
+}
+
+
+def contact_mask(method: str, reference: Image, image: Image) -> Image:
     """The contact mask of one image against one reference."""
-    detector = ContactDetector(method)
+    detector = DIFFERENCES[method]()
     detector.add_reference(reference)
     return detector.detect(image).mask
 
 
 TRACKERS: Mapping[str, Callable[[Image], Any]] = {
     "appearance": lambda reference: MarkerTracker(reference, detect_markers(reference)),
-    "seed": SeedTracker,
+    "classic": GridTracker,
 }
 
 
@@ -235,8 +267,8 @@ def tracked(make: Callable[[Image], Any], reference: Image, image: Image) -> Mar
 
 
 def filled(method: Any, _reference: Image, image: Image) -> Image:
-    """The image without what the seed's mask takes for markers."""
-    return remove_markers(image, seed_marker_mask(image), method=method)
+    """The image without what the script's mask takes for markers."""
+    return remove_markers(image, classic.mask_marker(image), method=method)
 
 
 PICTURE_METHODS: Mapping[str, Callable[[Image, Image], Any]] = {

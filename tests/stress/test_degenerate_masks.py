@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.draw import Annotator
-from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Markers
 from tests.stress.builders import FLOWS, HULLS, Image, assert_defined
@@ -139,7 +138,7 @@ def test_a_contact_cut_by_the_border_ends_there() -> None:
 @pytest.mark.parametrize("name", KNOWN)
 def test_every_method_describes_and_draws_awkward_contacts(method: str, name: str) -> None:
     mask = KNOWN[name].mask
-    found = contact_geometry(mask, method=method)  # type: ignore[arg-type]
+    found = HULLS[method](mask)
     assert found is not None
     assert_defined(found)
     assert found.hull.shape[1] == 2
@@ -155,10 +154,10 @@ def test_every_method_describes_and_draws_awkward_contacts(method: str, name: st
 @pytest.mark.parametrize("method", HULLS)
 @pytest.mark.parametrize("shape", [(0, 0), (0, 5), (5, 0), (1, 1), (1, 9), (9, 1), (13, 7)], ids=str)
 def test_no_contact_is_no_contact_in_any_size(method: str, shape: tuple[int, int]) -> None:
-    assert contact_geometry(np.zeros(shape, np.uint8), method=method) is None  # type: ignore[arg-type]
+    assert HULLS[method](np.zeros(shape, np.uint8)) is None
     if 0 in shape:
         return
-    full = contact_geometry(np.full(shape, 255, np.uint8), method=method)  # type: ignore[arg-type]
+    full = HULLS[method](np.full(shape, 255, np.uint8))
     assert full is not None
     assert_defined(full)
 
@@ -188,7 +187,7 @@ def test_random_specks_have_no_direction_or_a_finite_one() -> None:
         for _ in range(20):
             mask = (random.random((HEIGHT, WIDTH)) < density).astype(np.uint8) * np.uint8(255)
             for method in HULLS:
-                assert_defined(contact_geometry(mask, method=method, max_gap=3.0))  # type: ignore[arg-type]
+                assert_defined(HULLS[method](mask, max_gap=3.0))
 
 
 # -- flow -------------------------------------------------------------------------------------------------
@@ -215,7 +214,7 @@ INSIDE = {
 @pytest.mark.parametrize("method", FLOWS)
 @pytest.mark.parametrize("name", KNOWN)
 def test_the_flow_in_awkward_contacts_is_the_motion_of_who_is_inside(method: str, name: str) -> None:
-    flow = flow_in_mask(grid_markers(), KNOWN[name].mask, method=method)  # type: ignore[arg-type]
+    flow = FLOWS[method](grid_markers(), KNOWN[name].mask)
     assert_defined(flow)
     if name in INSIDE:
         assert flow.count == INSIDE[name]
@@ -249,9 +248,9 @@ def markers_at(origin: NDArray[np.float64], position: NDArray[np.float64]) -> Ma
 )
 def test_few_or_flat_or_far_markers_have_a_defined_flow(method: str, origin: NDArray[np.float64]) -> None:
     for dilate in (0.0, 1.0, 7.5, 1e6):
-        if method == "seed" and dilate > 100:
+        if method == "classic" and dilate > 100:
             continue
-        flow = flow_in_mask(markers_at(origin, origin + 1), _whole(), dilate=dilate, method=method)  # type: ignore[arg-type]
+        flow = FLOWS[method](markers_at(origin, origin + 1), _whole(), dilate=dilate)
         assert_defined(flow)
         if len(np.unique(origin, axis=0)) < 3 or np.ptp(origin[:, 1]) == 0:
             assert flow.rotation is None

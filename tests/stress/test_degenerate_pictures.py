@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.change import ChangeProbe
-from tactflow.vision.contact import ContactDetector
 from tactflow.vision.draw import Annotator
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers
@@ -115,7 +114,7 @@ def test_every_pair_of_degenerate_pictures_has_a_defined_answer(method: str, sha
 def test_the_same_frame_again_is_never_contact(method: str, name: str) -> None:
     for shape in SHAPES:
         image = PICTURES[name](shape)
-        detector = ContactDetector(method)  # type: ignore[arg-type]
+        detector = DIFFERENCES[method]()
         detector.add_reference(image)
         for _ in range(3):
             assert not detector.detect(image).touching, shape
@@ -256,13 +255,13 @@ def test_the_same_frame_for_ever_never_drifts(method: str) -> None:
 @pytest.mark.parametrize("method", DIFFERENCES)
 def test_a_reference_already_in_contact_shows_what_changes_and_recovers(method: str) -> None:
     pictures = gel(dots=False)
-    detector = ContactDetector(method)  # type: ignore[arg-type]
+    detector = DIFFERENCES[method]()
     detector.add_reference(pictures.touched)
     assert not detector.detect(pictures.touched).touching
     released = detector.detect(pictures.reference)
     assert_mask(released.mask, pictures.mask.shape)
-    # The seed's rule wants brightening, and a release darkens; the others report the change where it is.
-    assert released.touching == (method != "seed")
+    # The script's rule wants brightening, and a release darkens; the others report the change where it is.
+    assert released.touching == (method != "classic")
     assert not (released.mask[~pictures.contact] > 0).sum() > 0.2 * pictures.contact.sum()
     detector.reset()
     detector.add_reference(pictures.reference)
@@ -279,7 +278,7 @@ def test_a_frame_that_is_wholly_brighter_is_defined(method: str) -> None:
 
 
 def contact(method: str, reference: Image, image: Image) -> NDArray[np.uint8]:
-    detector = ContactDetector(method)  # type: ignore[arg-type]
+    detector = DIFFERENCES[method]()
     detector.add_reference(reference)
     return detector.detect(image).mask
 
@@ -287,7 +286,7 @@ def contact(method: str, reference: Image, image: Image) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("method", DIFFERENCES)
 def test_the_same_touch_for_ever_gives_the_same_mask_for_ever(method: str) -> None:
     pictures = gel(dots=False)
-    detector = ContactDetector(method)  # type: ignore[arg-type]
+    detector = DIFFERENCES[method]()
     detector.add_reference(pictures.reference)
     masks = [detector.detect(pictures.touched).mask for _ in range(60)]
     assert masks[0].any()
@@ -314,7 +313,7 @@ def four_k() -> tuple[Image, Image]:
 @pytest.mark.parametrize("method", LARGE)
 def test_4k_frames_have_an_answer(method: str, four_k: tuple[Image, Image]) -> None:
     reference, touched = four_k
-    if method == "tracker-seed":
+    if method == "tracker-classic":
         # Its dots have at most 500 px^2, these have 7000.
         with pytest.raises(NoMarkersError, match="markers found"):
             PICTURE_METHODS[method](reference, touched)

@@ -13,7 +13,6 @@ from tactflow.bench.stress import LARGEST_GROWTH, Block, Drift, measure_drift, m
 from tactflow.cli.bench import frame_count
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
-from tactflow.vision.contact import ContactDetector
 from tests.stress.builders import DIFFERENCES, TRACKERS, Image, gel
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -46,7 +45,7 @@ def test_marker_errors_do_not_grow_with_the_number_of_presses(method: str) -> No
 def test_a_detector_ends_every_one_of_many_contacts(method: str) -> None:
     pictures = gel(dots=False, noise=0.0)
     random = np.random.default_rng(0)
-    detector = ContactDetector(method)  # type: ignore[arg-type]
+    detector = DIFFERENCES[method]()
     detector.add_reference(noisy(pictures.reference, random))
     for _ in range(60):
         assert detector.detect(noisy(pictures.touched, random)).touching

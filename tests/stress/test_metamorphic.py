@@ -15,7 +15,6 @@ from _pytest.mark import ParameterSet
 from numpy.typing import NDArray
 
 from tactflow.vision.change import ChangeProbe
-from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry import Method, Preprocessor
 from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.markers.inpaint import remove_markers
@@ -60,10 +59,10 @@ def paired(before: Markers, after: Markers, origin: Points) -> tuple[NDArray[np.
 # How far masks may be apart, px: (moved, doubled).
 # dog: works on blocks of 2 x 2, which turns and mirrors keep (sides are even): exact. Doubled, its rim keeps
 #   its width and its blocks their size: derived, 2 px each, on the diagonal 4 * sqrt(2) of doubled pixels.
-# seed: samples every second pixel and enlarges with a shift of half a pixel; a turn swaps which ones:
+# classic: samples every second pixel and enlarges with a shift of half a pixel; a turn swaps which ones:
 #   measured 2.83. Its kernels have a fixed size in pixels, so it cannot follow a doubling.
-MASK_BOUND = {"dog": (0.0, 5.66), "seed": (5.66, float("inf"))}
-FOLLOWS_DOUBLING = {"dog": True, "appearance": True, "seed": False}
+MASK_BOUND = {"dog": (0.0, 5.66), "classic": (5.66, float("inf"))}
+FOLLOWS_DOUBLING = {"dog": True, "appearance": True, "classic": False}
 
 
 def motions_of(methods: Iterable[str]) -> list[ParameterSet]:
@@ -122,9 +121,9 @@ def test_inpainting_follows_when_doubled_with_twice_the_radius(method: str) -> N
 
 # How far contact masks may be apart, px: (moved, doubled).
 # noise: cells of 4 x 4 keep under turns (sides divide by 4); float32 sums in another order, 1 px.
-# colour, seed: symmetric kernels on whole numbers, exact. Doubled, their kernels keep their size:
+# colour, classic: symmetric kernels on whole numbers, exact. Doubled, their kernels keep their size:
 #   measured 1, 2 and 4 px.
-CONTACT_BOUND = {"noise": (1.0, 2.0), "colour": (0.0, 4.0), "seed": (0.0, 8.0)}
+CONTACT_BOUND = {"noise": (1.0, 2.0), "colour": (0.0, 4.0), "classic": (0.0, 8.0)}
 
 
 @pytest.mark.parametrize("method", DIFFERENCES)
@@ -167,10 +166,10 @@ def test_geometry_follows(motion: Transformation) -> None:
 
 
 @pytest.mark.parametrize("motion", RESIZED)
-def test_geometry_of_the_seed_follows(motion: Transformation) -> None:
+def test_geometry_of_the_script_follows(motion: Transformation) -> None:
     """Its centre is the middle of a line across the picture, which a turn does not keep: direction alone."""
     mask = gel().mask
-    here, there = contact_geometry(mask, method="seed"), contact_geometry(motion.picture(mask), method="seed")
+    here, there = HULLS["classic"](mask), HULLS["classic"](motion.picture(mask))
     assert here is not None
     assert there is not None
     assert here.angle is not None
@@ -188,8 +187,8 @@ def test_geometry_of_the_seed_follows(motion: Transformation) -> None:
 # appearance, moved: whole-pixel reads and the same sub-pixel phases up to sign; float32 sums reordered,
 #   measured 7e-10 and 2e-7; derived 1e-3, since the search for a centre ends within that of its goal.
 #   Doubled: both pictures have noise of their own scale, measured 0.011 and 0.062.
-# seed, moved: half-pixel shift and swapped samples, as for its mask; measured 1.84 and 1.85.
-TRACKER_BOUND = {"appearance": (1e-3, 1e-3), "seed": (3.7, 3.7)}
+# classic, moved: half-pixel shift and swapped samples, as for its mask; measured 1.84 and 1.85.
+TRACKER_BOUND = {"appearance": (1e-3, 1e-3), "classic": (3.7, 3.7)}
 TRACKER_BOUND_DOUBLED = (0.022, 0.13)
 
 
@@ -213,16 +212,14 @@ def test_the_tracker_follows(method: str, motion: Transformation) -> None:
 @pytest.mark.parametrize("motion", RESIZED)
 def test_the_flow_follows(method: str, motion: Transformation) -> None:
     pictures = gel()
-    # Whole pixels, so that what the seed cuts off is the same everywhere but for the sign.
-    position = np.rint(pictures.position) if method == "seed" else pictures.position
+    # Whole pixels, so that what the script cuts off is the same everywhere but for the sign.
+    position = np.rint(pictures.position) if method == "classic" else pictures.position
     origin = pictures.origin
     here_markers = Markers(origin, position, np.zeros(24, np.uint8), np.full(24, 0.1))
     turned = [motion.points(points, WIDTH, HEIGHT) for points in (origin, position)]
     there_markers = Markers(turned[0], turned[1], here_markers.status, here_markers.stderr)
-    here = flow_in_mask(here_markers, pictures.mask, dilate=3, method=method)  # type: ignore[arg-type]
-    there = flow_in_mask(
-        there_markers, motion.picture(pictures.mask), dilate=3 * motion.scale, method=method  # type: ignore[arg-type]
-    )  # fmt: skip
+    here = FLOWS[method](here_markers, pictures.mask, dilate=3)
+    there = FLOWS[method](there_markers, motion.picture(pictures.mask), dilate=3 * motion.scale)
     assert here.mean is not None
     assert there.mean is not None
     assert there.count == here.count
@@ -241,14 +238,15 @@ def test_the_flow_follows(method: str, motion: Transformation) -> None:
 # -- translated by whole pixels ---------------------------------------------------------------------------
 
 # How far masks may be apart within the part that both pictures show, px.
-# dog: blocks of 2 x 2 fall elsewhere on the gel: measured 1. seed: samples every second pixel, measured 1.41.
-# noise: cells of 4 x 4 fall elsewhere, measured 1. colour, seed difference: exact.
+# dog: blocks of 2 x 2 fall elsewhere on the gel: measured 1.
+# classic: samples every second pixel, measured 1.41.
+# noise: cells of 4 x 4 fall elsewhere, measured 1. colour, classic difference: exact.
 SHIFT_BOUND = {
     "marker_mask-dog": 2.0,
-    "marker_mask-seed": 2.83,
+    "marker_mask-classic": 2.83,
     "difference-noise": 2.0,
     "difference-colour": 0.0,
-    "difference-seed": 0.0,
+    "difference-classic": 0.0,
 }
 
 
@@ -290,8 +288,9 @@ def test_the_tracker_follows_a_translation(method: str, shift: tuple[int, int]) 
     index, away = paired(before, after, origin)
     # appearance: the search for centres ends when all moves are below 1e-3 px, and which marks are in view
     # decides when that is; measured 2e-8.
-    # seed: every second pixel is sampled, and the mask's border moves by a pixel or two; measured 0.45, 0.69.
-    of_origin, of_position = {"appearance": (1e-3, 1e-3), "seed": (0.9, 1.4)}[method]
+    # classic: every second pixel is sampled, and the mask's border moves by a pixel or two; measured 0.45 and
+    # 0.69.
+    of_origin, of_position = {"appearance": (1e-3, 1e-3), "classic": (0.9, 1.4)}[method]
     assert away[inner].max() <= of_origin
     assert np.hypot(*(after.position[index] - position).T)[inner].max() <= of_position
 
@@ -327,14 +326,14 @@ LIT = [pytest.param(change, id=change.name) for change in (*LIGHT, *SWAPPED)]
 # Offsets and swapped channels change no difference of pixels: exact, but for the float32 sums of `noise`.
 # dog, noise: thresholds scale with the marks' contrast or the noise; rounding to whole grey levels may move a
 #   border by one block of 2 x 2, derived 2.83, and by one pixel; measured 0 and 1.
-# colour, seed, and the seed's marker mask: fixed thresholds, so a gain moves the border along the slope of
-#   its rim: measured 1, 1 and 2.
+# colour, classic, and the classic marker mask: fixed thresholds, so a gain moves the border along the slope
+#   of its rim: measured 1, 1 and 2.
 LIGHT_BOUND = {
     "marker_mask-dog": (2.83, 0.0),
-    "marker_mask-seed": (4.0, 0.0),
+    "marker_mask-classic": (4.0, 0.0),
     "difference-noise": (1.0, 1.0),
     "difference-colour": (2.0, 0.0),
-    "difference-seed": (2.0, 0.0),
+    "difference-classic": (2.0, 0.0),
 }
 
 
@@ -377,8 +376,8 @@ def test_the_tracker_does_not_depend_on_gain_offset_or_the_order_of_channels(
     assert len(here.origin) == len(there.origin) == 24
     index, away = paired(here, there, here.origin)
     # appearance: luma is another mean of the channels, and rounding is other noise; measured 0.014, 0.019.
-    # seed: its fixed threshold moves the border of its mask with a gain; measured 0.55, 0.62.
-    of_origin, of_position = {"appearance": (0.03, 0.04), "seed": (1.1, 1.3)}[method]
+    # classic: its fixed threshold moves the border of its mask with a gain; measured 0.55, 0.62.
+    of_origin, of_position = {"appearance": (0.03, 0.04), "classic": (1.1, 1.3)}[method]
     assert away.max() <= of_origin
     assert np.hypot(*(there.position[index] - here.position).T).max() <= of_position
 
@@ -447,15 +446,15 @@ def test_geometry_follows_a_translation(method: str, shift: tuple[int, int]) -> 
     x, y = shift
     moved = np.zeros((HEIGHT + y, WIDTH + x), np.uint8)
     moved[y:, x:] = mask
-    here, there = (contact_geometry(part, method=method) for part in (mask, moved))  # type: ignore[arg-type]
+    here, there = (HULLS[method](part) for part in (mask, moved))
     assert here is not None
     assert there is not None
     assert here.angle is not None
     assert there.angle is not None
     assert there.area == here.area
     np.testing.assert_array_equal(there.hull, here.hull + shift)
-    # moments: whole numbers, exact to the rounding of the sum. seed: float32 at 2000 px holds 1e-4 px, over a
-    # contact of 60 px; derived.
-    assert axis_difference(there.angle, here.angle) <= {"moments": 1e-12, "seed": 1e-3}[method]
+    # moments: whole numbers, exact to the rounding of the sum. classic: float32 at 2000 px holds 1e-4 px, for
+    # a contact 60 px long; derived.
+    assert axis_difference(there.angle, here.angle) <= {"moments": 1e-12, "classic": 1e-3}[method]
     if method == "moments":
         np.testing.assert_allclose(there.center, np.add(here.center, shift), rtol=1e-15)

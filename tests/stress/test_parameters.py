@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
+from tactflow.classic.tracker import GridTracker
 from tactflow.config.load import load_pipeline
 from tactflow.config.registry import names, resolve
 from tactflow.engine.errors import ConfigError
@@ -21,12 +22,11 @@ from tactflow.vision.contact import ContactDetector, chi_square_threshold
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
-from tactflow.vision.geometry.hull import contact_geometry, regress_line
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, find_dot
 from tactflow.vision.markers.tracking import MarkerTracker
-from tactflow.vision.seed_tracker import SeedTracker
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
 from tactflow.vision.types import Markers
 from tests.stress.builders import gel
@@ -51,7 +51,6 @@ def spoiled(points: Any, value: float) -> Any:
 FUNCTIONS: dict[str, Callable[[float], Any]] = {
     "contact_geometry.min_area": lambda v: contact_geometry(MASK, min_area=v),
     "contact_geometry.min_confidence": lambda v: contact_geometry(MASK, min_confidence=v),
-    "regress_line.points": lambda v: regress_line(spoiled(SQUARE, v)),
     "flow_in_mask.dilate": lambda v: flow_in_mask(NO_MARKERS, MASK, dilate=v),
     "remove_markers.radius": lambda v: remove_markers(IMAGE, MASK // 255 * 0, radius=v),
     "remove_markers.radius (telea)": lambda v: remove_markers(IMAGE, MASK, radius=v, method="telea"),
@@ -63,8 +62,8 @@ FUNCTIONS: dict[str, Callable[[float], Any]] = {
     "MarkerTracker.max_displacement": lambda v: MarkerTracker(
         gel().reference, detect_markers(gel().reference), max_displacement=v
     ),
-    "SeedTracker.least_area": lambda v: SeedTracker(gel().reference, least_area=v),
-    "SeedTracker.most_area": lambda v: SeedTracker(gel().reference, most_area=v),
+    "GridTracker.least_area": lambda v: GridTracker(gel().reference, least_area=v),
+    "GridTracker.most_area": lambda v: GridTracker(gel().reference, most_area=v),
     "chi_square_threshold": chi_square_threshold,
     "ContactDetector.false_alarms": lambda v: ContactDetector(false_alarms=v),
     "ContactDetector.repeatability": lambda v: ContactDetector(repeatability=v),

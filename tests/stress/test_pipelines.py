@@ -29,9 +29,9 @@ from tests.stress.builders import (
 )
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PIPELINES = ("default", "seed", "markerless")
+PIPELINES = ("default", "classic", "markerless")
 FOLLOWING = ("default", "markerless")
-"""Pipelines whose stages scale and turn; the seed's have half-pixel shifts and kernels of a fixed size."""
+"""Pipelines whose stages scale and turn; the script's have half-pixel shifts and kernels of a fixed size."""
 
 COLLECT = '''
 from typing import ClassVar

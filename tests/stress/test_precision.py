@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision import seed_contact
+from tactflow.classic import functions
 from tactflow.vision.change import probe as change
 from tactflow.vision.contact import background, contact_outline, illumination
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor
-from tactflow.vision.geometry.hull import contact_geometry, regress_line
 from tactflow.vision.markers import detection as markers
 from tactflow.vision.markers import inpaint, template, tracking
 from tactflow.vision.markers import mask as marker_mask
@@ -40,7 +39,7 @@ def test_moments_ellipse_and_line_of_a_contact_a_million_pixels_away(method: str
     mask = gel().mask[20:100]
     wide = np.zeros((mask.shape[0], 1_000_000 + mask.shape[1]), np.uint8)
     wide[:, -mask.shape[1] :] = mask
-    here, there = (contact_geometry(part, method=method) for part in (mask, wide))  # type: ignore[arg-type]
+    here, there = (HULLS[method](part) for part in (mask, wide))
     assert here is not None
     assert there is not None
     assert here.angle is not None
@@ -62,28 +61,6 @@ def test_moments_ellipse_and_line_of_a_contact_a_million_pixels_away(method: str
         assert abs(there.ellipse.center[0] - FAR - here.ellipse.center[0]) <= 1e-4
 
 
-@pytest.mark.parametrize("offset", [(FAR, 0), (0, FAR), (FAR, -FAR), (-3 * FAR, FAR / 7)], ids=str)
-@pytest.mark.parametrize("angle", [0, 30, 45, 89, 90, -30, -89.9])
-def test_a_line_through_points_a_million_pixels_away(angle: float, offset: tuple[float, float]) -> None:
-    turn = math.radians(angle)
-    along = np.linspace(-40, 40, 81)[:, None] * [math.cos(turn), -math.sin(turn)]
-    near, far = regress_line(along), regress_line(along + offset)
-    assert near.angle is not None
-    assert far.angle is not None
-    # Each coordinate is rounded by up to half an ulp of 3e6 (2.3e-10 px): over 40 px, 3e-10 degrees each.
-    assert axis_difference(near.angle, angle) <= 1e-12 * 90
-    assert axis_difference(far.angle, angle) <= 1e-9
-    assert np.abs(np.subtract(far.point, offset)).max() <= 4 * float(np.spacing(3 * FAR))
-
-
-def test_points_a_million_pixels_away_without_a_direction_get_none() -> None:
-    around = np.arange(12) * (math.pi / 6)
-    circle = 30 * np.column_stack([np.cos(around), np.sin(around)])
-    assert regress_line(circle).angle is None
-    assert regress_line(circle + FAR).angle is None
-    assert regress_line(np.full((7, 2), FAR)).angle is None
-
-
 @pytest.mark.parametrize("method", FLOWS)
 def test_the_flow_of_markers_a_million_pixels_away(method: str) -> None:
     """A mask that is a million pixels wide, with the markers at its right end."""
@@ -93,8 +70,8 @@ def test_the_flow_of_markers_a_million_pixels_away(method: str) -> None:
     far = np.array([FAR, 0.0])
     given = Markers(pictures.origin, pictures.position, np.zeros(24, np.uint8), np.full(24, 0.1))
     moved = Markers(pictures.origin + far, pictures.position + far, given.status, given.stderr)
-    here = flow_in_mask(given, pictures.mask, dilate=3, method=method)  # type: ignore[arg-type]
-    there = flow_in_mask(moved, wide, dilate=3, method=method)  # type: ignore[arg-type]
+    here = FLOWS[method](given, pictures.mask, dilate=3)
+    there = FLOWS[method](moved, wide, dilate=3)
     assert here.mean is not None
     assert there.mean is not None
     assert here.count == there.count >= 3
@@ -148,7 +125,7 @@ def test_single_precision_costs_the_contact_nothing(method: str) -> None:
     pictures = gel(dots=False)
 
     def compute() -> contact.ContactResult:
-        detector = contact.ContactDetector(method)  # type: ignore[arg-type]
+        detector = DIFFERENCES[method]()
         detector.add_reference(pictures.reference)
         return detector.detect(pictures.touched)
 
@@ -203,8 +180,8 @@ def test_single_precision_costs_the_filling_at_most_a_rounding() -> None:
     assert int(np.abs(single.astype(int) - double).max()) <= 1
 
 
-def test_single_precision_moves_the_border_of_the_seeds_mask_by_at_most_a_pixel() -> None:
-    single, double = both(lambda: seed_contact.seed_marker_mask(gel().touched), seed_contact)
+def test_single_precision_moves_the_border_of_the_scripts_mask_by_at_most_a_pixel() -> None:
+    single, double = both(lambda: functions.mask_marker(gel().touched), functions)
     assert single.any()
     assert apart(single, double) <= 1
 
@@ -278,14 +255,6 @@ def test_the_flow_of_single_precision_markers_is_good_to_their_own_rounding() ->
     assert np.array_equal(*inside)
 
 
-def test_a_line_through_single_precision_points_is_good_to_their_own_rounding() -> None:
-    points = gel().position[:10]
-    a, b = regress_line(points.astype(np.float32)), regress_line(points)
-    assert a.angle is not None
-    assert b.angle is not None
-    assert axis_difference(a.angle, b.angle) <= math.degrees(2.0**-17 / 28)
-
-
 # -- angles across the seam -------------------------------------------------------------------------------
 
 
@@ -350,16 +319,16 @@ def test_the_direction_of_a_bar_is_continuous_through_the_vertical(method: str) 
         along = columns * math.cos(turn) - rows * math.sin(turn)
         across = columns * math.sin(turn) + rows * math.cos(turn)
         mask = ((np.abs(along) < 50.3) & (np.abs(across) < 6.3)).astype(np.uint8) * np.uint8(255)
-        found = contact_geometry(mask, method=method)  # type: ignore[arg-type]
+        found = HULLS[method](mask)
         assert found is not None
         assert found.angle is not None
         assert -90 < found.angle <= 90
-        # moments: the pixel grid turns a bar of 100 x 12; measured 0.073. seed: a line through the hull's
+        # moments: the pixel grid turns a bar of 100 x 12; measured 0.073. classic: a line through the hull's
         # vertices, few and uneven; measured 1.96.
-        assert axis_difference(found.angle, angle) <= {"moments": 0.15, "seed": 4.0}[method]
+        assert axis_difference(found.angle, angle) <= {"moments": 0.15, "classic": 4.0}[method]
         if angle == 90 and method == "moments":
             assert found.slope is None
         if last is not None:
             # A step of half a degree, and both ends' errors.
-            assert axis_difference(found.angle, last) <= {"moments": 0.8, "seed": 8.5}[method]
+            assert axis_difference(found.angle, last) <= {"moments": 0.8, "classic": 8.5}[method]
         last = found.angle

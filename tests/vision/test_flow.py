@@ -255,34 +255,8 @@ def test_the_inputs_stay_as_they_are() -> None:
     mask = EVERYWHERE.copy()
     kept = given.position.copy()
     flow_in_mask(given, mask, dilate=3)
-    flow_in_mask(given, mask, dilate=3, method="seed")
     np.testing.assert_array_equal(given.position, kept)
     np.testing.assert_array_equal(mask, EVERYWHERE)
-
-
-@pytest.mark.parametrize("dilate", [0, 7])
-def test_the_seed_method_is_the_original_loop(dilate: int) -> None:
-    rng = np.random.default_rng(2)
-    position = GRID + rng.normal(0, 3, GRID.shape)
-    position[0] = (-4.0, 500.0)
-    mask = np.zeros((160, 200), np.uint8)
-    cv2.ellipse(mask, (90, 80), (60, 30), 20, 0, 360, 255, -1)
-    status = rng.integers(0, 3, len(GRID)).astype(np.uint8)
-    grown = cv2.dilate(mask, np.ones((2 * dilate + 1, 2 * dilate + 1), np.uint8))
-    change, counter = [0, 0], 0
-    for (ox, oy), (cx, cy) in zip(GRID, position, strict=True):
-        if 0 <= int(cx) < 200 and 0 <= int(cy) < 160 and grown[int(cy), int(cx)] == 255:
-            change[0] += int(cx - ox)
-            change[1] += int(cy - oy)
-            counter += 1
-    flow = flow_in_mask(markers(position, status=status), mask, dilate=dilate, method="seed")
-    assert flow.count == counter > 10
-    assert flow.mean == pytest.approx((change[0] / counter, change[1] / counter), abs=1e-12)
-    assert flow.rotation is None
-
-
-def test_the_seed_method_without_contact_has_no_flow() -> None:
-    assert flow_in_mask(moved(), np.zeros((160, 200), np.uint8), dilate=5, method="seed") == Flow(None, 0)
 
 
 @pytest.mark.parametrize(
@@ -298,8 +272,3 @@ def test_the_seed_method_without_contact_has_no_flow() -> None:
 def test_bad_input_is_refused_with_a_reason(mask: Any, dilate: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         flow_in_mask(moved(), mask, dilate=dilate)
-
-
-def test_an_unknown_method_is_refused() -> None:
-    with pytest.raises(ValueError, match="'mean' or 'seed', got 'median'"):
-        flow_in_mask(moved(), EVERYWHERE, method="median")  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
-from tactflow.vision.geometry.hull import contact_geometry, regress_line
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Contact
 
 Mask = NDArray[np.uint8]
@@ -75,22 +75,20 @@ def turned(first: float, second: float) -> float:
 
 def test_nothing_is_no_contact() -> None:
     assert contact_geometry(blank()) is None
-    assert contact_geometry(blank(), method="seed") is None
     assert contact_geometry(np.zeros((0, 0), np.uint8)) is None
     assert contact_geometry(np.zeros((1, 1), np.uint8)) is None
 
 
-@pytest.mark.parametrize("method", ["moments", "seed"])
-def test_one_pixel_is_a_point(method: Any) -> None:
+def test_one_pixel_is_a_point() -> None:
     mask = blank()
     mask[7, 11] = 255
-    contact = described(mask, method=method)
+    contact = described(mask)
     assert contact.center == (11, 7)
     assert contact.angle is None
     assert contact.ellipse is None
     assert contact.hull.tolist() == [[11, 7]]
     assert contact.region_area == 1
-    assert contact.area == (1 if method == "moments" else 0)
+    assert contact.area == 1
 
 
 def test_a_frame_of_one_pixel_can_be_a_contact() -> None:
@@ -300,13 +298,10 @@ def test_doubling_the_scale_doubles_lengths_and_keeps_angles(seed: int) -> None:
     ),
     min_area=st.sampled_from([0.0, 1.0, 3.0]),
     max_gap=st.sampled_from([None, 0.0, 2.0, 5.0]),
-    method=st.sampled_from(["moments", "seed"]),
 )
-def test_any_mask_gives_sound_numbers_or_none(
-    mask: Mask, min_area: float, max_gap: float | None, method: Any
-) -> None:
+def test_any_mask_gives_sound_numbers_or_none(mask: Mask, min_area: float, max_gap: float | None) -> None:
     kept = mask.copy()
-    contact = contact_geometry(mask, min_area=min_area, max_gap=max_gap, method=method)
+    contact = contact_geometry(mask, min_area=min_area, max_gap=max_gap)
     np.testing.assert_array_equal(mask, kept)
     if contact is not None:
         assert_sound(contact)
@@ -429,7 +424,6 @@ def test_views_and_read_only_masks_are_as_good_as_any() -> None:
     view = wide[:, ::2]
     view.flags.writeable = False
     assert described(view).center == described(mask).center
-    assert described(view, method="seed").center == described(mask, method="seed").center
 
 
 def test_a_large_frame_loses_no_precision() -> None:
@@ -456,128 +450,11 @@ def test_a_large_frame_loses_no_precision() -> None:
         (np.zeros((3, 3), np.uint8), {"max_gap": math.nan}, "max_gap"),
         (np.zeros((3, 3), np.uint8), {"min_confidence": 1.1}, "min_confidence"),
         (np.zeros((3, 3), np.uint8), {"min_confidence": math.nan}, "min_confidence"),
-        (np.zeros((3, 3), np.uint8), {"method": "ellipse"}, "'moments' or 'seed', got 'ellipse'"),
     ],
 )
 def test_bad_input_is_refused_with_a_reason(mask: Any, kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         contact_geometry(mask, **kwargs)
-
-
-def seed_line(points: NDArray[Any], width: int) -> tuple[float, float, tuple[float, float]]:
-    """The seed's `regress_line`, step by step: (-angle, slope, midpoint)."""
-    vx, vy, x, y = (float(v) for v in np.ravel(cv2.fitLine(points, cv2.DIST_L2, 0, 0.01, 0.01)))
-    slope = vy / vx
-    left = int(-x * vy / vx + y)
-    right = int((width - x) * vy / vx + y)
-    ends = (width - 1, right), (0, left)
-    middle = ((ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2)
-    return -math.degrees(math.atan(slope)), slope, middle
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_the_seed_method_is_the_original_line_through_the_hull(seed: int) -> None:
-    mask = blobs(seed)
-    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    hull = cv2.convexHull(np.vstack(contours))
-    contact = described(mask, method="seed")
-    angle, slope, middle = seed_line(hull, mask.shape[1])
-    assert contact.area == cv2.contourArea(hull)
-    np.testing.assert_array_equal(contact.hull, hull.reshape(-1, 2))
-    assert contact.angle == pytest.approx(angle, abs=1e-9)
-    assert contact.slope == pytest.approx(slope, abs=1e-9)
-    assert contact.center == middle
-
-
-def test_the_seed_method_survives_a_vertical_line() -> None:
-    mask = blank()
-    mask[10:90, 30] = 255
-    contact = described(mask, method="seed")
-    assert contact.angle == pytest.approx(90, abs=1e-4)
-    assert contact.slope is None
-    assert contact.center == pytest.approx((30, 49.5), abs=1e-4)
-    assert contact.ellipse is None
-
-
-def test_the_seed_ellipse_is_the_one_that_was_drawn() -> None:
-    contact = described(ellipse_mask((70.0, 60.0), (80, 40), 25), method="seed")
-    assert contact.ellipse is not None
-    assert contact.ellipse.angle is not None
-    assert turned(contact.ellipse.angle, 25) < 1
-    # Contours run through pixel centres: about a pixel shorter than the shape.
-    assert contact.ellipse.axes == pytest.approx((80, 40), abs=1.5)
-
-
-@pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
-@pytest.mark.parametrize("angle", [-89.9, -45, 0, 0.01, 30, 89.99])
-def test_a_line_far_from_the_origin_is_fitted_as_well(angle: float, offset: float) -> None:
-    t = np.linspace(-50, 50, 41)
-    theta = math.radians(-angle)
-    points = np.column_stack([t * math.cos(theta), t * math.sin(theta)]) + offset
-    line = regress_line(points)
-    assert line.angle is not None
-    # Derived: a coordinate near 1e6 is rounded to 1.2e-10 px, over a length of 100 px that is 1e-10 rad.
-    assert turned(line.angle, angle) < 1e-8
-    assert line.point == pytest.approx((offset, offset), abs=1e-9)
-
-
-def test_float32_points_cost_no_more_than_their_own_rounding() -> None:
-    t = np.linspace(-50, 50, 41)
-    points = np.column_stack([t * 0.8, t * 0.6]) + 300
-    line = regress_line(points.astype(np.float32))
-    assert line.angle is not None
-    # float32 rounds 300 to 1.5e-5 px: at most 1.5e-5 / 50 rad.
-    assert turned(line.angle, -math.degrees(math.atan2(0.6, 0.8))) < math.degrees(3e-7)
-
-
-def test_the_line_minimises_perpendicular_distances() -> None:
-    rng = np.random.default_rng(3)
-    points = rng.normal(0, 1, (60, 2)) * [20, 4] @ np.array([[0.9, 0.436], [-0.436, 0.9]]) + 90
-
-    def cost(degrees: float) -> float:
-        theta = math.radians(-degrees)
-        away = (points - points.mean(axis=0)) @ [-math.sin(theta), math.cos(theta)]
-        return float(away @ away)
-
-    line = regress_line(points)
-    assert line.angle is not None
-    assert cost(line.angle) < min(cost(line.angle + 0.01), cost(line.angle - 0.01))
-
-
-def test_the_regression_line_agrees_with_opencv_and_the_seed() -> None:
-    rng = np.random.default_rng(4)
-    points = (rng.normal(0, 1, (50, 2)) * [30, 9] + [120, 80]).astype(np.float32)
-    angle, slope, middle = seed_line(points, 240)
-    line = regress_line(points, 240)
-    # OpenCV sums in float32.
-    assert line.angle == pytest.approx(angle, abs=1e-3)
-    assert line.slope == pytest.approx(slope, abs=1e-4)
-    assert line.midpoint == middle
-
-
-@pytest.mark.parametrize("offset", [0.0, 1e6])
-def test_points_without_direction_have_no_line(offset: float) -> None:
-    square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float64) + offset
-    for points in (square, square[:1], np.repeat(square[:1] + 0.1, 7, axis=0)):
-        line = regress_line(points, 100)
-        assert line.angle is None
-        assert line.slope is None
-        assert line.midpoint == line.point
-
-
-def test_a_vertical_line_has_no_slope() -> None:
-    line = regress_line([[5, 0], [5, 10], [5, 30]], 100)
-    assert line.angle == 90
-    assert line.slope is None
-    assert line.midpoint == line.point == pytest.approx((5, 40 / 3))
-
-
-@pytest.mark.parametrize(
-    "points", [np.empty((0, 2)), [[1, 2, 3]], [[np.nan, 1]], [[np.inf, 1], [0, 0]]], ids=str
-)
-def test_points_that_are_none_are_refused(points: Any) -> None:
-    with pytest.raises(ValueError, match="required finite points"):
-        regress_line(points)
 
 
 def test_with_numba_and_without_it_the_contact_is_the_same() -> None:

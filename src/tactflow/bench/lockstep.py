@@ -144,10 +144,12 @@ class LockstepPipeline:
             self._turns.end()
 
     def _keep(self, cpu: float, wall: float) -> None:
-        last = self._runner.nodes[_COLLECT].instance.last
+        collect: Any = self._runner.nodes[_COLLECT].instance
+        source: Any = self._runner.source
+        last = collect.last
         self._outcomes.append(
             Outcome(
-                frame=self._runner.source.last_frame,
+                frame=source.last_frame,
                 contact=last.get("contact"),
                 flow=last.get("flow"),
                 markers=last.get("markers"),

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
 
-from tactflow.bench.methods import SEED
+from tactflow.bench.methods import CLASSIC
 from tactflow.bench.pipelines import ORIGINAL, PLAIN
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.report import PRIMARY, TITLES, format_number, limit_of
@@ -55,8 +55,8 @@ def markdown(result: Result, default: str) -> str:
         "### Promises and results",
         _targets(result),
         "### Whole pipelines, scene by scene",
-        f"Each cell: `{SEED}`, then `{default}`. Times are CPU times of a frame with contact, ms; the script "
-        f"is `{SEED}` plus what the script computes twice. A dash: nothing to measure.",
+        f"Each cell: `{CLASSIC}`, then `{default}`. Times are CPU times of a frame with contact, ms; the "
+        f"script is `{CLASSIC}` plus what the script computes twice. A dash: nothing to measure.",
         _scenes(result, default),
         "### Methods alone, on the same inputs",
         "Median over the scenes, in brackets the worst scene. Times are copies of a raw frame.",
@@ -97,19 +97,26 @@ def _scenes(result: Result, default: str) -> str:
     compared = bool(result.of("pipeline", PLAIN))
     rows = []
     for scene in scenes:
-        others = (SEED, ORIGINAL, PLAIN)
+        others = (CLASSIC, ORIGINAL, PLAIN)
         own = [m for m in result.of("pipeline") if m.scene == scene and m.method not in others]
         mine = by_key.get(f"pipeline/{default}/{scene}", own[0] if own else None)
-        seed, script, plain = (by_key.get(f"pipeline/{name}/{scene}") for name in others)
+        classic, script, plain = (by_key.get(f"pipeline/{name}/{scene}") for name in others)
         times = []
-        for measurement in (script, seed, mine, plain) if compared else (script, seed, mine):
+        for measurement in (script, classic, mine, plain) if compared else (script, classic, mine):
             time = measurement.time if measurement else {}
             chosen = time.get("contact", time.get("idle"))
             times.append(format_number(chosen["cpu_ms_p50"]) if chosen else "-")
-        cells = [f"{_value(seed, keys)}, {_value(mine, keys)}" for _, keys in _PER_SCENE]
+        cells = [f"{_value(classic, keys)}, {_value(mine, keys)}" for _, keys in _PER_SCENE]
         rows.append([scene, *times, *cells])
     without = ["without numba"] if compared else []
-    header = ["scene", "script", f"`{SEED}`", f"`{default}`", *without, *(title for title, _ in _PER_SCENE)]
+    header = [
+        "scene",
+        "script",
+        f"`{CLASSIC}`",
+        f"`{default}`",
+        *without,
+        *(title for title, _ in _PER_SCENE),
+    ]
     return _table(header, rows)
 
 

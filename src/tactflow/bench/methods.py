@@ -1,9 +1,9 @@
 """Each stage's methods alone, on the same inputs.
 
-The alternatives are whatever the stage's `method` parameter allows, so a new method is measured without
-anything being added here. A method that a shipped pipeline uses is given that pipeline's parameters. The
-inputs come from the default pipeline's stages, the same for every alternative; geometry and flow are given
-the true contact mask.
+The alternatives are whatever the stage's `method` parameter allows and the classes that the pipelines use in
+its place, so a new one is measured without anything being added here. A method that a shipped pipeline uses
+is given that pipeline's parameters. The inputs come from the default pipeline's stages, the same for every
+alternative; geometry and flow are given the true contact mask.
 """
 
 from __future__ import annotations
@@ -27,17 +27,21 @@ from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
 from tactflow.vision.geometry import PixelMapping
 
-SEED = "seed"
-"""The name of the pipeline that is the yardstick."""
+CLASSIC = "classic"
+"""Name of the pipeline that is the yardstick: the original script."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """One way to do a stage's work. yardstick : whether the seed pipeline does it so."""
+    """One way to do a stage's work.
+
+    inputs : names of its input ports. yardstick : whether the original script does it so.
+    """
 
     name: str
     cls: type
     params: StageParams
+    inputs: frozenset[str]
     yardstick: bool = False
 
     def build(self) -> Any:
@@ -54,28 +58,30 @@ def methods_of(params: type[StageParams]) -> list[str]:
 
 
 def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Alternative]:
-    """Every method of a stage, the default pipeline's own first.
+    """Every way to do a stage's work, the default pipeline's own first.
+
+    A way is named after the stage's `method`; where the stage has none, after the pipeline.
 
     Parameters
     ----------
-    pipelines : name -> pipeline, the default one first, the yardstick under `SEED`.
-    stage : name of the stage (`use`).
+    pipelines : name -> pipeline, the default one first, the yardstick under `CLASSIC`.
+    stage : id of the stage.
     """
     found: dict[str, Alternative] = {}
     for name, pipeline in pipelines.items():
-        for node in pipeline.nodes.values():
-            if node.component.name != stage:
-                continue
-            known = methods_of(node.component.params)
-            method = str(getattr(node.params, "method", stage))
-            if method not in found:
-                found[method] = Alternative(method, node.component.cls, node.params, name == SEED)
-            elif name == SEED:
-                found[method] = Alternative(method, node.component.cls, node.params, True)
-            for other in known:
-                if other not in found:
-                    params = node.params.model_copy(update={"method": other})
-                    found[other] = Alternative(other, node.component.cls, params)
+        node = pipeline.nodes.get(stage)
+        if node is None:
+            continue
+        cls = node.component.cls
+        inputs = frozenset(port.name for port in node.component.ports.inputs)
+        method = str(getattr(node.params, "method", name))
+        if name == CLASSIC:
+            found[method] = Alternative(method, cls, node.params, inputs, yardstick=True)
+        elif not any((way.cls, way.params) == (cls, node.params) for way in found.values()):
+            found.setdefault(method, Alternative(method, cls, node.params, inputs))
+        for other in methods_of(node.component.params):
+            params = node.params.model_copy(update={"method": other})
+            found.setdefault(other, Alternative(other, cls, params, inputs))
     return found
 
 
@@ -118,7 +124,7 @@ def frames_of(rendered: Rendered, references: int = 1) -> Iterator[Frame]:
 def _chain(pipeline: Pipeline, rendered: Rendered) -> tuple[list[_Inputs], PixelMapping]:
     """Run the default pipeline's stages by hand and keep everything in between."""
     stage = {
-        node.component.name: node.component.cls(node.params)
+        node.id: node.component.cls(node.params)
         for node in pipeline.nodes.values()
         if node.component.kind == "stage"
     }
@@ -241,13 +247,13 @@ def _measure_group(
     failures: dict[str, str] = {}
 
     def call(name: str) -> Callable[[Any], Any]:
-        process = instances[name].process
+        process, inputs = instances[name].process, ways[name].inputs
 
         def run(arguments: Any) -> Any:
             if name in failures:
                 return None
             try:
-                return process(**arguments[1])
+                return process(**{port: arguments[1][port] for port in inputs & arguments[1].keys()})
             except Exception as error:
                 failures[name] = f"{type(error).__name__}: {error}"
                 return None

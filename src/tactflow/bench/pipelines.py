@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 
 from tactflow.bench import metrics
 from tactflow.bench.lockstep import LockstepPipeline, Outcome
-from tactflow.bench.methods import SEED, fill_times
+from tactflow.bench.methods import CLASSIC, fill_times
 from tactflow.bench.results import Measurement
 from tactflow.bench.scenes import Rendered
 from tactflow.bench.score import ContactScore, FlowScore, MarkerScore
 from tactflow.bench.timing import BLOCK, CopyUnit, Samples, quiet, timed
+from tactflow.classic.functions import contact_mask, difference, inpaint, mask_marker
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
 from tactflow.vision import compiled
 from tactflow.vision.geometry import PixelMapping
-from tactflow.vision.markers.inpaint import SEED_RADIUS, remove_markers
-from tactflow.vision.seed_contact import seed_contact_mask, seed_difference, seed_marker_mask
 
 
 def on_recording(pipeline: Pipeline, path: Path, **params: Any) -> Pipeline:
@@ -112,11 +111,11 @@ _REPEATS_EVERY = 5
 
 
 class OriginalRepeats:
-    """Times what the original script does in every frame and the seed pipeline does not.
+    """Times what the original script does in every frame and the classic pipeline does not.
 
     The script removes the markers from the reference again for every frame, computes the marker mask a third
     time to find the markers' centres, and works out the difference in floating point. None of that changes a
-    result, so the seed pipeline leaves it out; for the time of the script it counts.
+    result, so the classic pipeline leaves it out; for the time of the script it counts.
     """
 
     def __init__(self) -> None:
@@ -128,32 +127,29 @@ class OriginalRepeats:
         """Time it for one processed frame; the first one is the reference."""
         if self._reference is None or self._unmarked is None:
             self._reference = image.copy()
-            self._unmarked = self._remove(image)
+            self._unmarked = inpaint(image)
             return
+        unmarked = self._unmarked
         integer = Samples()
-        timed(lambda: seed_contact_mask(image, self._unmarked), integer)  # type: ignore[arg-type]
+        timed(lambda: contact_mask(image, unmarked), integer)
         samples = self.samples.setdefault(kind, Samples())
         timed(lambda: self._repeat(image), samples)
         samples.cpu[-1] -= integer.cpu[-1]
         samples.wall[-1] -= integer.wall[-1]
 
-    @staticmethod
-    def _remove(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return remove_markers(image, seed_marker_mask(image), method="telea", radius=SEED_RADIUS)
-
     def _repeat(self, image: NDArray[np.uint8]) -> None:
         assert self._reference is not None
         assert self._unmarked is not None
-        self._remove(self._reference)
-        seed_marker_mask(image)
-        seed_difference(image, self._unmarked)
+        inpaint(self._reference)
+        mask_marker(image)
+        difference(image, self._unmarked)
 
 
-def _original(seed: Measurement, repeats: OriginalRepeats, unit: CopyUnit) -> Measurement:
-    """The script's time: that of the seed pipeline and of the repeats; its answers are the same."""
-    made = replace(seed, method=ORIGINAL, time={}, copies={}, faster={}, stages_ms={}, peak_mb=None)
+def _original(classic: Measurement, repeats: OriginalRepeats, unit: CopyUnit) -> Measurement:
+    """The script's time: that of the classic pipeline and of the repeats; its answers are the same."""
+    made = replace(classic, method=ORIGINAL, time={}, copies={}, faster={}, stages_ms={}, peak_mb=None)
     for kind, samples in repeats.samples.items():
-        extra, own = samples.summary(), seed.time.get(kind, {})
+        extra, own = samples.summary(), classic.time.get(kind, {})
         if not own:
             continue
         made.time[kind] = {name: own[name] + extra[name] for name in own if name != "count"}
@@ -236,7 +232,8 @@ def measure_pipelines(
 
     Parameters
     ----------
-    pipelines : name -> pipeline; `SEED` is the yardstick. rendered : the scene. folder : for scratch files.
+    pipelines : name -> pipeline; `CLASSIC` is the yardstick.
+    rendered : the scene. folder : for scratch files.
     step : called after each frame. worst : called with each pipeline's name and worst frame.
     """
     scores = {name: _Score() for name in pipelines}
@@ -244,7 +241,7 @@ def measure_pipelines(
 
     def see(name: str, outcome: Outcome) -> str:
         kind = scores[name].add(outcome, rendered)
-        if name == SEED and outcome.image is not None and outcome.frame.seq % _REPEATS_EVERY == 0:
+        if name == CLASSIC and outcome.image is not None and outcome.frame.seq % _REPEATS_EVERY == 0:
             repeats.measure(outcome.image, kind)
         return kind
 
@@ -260,10 +257,10 @@ def measure_pipelines(
             limit = scores[name].limit
             if limit is not None:
                 measurement.limits["displacement_rms"] = limit
-            fill_times(measurement, times.samples[name], unit, times.samples.get(SEED))
+            fill_times(measurement, times.samples[name], unit, times.samples.get(CLASSIC))
             measurement.stages_ms = times.stages.get(name, {})
         made.append(measurement)
-        if name == SEED and repeats.samples and measurement.failure is None:
+        if name == CLASSIC and repeats.samples and measurement.failure is None:
             made.append(_original(measurement, repeats, unit))
     return made
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tactflow.bench import metrics
 from tactflow.bench.lockstep import Outcome
-from tactflow.bench.methods import SEED, fill_times
+from tactflow.bench.methods import CLASSIC, fill_times
 from tactflow.bench.pipelines import on_recording, take_turns
 from tactflow.bench.results import RECORDING, Measurement
 from tactflow.bench.timing import CopyUnit
@@ -55,7 +55,7 @@ def measure_recordings(
     Parameters
     ----------
     pipelines : for sensors with markers; their preprocessing is replaced by the Wedge's rectification.
-    markerless : for sensors without. `SEED` is the yardstick in both.
+    markerless : for sensors without. `CLASSIC` is the yardstick in both.
     data : folder of recordings. scratch : for temporary files. step : called after each frame.
 
     Raises
@@ -97,7 +97,7 @@ def rectified(pipeline: Pipeline) -> Pipeline:
     """The same pipeline with the Wedge's rectification as its only preprocessing."""
     nodes = {}
     for node in pipeline.nodes.values():
-        if node.component.name == "preprocess":
+        if node.id == "preprocess":
             node = replace(node, params=node.component.params.model_validate({"homography": RECTIFY}))
         nodes[node.id] = node
     return replace(pipeline, nodes=nodes)
@@ -105,7 +105,7 @@ def rectified(pipeline: Pipeline) -> Pipeline:
 
 def without_markers(pipeline: Pipeline) -> Pipeline:
     """The same pipeline without the stages that need markers to be there."""
-    gone = {node.id for node in pipeline.nodes.values() if node.component.name in _MARKER_STAGES}
+    gone = {node.id for node in pipeline.nodes.values() if node.id in _MARKER_STAGES}
     return replace(pipeline, nodes={i: node for i, node in pipeline.nodes.items() if i not in gone})
 
 
@@ -137,7 +137,7 @@ def _run(
         made[name] = Measurement("pipeline", name, RECORDING + scene, frames=frames)
         made[name].failure = failures.get(name)
         if name not in failures:
-            fill_times(made[name], times.samples[name], unit, times.samples.get(SEED))
+            fill_times(made[name], times.samples[name], unit, times.samples.get(CLASSIC))
             made[name].stages_ms = times.stages.get(name, {})
     return made
 

@@ -458,7 +458,7 @@ def _everything(result: Result) -> str:
         kinds = [k for k in ("contact", "idle", "all") if any(k in m.copies for m in rows_of)]
         header = ["method", "scene", "frames"]
         for kind in kinds:
-            header += [f"{kind}: copies", "ms p50", "ms p99", "× seed"]
+            header += [f"{kind}: copies", "ms p50", "ms p99", "× classic"]
         peak = any(m.peak_mb for m in rows_of)
         header += ["peak MB"] * peak + [_heading(QUANTITIES[q]) for q in names]
         rows = []

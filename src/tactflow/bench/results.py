@@ -25,7 +25,7 @@ class Measurement:
     method : the alternative's name. scene : what it was run on. frames : how many.
     time : kind ("contact", "idle", or "all") -> percentiles in ms; see `timing.Samples.summary`.
     copies : kind -> median CPU time in copies of a raw frame.
-    faster : kind -> how many times faster than the seed method of the same group in the same run.
+    faster : kind -> how many times faster than the original script in the same group in the same run.
     errors : quantity -> value; only what the scene can tell.
     limits : quantity -> the smallest value that physics allows.
     stages_ms : stage -> median time of a call, ms; whole pipelines only.

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from tactflow.bench import recordings
-from tactflow.bench.methods import SEED, measure_methods
+from tactflow.bench.methods import CLASSIC, measure_methods
 from tactflow.bench.pictures import draw
 from tactflow.bench.pipelines import PLAIN, Worst, growth, measure_pipelines, peak_memory_mb
 from tactflow.bench.results import Measurement, Result
@@ -44,7 +44,7 @@ WEDGE = "wedge"
 class Plan:
     """What to measure.
 
-    files : pipeline name -> file. `DEFAULT` and `SEED` must be among them.
+    files : pipeline name -> file. `DEFAULT` and `CLASSIC` must be among them.
     quick : a short run. data : folder of real recordings, or None. scenes : only these, or None for all.
     memory : whether to start each pipeline once more in a process of its own for its peak memory.
     pictures : folder for a picture of each pipeline's worst frame in each scene, or None.
@@ -107,7 +107,7 @@ def _needs_rectifying(pipeline: Pipeline) -> bool:
         getattr(node.params, "homography", None) is not None
         or getattr(node.params, "undistort", None) is not None
         for node in pipeline.nodes.values()
-        if node.component.name == "preprocess"
+        if node.id == "preprocess"
     )
 
 
@@ -130,9 +130,9 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
     loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
     general = {name: p for name, p in loaded.items() if not _needs_rectifying(p) and name != MARKERLESS}
     # For gels without markers: the pipeline made for them, else the default one without its tracker.
-    bare = {name: recordings.without_markers(loaded[name]) for name in (DEFAULT, SEED)}
+    bare = {name: recordings.without_markers(loaded[name]) for name in (DEFAULT, CLASSIC)}
     if MARKERLESS in loaded:
-        bare = {MARKERLESS: loaded[MARKERLESS], SEED: bare[SEED]}
+        bare = {MARKERLESS: loaded[MARKERLESS], CLASSIC: bare[CLASSIC]}
     compared = not plan.quick and compiled.active()
     total = sum(case.frames for case in whole) + 7 * len(alone) + (1 if plan.quick else 60)
     if plan.memory:

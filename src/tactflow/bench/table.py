@@ -33,7 +33,7 @@ def _methods(result: Result, group: str) -> Table:
     fronts = {q.key: {p.method for p in pareto(points(result, group, q))} for q in quantities}
     table = Table(title=TITLES.get(group, group), title_justify="left", title_style="bold")
     table.add_column("method")
-    for heading in ("contact, copies", "idle, copies", "x seed"):
+    for heading in ("contact, copies", "idle, copies", "x classic"):
         table.add_column(heading, justify="right")
     for quantity in quantities:
         heading = quantity.title + (f", {quantity.unit}" if quantity.unit else "")
@@ -100,7 +100,7 @@ def _scenes(result: Result) -> Table:
     table.add_column("scene")
     table.add_column("pipeline")
     table.add_column("copies", justify="right")
-    table.add_column("x seed", justify="right")
+    table.add_column("x classic", justify="right")
     for heading in short:
         table.add_column(heading, justify="right")
     rows = [m for m in result.of("pipeline") if not m.scene.startswith(RECORDING)]

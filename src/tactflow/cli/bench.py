@@ -15,7 +15,7 @@ from rich.table import Table
 
 from tactflow.bench.compare import Regression, against, load_comparable
 from tactflow.bench.markdown import write_markdown
-from tactflow.bench.methods import SEED
+from tactflow.bench.methods import CLASSIC
 from tactflow.bench.report import html
 from tactflow.bench.results import Result
 from tactflow.bench.run import DEFAULT, Plan, run_bench
@@ -172,8 +172,8 @@ def _stress(given: list[str], frames: int) -> int:
 
 def packaged_files() -> dict[str, Path]:
     """Name -> file of the packaged pipelines, the default one first."""
-    others = [name for name in packaged_pipelines() if name not in (DEFAULT, SEED)]
-    return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, SEED, *others)}
+    others = [name for name in packaged_pipelines() if name not in (DEFAULT, CLASSIC)]
+    return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, CLASSIC, *others)}
 
 
 def _files(given: list[str]) -> dict[str, Path]:

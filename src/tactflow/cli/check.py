@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 
-from tactflow.cli.fleet import clash_problems
 from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.cli.pipelines import find_pipeline
@@ -12,6 +11,7 @@ from tactflow.config.load import sensor_names
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan
+from tactflow.fleet.sinks import clash_problems
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
-from tactflow.cli.options import add_pipeline, load_plan
-from tactflow.cli.story import Story, milliseconds, saving
-from tactflow.engine.errors import ConfigError
+from tactflow.cli.node_summary import NodeSummary, milliseconds, saving
+from tactflow.cli.options import add_pipeline_and_stats, load_with_stats
+from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `explain`."""
-    add_pipeline(parser)
-    parser.add_argument(
-        "--stats", metavar="run.json", help="statistics of a run (tactflow run --stats), to show what it cost"
-    )
+    add_pipeline_and_stats(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph for each stage and sink."""
-    statistics = None if args.stats is None else read_statistics(Path(args.stats))
-    pipeline, plan = load_plan(args)
-    print("\n".join(explanation(pipeline, plan, statistics)))
+    print("\n".join(explanation(*load_with_stats(args))))
     return 0
 
 
@@ -90,20 +83,17 @@ def _facts(
 
 def _demand(node: Node) -> str:
     rate = "" if node.max_rate is None else f", at most {node.max_rate:g} times a second"
-    own = "; it says for each frame whether it wants it" if hasattr(node.component.cls, "wants") else ""
+    asks = getattr(node.component.cls, "wants", None) is not Sink.wants
+    own = "; it says for each frame whether it wants it" if asks else ""
     return rate + own
 
 
 def _gate(gate: Gate) -> str:
     text = f"{gate.signal} is false"
-    if gate.hold:
-        text += f" for more than {gate.hold} frames"
     if gate.otherwise == "repeat":
         text += " (its last outputs are repeated)"
     else:
         text += f" (its outputs are absent: {gate.reason})"
-    if gate.at_least_every is not None:
-        text += f", but it runs at least every {gate.at_least_every} frames"
     return text
 
 
@@ -151,9 +141,9 @@ def _run_line(statistics: Mapping[str, Any]) -> str:
 def _saving(pipeline: Pipeline, statistics: Mapping[str, Any]) -> Iterator[str]:
     """What skipping saved in all stages together, and how that is counted."""
     stages = [node.id for node in pipeline.nodes.values() if node.component.kind == "stage"]
-    stories = [Story.of(entry) for id_, entry in statistics["stages"].items() if id_ in stages]
-    saved = sum(story.saved_ms or 0.0 for story in stories)
-    spent = sum(story.spent_ms for story in stories)
+    summaries = [NodeSummary.of(entry) for id_, entry in statistics["stages"].items() if id_ in stages]
+    saved = sum(summary.saved_ms or 0.0 for summary in summaries)
+    spent = sum(summary.spent_ms for summary in summaries)
     if statistics["frames"] and saved + spent > 0:
         yield f"all stages: {saving(saved, saved + spent, statistics['frames'])}"
         yield "            (saved = frames skipped x mean time of a run; of = that + the time spent)"
@@ -163,55 +153,16 @@ def _cost(node: Node, statistics: Mapping[str, Any]) -> str:
     entry = {**statistics.get("sinks", {}), **statistics["stages"]}.get(node.id)
     if entry is None:
         return "not part of that run"
-    story = Story.of(entry)
+    summary = NodeSummary.of(entry)
     if node.component.kind != "sink":
-        return story.told()
+        return summary.told()
     # A sink in its own thread only gets the frames that it asked for.
-    times = "once" if story.runs == 1 else f"{story.runs} times"
-    cost = f", {milliseconds(story.mean_ms)} each (p99 {milliseconds(story.p99_ms)})" if story.runs else ""
+    times = "once" if summary.runs == 1 else f"{summary.runs} times"
+    cost = (
+        f", {milliseconds(summary.mean_ms)} each (p99 {milliseconds(summary.p99_ms)})" if summary.runs else ""
+    )
     return f"written {times} in {statistics['frames']} frames{cost}"
 
 
 def _ms(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.2f} ms"
-
-
-def read_statistics(path: Path) -> Mapping[str, Any]:
-    """The content of a statistics file; raises ConfigError if it is none."""
-    try:
-        data = json.loads(path.read_bytes())
-    except OSError as error:
-        raise ConfigError(f"--stats {path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ConfigError(f"--stats {path}: not JSON: {error}") from None
-    if not _are_statistics(data):
-        raise ConfigError(f"--stats {path}: not a statistics file; tactflow run --stats writes one")
-    return data  # type: ignore[no-any-return]
-
-
-def _are_statistics(data: Any) -> bool:
-    """True if the parts shown here are there and have the right types."""
-    if not isinstance(data, dict):
-        return False
-    stages, sinks = data.get("stages"), data.get("sinks", {})
-    return (
-        isinstance(stages, dict)
-        and isinstance(sinks, dict)
-        and "end" in data
-        and all(isinstance(data.get(key), int | float) for key in ("frames", "dropped", "wall_s"))
-        and _is_pair(data.get("latency_ms"), "p50", "p99")
-        and all(
-            _is_pair(node, "p50_ms", "p99_ms")
-            and isinstance(node.get("runs"), int)
-            and isinstance(node.get("skips"), dict)
-            and all(isinstance(count, int) for count in node["skips"].values())
-            and isinstance(node.get("total_ms"), int | float | None)
-            for node in (*stages.values(), *sinks.values())
-        )
-    )
-
-
-def _is_pair(value: Any, *keys: str) -> bool:
-    return isinstance(value, dict) and all(
-        key in value and isinstance(value[key], int | float | None) for key in keys
-    )

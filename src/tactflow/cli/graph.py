@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
-from tactflow.cli.explain import read_statistics
-from tactflow.cli.options import add_pipeline, load_plan
-from tactflow.cli.story import Story, milliseconds, share
+from tactflow.cli.node_summary import NodeSummary, milliseconds, share
+from tactflow.cli.options import add_pipeline_and_stats, load_with_stats
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.plan import Plan
 
@@ -18,17 +16,12 @@ _COSTLY = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `graph`."""
-    add_pipeline(parser)
-    parser.add_argument(
-        "--stats", metavar="run.json", help="statistics of a run (tactflow run --stats), shown on the nodes"
-    )
+    add_pipeline_and_stats(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the flowchart."""
-    statistics = None if args.stats is None else read_statistics(Path(args.stats))
-    pipeline, plan = load_plan(args)
-    print("\n".join(mermaid(pipeline, plan, statistics)))
+    print("\n".join(mermaid(*load_with_stats(args))))
     return 0
 
 
@@ -40,8 +33,8 @@ def mermaid(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | None
     of the time after the source are filled.
     """
     told = {} if statistics is None else {**statistics.get("sinks", {}), **statistics["stages"]}
-    stories = {id_: Story.of(entry) for id_, entry in told.items() if id_ in pipeline.nodes}
-    spent = {id_: story.spent_ms for id_, story in stories.items() if id_ != pipeline.source.id}
+    summaries = {id_: NodeSummary.of(entry) for id_, entry in told.items() if id_ in pipeline.nodes}
+    spent = {id_: summary.spent_ms for id_, summary in summaries.items() if id_ != pipeline.source.id}
     costly = [id_ for id_, time in spent.items() if time > _COSTLY * sum(spent.values())]
     names = {id_: f"n{index}" for index, id_ in enumerate(pipeline.nodes)}
     boxes = {segment: f"s{index}" for index, segment in enumerate(plan.segments)}
@@ -49,7 +42,7 @@ def mermaid(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | None
     for segment, members in plan.segments.items():
         yield f'  subgraph {boxes[segment]}["segment {segment}"]'
         for id_ in members:
-            yield f"    {names[id_]}{_shape(pipeline.nodes[id_], stories.get(id_))}"
+            yield f"    {names[id_]}{_shape(pipeline.nodes[id_], summaries.get(id_))}"
         yield "  end"
     for node in plan.pruned:
         yield f"  {names[node.id]}{_shape(node, None)}:::pruned"
@@ -72,15 +65,15 @@ def mermaid(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | None
         yield f"  class {','.join(names[id_] for id_ in costly)} costly"
 
 
-def _shape(node: Node, story: Story | None) -> str:
+def _shape(node: Node, summary: NodeSummary | None) -> str:
     left, right = {"source": ("([", "])"), "stage": ("[", "]"), "sink": ("[/", "/]")}[node.component.kind]
     lines = [node.id]
-    if story is not None and node.component.kind == "sink":
-        lines.append(f"{story.runs} times")
-    elif story is not None and story.ticks:
-        lines += [f"ran {share(story.runs, story.ticks)}", *story.reasons()]
-    if story is not None and story.mean_ms is not None:
-        lines.insert(1, milliseconds(story.mean_ms))
+    if summary is not None and node.component.kind == "sink":
+        lines.append(f"{summary.runs} times")
+    elif summary is not None and summary.ticks:
+        lines += [f"ran {share(summary.runs, summary.ticks)}", *summary.reasons()]
+    if summary is not None and summary.mean_ms is not None:
+        lines.insert(1, milliseconds(summary.mean_ms))
     # A quotation mark would end the label, and < begin a tag.
     label = "<br/>".join(line.replace('"', "'").replace("<", "&lt;") for line in lines)
     return f'{left}"{label}"{right}'

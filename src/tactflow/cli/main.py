@@ -8,7 +8,7 @@ import importlib
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError, TactflowError
@@ -27,6 +27,7 @@ COMMANDS = {
     "cameras": "list the cameras that are plugged in, with names that stay the same",
     "sim": "write a simulated recording and its ground truth",
     "schema": "print the JSON Schema of the result message or of a pipeline file",
+    "completion": "print a script that completes commands, options and files in a shell",
 }
 """Subcommand -> what it does.
 
@@ -72,7 +73,11 @@ def main(argv: Sequence[str]) -> int:
         return error.code if isinstance(error.code, int) else 0
 
 
-def _parse(argv: Sequence[str]) -> argparse.Namespace:
+def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:
+    """The parser of the command line.
+
+    complete : the commands whose arguments it knows; their modules are imported.
+    """
     parser = argparse.ArgumentParser(
         prog="tactflow",
         description="From camera frames of a tactile sensor to contact geometry and marker flow.",
@@ -81,17 +86,22 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--version", action="version", version=f"tactflow {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name, summary in COMMANDS.items():
+        command = subparsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        if name in complete:
+            module = importlib.import_module(f"tactflow.cli.{name}")
+            module.add_arguments(command)
+            command.set_defaults(run=module.run)
+    return parser
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
     wanted = next((word for word in argv if not word.startswith("-")), None)
+    parser = make_parser([wanted] if wanted in COMMANDS else [])
     if wanted is not None and wanted not in COMMANDS:
         guess = difflib.get_close_matches(wanted, COMMANDS, n=1)
         hint = f"did you mean {guess[0]}?" if guess else f"there are {', '.join(COMMANDS)}"
         parser.error(f"there is no command {wanted}; {hint}")
-    for name, summary in COMMANDS.items():
-        command = subparsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
-        if name == wanted:
-            module = importlib.import_module(f"tactflow.cli.{name}")
-            module.add_arguments(command)
-            command.set_defaults(run=module.run)
     return parser.parse_args(argv)
 
 

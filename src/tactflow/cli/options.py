@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 from tactflow.cli.pipelines import find_pipeline
+from tactflow.cli.statistics import read_statistics
 from tactflow.config.load import load_pipeline
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan, make_plan
@@ -37,3 +41,19 @@ def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipe
     for warning in (*pipeline.warnings, *plan.warnings):
         print(f"tactflow: warning: {warning}", file=sys.stderr)
     return pipeline, plan
+
+
+def add_pipeline_and_stats(parser: argparse.ArgumentParser) -> None:
+    """Declare PIPELINE, `--set` and `--stats`."""
+    add_pipeline(parser)
+    parser.add_argument(
+        "--stats",
+        metavar="run.json",
+        help="statistics of a run (tactflow run --stats), to show how often each stage ran and what it cost",
+    )
+
+
+def load_with_stats(args: argparse.Namespace) -> tuple[Pipeline, Plan, Mapping[str, Any] | None]:
+    """As `load_plan`, and the content of the statistics file, or None."""
+    statistics = None if args.stats is None else read_statistics(Path(args.stats))
+    return (*load_plan(args), statistics)

@@ -16,7 +16,7 @@ def find_pipeline(name: str | None) -> Path:
     """The file that PIPELINE names.
 
     Without a name: `./pipeline.yaml` if it is there, else the packaged default. A name that is no file, such
-    as `seed` or `pipelines/seed.yaml`, finds the packaged pipeline of that name.
+    as `classic` or `pipelines/classic.yaml`, finds the packaged pipeline of that name.
     """
     if name is None:
         local = Path("pipeline.yaml")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tactflow.cli import run as run_command
 from tactflow.engine.errors import ConfigError
+from tactflow.fleet.names import with_name
 from tactflow.recording import missing_packages
 from tactflow.recording.names import next_name
 
@@ -34,17 +35,21 @@ def run(args: argparse.Namespace) -> int:
     ConfigError
         If the file cannot be recorded to, or as `tactflow run` does. Nothing was started.
     """
-    out: Path = args.out
     problem = missing_packages()
     if problem is not None:
         raise ConfigError(problem)
-    if out.suffix != ".mcap":
-        raise ConfigError(f"--out: required a file whose name ends in .mcap, got {out}")
+    if args.out.suffix != ".mcap":
+        raise ConfigError(f"--out: required a file whose name ends in .mcap, got {args.out}")
+    return run_command.run(args, lambda sensor: _recording(args, sensor))
+
+
+def _recording(args: argparse.Namespace, sensor: str | None) -> run_command.Sinks:
+    """The sink that records one of several sensors, or, for None, the only one."""
+    out = args.out if sensor is None else Path(with_name(str(args.out), sensor))
     if out.exists() and args.number:
         out = next_name(out)
     if out.exists() and not args.overwrite:
         raise ConfigError(
             f"--out: {out} is already there; give --overwrite to replace it or --number to record beside it"
         )
-    args.extra_sinks = {"--record": {"use": "record", "path": str(out), "overwrite": args.overwrite}}
-    return run_command.run(args)
+    return {"--record": {"use": "record", "path": str(out), "overwrite": args.overwrite}}

@@ -7,7 +7,7 @@ import json
 import logging
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -15,22 +15,21 @@ from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from tactflow.cli.fleet import run_fleet
 from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline
 from tactflow.cli.pipelines import find_pipeline
-from tactflow.cli.story import share
+from tactflow.cli.progress import progress_display, summary, with_statistics
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.run import Progress as RunProgress
-from tactflow.engine.run import Runner, RunResult
+from tactflow.engine.run import Runner
 from tactflow.engine.trace import Trace
+from tactflow.fleet.names import with_name
+from tactflow.fleet.run import Request, run_fleet
 
-_COSTLIEST = 4
-"""Stages named in a line of statistics."""
+Sinks = dict[str, dict[str, Any]]
+"""Option of the command line -> settings of the sink that it adds."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,17 +68,93 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started."""
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+def run(args: argparse.Namespace, extra_sinks: Callable[[str | None], Sinks] = lambda _: {}) -> int:
+    """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started.
+
+    extra_sinks : gives the sinks that a command adds for one of several sensors, or for None, the only one.
+    """
     file = find_pipeline(args.pipeline)
     if args.sensor is None:
         # Else it was said already by the process that starts one for each sensor.
         warn_of_conflict()
     several = sensor_names(file, args.overrides) if args.sensor is None else []
     if len(several) > 1:
-        return run_fleet(args, file, {name: _load(args, file, name) for name in several})
-    pipeline = _load(args, file, args.sensor)
+        return _run_all(args, file, several, extra_sinks)
+    pipeline = _load(args, file, args.sensor, _added_sinks(args, None) | extra_sinks(None))
+    return _run_one(args, pipeline)
+
+
+def _run_all(
+    args: argparse.Namespace, file: Path, sensors: Sequence[str], extra_sinks: Callable[[str | None], Sinks]
+) -> int:
+    """Run every sensor in a process of its own."""
+    problems = _option_problems(args, sensors)
+    if problems:
+        raise ConfigError("\n".join(problems))
+    sinks = {sensor: _added_sinks(args, sensor) | extra_sinks(sensor) for sensor in sensors}
+    request = Request(
+        file,
+        args.overrides,
+        added={option for added in sinks.values() for option in added},
+        options={sensor: _options(args, sensor) for sensor in sensors},
+    )
+    return run_fleet(request, {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors})
+
+
+def _options(args: argparse.Namespace, sensor: str) -> list[str]:
+    """The options of this run for the process of one sensor, but for those about sinks."""
+    words = []
+    for option, path in (("--stats", args.stats), ("--trace", args.trace)):
+        if path is not None:
+            words += [option, with_name(path, sensor)]
+    for option, value in (("--max-frames", args.max_frames), ("--stats-every", args.stats_every)):
+        if value is not None:
+            words += [option, str(value)]
+    flags = (("--realtime", args.realtime), ("--quiet", args.quiet), ("--check", args.check))
+    return words + [flag for flag, given in flags if given]
+
+
+def _option_problems(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
+    """What is wrong with the command line of a run of several sensors."""
+    problems = []
+    if args.source is not None:
+        problems.append(
+            f"--source: the pipeline has {len(sensors)} sensors, each with its own source; choose one with "
+            f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
+        )
+    for option in ("jsonl", "stats", "trace", "out"):
+        path = getattr(args, option, None)
+        try:
+            for sensor in sensors if path is not None else ():
+                with_name(str(path), sensor)
+        except ConfigError as error:
+            problems.append(f"--{option} {path}: {error}")
+    return problems
+
+
+def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
+    """The sink of `--jsonl`."""
+    if args.jsonl is None:
+        return {}
+    return {
+        "--jsonl": {"use": "jsonl", "path": args.jsonl if sensor is None else with_name(args.jsonl, sensor)}
+    }
+
+
+def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks) -> Pipeline:
+    source_values: dict[str, Any] = {}
+    if args.source is not None:
+        source_values["source"] = args.source
+    if args.realtime:
+        source_values["realtime"] = True
+    return load_pipeline(
+        file, overrides=args.overrides, extra_sinks=sinks, source_values=source_values, sensor=sensor
+    )
+
+
+def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
+    """Run one sensor's pipeline in this process."""
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
     trace = None if args.trace is None else Trace(f"tactflow {pipeline.sensor}")
     runner = Runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
     _refuse_unwritable("--stats", args.stats)
@@ -90,8 +165,8 @@ def run(args: argparse.Namespace) -> int:
             logger.warning("%s", warning)
         if runner.plan.pruned:
             logger.info("not run, as no sink needs it: %s", ", ".join(n.id for n in runner.plan.pruned))
-        with _progress_display(console, runner, shown=not args.quiet) as on_progress:
-            result = runner.run(_with_statistics(on_progress, runner, args.stats_every, console))
+        with progress_display(console, runner, shown=not args.quiet) as on_progress:
+            result = runner.run(with_statistics(on_progress, runner, args.stats_every, console))
     if trace is not None:
         trace.write(Path(args.trace))
     if args.stats:
@@ -99,26 +174,8 @@ def run(args: argparse.Namespace) -> int:
     if result.error is not None:
         print(f"tactflow: {result.error}", file=sys.stderr)
     if not args.quiet:
-        console.print(_summary(result, runner), markup=False)
+        console.print(summary(result, runner), markup=False)
     return result.exit_code
-
-
-def _load(args: argparse.Namespace, file: Path, sensor: str | None) -> Pipeline:
-    source_values: dict[str, Any] = {}
-    if args.source is not None:
-        source_values["source"] = args.source
-    if args.realtime:
-        source_values["realtime"] = True
-    extra_sinks: dict[str, dict[str, Any]] = dict(getattr(args, "extra_sinks", {}))
-    if args.jsonl is not None:
-        extra_sinks["--jsonl"] = {"use": "jsonl", "path": args.jsonl}
-    return load_pipeline(
-        file,
-        overrides=args.overrides,
-        extra_sinks=extra_sinks,
-        source_values=source_values,
-        sensor=sensor,
-    )
 
 
 def _positive(text: str) -> int:
@@ -187,96 +244,3 @@ def _signals(runner: Runner) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def _progress_display(
-    console: Console, runner: Runner, *, shown: bool
-) -> Iterator[Callable[[RunProgress], None] | None]:
-    """A line that counts frames, on a terminal only."""
-    if not shown or not console.is_terminal:
-        yield None
-        return
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed} frames, {task.fields[rate]:.0f}/s, {task.fields[dropped]} dropped"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console, transient=True) as display:
-        task = display.add_task(runner.pipeline.sensor, total=None, rate=0.0, dropped=0)
-
-        def update(now: RunProgress) -> None:
-            total = runner.max_frames or getattr(runner.source, "total", None)
-            rate = now.frames / now.elapsed_s if now.elapsed_s > 0 else 0.0
-            display.update(task, completed=now.frames, total=total, rate=rate, dropped=now.dropped)
-
-        yield update
-
-
-def _with_statistics(
-    on_progress: Callable[[RunProgress], None] | None, runner: Runner, every: float | None, console: Console
-) -> Callable[[RunProgress], None] | None:
-    """Also print a line of statistics every so many seconds."""
-    if every is None:
-        return on_progress
-    last: Mapping[str, Any] | None = None
-    due = every
-
-    def update(now: RunProgress) -> None:
-        nonlocal last, due
-        if on_progress is not None:
-            on_progress(now)
-        if now.elapsed_s >= due:
-            due = now.elapsed_s + every
-            stats = runner.snapshot()
-            console.print(statistics_line(stats, last), markup=False)
-            last = stats
-
-    return update
-
-
-def statistics_line(stats: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> str:
-    """Rate, drops and latency, and for the costliest stages their time a frame and how often they ran.
-
-    stats, before : statistics of a run now and earlier (None: at its start); what is told happened between
-    them, except for the latency, which is that of the run so far.
-    """
-    if before is None:
-        before = {"frames": 0, "dropped": 0, "wall_s": 0.0, "stages": {}}
-    frames, dropped = stats["frames"] - before["frames"], stats["dropped"] - before["dropped"]
-    seconds = stats["wall_s"] - before["wall_s"]
-    parts = [f"{stats['wall_s']:.1f} s: {frames / seconds if seconds > 0 else 0:.1f} frames/s"]
-    parts.append(f"{dropped} dropped")
-    latency = stats["latency_ms"]
-    if latency["p50"] is not None:
-        parts.append(f"latency p50 {latency['p50']:.2f} p99 {latency['p99']:.2f} ms")
-    costs = []
-    for name, entry in stats["stages"].items():
-        earlier = before["stages"].get(name, {"runs": 0, "total_ms": 0.0})
-        runs, spent = entry["runs"] - earlier["runs"], entry["total_ms"] - earlier["total_ms"]
-        if runs > 0 and frames > 0:
-            costs.append((spent / frames, f"{name} {spent / frames:.2f} ms (ran {share(runs, frames)})"))
-    costs.sort(reverse=True)
-    if costs:
-        parts.append("a frame: " + ", ".join(text for _, text in costs[:_COSTLIEST]))
-    return "; ".join(parts)
-
-
-def _summary(result: RunResult, runner: Runner) -> str:
-    stats = result.stats
-    lines = [
-        f"{stats['frames']} frames in {stats['wall_s']:.1f} s, {stats['dropped']} dropped ({stats['end']})"
-    ]
-    touching = next((s for name, s in stats["signals"].items() if name.endswith(".touching")), None)
-    if touching is not None:
-        lines.append(f"contacts: {touching['rises']} ({touching['true']} frames with contact)")
-    latency = stats["latency_ms"]
-    if latency["p50"] is not None:
-        lines.append(f"latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")
-    for name, node in runner.nodes.items():
-        target = getattr(node.instance, "description", None)
-        if node.is_sink and target:
-            lines.append(f"{name}: {target}")
-    return "\n".join(lines)

@@ -10,7 +10,6 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from tactflow import files
 from tactflow.config import sensors, wiring
 from tactflow.config.complaints import complain
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
@@ -18,10 +17,11 @@ from tactflow.config.overrides import add_sinks, apply, replaced
 from tactflow.config.registry import Section, code_place, did_you_mean, resolve
 from tactflow.config.wiring import Draft
 from tactflow.config.yamlmap import Item, Problems, read_yaml, wrap
-from tactflow.engine.contract import StageParams
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
+from tactflow.files import is_device
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 
@@ -224,16 +224,16 @@ def _one_writer_each(drafts: Sequence[Draft], options: Collection[str], problems
     kept: list[Draft] = []
     writers: dict[str, Draft] = {}
     for draft in drafts:
-        place = _written(draft)
-        other = None if place is None else writers.setdefault(place, draft)
-        if other is None or other is draft:
-            kept.append(draft)
-        elif draft.mark.file not in options or not _does_as_much(other, draft):
-            kept.append(draft)
-            problems.add(
-                draft.mark,
-                f"{draft.path}: {other.id} ({other.mark}) writes {place} already; choose another path",
-            )
+        places = _written(draft)
+        place = next((place for place in places if place in writers), None)
+        other = writers[place] if place is not None else None
+        if other and draft.mark.file in options and _does_as_much(other, draft):
+            continue
+        kept.append(draft)
+        if other:
+            there = f"{other.id} ({other.mark}) writes {place} already; choose another path"
+            problems.add(draft.mark, f"{draft.path}: {there}")
+        writers |= {place: draft for place in places if place not in writers}
     return kept
 
 
@@ -244,13 +244,14 @@ def _does_as_much(there: Draft, added: Draft) -> bool:
     return there.component.cls is added.component.cls and "max_rate" not in there.item.entries
 
 
-def _written(draft: Draft) -> str | None:
-    """The file or folder that a sink writes, however it is spelled; None for what is not one."""
-    named = files.output(draft.params) if draft.section == "sinks" else None
-    # No file has such a name; the sink will say so.
-    if named is None or "\0" in named[1]:
-        return None
-    return os.path.realpath(files.expanded(named[1]))
+def _written(draft: Draft) -> list[str]:
+    """The files and folders that a sink writes, however they are spelled; no devices."""
+    cls = draft.component.cls if draft.component else None
+    if cls is None or not issubclass(cls, Sink) or draft.params is None:
+        return []
+    paths = [str(output.path) for output in cls.outputs(draft.params)]
+    # No file has a name with NUL; the sink will say so.
+    return [os.path.realpath(path) for path in paths if "\0" not in path and not is_device(path)]
 
 
 def _check_needs(drafts: Sequence[Draft], problems: Problems) -> None:
@@ -273,9 +274,11 @@ def _node(draft: Draft, entry: Entry) -> Node:
     """The node that a right draft describes."""
     assert draft.component is not None, "a stage without one was reported"
     assert draft.params is not None, "parameters that are wrong were reported"
-    entries = draft.item.entries
+    cls, entries = draft.component.cls, draft.item.entries
     # A picture for people must never stop the run.
-    observer = getattr(draft.component.cls, "observer", False)
+    on_error = OnError("disable" if issubclass(cls, Sink) and cls.observer else "stop")
+    if entry.on_error:
+        on_error = OnError(entry.on_error.action, entry.on_error.budget)
     gates = [
         Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
         for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
@@ -289,9 +292,7 @@ def _node(draft: Draft, entry: Entry) -> Node:
         gates=tuple(gates),
         segment=entry.segment,
         queue=Queue(entry.queue.capacity, entry.queue.when_full),
-        on_error=OnError(entry.on_error.action, entry.on_error.budget)
-        if entry.on_error
-        else OnError("disable" if observer else "stop"),
+        on_error=on_error,
         max_rate=entry.max_rate if isinstance(entry, SinkEntry) else None,
         marks={key: entries[key].item.mark for key in ("segment", "queue") if key in entries},
     )

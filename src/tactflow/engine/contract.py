@@ -112,11 +112,15 @@ class Stage(Part):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """A file or folder that a sink writes. parameter : the one that names it."""
+    """A file or folder that a sink writes.
+
+    parameter : the one that names it. refuses_existing : whether the sink fails if there is something in it.
+    """
 
     path: Path
     kind: Literal["file", "folder"]
     parameter: str
+    refuses_existing: bool = False
 
 
 @dataclass(frozen=True, slots=True)

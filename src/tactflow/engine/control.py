@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from tactflow.engine.contract import Recorder, Source
 from tactflow.engine.graph import Pipeline
 
 
@@ -34,15 +35,12 @@ class Control(Protocol):
         """The run's statistics so far, as in the statistics file."""
 
     @property
-    def source(self) -> Any:
-        """The source stage's instance."""
+    def source(self) -> Source | None:
+        """The source stage's instance, once it is built."""
 
     @property
     def pipeline(self) -> Pipeline:
         """What is run."""
 
-    def recorder(self) -> Any:
-        """The first sink that can start and stop a recording, or None.
-
-        It has the methods `start_recording` and `stop_recording` and the property `recording`.
-        """
+    def recorder(self) -> Recorder | None:
+        """The first sink that can be told to record, or None."""

@@ -61,15 +61,12 @@ class Gate:
 
     signal : the boolean port. reason : why outputs are absent while it is closed.
     otherwise : "absent" makes the outputs `Absent(reason)`; "repeat" gives the last outputs again (absent if
-    there are none yet). hold : frames for which the gate stays open after the signal fell.
-    at_least_every : opens the gate anyway after this many frames closed; None for never.
+    there are none yet).
     """
 
     signal: Ref
     reason: str
     otherwise: Literal["absent", "repeat"] = "absent"
-    hold: int = 0
-    at_least_every: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +121,7 @@ class Pipeline:
     nodes: Mapping[str, Node]
     skipping: bool = True
     opencv_threads: int | None = None
-    realtime_priority: bool = True
+    realtime_priority: bool = False
     runs: int = 1
     warnings: Sequence[str] = field(default_factory=list[str])
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])

@@ -11,13 +11,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from tactflow.engine.conformance import OFFERED
+from tactflow.engine.contract import Part, Recorder, Source
 from tactflow.engine.errors import SourceError, StageError, TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.link import Link
+from tactflow.engine.node import UNCONNECTED, RunningNode, TickState
 from tactflow.engine.plan import Plan, make_plan
-from tactflow.engine.priority import Precedence
-from tactflow.engine.segment import NOTHING, NodeFailedError, RunningNode, RunningTick, Segment
+from tactflow.engine.priority import ask_for_realtime
+from tactflow.engine.schedule import make_schedule
+from tactflow.engine.segment import NodeFailedError, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.engine.trace import Trace
 
@@ -76,12 +80,11 @@ class Runner:
         self.latency = Durations()
         self.nodes: dict[str, RunningNode] = {}
         self._slots: dict[tuple[str, str], int] = {}
-        self._demands: dict[tuple[str, ...], frozenset[str]] = {}
         self.plan: Plan = make_plan(pipeline)
-        self._links: list[Link[RunningTick]] = []
+        self._links: list[Link[TickState]] = []
         self._segments: dict[str, Segment] = {}
         self._threads: dict[str, threading.Thread] = {}
-        self._opened: list[tuple[str, Any]] = []
+        self._opened: list[tuple[str, Part]] = []
         self._lock = threading.Lock()
         self._error: TactflowError | None = None
         self._end: str | None = None
@@ -93,8 +96,8 @@ class Runner:
         self._turn = threading.Condition()
         self._paused = False
         self._steps = 0
-        self._source: Any = None
-        self._precedence: Precedence | None = None
+        self._source: Source | None = None
+        self._has_priority = False
 
     # -- life cycle ---------------------------------------------------------------------------------------
 
@@ -118,10 +121,8 @@ class Runner:
                 self._threads[name] = thread
             for thread in self._threads.values():
                 thread.start()
-            if getattr(self._source, "live", False):
-                pipeline = self.pipeline
-                self._precedence = Precedence(self._live_threads, pipeline.realtime_priority, pipeline.runs)
-                self._precedence.start()
+            if self._is_live and self.pipeline.realtime_priority:
+                self._go_first()
             self._wait(on_progress, interval_s)
         except TactflowError as failure:
             self.fail(failure)
@@ -131,8 +132,6 @@ class Runner:
             for link in self._links:
                 link.abort()
         finally:
-            if self._precedence is not None:
-                self._precedence.stop()
             self._close()
         stats = self._stats(time.perf_counter() - self._began)
         error = self._error
@@ -147,7 +146,7 @@ class Runner:
         self._stopping.set()
         with self._turn:
             self._turn.notify_all()
-        if self._source is not None and hasattr(self._source, "stop"):
+        if self._source is not None:
             self._source.stop()
 
     def fail(self, error: TactflowError, cause: BaseException | None = None) -> None:
@@ -162,7 +161,7 @@ class Runner:
 
     def retake_reference(self) -> None:
         """Take the next frames as a new reference. From any thread."""
-        if self._source is not None and hasattr(self._source, "retake"):
+        if self._source is not None:
             self._source.retake()
 
     def pause(self, paused: bool) -> None:
@@ -187,17 +186,14 @@ class Runner:
         return self._stats(time.perf_counter() - self._began)
 
     @property
-    def source(self) -> Any:
-        """The instance of the source stage, once opened."""
+    def source(self) -> Source | None:
+        """The instance of the source stage, once it is built."""
         return self._source
 
-    def recorder(self) -> Any:
-        """The first sink that has `start_recording`, `stop_recording` and `recording`, or None."""
-        wanted = ("start_recording", "stop_recording", "recording")
-        for node in list(self.nodes.values()):
-            if node.is_sink and all(hasattr(node.instance, name) for name in wanted):
-                return node.instance
-        return None
+    def recorder(self) -> Recorder | None:
+        """The first sink that can be told to record, or None."""
+        sinks = [node.sink for node in list(self.nodes.values())]
+        return next((sink for sink in sinks if isinstance(sink, Recorder)), None)
 
     def progress(self) -> Progress:
         """How far the run is."""
@@ -207,16 +203,13 @@ class Runner:
     def _open(self) -> None:
         """Build and open the source first, then stages, then sinks: a missing recording truncates no file."""
         pipeline = self.pipeline
-        if pipeline.opencv_threads is not None:
-            import cv2
-
-            cv2.setNumThreads(pipeline.opencv_threads)
-        self._source = self._build(pipeline.source, SourceError)
-        live = bool(getattr(self._source, "live", False))
-        self.plan = make_plan(pipeline, live=live)
+        source = self._build(pipeline.source, SourceError)
+        assert isinstance(source, Source)
+        self._source = source
+        self.plan = make_plan(pipeline, live=source.live)
         pruned = {node.id for node in self.plan.pruned}
         ports = [(id_, port.name) for id_, n in pipeline.nodes.items() for port in n.component.ports.outputs]
-        self._slots = {port: slot for slot, port in enumerate(ports, start=NOTHING + 1)}
+        self._slots = {port: slot for slot, port in enumerate(ports, start=UNCONNECTED + 1)}
         for node in pipeline.nodes.values():
             if node.component.kind == "source" or node.id in pruned:
                 continue
@@ -225,22 +218,17 @@ class Runner:
                 node, instance, self._slots, skipping=pipeline.skipping, check=self.check
             )
 
-    def _build(self, node: Node, kind: type[TactflowError]) -> Any:
+    def _build(self, node: Node, kind: type[TactflowError]) -> Part:
         """Construct a node's class with what its constructor asks for, and open it."""
         pipeline = self.pipeline
-        offered = {
-            "sensor": pipeline.sensor,
-            "directory": pipeline.directory,
-            "skipping": pipeline.skipping,
-            "control": self,
-        }
+        values = (pipeline.sensor, pipeline.directory, pipeline.skipping, self)
+        offered = dict(zip(OFFERED, values, strict=True))
         try:
             wanted = inspect.signature(node.component.cls).parameters
             extra = {name: value for name, value in offered.items() if name in wanted}
-            instance = node.component.cls(node.params, **extra)
+            instance: Part = node.component.cls(node.params, **extra)
             self._opened.append((node.id, instance))
-            if hasattr(instance, "open"):
-                instance.open()
+            instance.open()
         except kind as error:
             raise kind(f"{node.id} ({node.mark}): {error}") from error
         except TactflowError:
@@ -254,16 +242,16 @@ class Runner:
         return instance
 
     def _connect(self) -> None:
-        for name in self.plan.segments:
+        for name, steps in make_schedule(self.plan).items():
             track = None if self.trace is None else self.trace.track(name)
-            self._segments[name] = Segment(name, self, track)
+            self._segments[name] = Segment(name, self, steps, self._slots, track)
         for link_plan in self.plan.links:
-            link: Link[RunningTick] = Link(link_plan.name, link_plan.capacity, link_plan.when_full)
+            link: Link[TickState] = Link(link_plan.name, link_plan.capacity, link_plan.when_full)
             self._links.append(link)
             consumer = self._segments[link_plan.consumer]
             consumer.inputs.append(link)
             only_sinks = None
-            if all(node.is_sink for node in consumer.nodes):
+            if all(node.sink for node in consumer.nodes):
                 only_sinks = frozenset(node.id for node in consumer.nodes)
             self._segments[link_plan.producer].outputs.append((link, only_sinks))
 
@@ -290,11 +278,21 @@ class Runner:
                     f"the run was stopped, but did not end in {CLOSE_SECONDS:g} s: {hanging} hangs"
                 )
 
-    def _live_threads(self) -> list[int | None]:
-        """Native ids of the threads that a live frame's results wait for."""
-        own = [thread.native_id for name, thread in self._threads.items() if self._segments[name].urgent]
-        theirs = [id_ for _, instance in list(self._opened) for id_ in getattr(instance, "live_threads", ())]
-        return [*own, *theirs]
+    @property
+    def _is_live(self) -> bool:
+        return self._source is not None and self._source.live
+
+    def _go_first(self) -> None:
+        """Ask for real-time priority for the threads that a live frame's results wait for; say what came."""
+        urgent = {self._source_segment, *(name for name, s in self._segments.items() if s.urgent)}
+        own = [self._threads[name].native_id for name in urgent]
+        theirs = [id_ for _, instance in self._opened for id_ in instance.live_threads]
+        refused = ask_for_realtime([id_ for id_ in [*own, *theirs] if id_ is not None])
+        self._has_priority = refused is None
+        if refused is None:
+            logger.info("live frames go first: their threads have real-time priority")
+        else:
+            logger.warning("realtime_priority: not granted: %s", refused)
 
     def _no_headway(self) -> bool:
         """Whether no link has delivered anything for a moment: draining a long queue is not hanging."""
@@ -306,8 +304,7 @@ class Runner:
         """Close whatever was opened, last opened first; every one gets its turn."""
         for node_id, instance in reversed(self._opened):
             try:
-                if hasattr(instance, "close"):
-                    instance.close()
+                instance.close()
             except Exception as error:
                 self.fail(StageError(f"{node_id}: closing failed: {error}"), error)
         self._opened.clear()
@@ -318,11 +315,11 @@ class Runner:
         segment = self._segments[self._source_segment]
         node = self.pipeline.source
         slot = self._slots[node.id, node.component.ports.outputs[0].name]
-        table = NOTHING + 1 + len(self._slots)
-        sinks = [n for n in self.nodes.values() if n.is_sink]
-        add_duration = self._source_stats.durations.add
+        table = UNCONNECTED + 1 + len(self._slots)
+        sinks = [node for node in self.nodes.values() if node.sink is not None]
         index = 0
         try:
+            assert self._source is not None
             frames = iter(self._source.frames())
             while not self._stopping.is_set():
                 segment.current = node.id
@@ -336,12 +333,12 @@ class Runner:
                 if self._paused and not self._may_go_on():
                     continue
                 ended = time.perf_counter()
-                add_duration(ended - began)
+                self._source_stats.durations.add(ended - began)
                 if segment.track is not None:
                     segment.track.add(node.id, began, ended, {"seq": frame.seq})
                 if frame.seq >= 0:
                     self._frames += 1
-                tick = RunningTick(index, frame, self._demand(sinks, frame), table)
+                tick = TickState(index, frame, _demand(sinks, frame), table)
                 tick.values[slot] = frame
                 index += 1
                 segment.handle(tick)
@@ -363,37 +360,11 @@ class Runner:
     def _may_go_on(self) -> bool:
         """While paused: whether the frame just captured is to be handled; waits for that, or lets it go."""
         with self._turn:
-            if not getattr(self._source, "live", False):
+            if not self._is_live:
                 self._turn.wait_for(lambda: not self._paused or self._steps or self._stopping.is_set())
             go = not self._paused or self._steps > 0
             self._steps = max(0, self._steps - 1)
             return go and not self._stopping.is_set()
-
-    def _demand(self, sinks: Sequence[RunningNode], frame: Frame) -> frozenset[str]:
-        """The sinks that want this frame.
-
-        One with `takes_references` gets all references; no other gets a reference image that is not part of
-        the source.
-        """
-        wanted = tuple(
-            [
-                sink.id
-                for sink in sinks
-                if not sink.disabled
-                and (
-                    (frame.reference and sink.takes_references)
-                    or (
-                        frame.seq >= 0
-                        and (sink.rate_limit is None or sink.rate_limit.due(frame.t))
-                        and (sink.wants is None or sink.wants())
-                    )
-                )
-            ]
-        )
-        demand = self._demands.get(wanted)
-        if demand is None:
-            demand = self._demands[wanted] = frozenset(wanted)
-        return demand
 
     # -- statistics ---------------------------------------------------------------------------------------
 
@@ -407,7 +378,7 @@ class Runner:
 
     def _missed(self) -> int:
         """Frames of a live source that were overtaken before they could be taken."""
-        return int(getattr(self._source, "missed", 0))
+        return 0 if self._source is None else self._source.missed
 
     def _stats(self, wall_s: float) -> dict[str, Any]:
         stages: dict[str, Any] = {self.pipeline.source.id: _node_stats(self._source_stats)}
@@ -416,10 +387,8 @@ class Runner:
         # A sink may ask while others are still being opened.
         for node in list(self.nodes.values()):
             entry = _node_stats(node.stats)
-            if node.is_sink:
-                if hasattr(node.instance, "counters"):
-                    entry["counters"] = dict(node.instance.counters())
-                sinks[node.id] = entry
+            if node.sink is not None:
+                sinks[node.id] = entry | {"counters": dict(node.sink.counters())}
             else:
                 stages[node.id] = entry
             signals.update({f"{node.id}.{name}": dict(signal) for name, (_, signal) in node.signals.items()})
@@ -445,7 +414,7 @@ class Runner:
             "sinks": sinks,
             "signals": signals,
             "links": links,
-            "priority": "ordinary" if self._precedence is None else self._precedence.how,
+            "priority": "real-time" if self._has_priority else "ordinary",
             "latency_ms": {"p50": self.latency.milliseconds(0.5), "p99": self.latency.milliseconds(0.99)},
         }
 
@@ -459,3 +428,20 @@ def _node_stats(stats: NodeStats) -> dict[str, Any]:
         "p50_ms": stats.durations.milliseconds(0.5),
         "p99_ms": stats.durations.milliseconds(0.99),
     }
+
+
+def _demand(sinks: Sequence[RunningNode], frame: Frame) -> frozenset[str]:
+    """The sinks that want this frame."""
+    return frozenset([node.id for node in sinks if not node.disabled and _wants(node, frame)])
+
+
+def _wants(node: RunningNode, frame: Frame) -> bool:
+    """Whether a sink wants a frame.
+
+    One that takes references gets all of them; no other gets a reference image from outside the source.
+    """
+    sink = node.sink
+    assert sink is not None
+    if frame.reference and sink.takes_references:
+        return True
+    return frame.seq >= 0 and node.rate_limit.due(frame.t) and sink.wants()

@@ -37,11 +37,10 @@ _STATUS_COLOURS: Final = (
 
 
 class Annotator:
-    """Draws contact, markers and flow on a copy of the processed frame (seed's `draw_flow`, `regress_line`).
+    """Draws contact, markers and flow on a copy of the processed frame.
 
     arrow_scale : length of an arrow over the displacement it shows; 1 ends it where the marker is now.
-    view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest black
-        (seed's `draw_flow_mask`).
+    view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest black.
     ellipse : whether the fitted ellipse is drawn.
     text : whether numbers are written.
     dilate : px, for the "contact" view: how far outside the contact the picture and its arrows reach.
@@ -204,7 +203,7 @@ class Annotator:
 
 
 def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0, unit: float = 1.0) -> None:
-    """Draw every marker's displacement into `picture`, from its origin, to 1/16 px (seed's `draw_flow`).
+    """Draw every marker's displacement into `picture`, from its origin, to 1/16 px.
 
     picture : (H, W, 3) uint8, changed. scale : arrow length over displacement. unit : line width, px.
     Tracked markers are yellow, inferred white, lost dim gray; a displacement too short for a head is a dot.

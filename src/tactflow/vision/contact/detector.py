@@ -18,7 +18,7 @@ References
 T. Aach, A. Kaup, R. Mester, "Statistical model-based change detection in moving video", Signal Processing 31
 (1993), for the test; K. Friston et al., "Assessing the significance of focal activations using their spatial
 extent", Human Brain Mapping 1 (1994), for the test by extent. `light` and `imprint` name the sources of
-theirs. Seed function `difference`.
+theirs.
 """
 
 from __future__ import annotations
@@ -36,9 +36,8 @@ from tactflow.vision.contact import background_kernels, contact_outline_kernels
 from tactflow.vision.contact.background import CELL, UntouchedGel
 from tactflow.vision.contact.contact_outline import fill_level, hidden_cells, outline_level
 from tactflow.vision.geometry import downsample
-from tactflow.vision.seed_contact import seed_contact_mask
 
-ContactMethod = Literal["noise", "colour", "seed"]
+ContactMethod = Literal["noise", "colour"]
 Float = NDArray[np.float32]
 
 _WEAK = 0.02
@@ -100,7 +99,7 @@ class ContactDetector:
     Parameters
     ----------
     method : `noise` works for gels that answer with brightness or colour. `colour` is a plain distance of
-        colours with a fixed threshold. `seed` is the original rule: brighter in all channels.
+        colours with a fixed threshold.
     false_alarms : expected number of frames of the untouched gel that are called contact, per frame, in
         (0, 1). Lower misses lighter contacts.
     repeatability : part of the brightness by which the light of the untouched gel may vary from place to
@@ -133,8 +132,8 @@ class ContactDetector:
         creep: float = 0.1,
         distance: float = 24.0,
     ) -> None:
-        if method not in ("noise", "colour", "seed"):
-            raise ValueError(f"method: required 'noise', 'colour' or 'seed', got {method!r}")
+        if method not in ("noise", "colour"):
+            raise ValueError(f"method: required 'noise' or 'colour', got {method!r}")
         if not 0 < false_alarms < 1:
             raise ValueError(f"false_alarms: required in (0, 1), got {false_alarms}")
         if not 0 <= repeatability <= 1:
@@ -209,9 +208,6 @@ class ContactDetector:
             )
         if self._last is None:
             raise ValueError("required a reference frame first: call add_reference")
-        if self._method == "seed":
-            mask = seed_contact_mask(image, self._last)
-            return ContactResult(mask, bool(mask.any()))
         if self._method == "colour":
             return _colour_distance(image, self._last, self._distance)
         return self._against_noise(image, hidden)

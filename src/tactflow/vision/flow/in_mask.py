@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -14,7 +14,6 @@ from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.inside import inside_outline
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
-Method = Literal["mean", "seed"]
 FloatArray = NDArray[np.float64]
 
 # Markers whose scatter across a line is below this share of that along it do not span a plane.
@@ -26,10 +25,8 @@ _TRACKED: Final = int(MarkerStatus.TRACKED)
 _LOST: Final = int(MarkerStatus.LOST)
 
 
-def flow_in_mask(
-    markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0.0, method: Method = "mean"
-) -> Flow:
-    """Summarise the displacement of the markers inside the contact (seed function `draw_flow_mask`).
+def flow_in_mask(markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0.0) -> Flow:
+    """Summarise the displacement of the markers inside the contact.
 
     markers : as the tracker gives them, processed pixels.
     mask : (H, W) uint8, non-zero inside the contact.
@@ -38,12 +35,10 @@ def flow_in_mask(
         Where the markers' radius is known, the region's outline is bridged below each of them
         (`tactflow.vision.contact.inside`) and the distance counts to a fraction of a pixel; otherwise it is
         that between the pixel that a centre falls on and the nearest pixel of the mask.
-    method : "mean" uses tracked and inferred markers with equal weight, since the mean is one over the
-        contact's area and not over how well each marker is seen; but a single tracked marker stands alone,
-        since an inferred one has its motion from neighbours, which are then outside and move otherwise.
-        Lost ones count nowhere. "seed" is the original: every marker, position and displacement cut to
-        whole pixels, a square of side 2 * round(dilate) + 1 as structuring element, nothing but mean and
-        count.
+
+    Tracked and inferred markers have equal weight, since the mean is one over the contact's area and not over
+    how well each marker is seen; but a single tracked marker stands alone, since an inferred one has its
+    motion from neighbours, which are then outside and move otherwise. Lost ones count nowhere.
 
     rotation and divergence come from the least-squares similarity that takes the markers' origins to their
     positions (closed form, as in Umeyama, 1991, here by complex numbers). Both and the residual are the
@@ -55,14 +50,9 @@ def flow_in_mask(
     Computed in float64. Markers in float32 give the same to their own rounding: a mean to 2^-23 of the
     largest coordinate, a rotation to that over the distance of the markers.
 
-    Raises ValueError if mask is not (H, W) uint8, if dilate is negative or not finite, or for an unknown
-    method.
+    Raises ValueError if mask is not (H, W) uint8, or if dilate is negative or not finite.
     """
     _check(mask, dilate)
-    if method not in ("mean", "seed"):
-        raise ValueError(f"required method to be 'mean' or 'seed', got {method!r}")
-    if method == "seed":
-        return _seed_flow(markers, mask, round(dilate))
     if markers.radius is None:
         inside = inside_mask(markers.position, mask, dilate)
     else:
@@ -198,18 +188,3 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
 def _clip(values: NDArray[np.intp], high: int) -> NDArray[np.intp]:
     # np.clip costs 6 us a call on small arrays, these two 1 us.
     return np.minimum(np.maximum(values, 0), high)
-
-
-def _seed_flow(markers: Markers, mask: NDArray[np.uint8], dilate: int) -> Flow:
-    grown: NDArray[Any] = mask
-    if dilate:
-        grown = cv2.dilate(mask, np.ones((2 * dilate + 1, 2 * dilate + 1), np.uint8))
-    height, width = mask.shape
-    pixels = np.trunc(markers.position)
-    within = (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
-    x, y = pixels[within].astype(np.intp).T
-    chosen = np.flatnonzero(within)[grown[y, x] == 255]
-    if len(chosen) == 0:
-        return Flow(None, 0)
-    mean = np.trunc(markers.displacement[chosen]).mean(axis=0)
-    return Flow((float(mean[0]), float(mean[1])), len(chosen))

@@ -1,21 +1,18 @@
-"""Geometry of the contact region: hull, centroid, principal direction, ellipse, regression line."""
+"""Geometry of the contact region: hull, centroid, principal direction, ellipse."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tactflow.vision import compiled
 from tactflow.vision.geometry import moments
 from tactflow.vision.types import Contact, Ellipse
-
-Method = Literal["moments", "seed"]
 
 FALSE_DIRECTION: Final = 1e-3
 """Share of directionless regions that may be given a direction by chance."""
@@ -31,30 +28,12 @@ _LARGE: Final = 20_000
 _LINEAR_LIMIT: Final = 0.6
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A regression line.
-
-    point : (x, y) on the line, the mean of the points, px.
-    angle : degrees in (-90, 90], counter-clockwise on the screen; None where the points have no direction.
-    slope : dy/dx (y down), -tan(angle); None where vertical or undirected.
-    midpoint : (x, y), middle of the line between the left and the right edge of the picture, as the seed's
-        `regress_line` draws it; `point` where the line is vertical or undirected.
-    """
-
-    point: tuple[float, float]
-    angle: float | None
-    slope: float | None
-    midpoint: tuple[float, float]
-
-
 def contact_geometry(
     mask: NDArray[np.uint8],
     *,
     min_area: float = 1.0,
     max_gap: float | None = None,
     min_confidence: float = 0.0,
-    method: Method = "moments",
 ) -> Contact | None:
     """Describe the contact region of a mask; None where there is none.
 
@@ -67,10 +46,6 @@ def contact_geometry(
     min_confidence : 0 to 1; a region whose confidence is not above it gets no direction. For errors that the
         mask makes in one direction (light from one side), which no statistics of its outline can tell from
         shape; 0.3 is an axis ratio of 1.36. Higher withholds the direction of stubby shapes.
-    method : "moments" describes the region itself. "seed" is the original's `get_convex_hull_area`,
-        `regress_line` and `get_all_contour`: its line through the hull's vertices gives angle and slope, the
-        middle of that line across the picture is the centre, the ellipse is fitted to the contour points.
-        It ignores the other parameters. OpenCV fits in single precision: 2e-4 degrees and 1e-4 px.
 
     area counts the pixels whose centre lies in or on the hull (Pick's theorem). For a convex region this is
     its number of pixels, so it carries no bias from the half pixel between the outermost centres and the
@@ -94,12 +69,8 @@ def contact_geometry(
         raise ValueError(f"required max_gap >= 0 px or None, got {max_gap}")
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
-    if method not in ("moments", "seed"):
-        raise ValueError(f"required method to be 'moments' or 'seed', got {method!r}")
     if mask.size == 0:
         return None
-    if method == "seed":
-        return _seed_contact(mask)
     (left, top, width, height), sums = _measured(mask)
     if width == 0:
         return None
@@ -133,7 +104,7 @@ def contact_geometry(
     if confidence > min_confidence and confidence > _anisotropy_limit(
         contours, count, center, (xx, xy, yy), confidence
     ):
-        angle, slope = _direction(0.5 * math.atan2(2 * xy, xx - yy))
+        angle, slope = axis_direction(0.5 * math.atan2(2 * xy, xx - yy))
     ellipse = None
     # A straight line of pixels one pixel wide has a variance of up to 1/12 across.
     if count >= 5 and minor > 1 / 12 + 1e-9:
@@ -150,46 +121,16 @@ def contact_geometry(
     )
 
 
-def regress_line(points: ArrayLike, width: int | None = None) -> Line:
-    """Total least squares line through points (the seed's `regress_line`, in double precision).
+def axis_direction(theta: float) -> tuple[float, float | None]:
+    """Angle and slope of an axis.
 
-    points : (N, 2), px, x right, y down, N >= 1. Taken relative to their mean in float64: an offset of 1e6 px
-        costs no accuracy beyond the 1e-10 px that the coordinates themselves lose.
-    width : of the picture, px; the midpoint is that of the line between x = 0 and x = width, both ends cut to
-        whole pixels as the seed does; without it the midpoint is the mean of the points.
-    Raises ValueError for no points, another shape, or numbers that are not finite.
+    theta : direction of the axis, radians, from +x towards +y (y down).
+    Returns (angle, slope): degrees in (-90, 90], counter-clockwise on the screen, and dy/dx (y down); the
+    slope is None where the axis is vertical.
+
+    >>> axis_direction(0.0)
+    (0.0, 0.0)
     """
-    given = np.asarray(points, dtype=np.float64)
-    given = given.reshape(-1, 2) if given.ndim == 3 and given.shape[1:] == (1, 2) else given
-    if given.ndim != 2 or given.shape[1] != 2 or len(given) == 0 or not np.isfinite(given).all():
-        raise ValueError(f"required finite points of shape (N, 2) with N >= 1, got shape {given.shape}")
-    # Twice: the first mean of large coordinates is itself rounded.
-    mean = given.mean(axis=0)
-    mean = mean + (given - mean).mean(axis=0)
-    x, y = (given - mean).T
-    xx, yy, xy = float(x @ x), float(y @ y), float(x @ y)
-    # Variances that are equal up to the rounding of the coordinates leave the direction to chance.
-    total = xx + yy
-    rounding = float(np.finfo(np.float64).eps * np.abs(given).max())
-    noise = 1e-12 * total + 4 * rounding * math.sqrt(len(given) * total)
-    if math.hypot(xx - yy, 2 * xy) <= noise:
-        point = (float(mean[0]), float(mean[1]))
-        return Line(point, None, None, point)
-    theta = 0.5 * math.atan2(2 * xy, xx - yy)
-    return _line(math.cos(theta), math.sin(theta), float(mean[0]), float(mean[1]), width)
-
-
-def _line(vx: float, vy: float, x: float, y: float, width: int | None) -> Line:
-    angle, slope = _direction(math.atan2(vy, vx))
-    if slope is None or width is None:
-        return Line((x, y), angle, slope, (x, y))
-    left = int(-x * vy / vx + y)
-    right = int((width - x) * vy / vx + y)
-    return Line((x, y), angle, slope, ((width - 1) / 2, (left + right) / 2))
-
-
-def _direction(theta: float) -> tuple[float, float | None]:
-    """Angle (degrees, screen, (-90, 90]) and slope of an axis at theta (radians, y down)."""
     angle = -math.degrees(theta)
     angle = angle - 180 * math.floor((angle + 90) / 180)
     if angle <= -90.0:
@@ -353,47 +294,3 @@ def _median_ratio(probability: float) -> float:
 
 
 _MEDIAN_RATIO: Final = _median_ratio(FALSE_DIRECTION)
-
-
-def _seed_contact(mask: NDArray[np.uint8]) -> Contact | None:
-    left, top, width, height = cv2.boundingRect(mask)
-    if width == 0:
-        return None
-    roi = mask[top : top + height, left : left + width]
-    region_area = float(cv2.countNonZero(roi))
-    outline = np.vstack(cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
-    polygon = cv2.convexHull(outline)
-    vertices = polygon.reshape(-1, 2).astype(np.float64)
-    vertices += (left, top)
-    if len(vertices) < 2:
-        place = (float(vertices[0, 0]), float(vertices[0, 1]))
-        return Contact(0.0, place, None, None, vertices, None, 0.0, region_area)
-    # OpenCV fits in single precision: relative to the contact, so that its place in the frame costs nothing.
-    vx, vy, x, y = (float(value) for value in np.ravel(cv2.fitLine(polygon, cv2.DIST_L2, 0, 0.01, 0.01)))
-    line = _line(vx, vy, x + left, y + top, mask.shape[1])
-    return Contact(
-        area=cv2.contourArea(polygon),
-        center=line.midpoint,
-        angle=line.angle,
-        slope=line.slope,
-        hull=vertices,
-        ellipse=_seed_ellipse(outline, left, top) if cv2.contourArea(polygon) > 0 else None,
-        confidence=1.0,
-        region_area=region_area,
-    )
-
-
-def _seed_ellipse(outline: NDArray[Any], left: int, top: int) -> Ellipse | None:
-    """`cv2.fitEllipse` of the contour points; None where it fails or is not an ellipse."""
-    if len(outline) < 5:
-        return None
-    try:
-        (x, y), (first, second), turned = cv2.fitEllipse(outline)
-    except cv2.error:
-        return None
-    if not np.isfinite([x, y, first, second, turned]).all() or min(first, second) <= 1e-3:
-        return None
-    # cv2 measures the angle of the first axis, clockwise on the screen.
-    theta = math.radians(turned if first >= second else turned + 90)
-    angle = None if first == second else _direction(theta)[0]
-    return Ellipse((x + left, y + top), (float(max(first, second)), float(min(first, second))), angle)

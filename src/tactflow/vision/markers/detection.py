@@ -100,8 +100,7 @@ def detect_markers(
     References
     ----------
     Lindeberg, "Feature detection with automatic scale selection", IJCV 30 (1998); Lowe, "Distinctive image
-    features from scale-invariant keypoints", IJCV 60 (2004), for the difference of Gaussians. Seed function
-    `marker_center`.
+    features from scale-invariant keypoints", IJCV 60 (2004), for the difference of Gaussians.
     """
     gray = to_gray(image).astype(np.float32)
     shortest = min(gray.shape)

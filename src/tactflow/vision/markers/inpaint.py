@@ -17,8 +17,8 @@ from tactflow.vision.markers.mask import doubled, halved_mask
 
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 
-SEED_RADIUS = 7
-"""Inpainting radius of the original script, px."""
+RADIUS = 7.0
+"""Neighbourhood from which a marker is filled unless said otherwise, px: that of the original script."""
 
 _CELL = 4
 """Side of the blocks on which averages are formed, px."""
@@ -35,7 +35,7 @@ def remove_markers(
     mask: NDArray[np.uint8],
     *,
     method: InpaintMethod = "normalized",
-    radius: float = SEED_RADIUS,
+    radius: float = RADIUS,
 ) -> NDArray[np.uint8]:
     """Replace masked pixels by what surrounds them.
 
@@ -43,7 +43,7 @@ def remove_markers(
     ----------
     image : (H, W, 3) uint8, BGR grey levels.
     mask : (H, W) uint8, non-zero where the image is to be replaced.
-    method : `telea` marches inwards from the rim (the seed's choice, 10 ms and more); `ns` continues lines
+    method : `telea` marches inwards from the rim (10 ms and more); `ns` continues lines
         of equal brightness by a Navier-Stokes analogy (as slow); `normalized` takes a smooth average of the
         valid pixels around (below 0.2 ms, or 0.1 ms with numba, and closer to the truth where the gel is
         smooth, because it looks at more than the soft rim of a dot); `none` hands the image on.
@@ -65,7 +65,6 @@ def remove_markers(
     A. Telea, "An image inpainting technique based on the fast marching method", 2004.
     M. Bertalmio et al., "Navier-Stokes, fluid dynamics, and image and video inpainting", CVPR 2001.
     H. Knutsson, C.-F. Westin, "Normalized and differential convolution", CVPR 1993.
-    Seed function `inpaint`.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise ValueError(

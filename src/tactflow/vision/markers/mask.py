@@ -26,7 +26,7 @@ _RIM = 1.5
 _SHARE = 0.25
 """Part of the dots' median contrast from which on something is a dot: worn dots keep that much."""
 _LEAST = 6.0
-"""Least contrast of a dot, grey levels: what the seed's threshold of 120 / 20 lets through."""
+"""Least contrast of a dot, grey levels: what the original script's threshold of 120 / 20 lets through."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ def find_dot(
 def marker_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
     """Mask of spots of a given size, with their soft rims, without shift.
 
-    A difference of two scales, as in the seed's difference of Gaussians, but its outer scale is the *least*
+    A difference of two scales, as in a difference of Gaussians, but its outer scale is the *least*
     contrast on a circle around the spot instead of a mean: so the edge of a contact, dark on one side only
     or along a line, is not taken for a marker. Works at half resolution.
 
@@ -92,7 +92,6 @@ def marker_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
 
     References
     ----------
-    Seed function `mask_marker`.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise ValueError(

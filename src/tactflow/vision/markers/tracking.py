@@ -145,7 +145,7 @@ class MarkerTracker:
     Lucas and Kanade (1981); Hager and Belhumeur, "Efficient region tracking with parametric models of
     geometry and illumination", PAMI 20 (1998); Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 56
     (2004); Lowe, IJCV 60 (2004), for the spots; Felzenszwalb and Huttenlocher, "Efficient belief propagation
-    for early vision", IJCV 70 (2006). Seed functions `m.init`, `m.run`, `m.get_flow`.
+    for early vision", IJCV 70 (2006).
     """
 
     def __init__(

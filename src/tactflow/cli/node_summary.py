@@ -25,7 +25,7 @@ def share(part: int, whole: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Story:
+class NodeSummary:
     """What one stage or sink did in a run.
 
     ticks : frames that reached it. runs : of these, those it ran on. skips : reason -> frames.
@@ -40,7 +40,7 @@ class Story:
     p99_ms: float | None
 
     @classmethod
-    def of(cls, entry: Mapping[str, Any]) -> Story:
+    def of(cls, entry: Mapping[str, Any]) -> NodeSummary:
         """From the entry of a statistics file."""
         skips = {reason: count for reason, count in entry["skips"].items() if count}
         runs, total = entry["runs"], entry.get("total_ms")

@@ -1,28 +1,24 @@
-"""The original script's marker tracking, kept as the yardstick: contour centres, and a search over a grid."""
+"""The marker tracking of the original script: contour centres, matched to a grid by a search."""
 
 from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.classic.functions import MARKER_AREAS, marker_center
 from tactflow.vision.markers.detection import NoMarkersError, neighbour_graph
-from tactflow.vision.seed_contact import seed_marker_mask
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]
 
-SEED_AREA: Final = (50.0, 500.0)
-"""Areas between which a contour is a marker, px^2."""
-
-SEED_VISITS: Final = 5000
-"""Nodes the search may visit per frame; about what the original's time limit of 33 ms allows in Python.
+MAX_VISITS: Final = 5000
+"""Nodes that the search may visit per frame; about what the original's time limit of 33 ms allows in Python.
 A limit in visits instead of milliseconds gives the same answer on every run and every machine."""
 
 
-class SeedFlow(NamedTuple):
+class GridFlow(NamedTuple):
     """The flow as the original returns it: five arrays of shape (rows, columns).
 
     Ox, Oy : where the markers were, px. Cx, Cy : where they are, px. Occupied : number of the centre that was
@@ -36,50 +32,18 @@ class SeedFlow(NamedTuple):
     Occupied: NDArray[np.int64]
 
 
-def seed_marker_centers(
-    image: NDArray[np.uint8], *, least_area: float = SEED_AREA[0], most_area: float = SEED_AREA[1]
-) -> FloatArray:
-    """Centres of the markers by contour moments, in the order OpenCV finds the contours.
-
-    A contour counts if its area lies strictly between the limits and the longer side of its bounding box is
-    less than twice the shorter one.
-
-    Parameters
-    ----------
-    image : (H, W, 3) uint8, BGR grey levels. least_area, most_area : px^2.
-
-    Returns
-    -------
-    centers : (N, 2) float64, px, with the half-pixel shift of the seed's mask.
-
-    References
-    ----------
-    Seed function `marker_center`.
-    """
-    contours, _ = cv2.findContours(seed_marker_mask(image), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    centers = []
-    for contour in contours:
-        if not least_area < cv2.contourArea(contour) < most_area:
-            continue
-        _, _, width, height = cv2.boundingRect(contour)
-        if max(width, height) < 2 * min(width, height):
-            moments = cv2.moments(contour)
-            centers.append((moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]))
-    return np.array(centers, np.float64).reshape(-1, 2)
-
-
-class SeedMatcher:
+class Matcher:
     """Matches centres to a grid of rows and columns by depth-first search.
 
-    Seed functions `m.init`, `m.run` and `m.get_flow`. The grid is visited row by row. Each node tries the
+    The script's `m.init`, `m.run` and `m.get_flow`. The grid is visited row by row. Each node tries the
     free centres that continue the motion of its left and upper neighbours best, or stays empty at a price; a
     branch is given up when it costs more than the best complete one so far.
 
     origin : (rows, columns, 2) float64, the grid, px; NaN where it has no marker.
-    spacing : typical distance of neighbours, px. max_visits : see `SEED_VISITS`.
+    spacing : typical distance of neighbours, px. max_visits : see `MAX_VISITS`.
     """
 
-    def __init__(self, origin: FloatArray, spacing: float, *, max_visits: int = SEED_VISITS) -> None:
+    def __init__(self, origin: FloatArray, spacing: float, *, max_visits: int = MAX_VISITS) -> None:
         if origin.ndim != 3 or origin.shape[2] != 2:
             raise ValueError(f"required origin of shape (rows, columns, 2), got {origin.shape}")
         self._origin = origin
@@ -165,7 +129,7 @@ class SeedMatcher:
         found.sort(key=lambda option: option[:2])
         return [*found[:3], (empty_price, -1, expected)]
 
-    def get_flow(self) -> SeedFlow:
+    def get_flow(self) -> GridFlow:
         """The result of the last `run`; nodes without a centre follow their neighbours."""
         shape = self._origin.shape[:2]
         current = self._origin.copy()
@@ -174,7 +138,7 @@ class SeedMatcher:
             now = place + move
             current[node] = now.real, now.imag
             occupied[node] = center
-        return SeedFlow(
+        return GridFlow(
             self._origin[..., 0].copy(),
             self._origin[..., 1].copy(),
             current[..., 0],
@@ -183,11 +147,11 @@ class SeedMatcher:
         )
 
 
-class SeedTracker:
+class GridTracker:
     """The original tracker on a grid that is read off the reference frame instead of being typed in.
 
-    reference : (H, W, 3) uint8, BGR. max_visits : see `SEED_VISITS`.
-    least_area, most_area : see `seed_marker_centers`.
+    reference : (H, W, 3) uint8, BGR. max_visits : see `MAX_VISITS`.
+    least_area, most_area : see `marker_center`.
 
     Raises
     ------
@@ -199,22 +163,22 @@ class SeedTracker:
         self,
         reference: NDArray[np.uint8],
         *,
-        max_visits: int = SEED_VISITS,
-        least_area: float = SEED_AREA[0],
-        most_area: float = SEED_AREA[1],
+        max_visits: int = MAX_VISITS,
+        least_area: float = MARKER_AREAS[0],
+        most_area: float = MARKER_AREAS[1],
     ) -> None:
         if not 0 <= least_area < most_area < np.inf:
             raise ValueError(f"required 0 <= least_area < most_area, px^2, got {least_area}, {most_area}")
         self._areas = (least_area, most_area)
-        centers = seed_marker_centers(reference, least_area=least_area, most_area=most_area)
+        centers = marker_center(reference, least_area=least_area, most_area=most_area)
         grid, spacing = grid_of(centers)
         self._present = np.isfinite(grid[..., 0])
-        self._matcher = SeedMatcher(grid, spacing, max_visits=max_visits)
+        self._matcher = Matcher(grid, spacing, max_visits=max_visits)
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
         """Match one frame; markers without a centre are inferred. Standard errors are unknown (NaN)."""
         least, most = self._areas
-        self._matcher.init(seed_marker_centers(image, least_area=least, most_area=most))
+        self._matcher.init(marker_center(image, least_area=least, most_area=most))
         self._matcher.run()
         flow = self._matcher.get_flow()
         here = self._present
@@ -267,9 +231,9 @@ def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
             "0 markers found in a grid: is the sensor marker-less? then use pipelines/markerless.yaml"
         )
     place: dict[tuple[int, int], int] = {}
-    for seed in sorted(links, key=lambda center: -len(links[center])):
-        reached = {seed: (0, 0)}
-        queue = [seed]
+    for start in sorted(links, key=lambda center: -len(links[center])):
+        reached = {start: (0, 0)}
+        queue = [start]
         for center in queue:
             row, column = reached[center]
             for other, down, right in links[center]:

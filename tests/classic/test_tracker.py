@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from tactflow.classic.functions import marker_center, mask_marker
+from tactflow.classic.tracker import GridTracker, Matcher, grid_of
 from tactflow.vision.markers.detection import NoMarkersError
-from tactflow.vision.seed_contact import seed_marker_mask
-from tactflow.vision.seed_tracker import SeedMatcher, SeedTracker, grid_of, seed_marker_centers
 from tactflow.vision.types import MarkerStatus
 from tests.vision.dots import grid, match, render
 
@@ -17,22 +17,22 @@ TRUTH = grid(10, 8, 34.0, corner=(30.2, 45.7), jitter=0.4)
 
 def test_centres_are_the_moments_of_the_masks_contours() -> None:
     image = render((300, 400), TRUTH, 4.6)
-    contours, _ = cv2.findContours(seed_marker_mask(image), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    contours, _ = cv2.findContours(mask_marker(image), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     first = cv2.moments(contours[0])
-    centers = seed_marker_centers(image)
+    centers = marker_center(image)
     assert len(centers) == 80
     assert centers[0].tolist() == [first["m10"] / first["m00"], first["m01"] / first["m00"]]
-    # The seed's mask is enlarged with a half-pixel shift; measured: within 0.9 px of the truth.
+    # The mask is enlarged with a half-pixel shift; measured: within 0.9 px of the truth.
     assert match(centers, TRUTH)[1].max() < 1.5
 
 
 def test_contours_too_small_too_large_or_oblong_do_not_count() -> None:
     image = render((300, 400), TRUTH[:2], 4.6)
-    assert len(seed_marker_centers(image)) == 2
-    assert len(seed_marker_centers(image, least_area=400)) == 0
-    assert len(seed_marker_centers(image, most_area=60)) == 0
+    assert len(marker_center(image)) == 2
+    assert len(marker_center(image, least_area=400)) == 0
+    assert len(marker_center(image, most_area=60)) == 0
     cv2.rectangle(image, (100, 200), (160, 206), (20, 20, 20), -1)
-    assert len(seed_marker_centers(image, most_area=5000)) == 2
+    assert len(marker_center(image, most_area=5000)) == 2
 
 
 def test_the_grid_is_read_off_the_centres_in_any_order() -> None:
@@ -55,7 +55,7 @@ def test_too_few_centres_are_an_error_with_advice(count: int) -> None:
 
 
 def test_small_motions_are_followed() -> None:
-    under_test = SeedTracker(render((300, 400), TRUTH, 4.6))
+    under_test = GridTracker(render((300, 400), TRUTH, 4.6))
     markers = under_test.track(render((300, 400), TRUTH + np.array([3.0, -2.0]), 4.6))
     assert (markers.status == MarkerStatus.TRACKED).all()
     # The mask has whole pixels, doubled: measured 0.5 px at most.
@@ -64,7 +64,7 @@ def test_small_motions_are_followed() -> None:
 
 
 def test_a_marker_without_a_centre_follows_its_neighbours_and_is_inferred() -> None:
-    under_test = SeedTracker(render((300, 400), TRUTH, 4.6))
+    under_test = GridTracker(render((300, 400), TRUTH, 4.6))
     shown = np.arange(80) != 35
     markers = under_test.track(render((300, 400), (TRUTH + np.array([4.0, 1.0]))[shown], 4.6))
     assert np.flatnonzero(markers.status == MarkerStatus.INFERRED).tolist() == [35]
@@ -72,7 +72,7 @@ def test_a_marker_without_a_centre_follows_its_neighbours_and_is_inferred() -> N
 
 
 def test_the_flow_has_the_originals_five_arrays() -> None:
-    matcher = SeedMatcher(TRUTH.reshape(10, 8, 2), 34.0)
+    matcher = Matcher(TRUTH.reshape(10, 8, 2), 34.0)
     matcher.init(TRUTH[::-1] + 1.5)
     matcher.run()
     flow = matcher.get_flow()
@@ -86,7 +86,7 @@ def test_the_search_stops_after_its_visits_with_the_same_answer_every_time() -> 
     centers = TRUTH + rng.uniform(-15, 15, TRUTH.shape)
     found = []
     for visits in (90, 90, 4000):
-        matcher = SeedMatcher(TRUTH.reshape(10, 8, 2), 34.0, max_visits=visits)
+        matcher = Matcher(TRUTH.reshape(10, 8, 2), 34.0, max_visits=visits)
         matcher.init(centers)
         matcher.run()
         found.append(matcher.get_flow().Occupied)
@@ -97,7 +97,7 @@ def test_the_search_stops_after_its_visits_with_the_same_answer_every_time() -> 
 
 
 def test_a_search_without_centres_leaves_everything_where_it_was() -> None:
-    matcher = SeedMatcher(TRUTH.reshape(10, 8, 2), 34.0)
+    matcher = Matcher(TRUTH.reshape(10, 8, 2), 34.0)
     matcher.init(np.zeros((0, 2)))
     matcher.run()
     flow = matcher.get_flow()
@@ -107,4 +107,4 @@ def test_a_search_without_centres_leaves_everything_where_it_was() -> None:
 
 def test_an_origin_of_another_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"required origin of shape \(rows, columns, 2\), got \(80, 2\)"):
-        SeedMatcher(TRUTH, 34.0)
+        Matcher(TRUTH, 34.0)

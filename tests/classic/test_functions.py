@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.vision.contact import ContactDetector
-from tactflow.vision.seed_contact import (
-    SEED_BRIGHTER_BY,
-    seed_contact_mask,
-    seed_difference,
-    seed_marker_mask,
+from tactflow.classic.functions import (
+    BRIGHTER_BY,
+    contact_mask,
+    difference,
+    mask_marker,
 )
 
 
@@ -35,12 +34,12 @@ def test_integer_rule_equals_the_floating_point_chain_for_every_pair_of_values_i
         # Tiles of 11 x 11 px survive the erosion by 9 x 9, so that each pair decides about pixels of its own.
         large_now = now.repeat(11, axis=0).repeat(11, axis=1)
         large_before = before.repeat(11, axis=0).repeat(11, axis=1)
-        expected = seed_difference(large_now, large_before)
-        assert np.array_equal(seed_contact_mask(large_now, large_before), expected)
+        expected = difference(large_now, large_before)
+        assert np.array_equal(contact_mask(large_now, large_before), expected)
         centers = expected[5::11, 5::11].ravel() == 255
-        difference = frame[part].astype(int) - reference[part].astype(int)
+        brighter_by = frame[part].astype(int) - reference[part].astype(int)
         # A dilation by 5 x 5 reaches no further than 2 px: neighbours cannot decide a tile's centre.
-        assert np.array_equal(centers, difference >= SEED_BRIGHTER_BY)
+        assert np.array_equal(centers, brighter_by >= BRIGHTER_BY)
 
 
 def test_integer_rule_equals_the_chain_on_noise_and_blobs() -> None:
@@ -48,15 +47,15 @@ def test_integer_rule_equals_the_chain_on_noise_and_blobs() -> None:
     reference = rng.integers(60, 180, (97, 131, 3), dtype=np.uint8)
     frame = np.clip(reference.astype(int) + rng.integers(-8, 9, reference.shape), 0, 255).astype(np.uint8)
     frame[20:60, 30:90] = np.minimum(frame[20:60, 30:90].astype(int) + 30, 255).astype(np.uint8)
-    mask = seed_contact_mask(frame, reference)
+    mask = contact_mask(frame, reference)
     assert mask.any()
-    assert np.array_equal(mask, seed_difference(frame, reference))
+    assert np.array_equal(mask, difference(frame, reference))
 
 
-def test_negative_scale_of_the_seed_changes_nothing() -> None:
+def test_the_scale_of_negative_differences_changes_nothing() -> None:
     rng = np.random.default_rng(2)
     frame, reference = rng.integers(0, 256, (2, 40, 50, 3), dtype=np.uint8)
-    masks = [seed_difference(frame, reference, scale=scale) for scale in (0.2, 0.5, 0.7)]
+    masks = [difference(frame, reference, scale=scale) for scale in (0.2, 0.5, 0.7)]
     assert np.array_equal(masks[0], masks[1])
     assert np.array_equal(masks[1], masks[2])
 
@@ -65,23 +64,12 @@ def test_brightening_in_two_channels_only_is_not_contact() -> None:
     reference = np.full((40, 40, 3), 100, np.uint8)
     frame = reference.copy()
     frame[..., :2] += 50
-    assert not seed_contact_mask(frame, reference).any()
-    frame[..., 2] += SEED_BRIGHTER_BY
-    assert seed_contact_mask(frame, reference).all()
+    assert not contact_mask(frame, reference).any()
+    frame[..., 2] += BRIGHTER_BY
+    assert contact_mask(frame, reference).all()
 
 
-def test_detector_with_the_seed_method_gives_the_seed_mask() -> None:
-    reference = np.full((40, 60, 3), 100, np.uint8)
-    frame = reference.copy()
-    frame[10:30, 10:40] += 20
-    detector = ContactDetector("seed")
-    detector.add_reference(reference)
-    result = detector.detect(frame)
-    assert result.touching
-    assert np.array_equal(result.mask, seed_difference(frame, reference))
-
-
-def test_seed_marker_mask_follows_the_description_step_by_step() -> None:
+def test_mask_marker_follows_the_description_step_by_step() -> None:
     rng = np.random.default_rng(3)
     image = np.full((121, 90, 3), 150, np.uint8)
     for x, y in rng.uniform(12, 78, (8, 2)):
@@ -93,7 +81,7 @@ def test_seed_marker_mask_follows_the_description_step_by_step() -> None:
     votes = [(amplified[..., channel] > 120).astype(int) for channel in range(3)]
     marked = votes[0] * votes[1] + votes[0] * votes[2] + votes[1] * votes[2] > 0
     expected = cv2.resize(marked.astype(np.uint8), (90, 121)) * 255
-    mask = seed_marker_mask(image)
+    mask = mask_marker(image)
     assert mask.any()
     assert np.array_equal(mask, expected)
 
@@ -101,9 +89,9 @@ def test_seed_marker_mask_follows_the_description_step_by_step() -> None:
 @pytest.mark.parametrize("shape", [(10, 10), (10, 10, 4), (0, 5, 3)])
 def test_what_is_not_a_colour_image_is_refused_with_its_shape(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="required a non-empty"):
-        seed_marker_mask(np.zeros(shape, np.uint8))
+        mask_marker(np.zeros(shape, np.uint8))
 
 
 def test_another_size_than_the_reference_is_refused() -> None:
     with pytest.raises(ValueError, match="required a reference of shape"):
-        seed_contact_mask(np.zeros((4, 5, 3), np.uint8), np.zeros((5, 4, 3), np.uint8))
+        contact_mask(np.zeros((4, 5, 3), np.uint8), np.zeros((5, 4, 3), np.uint8))

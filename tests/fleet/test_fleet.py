@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 import zmq
 
-from tactflow.cli import fleet
-from tactflow.cli.fleet import with_name
 from tactflow.cli.main import main
 from tactflow.engine.errors import ConfigError
+from tactflow.fleet import supervisor
+from tactflow.fleet.names import with_name
 
 GRAPH = """
 opencv_threads: 1
@@ -283,7 +283,7 @@ def test_a_sensor_that_the_system_kills_has_failed(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(fleet, "GIVE_UP_AFTER", 0)
+    monkeypatch.setattr(supervisor, "GIVE_UP_AFTER", 0)
     waiting(folder, "\n    os.kill(os.getpid(), signal.SIGKILL)\n")
     assert main(["run"]) == 3
     assert "left failed 1 times in a row (exit code -9); given up" in capfd.readouterr().err

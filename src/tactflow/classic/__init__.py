@@ -1,0 +1,1 @@
+"""The original script, faithfully: its functions, and stages for `pipelines/classic.yaml`."""

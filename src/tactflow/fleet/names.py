@@ -1,0 +1,43 @@
+"""What each sensor's process calls a file that the command line names once for all of them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from tactflow.config.sensors import PLACEHOLDER
+from tactflow.engine.errors import ConfigError
+from tactflow.files import expanded, is_device
+
+STREAMS = ("/dev/stdout", "/dev/stderr")
+"""They lead to the supervisor, even where what they stand for is a regular file just now."""
+
+
+def with_name(path: str, sensor: str) -> str:
+    """The file that one sensor's process writes where the command line names `path` for all of them.
+
+    Standard output and devices are the same for all.
+
+    Raises
+    ------
+    ConfigError : it is a folder.
+
+    >>> with_name("out.jsonl", "left")
+    'out-left.jsonl'
+    >>> with_name("{sensor}/out.jsonl", "left")
+    'left/out.jsonl'
+    """
+    if path == "-" or path in STREAMS or is_device(path):
+        return path
+    named = path.replace(PLACEHOLDER, sensor)
+    if named == path and not _is_folder(path):
+        whole = Path(path)
+        named = str(whole.with_name(f"{whole.stem}-{sensor}{whole.suffix}"))
+    if _is_folder(named):
+        example = os.path.join(named, f"{PLACEHOLDER}.json")
+        raise ConfigError(f"required a file, not a folder; each sensor writes its own, as in {example}")
+    return named
+
+
+def _is_folder(path: str) -> bool:
+    return os.path.basename(path) in ("", ".", "..") or expanded(path).is_dir()

@@ -1,0 +1,76 @@
+"""One address for subscribers of several sensors."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import zmq
+
+from tactflow.engine.errors import StageError
+
+SEND_BUFFER = 32_768
+"""Kernel send buffer per subscriber, bytes, as in the ZeroMQ sink. Large ones hold seconds of messages."""
+LINGER_MS = 500
+"""Time to deliver the last messages at the end. Chosen by hand."""
+POLL_MS = 100
+"""How often the thread looks whether it shall end. Chosen by hand."""
+
+
+@contextmanager
+def relay(address: str, upstream: Sequence[str], backlog: int) -> Iterator[None]:
+    """Bind `address` and pass on what the upstream publishers send, while the block lasts.
+
+    upstream : addresses of the publishers. backlog : messages that may wait for each subscriber.
+
+    Raises
+    ------
+    StageError : the address cannot be bound.
+    """
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    front, back = context.socket(zmq.XPUB), context.socket(zmq.XSUB)
+    front.linger = LINGER_MS
+    back.linger = 0
+    # As in the sink: a slow reader shall not be seconds behind.
+    front.sndhwm = back.rcvhwm = backlog
+    front.setsockopt(zmq.SNDBUF, SEND_BUFFER)
+    try:
+        front.bind(address)
+    except zmq.ZMQError as error:
+        context.destroy(linger=0)
+        raise StageError(
+            f"{address} cannot be bound: {error.strerror}; end what publishes there, or give the sinks "
+            "another address, such as tcp://127.0.0.1:5557"
+        ) from error
+    for publisher in upstream:
+        back.connect(publisher)
+    stop = threading.Event()
+    thread = threading.Thread(target=_pass_on, args=(front, back, stop), name="tactflow-relay", daemon=True)
+    thread.start()
+
+    print(f"tactflow: publishing {len(upstream)} sensors on {address}", file=sys.stderr)
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(5)
+        front.close()
+        back.close()
+        context.term()
+
+
+def _pass_on(front: zmq.Socket[bytes], back: zmq.Socket[bytes], stop: threading.Event) -> None:
+    """Body of the relay's thread: messages to the front, subscriptions to the back, until told to stop."""
+    poller = zmq.Poller()
+    poller.register(front, zmq.POLLIN)
+    poller.register(back, zmq.POLLIN)
+    while True:
+        events = dict(poller.poll(POLL_MS))
+        if front in events:
+            back.send(front.recv())
+        if back in events:
+            front.send(back.recv())
+        elif stop.is_set():
+            return

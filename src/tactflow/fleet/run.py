@@ -1,0 +1,102 @@
+"""Runs every sensor of a pipeline file."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Node, Pipeline
+from tactflow.fleet.relay import relay
+from tactflow.fleet.sinks import (
+    Shared,
+    WatchedSink,
+    added,
+    changes,
+    clash_problems,
+    shared_addresses,
+    sink_class,
+)
+from tactflow.fleet.supervisor import Member, Supervisor
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What every sensor's process is asked to do.
+
+    file : the pipeline file. overrides : for `--set`. added : options of the command line that added sinks,
+    as in the marks of these. options : sensor -> all other words of its command line.
+    """
+
+    file: Path
+    overrides: Sequence[str]
+    added: Collection[str]
+    options: Mapping[str, Sequence[str]]
+
+
+def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
+    """Run every sensor's pipeline in a process of its own until all have ended.
+
+    pipelines : sensor -> its pipeline, checked.
+
+    Returns
+    -------
+    0 if all ended well, 130 after a second signal, else the exit code of the first sensor that was given up.
+
+    Raises
+    ------
+    ConfigError : several sensors would write one file.
+    StageError : the address for subscribers is taken.
+    """
+    problems = clash_problems(pipelines)
+    if problems:
+        raise ConfigError("\n".join(problems))
+    shared = shared_addresses(pipelines)
+    with ExitStack() as stack:
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-")))
+        for one in shared:
+            upstream = [_private(scratch, sensor, node) for sensor, node in one.sinks]
+            stack.enter_context(relay(one.address, upstream, one.backlog))
+        members = [
+            Member(
+                sensor,
+                _command(request, sensor, pipeline, _side_by_side(sensor, pipeline, shared, scratch)),
+                [WatchedSink(node) for node in pipeline.sinks],
+            )
+            for sensor, pipeline in pipelines.items()
+        ]
+        return Supervisor(members).run()
+
+
+def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequence[str]) -> list[str]:
+    """The command that runs one sensor.
+
+    changed : settings that differ from what the user has asked for.
+    """
+    sinks = [added(node) for node in pipeline.sinks if str(node.mark) in request.added]
+    # Without -P, Python would look for its own modules in the current folder first.
+    command = [sys.executable, "-P", "-m", "tactflow", "run", str(request.file), "--sensor", sensor]
+    for text in (*request.overrides, *sinks, *changed):
+        command += ["--set", text]
+    return [*command, *request.options[sensor]]
+
+
+def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scratch: Path) -> list[str]:
+    """Settings of one sensor's sinks that follow from the other sensors beside it."""
+    relayed = {node.id for one in shared for name, node in one.sinks if name == sensor}
+    settings = []
+    for node in pipeline.sinks:
+        params = sink_class(node).among(node.params, scratch)
+        if node.id in relayed:
+            params = sink_class(node).publish_at(params, _private(scratch, sensor, node))
+        settings += changes(node, params)
+    return settings
+
+
+def _private(scratch: Path, sensor: str, node: Node) -> str:
+    """The address at which a sink publishes to the relay."""
+    return f"ipc://{scratch}/{sensor}.{node.id}"

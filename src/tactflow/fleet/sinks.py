@@ -1,0 +1,145 @@
+"""What the sinks of several sensors declare: files they write, addresses they publish at."""
+
+from __future__ import annotations
+
+import json
+import stat
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from tactflow.config.sensors import PLACEHOLDER
+from tactflow.engine.contract import Output, Sink, StageParams
+from tactflow.engine.graph import Node, Pipeline
+from tactflow.files import is_device, status
+from tactflow.fleet.names import STREAMS
+
+
+class _State(NamedTuple):
+    """What tells whether somebody has written to a file."""
+
+    device: int
+    inode: int
+    size: int
+    modified_ns: int
+
+
+class WatchedSink:
+    """The files of one sink of one sensor, watched from before its sensor's first start.
+
+    node : the sink.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._before = {output.path: _state(output.path) for output in written_files(node, node.params)}
+
+    @property
+    def overrides(self) -> list[str]:
+        """Settings (`--set`) with which the sink is started now.
+
+        What it has written so far must stay. For a file to which it has not come yet, what the user wants
+        still holds.
+        """
+        return changes(self._node, self._params)
+
+    @property
+    def refused(self) -> Path | None:
+        """A file that the sink would refuse to write if it were started now, None if there is none."""
+        for output in written_files(self._node, self._params):
+            now = _state(output.path)
+            if output.refuses_existing and now is not None and now.size > 0:
+                return output.path
+        return None
+
+    @property
+    def _params(self) -> StageParams:
+        begun = any(_state(path) not in (None, before) for path, before in self._before.items())
+        return sink_class(self._node).on_restart(self._node.params) if begun else self._node.params
+
+
+def sink_class(node: Node) -> type[Sink]:
+    """The class of a sink."""
+    cls = node.component.cls
+    assert issubclass(cls, Sink)
+    return cls
+
+
+def written_files(node: Node, params: StageParams) -> Sequence[Output]:
+    """The files and folders that a sink declares with these parameters, without devices and streams."""
+    declared: Sequence[Output] = sink_class(node).outputs(params)
+    return [
+        output for output in declared if str(output.path) not in STREAMS and not is_device(str(output.path))
+    ]
+
+
+def changes(node: Node, params: StageParams) -> list[str]:
+    """`sinks.ID.KEY=VALUE` for every parameter in which `params` differ from those of the sink."""
+    old, new = _plain(node.params), _plain(params)
+    return [
+        f"sinks.{node.id}.{key}={json.dumps(value)}" for key, value in new.items() if value != old.get(key)
+    ]
+
+
+def added(node: Node) -> str:
+    """The override that adds a sink which an option of the command line has added."""
+    given = node.params.model_dump(mode="json", by_alias=True, exclude_unset=True)
+    return f"sinks.{node.id}={json.dumps({'use': node.component.name} | given)}"
+
+
+def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
+    """One message for each sink that would write where another sensor's does.
+
+    pipelines : sensor -> its pipeline.
+    """
+    problems = []
+    seen: dict[Path, str] = {}
+    for sensor, pipeline in pipelines.items():
+        for node in pipeline.sinks:
+            for output in written_files(node, node.params):
+                other = seen.setdefault(output.path, sensor)
+                if other != sensor:
+                    place = f"{node.mark}  " if node.mark.line else f"{node.mark}: "
+                    problems.append(
+                        f"{place}sinks.{node.id}.{output.parameter}: {other} and {sensor} would both write "
+                        f"{output.path}; put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
+                    )
+    return problems
+
+
+class Shared(NamedTuple):
+    """An address at which several sinks would publish. sinks : (sensor, its sink). backlog : messages."""
+
+    address: str
+    sinks: Sequence[tuple[str, Node]]
+    backlog: int
+
+
+def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
+    """The addresses that the sinks of several sensors share.
+
+    pipelines : sensor -> its pipeline.
+    """
+    found: dict[str, Shared] = {}
+    for sensor, pipeline in pipelines.items():
+        for node in pipeline.sinks:
+            publication = sink_class(node).publishes(node.params)
+            if publication is not None:
+                address = publication.address
+                before = found.get(address, Shared(address, (), 0))
+                found[address] = Shared(
+                    address, (*before.sinks, (sensor, node)), before.backlog + publication.backlog
+                )
+    return [shared for shared in found.values() if len(shared.sinks) > 1]
+
+
+def _plain(params: StageParams) -> dict[str, object]:
+    return params.model_dump(mode="json", by_alias=True)
+
+
+def _state(path: Path) -> _State | None:
+    """The present state of a regular file; None if there is none."""
+    there = status(str(path))
+    if there is None or not stat.S_ISREG(there.st_mode):
+        return None
+    return _State(there.st_dev, there.st_ino, there.st_size, there.st_mtime_ns)

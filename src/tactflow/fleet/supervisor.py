@@ -1,0 +1,213 @@
+"""Starts a process for each sensor, passes signals on, starts again what failed."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import IO, TextIO
+
+from tactflow.engine.errors import ConfigError, StageError
+from tactflow.engine.run import INTERRUPTED
+from tactflow.files import lead_nowhere
+from tactflow.fleet.sinks import WatchedSink
+
+FIRST_PAUSE = 1.0
+"""Time before the first new start after a failure, s; it doubles with each further one. Chosen by hand."""
+LONGEST_PAUSE = 30.0
+"""Never longer than this, s. Chosen by hand."""
+GIVE_UP_AFTER = 5
+"""Failures in a row after which a sensor is not started again. Chosen by hand."""
+GOOD_RUN = 30.0
+"""A process that ran so long, s, starts with the first pause again when it fails. Chosen by hand."""
+LOOK_EVERY = 0.05
+"""Time between two looks at the processes, s. Chosen by hand."""
+
+Process = subprocess.Popen[bytes]
+
+
+def start_process(command: Sequence[str]) -> Process:
+    """Start the process of a sensor; its output comes through pipes."""
+    # A session of its own: Ctrl-C on the terminal reaches the supervisor alone, which passes it on once.
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+
+
+@dataclass(slots=True)
+class Member:
+    """One sensor's process and its history.
+
+    command : runs the sensor. sinks : what it has written decides how it is started again.
+    told : signals passed on to the process. code : how the sensor ended for good.
+    """
+
+    sensor: str
+    command: Sequence[str]
+    sinks: Sequence[WatchedSink] = ()
+    process: Process | None = None
+    started: float = 0.0
+    start_at: float = 0.0
+    told: int = 0
+    failures: int = 0
+    code: int | None = None
+    readers: list[threading.Thread] = field(default_factory=list[threading.Thread])
+
+    def next_command(self) -> list[str]:
+        """The command that starts the sensor now: what it has written so far must stay."""
+        command = list(self.command)
+        for sink in self.sinks:
+            for text in sink.overrides:
+                command += ["--set", text]
+        return command
+
+
+class Supervisor:
+    """Keeps the processes of several sensors running until each has ended for good.
+
+    start : starts a command. clock : seconds. pause : waits so many seconds.
+    """
+
+    def __init__(
+        self,
+        members: Sequence[Member],
+        start: Callable[[Sequence[str]], Process] = start_process,
+        clock: Callable[[], float] = time.monotonic,
+        pause: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._members = members
+        self._start_process = start
+        self._clock = clock
+        self._pause = pause
+        self._signals = 0
+        self._refused = False
+        self._unwritten = False
+        self._output = threading.Lock()
+
+    def run(self) -> int:
+        """Until every process has ended for good; the exit code.
+
+        Returns
+        -------
+        0 if all ended well, 130 after a second signal, else the exit code of the first sensor that failed.
+        """
+        with self._counting_signals():
+            while any(member.code is None for member in self._members):
+                for member in self._members:
+                    self._attend(member)
+                self._pause(LOOK_EVERY)
+        for member in self._members:
+            for reader in member.readers:
+                reader.join(5)
+        if self._signals > 1:
+            return INTERRUPTED
+        return next((m.code for m in self._members if m.code), StageError.exit_code if self._unwritten else 0)
+
+    @property
+    def _ends(self) -> int:
+        """How often a process is to be told to end."""
+        return max(self._signals, int(self._refused or self._unwritten))
+
+    def _attend(self, member: Member) -> None:
+        if member.code is not None:
+            return
+        if member.process is None:
+            if self._ends:
+                member.code = 0
+            elif self._clock() >= member.start_at:
+                self._start(member)
+            return
+        code = member.process.poll()
+        if code is None:
+            if member.told < self._ends:
+                # Not SIGINT, for which a process that is still importing shows a traceback. And one at a
+                # time: two at once may arrive as one.
+                member.process.send_signal(signal.SIGTERM)
+                member.told += 1
+            return
+        member.process = None
+        if code in (0, ConfigError.exit_code, INTERRUPTED) or self._ends:
+            member.code = self._last_code(member, code)
+            # The command line or the file is wrong for this sensor, so the whole is: end the others.
+            self._refused |= code == ConfigError.exit_code
+        else:
+            self._start_again(member, code)
+
+    def _last_code(self, member: Member, code: int) -> int:
+        """What counts as the exit code of a sensor that is not started again."""
+        if self._ends and self._signals < 2 and code in (-signal.SIGINT, -signal.SIGTERM, INTERRUPTED):
+            # The one signal came before the process could catch it.
+            return 0
+        if code < 0:
+            self._say(member, f"was ended by signal {-code}")
+            return StageError.exit_code
+        return code
+
+    def _start_again(self, member: Member, code: int) -> None:
+        """Plan the next start after a failure, if there is to be one."""
+        refused = next((path for sink in member.sinks if (path := sink.refused)), None)
+        if code == StageError.exit_code and refused is not None:
+            self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
+            member.code = code
+            return
+        lasted = self._clock() - member.started
+        member.failures = 1 if lasted > GOOD_RUN else member.failures + 1
+        if member.failures > GIVE_UP_AFTER:
+            self._say(member, f"failed {member.failures} times in a row (exit code {code}); given up")
+            member.code = self._last_code(member, code)
+            return
+        pause = min(FIRST_PAUSE * 2 ** (member.failures - 1), LONGEST_PAUSE)
+        member.start_at = self._clock() + pause
+        self._say(member, f"failed (exit code {code}); starting again in {pause:g} s")
+
+    def _start(self, member: Member) -> None:
+        member.process = self._start_process(member.next_command())
+        member.started = self._clock()
+        assert member.process.stdout is not None
+        assert member.process.stderr is not None
+        for stream, target, prefix in (
+            (member.process.stdout, sys.stdout, ""),
+            (member.process.stderr, sys.stderr, f"[{member.sensor}] "),
+        ):
+            reader = threading.Thread(target=self._copy, args=(stream, target, prefix), daemon=True)
+            reader.start()
+            member.readers.append(reader)
+
+    def _copy(self, stream: IO[bytes], target: TextIO, prefix: str) -> None:
+        """Pass whole lines on, so that those of two processes do not mix; they need not be text."""
+        with stream:
+            for line in stream:
+                self._write(target, prefix.encode() + line)
+
+    def _say(self, member: Member, text: str) -> None:
+        self._write(sys.stderr, f"tactflow: {member.sensor} {text}\n".encode())
+
+    def _write(self, target: TextIO, line: bytes) -> None:
+        """Write at once. When the reader has gone away, fall silent; when the disk is full, end the run."""
+        with self._output:
+            try:
+                target.flush()
+                target.buffer.write(line)
+                target.buffer.flush()
+            except OSError as error:
+                lead_nowhere(target)
+                if target is sys.stdout and not isinstance(error, BrokenPipeError | ConnectionResetError):
+                    self._unwritten = True
+                    sys.stderr.write(f"tactflow: standard output: {error.strerror}; the run ends\n")
+
+    @contextmanager
+    def _counting_signals(self) -> Iterator[None]:
+        def handle(_number: int, _frame: FrameType | None) -> None:
+            # Nothing else: this may be in the middle of starting a process, which would not be told.
+            self._signals += 1
+
+        before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
