@@ -548,6 +548,17 @@ def test_aliases_that_unfold_without_end_are_refused(
     assert "unfolds to more than" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["long.yaml", "/dev/zero"])
+def test_a_file_without_end_is_not_read_to_the_end(
+    name: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if not Path("/dev/zero").exists():
+        pytest.skip("there is no /dev/zero on this system")
+    (folder / "long.yaml").write_text("stages:\n" + "- a\n" * 100_000)
+    assert main(["check", name]) == 2
+    assert f"{name} is larger than 256 KiB" in capsys.readouterr().err
+
+
 def test_endless_nesting_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "bad.yaml").write_text("stages: " + "[" * 5000)
     assert main(["check", "bad.yaml"]) == 2
