@@ -17,7 +17,11 @@ FloatArray = NDArray[np.floating[Any]]
 
 
 class MarkerStatus(IntEnum):
-    """How a marker's position is known."""
+    """How a marker's position is known.
+
+    >>> MarkerStatus(1).name
+    'INFERRED'
+    """
 
     TRACKED = 0
     """Seen in this frame."""
@@ -52,6 +56,10 @@ class Contact:
     ellipse : fitted ellipse, or None where none can be fitted.
     confidence : of the direction, in [0, 1]: 0 for a disc, towards 1 for a line.
     region_area : number of pixels of the region, px^2.
+
+    >>> square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+    >>> Contact(4.0, (1.0, 1.0), None, None, square, None).center
+    (1.0, 1.0)
     """
 
     area: float
@@ -72,7 +80,12 @@ class Markers:
     position : (N, 2) float64, position in this frame, px. Finite for every status.
     status : (N,) uint8, values of `MarkerStatus`.
     stderr : (N,) float64, standard error of each coordinate of `position`, px; NaN where unknown.
-    radius : of a mark in the reference frame, px; None where the method does not know it.
+    radius : of a marker in the reference frame, px; None where the method does not know it.
+
+    >>> origin = np.array([[10.0, 20.0]])
+    >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(1, np.uint8), np.array([0.01]))
+    >>> markers.displacement
+    array([[1. , 0.5]])
     """
 
     origin: NDArray[np.float64]
@@ -98,6 +111,9 @@ class Flow:
         None with fewer than 3 markers or where they do not span a plane.
     divergence : relative areal growth of the marker pattern (press), 1; None where rotation is None.
     residual : RMS of what mean, rotation and divergence leave unexplained, px; None where rotation is None.
+
+    >>> Flow((1.2, -0.3), 9).mean
+    (1.2, -0.3)
     """
 
     mean: tuple[float, float] | None
