@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from tactflow.cli.options import add_pipeline
-from tactflow.cli.pipelines import find_pipeline
 from tactflow.config.load import load_pipeline, sensor_names
+from tactflow.config.shipped import find_pipeline
 from tactflow.vision import compiled
 
 
