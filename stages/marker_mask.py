@@ -11,7 +11,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
-from tactflow.vision.markers import mask_kernels
+from tactflow.vision.markers import mask
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 
 
@@ -33,24 +33,24 @@ class MarkerMaskStage(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        compiled.load(downsample, mask_kernels)
+        compiled.load(downsample, mask)
         self._params = params
         self._dot: Dot | None = None
-        self._looked = False
+        self._known = False
 
     def reset(self) -> None:
-        """Look at the dots again; a new reference follows."""
-        self._dot, self._looked = None, False
+        """Forget the dots; a new reference follows."""
+        self._dot, self._known = None, False
 
     def process(self, image: Image) -> MarkerMask:
         """255 where a marker covers the gel; all 0 where the first frame showed no markers."""
-        if not self._looked:
-            self._dot, self._looked = self._look(image), True
+        if not self._known:
+            self._dot, self._known = self._find(image), True
         if self._dot is None:
             return np.zeros(image.shape[:2], np.uint8)
         return marker_mask(image, self._dot)
 
-    def _look(self, image: Image) -> Dot | None:
+    def _find(self, image: Image) -> Dot | None:
         params = self._params
         radius = None if params.dot == "auto" else params.dot
         found = find_dot(image, radius=radius, polarity=params.polarity)

@@ -23,8 +23,8 @@ from tactflow.bench.skipping import Pipelines, compare_all, print_comparisons
 from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
 from tactflow.bench.timing import CopyUnit
-from tactflow.cli.pipelines import find_pipeline, packaged_pipelines
 from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError
 
 WORSE = 3
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="compare the errors with a stored result; exit code 3 if one got worse than its tolerance",
     )
     parser.add_argument(
-        "--errors", type=Path, metavar="PATH", help="write the errors alone, to be used with --against"
+        "--write-baseline", type=Path, metavar="FILE", help="write the errors alone, for --against"
     )
     parser.add_argument(
         "--stress",
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         return _skipping(args.pipelines, args.skipping, args.data)
     if args.against is not None:
         load_comparable(args.against, args.quick)
-    for path in (args.json, args.html, args.errors, args.markdown):
+    for path in (args.json, args.html, args.write_baseline, args.markdown):
         _refuse_unwritable(path)
     plan = Plan(
         files=_files(args.pipelines),
@@ -202,7 +202,7 @@ def _refuse_unwritable(path: Path | None) -> None:
 def _write(args: argparse.Namespace, result: Result) -> None:
     writers: list[tuple[Path | None, Callable[[Path], object]]] = [
         (args.json, result.save),
-        (args.errors, result.save_errors),
+        (args.write_baseline, result.save_errors),
         (args.html, lambda path: path.write_text(html(result), encoding="utf-8")),
         (args.markdown, lambda path: write_markdown(result, path, DEFAULT)),
     ]
