@@ -12,8 +12,8 @@ _WEIGHT: Final = 400
 """Weight of OpenCV 5's letters: the font's regular one."""
 _STROKES: Final = cv2.FONT_HERSHEY_SIMPLEX
 _STROKE_SCALE: Final = 1 / 30
-"""Scale of OpenCV 4's strokes over the letters' size, 1/px: at scale 1 capitals are 22 px high, in a usual font
-seven tenths of its size."""
+"""Scale of OpenCV 4's strokes over the letters' size, 1/px: at scale 1 capitals are 22 px high; in a usual
+font seven tenths of its size."""
 _PLAIN: Final = str.maketrans({"°": " deg", "²": "2", "−": "-"})
 """OpenCV 4's strokes know ASCII only."""
 
