@@ -23,8 +23,6 @@ class Images(Sink):
     """
 
     threaded = True
-    when_live = "block"
-    observer = False
 
     class Params(StageParams):
         """Where to write, what kind of file, and how many."""
@@ -46,7 +44,7 @@ class Images(Sink):
 
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is written yet."""
-        self.params = params
+        super().__init__(params)
         self._folder = expanded(params.folder)
         self.description = str(self._folder)
         self._next = 0

@@ -19,9 +19,7 @@ from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.files import expanded, lead_nowhere
-from tactflow.message import encode_message
-from tactflow.ports import Image
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.message import Results, encode_message
 
 log = logging.getLogger("tactflow")
 
@@ -32,10 +30,6 @@ class Jsonl(Sink):
     Lines reach a file at least every `flush` seconds of frames and at the end, and standard output at once.
     When the reader of standard output goes away, the sink falls silent and wants nothing more.
     """
-
-    threaded = False
-    when_live = "block"
-    observer = False
 
     class Params(StageParams):
         """Where to write, and what to do with a file that is there already."""
@@ -58,10 +52,9 @@ class Jsonl(Sink):
                 raise ValueError("overwrite and append exclude each other")
             return self
 
-    def __init__(self, params: Params, sensor: str = "main", directory: Path | None = None) -> None:
-        """Prepare; nothing is opened yet. Messages carry the sensor's name themselves."""
-        del sensor, directory
-        self.params = params
+    def __init__(self, params: Params) -> None:
+        """Prepare; nothing is opened yet."""
+        super().__init__(params)
         self._name = "standard output" if params.path == "-" else params.path
         self.description = self._name
         self._file: BinaryIO | None = None
@@ -128,14 +121,7 @@ class Jsonl(Sink):
         """lines : written so far."""
         return {"lines": self._lines}
 
-    def write(
-        self,
-        tick: Tick,
-        image: Image | None,
-        contact: Contact | None,
-        flow: Flow | None,
-        markers: Markers | None,
-    ) -> None:
+    def write(self, tick: Tick, results: Results) -> None:
         """Add one line.
 
         Raises
@@ -146,7 +132,7 @@ class Jsonl(Sink):
         """
         if self._file is None:
             return
-        self._pending.append(encode_message(tick, image, contact, flow, markers, detail=self.params.detail))
+        self._pending.append(encode_message(tick, results, detail=self.params.detail))
         now = time.monotonic()
         if self.params.path == "-" or now - self._flushed >= self.params.flush:
             self._flushed = now

@@ -23,12 +23,11 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.rate import SLACK, RateLimit
 from tactflow.files import expanded
-from tactflow.message import encode_message
+from tactflow.message import Results, encode_message
 from tactflow.ports import Image
 from tactflow.recording import missing_packages
 from tactflow.recording.names import next_name
 from tactflow.vision import compiled
-from tactflow.vision.types import Contact, Flow, Markers
 
 if TYPE_CHECKING:
     from tactflow.recording.frames import FrameCoder
@@ -51,8 +50,6 @@ class Record(Recorder):
     """
 
     threaded = True
-    when_live = "block"
-    observer = False
     takes_references = True
     queue_capacity = 32
 
@@ -97,13 +94,7 @@ class Record(Recorder):
             """A contact must be seen to begin a recording."""
             return {"contact": "trigger"} if self.trigger == "contact" else {}
 
-    def __init__(
-        self,
-        params: Params,
-        sensor: str = "main",
-        directory: Path | None = None,
-        control: Control | None = None,
-    ) -> None:
+    def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is written yet.
 
         Parameters
@@ -111,8 +102,7 @@ class Record(Recorder):
         sensor : names the channels of the file.
         control : handle on the run, for the settings that are written beside the frames.
         """
-        del directory
-        self.params = params
+        super().__init__(params)
         self.description = params.path
         self._path = expanded(params.path)
         self._trigger = params.trigger or ("start" if params.ring is None else "button")
@@ -202,14 +192,7 @@ class Record(Recorder):
         """frames, files : written so far. bytes : of the finished files. ring_frames, ring_bytes : kept."""
         return self._counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
 
-    def write(
-        self,
-        tick: Tick,
-        image: Image | None,
-        contact: Contact | None,
-        flow: Flow | None,
-        markers: Markers | None,
-    ) -> None:
+    def write(self, tick: Tick, results: Results) -> None:
         """Record one frame, or keep it for later.
 
         Raises
@@ -220,9 +203,9 @@ class Record(Recorder):
         with self._lock:
             if not self.wants() and not tick.frame.reference:
                 return
-            entry = self._entry(tick, image, contact, flow, markers)
+            entry = self._entry(tick, results)
             if self._trigger == "contact":
-                self._follow(contact is not None, tick.frame.t)
+                self._follow(results.contact is not None, tick.frame.t)
             if self._file is not None and not self._ends:
                 self._backlog.append(entry)
             self._write_backlog(BACKLOG_SHARE)
@@ -238,14 +221,7 @@ class Record(Recorder):
             self._coder = None
             self._ring.clear()
 
-    def _entry(
-        self,
-        tick: Tick,
-        image: Image | None,
-        contact: Contact | None,
-        flow: Flow | None,
-        markers: Markers | None,
-    ) -> Entry:
+    def _entry(self, tick: Tick, results: Results) -> Entry:
         from tactflow.recording.frames import nanoseconds
         from tactflow.recording.schemas import encode_picture
         from tactflow.recording.writer import Entry
@@ -256,9 +232,9 @@ class Record(Recorder):
         message = picture = None
         # A reference image that is not part of the source has no results of its own.
         if frame.seq >= 0:
-            message = encode_message(tick, image, contact, flow, markers, detail=True)
+            message = encode_message(tick, results, detail=True)
             if self._previews is not None and self._previews.due(frame.t):
-                jpeg = self._jpeg(frame.image if image is None else image)
+                jpeg = self._jpeg(frame.image if results.image is None else results.image)
                 picture = encode_picture(jpeg, self._sensor, time)
         pixels = self._coder.encode(frame)
         return Entry(time, frame.seq, frame.reference, frame.epoch, pixels, message, picture)
@@ -396,7 +372,7 @@ class Record(Recorder):
         texts: dict[str, str] = {}
         if self._control is not None:
             pipeline = self._control.pipeline
-            facts["source"] = str(getattr(self._control.source, "description", ""))
+            facts["source"] = str((self._control.source and self._control.source.description) or "")
             texts["pipeline.yaml"] = yaml.safe_dump(dict(pipeline.settings), sort_keys=False)
             try:
                 texts["pipeline.original.yaml"] = Path(pipeline.file).read_text(encoding="utf-8")

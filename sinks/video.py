@@ -41,8 +41,6 @@ class Video(Sink):
     """
 
     threaded = True
-    when_live = "block"
-    observer = False
 
     class Params(StageParams):
         """Where to write, and how."""
@@ -73,7 +71,7 @@ class Video(Sink):
 
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is opened yet."""
-        self.params = params
+        super().__init__(params)
         self._path = expanded(params.path)
         self.description = str(self._path)
         self._codec = ""

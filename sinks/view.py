@@ -19,10 +19,10 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
-from tactflow.message import STATUS_NAMES, encode_message
+from tactflow.message import STATUS_NAMES, Results, encode_message
 from tactflow.ports import Image
 from tactflow.view.address import Neighbours, address, bind, is_loopback
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.vision.types import Markers
 
 if TYPE_CHECKING:
     from tactflow.view.hub import Hub
@@ -88,13 +88,7 @@ class View(Sink):
                 )
             return self
 
-    def __init__(
-        self,
-        params: Params,
-        sensor: str = "main",
-        directory: Path | None = None,
-        control: Control | None = None,
-    ) -> None:
+    def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is served yet.
 
         Parameters
@@ -102,9 +96,7 @@ class View(Sink):
         sensor : names the tab.
         control : handle on the run, for the statistics and the buttons.
         """
-        del directory
-        self.params = params
-        self.description: str | None = None
+        super().__init__(params)
         self._sensor = sensor
         self._control = control
         self._hub: Hub | None = None
@@ -154,14 +146,7 @@ class View(Sink):
         """encoded : pictures made; and those of `Hub.counters`."""
         return {"encoded": self._encoded} | ({} if self._hub is None else self._hub.counters())
 
-    def write(
-        self,
-        tick: Tick,
-        image: Image | None,
-        contact: Contact | None,
-        flow: Flow | None,
-        markers: Markers | None,
-    ) -> None:
+    def write(self, tick: Tick, results: Results) -> None:
         """Send the plain picture and the result message; the page draws one over the other.
 
         Browsers take in a message a kilobyte at a time, and each costs a switch between processes. So what is
@@ -174,10 +159,11 @@ class View(Sink):
         # Counted from when this one was due, so that an uneven source does not lower the rate.
         self._due = max(self._due, now - self._interval / 2) + self._interval
         frame = tick.frame
+        contact, markers = results.contact, results.markers
         if contact is not None:
             contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1))
-        message = encode_message(tick, image, contact, flow, None, detail=True)
-        jpeg = self._encode(frame.image if image is None else image)
+        message = encode_message(tick, results._replace(contact=contact, markers=None), detail=True)
+        jpeg = self._encode(frame.image if results.image is None else results.image)
         latency = (now - frame.captured) * 1000 if frame.captured else -1.0
         header = b'{"latency_ms":%.3f,"epoch":%d,"message":%b,"markers":%b' % (
             *(latency, frame.epoch, message),

@@ -6,7 +6,6 @@ import errno
 import logging
 import threading
 import time
-from pathlib import Path
 
 import orjson
 import zmq
@@ -16,9 +15,7 @@ from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.message import encode_message
-from tactflow.ports import Image
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.message import Results, encode_message
 
 log = logging.getLogger("tactflow")
 
@@ -38,7 +35,6 @@ class Zmq(Sink):
 
     threaded = True
     when_live = "latest"
-    observer = False
 
     class Params(StageParams):
         """Where to publish, and how much may wait for a slow subscriber."""
@@ -76,13 +72,7 @@ class Zmq(Sink):
             description="time between two messages of statistics (topic tactflow.stats), s; 0: none",
         )
 
-    def __init__(
-        self,
-        params: Params,
-        sensor: str = "main",
-        directory: Path | None = None,
-        control: Control | None = None,
-    ) -> None:
+    def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is bound yet.
 
         Parameters
@@ -90,8 +80,7 @@ class Zmq(Sink):
         sensor : names the topic.
         control : the run, asked for its statistics; None: there are none to publish.
         """
-        del directory
-        self.params = params
+        super().__init__(params)
         self.endpoint = params.endpoint
         self.description = params.endpoint
         self._sensor = sensor
@@ -168,18 +157,11 @@ class Zmq(Sink):
         """serialised : messages encoded. subscriptions : distinct ones now."""
         return {"serialised": self._serialised, "subscriptions": len(self._subscriptions)}
 
-    def write(
-        self,
-        tick: Tick,
-        image: Image | None,
-        contact: Contact | None,
-        flow: Flow | None,
-        markers: Markers | None,
-    ) -> None:
+    def write(self, tick: Tick, results: Results) -> None:
         """Send one message to whoever has subscribed; never waits."""
         if not self.wants():
             return
-        body = encode_message(tick, image, contact, flow, markers, detail=self.params.detail)
+        body = encode_message(tick, results, detail=self.params.detail)
         self._serialised += 1
         with self._lock:
             if self._socket is not None:

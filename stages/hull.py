@@ -19,13 +19,15 @@ class Hull(Stage):
     memory = "pure"
 
     class Params(StageParams):
-        """Which blobs of the mask are the contact, and how it is described."""
+        """Which components of the mask are the contact, and how it is described."""
 
         min_area: float = Field(
-            20.0, ge=0, description="smaller blobs are ignored, px^2; too large misses light contacts"
+            20.0, ge=0, description="smaller components are ignored, px^2; too large misses light contacts"
         )
         max_gap: float | None = Field(
-            None, ge=0, description="blobs farther apart than this are not one contact, px; null: all are"
+            None,
+            ge=0,
+            description="components farther apart than this are not one contact, px; null: all are",
         )
         min_confidence: float = Field(
             0.3,

@@ -9,10 +9,7 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Changed
-from tactflow.vision.change import ChangeProbe
-
-_SETTLING = 3
-"""The last held frames, which are looked at; those before are worked on anyway, whatever a look would say."""
+from tactflow.vision.change import ChangeHold, ChangeProbe
 
 
 class ProbePorts(NamedTuple):
@@ -54,10 +51,7 @@ class Probe(Stage):
         self.params = params
         self._skipping = skipping
         self._probe: ChangeProbe | None = None
-        self._since = 0
-        self._left = 0
-        self._span = params.hold
-        self._rest = 0
+        self._hold = ChangeHold(params.hold, params.at_least_every)
 
     def reset(self) -> None:
         """A new reference follows: choose the places to look at anew."""
@@ -71,36 +65,4 @@ class Probe(Stage):
             self._probe = ChangeProbe(
                 frame.image, false_alarms=self.params.false_alarms, tile=self.params.tile
             )
-        probe = self._probe
-        if self._left > _SETTLING and probe.ready:
-            self._left -= 1
-            return ProbePorts(True)
-        changed = probe.look(frame.image)
-        self._since += 1
-        if changed or (self._left == 1 and not probe.calm):
-            # Rest begins with a calm frame only: what is in doubt is taken for a change.
-            self._span = self._held_for(probe.strongest <= 2 * probe.bound)
-            self._left, self._rest = self._span, 0
-            probe.anchor_here()
-        elif self._left > 0:
-            self._left -= 1
-            if self._left == 0:
-                probe.anchor_here()
-        elif frame.reference or self._since >= self.params.at_least_every:
-            probe.anchor_here()
-        else:
-            self._rest += 1
-            return ProbePorts(False)
-        self._since = 0
-        return ProbePorts(True)
-
-    def _held_for(self, faint: bool) -> int:
-        """For how many frames a change is held.
-
-        One that is faint and ends a short rest is a slow motion: it is held for twice as long as the last
-        one, to see more of it.
-        """
-        hold: int = self.params.hold
-        if not faint or self._rest >= 2 * self._span:
-            return hold
-        return self._span if self._rest == 0 else min(2 * self._span, max(hold, self.params.at_least_every))
+        return ProbePorts(self._hold.works_on(frame.image, self._probe, reference=frame.reference))

@@ -30,10 +30,13 @@ class Smooth(Stage):
             0.02, ge=0, le=1000, description="one_euro: Hz of cut-off per px/s or degree/s; higher lags less"
         )
         alpha: float = Field(
-            0.5, gt=0, le=1, description="alpha_beta: share of a surprise that corrects the value, 1"
+            0.5, gt=0, le=1, description="alpha_beta: fraction of the innovation that corrects the value, 1"
         )
         beta: float | None = Field(
-            None, ge=0, lt=4, description="alpha_beta: share that corrects the velocity, 1; null fits alpha"
+            None,
+            ge=0,
+            lt=4,
+            description="alpha_beta: fraction that corrects the velocity, 1; null fits alpha",
         )
 
         @model_validator(mode="after")

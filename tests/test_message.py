@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import STATUS_NAMES, build_message, encode_message, message_schema
+from tactflow.message import STATUS_NAMES, Results, build_message, encode_message, message_schema
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
 
 VALIDATOR = jsonschema.Draft202012Validator(message_schema())
@@ -41,7 +41,7 @@ MARKERS = Markers(
 
 
 def test_the_message_has_exactly_the_fields_of_the_contract() -> None:
-    message = build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS)
+    message = build_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS))
     assert message == {
         "schema": "tactflow.frame/1",
         "sensor": "main",
@@ -68,8 +68,8 @@ def test_the_message_has_exactly_the_fields_of_the_contract() -> None:
 
 
 def test_detail_adds_what_is_documented_and_nothing_else() -> None:
-    plain = build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS)
-    detailed = build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS, detail=True)
+    plain = build_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS))
+    detailed = build_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS), detail=True)
     VALIDATOR.validate(detailed)
     assert detailed["contact"].pop("confidence") == 0.75
     assert detailed["flow"].pop("stderr") == [0.1, 0.2]
@@ -97,7 +97,7 @@ def test_detail_adds_what_is_documented_and_nothing_else() -> None:
 def test_whatever_is_unknown_is_null_and_the_message_stays_valid(
     contact: Contact | None, flow: Flow | None, markers: Markers | None, detail: bool
 ) -> None:
-    message = build_message(TICK, PROCESSED, contact, flow, markers, detail=detail)
+    message = build_message(TICK, Results(PROCESSED, contact, flow, markers), detail=detail)
     VALIDATOR.validate(message)
     assert (message["contact"] is None) == (contact is None)
     assert (message["flow"] is None) == (flow is None)
@@ -105,25 +105,25 @@ def test_whatever_is_unknown_is_null_and_the_message_stays_valid(
 
 
 def test_without_a_processed_image_the_size_is_that_of_the_raw_one() -> None:
-    assert build_message(TICK, None, None, None, None)["size"] == [800, 600]
+    assert build_message(TICK, Results())["size"] == [800, 600]
 
 
 def test_reasons_for_skipping_are_passed_on() -> None:
     tick = Tick(TICK.frame, {"contact": "no_contact", "flow": "no_contact"})
-    message = build_message(tick, None, None, None, None)
+    message = build_message(tick, Results())
     assert message["skipped"] == {"contact": "no_contact", "flow": "no_contact"}
     VALIDATOR.validate(message)
 
 
 def test_the_message_is_one_line() -> None:
-    assert b"\n" not in encode_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS, detail=True)
+    assert b"\n" not in encode_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS), detail=True)
 
 
 def test_views_that_are_not_contiguous_and_other_number_types_are_written_correctly() -> None:
     wide = np.arange(12, dtype=np.float64).reshape(3, 4)
     markers = Markers(wide[:, ::2], wide[:, 1::2], np.array([0, 9, 0, 9, 0], np.uint8)[::2], wide[:, 0])
     contact = replace(CONTACT, area=np.float64(2.5), center=(np.float32(1.5), 2))
-    message = build_message(TICK, None, contact, Flow((0.5, 0.5), np.int64(3)), markers, detail=True)
+    message = build_message(TICK, Results(None, contact, Flow((0.5, 0.5), np.int64(3)), markers), detail=True)
     assert message["markers"]["origin"] == [[0.0, 2.0], [4.0, 6.0], [8.0, 10.0]]
     assert message["markers"]["position"] == [[1.0, 3.0], [5.0, 7.0], [9.0, 11.0]]
     assert message["contact"]["center"] == [1.5, 2.0]
@@ -140,7 +140,7 @@ def test_numbers_arrive_as_they_were(rows: list[tuple[float, float, float, float
     table = np.array([row[:4] for row in rows], np.float64).reshape(-1, 4)
     status = np.array([row[4] for row in rows], np.uint8)
     markers = Markers(table[:, :2], table[:, 2:], status, np.zeros(len(rows)))
-    body = encode_message(TICK, None, None, None, markers)
+    body = encode_message(TICK, Results(None, None, None, markers))
     # Read with the standard library: another parser than the encoder's own.
     message = json.loads(body)
     assert message["markers"]["origin"] == table[:, :2].tolist()
@@ -171,12 +171,14 @@ def test_a_number_that_is_not_finite_is_refused_by_name(field: str, bad: float) 
     else:
         markers = replace(MARKERS, **{rest: points})
     with pytest.raises(ValueError, match=field):
-        encode_message(tick, None, contact, flow, markers, detail=True)
+        encode_message(tick, Results(None, contact, flow, markers), detail=True)
 
 
 def test_an_infinite_standard_error_is_refused() -> None:
     with pytest.raises(ValueError, match=r"markers\.stderr"):
-        encode_message(TICK, None, None, None, replace(MARKERS, stderr=np.array([np.inf, 0, 0])), detail=True)
+        encode_message(
+            TICK, Results(None, None, None, replace(MARKERS, stderr=np.array([np.inf, 0, 0]))), detail=True
+        )
 
 
 def test_origins_that_change_in_place_or_are_copied_are_written_as_they_are() -> None:
@@ -184,7 +186,7 @@ def test_origins_that_change_in_place_or_are_copied_are_written_as_they_are() ->
     for value in (1.0, 7.0, 1.0):
         origin[0, 0] = value
         for array in (origin, origin.copy()):
-            message = build_message(TICK, None, None, None, replace(MARKERS, origin=array))
+            message = build_message(TICK, Results(None, None, None, replace(MARKERS, origin=array)))
             assert message["markers"]["origin"] == [[value, 2.0], [3.0, 4.0], [5.0, 6.0]]
 
 
@@ -198,7 +200,7 @@ def test_markers_that_stay_partly_the_same_are_written_as_they_are() -> None:
             for real in (np.float64, np.float32):
                 moved = replace(MARKERS, position=position.astype(real), status=status.astype(kind))
                 for markers in (moved, replace(moved, position=moved.position[::-1])):
-                    message = build_message(TICK, None, None, None, markers)["markers"]
+                    message = build_message(TICK, Results(None, None, None, markers))["markers"]
                     assert message["position"] == markers.position.tolist()
                     assert message["status"] == [STATUS_NAMES[value] for value in markers.status]
 
@@ -207,8 +209,8 @@ def test_a_bad_position_is_refused_every_time_and_forgotten() -> None:
     bad = replace(MARKERS, position=np.array([[1.0, np.nan]]))
     for _ in range(2):
         with pytest.raises(ValueError, match=r"markers\.position"):
-            encode_message(TICK, None, None, None, bad)
-    message = build_message(TICK, None, None, None, MARKERS)
+            encode_message(TICK, Results(None, None, None, bad))
+    message = build_message(TICK, Results(None, None, None, MARKERS))
     assert message["markers"]["position"] == MARKERS.position.tolist()
 
 
@@ -217,7 +219,7 @@ def test_status_names_follow_the_enum() -> None:
 
 
 def _changed(path: str, value: Any) -> dict[str, Any]:
-    message = build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS)
+    message = build_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS))
     *parents, last = path.split(".")
     target = message
     for name in parents:
@@ -266,7 +268,7 @@ def _changed(path: str, value: Any) -> dict[str, Any]:
     ],
 )
 def test_the_schema_refuses_what_the_contract_does_not_say(path: str, value: Any) -> None:
-    VALIDATOR.validate(build_message(TICK, PROCESSED, CONTACT, FLOW, MARKERS))
+    VALIDATOR.validate(build_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS)))
     with pytest.raises(jsonschema.ValidationError):
         VALIDATOR.validate(_changed(path, value))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import orjson
@@ -28,6 +28,18 @@ _RESULTS = frozenset({"contact", "flow", "markers"})
 """Ports whose absence or repetition the message explains: those that it publishes."""
 
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY
+
+
+class Results(NamedTuple):
+    """What the pipeline found in one frame, for sinks: `def write(self, tick: Tick, results: Results)`.
+
+    image : the processed frame. Each is None where it was not computed or nothing was found.
+    """
+
+    image: Image | None = None
+    contact: Contact | None = None
+    flow: Flow | None = None
+    markers: Markers | None = None
 
 
 class _Kept:
@@ -56,22 +68,14 @@ class _Kept:
         return text
 
 
-def encode_message(
-    tick: Tick,
-    image: Image | None,
-    contact: Contact | None,
-    flow: Flow | None,
-    markers: Markers | None,
-    *,
-    detail: bool = False,
-) -> bytes:
+def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> bytes:
     """The result message of one frame, as JSON in UTF-8 on a single line without a line end.
 
     Parameters
     ----------
     tick : the frame, and why values are missing.
-    image : (H, W, 3) uint8, the processed frame, of which only the size is told; None stands for the raw one.
-    contact, flow, markers : results in pixels of the processed frame; None becomes null.
+    results : in pixels of the processed frame; None becomes null. Of the image only the size is told; without
+        it, that of the raw frame.
     detail : also tell `contact.confidence`, `flow.stderr`, `flow.rotation`, `flow.divergence`,
         `flow.residual` and `markers.stderr`.
 
@@ -81,6 +85,7 @@ def encode_message(
         If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
     """
     frame = tick.frame
+    image, contact, flow, markers = results
     pixels = frame.image if image is None else image
     return orjson.dumps(
         {
@@ -98,17 +103,9 @@ def encode_message(
     )
 
 
-def build_message(
-    tick: Tick,
-    image: Image | None,
-    contact: Contact | None,
-    flow: Flow | None,
-    markers: Markers | None,
-    *,
-    detail: bool = False,
-) -> dict[str, Any]:
+def build_message(tick: Tick, results: Results, *, detail: bool = False) -> dict[str, Any]:
     """The same message as plain dicts, lists and numbers: what a subscriber gets after parsing it."""
-    message: dict[str, Any] = orjson.loads(encode_message(tick, image, contact, flow, markers, detail=detail))
+    message: dict[str, Any] = orjson.loads(encode_message(tick, results, detail=detail))
     return message
 
 

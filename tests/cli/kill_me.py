@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results
 from tactflow.sinks.record import Record
 
 
@@ -24,7 +25,7 @@ def record(path: str, counter: str) -> None:
     sink.open()
     count = os.open(counter, os.O_CREAT | os.O_WRONLY)
     for seq in range(1_000_000):
-        sink.write(Tick(Frame("main", seq, seq / 60, image(seq), reference=seq == 0)), None, None, None, None)
+        sink.write(Tick(Frame("main", seq, seq / 60, image(seq), reference=seq == 0)), Results())
         os.pwrite(count, (seq + 1).to_bytes(8, "little"), 0)
 
 

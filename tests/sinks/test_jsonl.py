@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results
 from tactflow.sinks import jsonl as jsonl_module
 from tactflow.sinks.jsonl import Jsonl
 
@@ -36,7 +37,7 @@ def opened(path: Path | str, **params: Any) -> Jsonl:
 
 def write(sink: Jsonl, seqs: range) -> None:
     for seq in seqs:
-        sink.write(tick(seq), None, None, None, None)
+        sink.write(tick(seq), Results())
 
 
 def write_and_close(sink: Jsonl, seqs: range) -> None:
@@ -221,12 +222,13 @@ def test_a_reader_that_leaves_ends_the_output_quietly() -> None:
     program = """
 import numpy as np, sys
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results
 from tactflow.sinks.jsonl import Jsonl
 sink = Jsonl(Jsonl.Params(path="-"))
 sink.open()
 seq = 0
 while sink.wants():
-    sink.write(Tick(Frame("main", seq, 0.0, np.zeros((3, 4, 3), np.uint8))), None, None, None, None)
+    sink.write(Tick(Frame("main", seq, 0.0, np.zeros((3, 4, 3), np.uint8))), Results())
     seq += 1
 sink.close()
 print("more text that nobody reads")

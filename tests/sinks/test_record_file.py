@@ -19,7 +19,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
-from tactflow.message import message_schema
+from tactflow.message import Results, message_schema
 from tactflow.recording.frames import FrameCoder, StoredFrame
 from tactflow.recording.protobuf import decode, encode, unzigzag, zigzag
 from tactflow.recording.schemas import plain_schema
@@ -109,7 +109,7 @@ def test_results_are_valid_under_the_schema_in_the_file(tmp_path: Path) -> None:
     sink.open()
     contact = Contact(4.0, (1.0, 1.0), 10.0, -0.2, np.eye(3, 2), Ellipse((1.0, 1.0), (3.0, 2.0), 10.0), 0.5)
     pixels = np.zeros((3, 4, 3), np.uint8)
-    sink.write(Tick(Frame("main", 0, 0.0, pixels)), None, contact, Flow((1.0, 2.0), 3), None)
+    sink.write(Tick(Frame("main", 0, 0.0, pixels)), Results(None, contact, Flow((1.0, 2.0), 3), None))
     sink.close()
     with path.open("rb") as file:
         ((schema, channel, message),) = make_reader(file).iter_messages("/main/results")

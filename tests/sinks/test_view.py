@@ -29,7 +29,7 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
-from tactflow.message import build_message
+from tactflow.message import Results, build_message
 from tactflow.sinks.view import View
 from tactflow.view.address import address, bind, is_loopback
 from tactflow.vision.types import Contact, Markers
@@ -178,7 +178,7 @@ def wait_for(condition: Callable[[], object]) -> None:
 def write(sink: View, seq: int) -> None:
     """Have a frame shown, as the engine does: when the sink wants one."""
     wait_for(sink.wants)
-    sink.write(tick(seq), picture(), None, None, None)
+    sink.write(tick(seq), Results(picture(), None, None, None))
 
 
 # -- what pages are sent ------------------------------------------------------------------------------------
@@ -187,7 +187,7 @@ def write(sink: View, seq: int) -> None:
 def test_without_a_page_nothing_is_wanted_and_nothing_encoded(view: Callable[..., View]) -> None:
     sink = view()
     assert not sink.wants()
-    sink.write(tick(), picture(), None, None, None)
+    sink.write(tick(), Results(picture(), None, None, None))
     assert sink.counters()["encoded"] == 0
 
 
@@ -200,7 +200,7 @@ def test_a_page_gets_the_plain_picture_and_the_result_message(
     write(sink, 7)
     header, jpeg = browser.next("frame")
     sent = tick(7)
-    assert header["message"] == build_message(sent, picture(), None, None, None, detail=True)
+    assert header["message"] == build_message(sent, Results(picture(), None, None, None), detail=True)
     shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
     # Measured: a mean of 1.0 grey level at quality 95; a picture that was drawn on, or another one, has tens.
@@ -216,7 +216,7 @@ def test_a_page_is_sent_nothing_more_until_it_has_drawn(
     write(sink, 0)
     first, _ = browser.next("frame")
     wait_for(lambda: not sink.wants())
-    sink.write(tick(1), picture(), None, None, None)
+    sink.write(tick(1), Results(picture(), None, None, None))
     assert sink.counters()["encoded"] == 1
     browser.say(ack=first["number"])
     write(sink, 2)
@@ -254,7 +254,7 @@ def test_a_page_that_reads_nothing_holds_up_neither_writing_nor_closing(
     noise = np.random.default_rng(1).integers(0, 256, (800, 800, 3)).astype(np.uint8)
     for number in range(1, 60):
         wait_for(sink.wants)
-        sink.write(tick(number), noise, None, None, None)
+        sink.write(tick(number), Results(noise, None, None, None))
         fast.say(ack=fast.next("frame")[0]["number"])
         deaf.say(ack=number)
     assert fast.next("stats")["run"]["frames"] == 3
@@ -270,7 +270,7 @@ def test_max_fps_bounds_what_is_encoded(view: Callable[..., View], page: Callabl
     wait_for(lambda: "screen_p50_ms" in sink.counters())
     # The page is ready, but the next frame is due in 50 s.
     assert not sink.wants()
-    sink.write(tick(1), picture(), None, None, None)
+    sink.write(tick(1), Results(picture(), None, None, None))
     assert sink.counters()["encoded"] == 1
 
 
@@ -280,7 +280,7 @@ def test_a_large_picture_is_reduced_and_its_coordinates_are_not(
     sink = view(max_size=64)
     browser = page(sink)
     wait_for(sink.wants)
-    sink.write(tick(), picture(100, 200), None, None, None)
+    sink.write(tick(), Results(picture(100, 200), None, None, None))
     header, jpeg = browser.next("frame")
     shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
@@ -294,7 +294,7 @@ def test_without_a_processed_image_the_raw_one_is_shown(
     sink = view()
     browser = page(sink)
     wait_for(sink.wants)
-    sink.write(tick(), None, None, None, None)
+    sink.write(tick(), Results())
     assert browser.next("frame")[0]["message"]["size"] == [60, 80]
 
 
@@ -460,7 +460,7 @@ def test_what_is_only_drawn_is_sent_in_tenths_of_a_pixel(
     origin = np.array([[1.04, 2.06], [-3.14159, 40.0], [5.0, 6.0]])
     markers = Markers(origin, origin + 0.5, np.array([0, 1, 2], np.uint8), np.full(3, np.nan))
     wait_for(sink.wants)
-    sink.write(tick(), picture(), contact, None, markers)
+    sink.write(tick(), Results(picture(), contact, None, markers))
     header, _ = browser.next("frame")
     assert header["markers"] == {
         "origin": [10, 21, -31, 400, 50, 60],

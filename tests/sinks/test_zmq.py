@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import sys
 import threading
-import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -16,6 +13,7 @@ import zmq
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Markers
 
@@ -37,7 +35,7 @@ def opened(**params: Any) -> Zmq:
 
 def write(sink: Zmq, seqs: range) -> None:
     for seq in seqs:
-        sink.write(tick(seq), IMAGE, None, None, MANY)
+        sink.write(tick(seq), Results(IMAGE, None, None, MANY))
 
 
 def wait_until_wanted(sink: Zmq) -> None:
@@ -208,24 +206,6 @@ def test_closing_delivers_the_last_messages(subscribe: Subscribing) -> None:
         socket.close()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="threads are found by their names on Linux only")
-def test_it_names_the_threads_that_zeromq_sends_in(subscribe: Subscribing) -> None:
-    # One of another context, which is not meant.
-    socket = subscribe("tcp://127.0.0.1:9")
-    sink = opened()
-    try:
-        # A thread names itself, in its own time.
-        until = time.monotonic() + WAIT / 1000
-        while not sink.live_threads and time.monotonic() < until:
-            time.sleep(0.001)
-        (sending,) = sink.live_threads
-        assert Path(f"/proc/self/task/{sending}/comm").read_text().startswith("ZMQbg/IO")
-    finally:
-        sink.close()
-        socket.close()
-    assert not Path(f"/proc/self/task/{sending}").exists()
-
-
 def test_an_address_in_use_is_an_error_that_says_what_to_try() -> None:
     first = opened()
     second = Zmq(Zmq.Params(endpoint=first.endpoint))
@@ -296,7 +276,7 @@ def test_the_sensor_names_the_topic(subscribe: Subscribing) -> None:
     sink.open()
     socket = subscribe(sink.endpoint, b"tactflow.thumb")
     wait_until_wanted(sink)
-    sink.write(tick(4, "thumb"), IMAGE, None, None, None)
+    sink.write(tick(4, "thumb"), Results(IMAGE, None, None, None))
     topic, message = receive(socket)
     assert topic == b"tactflow.thumb"
     assert message["sensor"] == "thumb"

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.vision import compiled
-
 RUN = """
 import sys
 
@@ -19,12 +17,12 @@ from tactflow.engine.run import Runner
 from tactflow.vision import compiled, geometry
 
 begun, late, early = [], [], []
-compile_kernel, convert = compiled.Kernel._compile, geometry.Preprocessor.__call__
+load_kernel, convert = compiled.Kernel._load, geometry.Preprocessor.__call__
 
 
-def watched(kernel):
+def watched(kernel, wait):
     (late if begun else early).append(kernel.__name__)
-    return compile_kernel(kernel)
+    return load_kernel(kernel, wait)
 
 
 def first(self, *args, **kwargs):
@@ -32,7 +30,7 @@ def first(self, *args, **kwargs):
     return convert(self, *args, **kwargs)
 
 
-compiled.Kernel._compile, geometry.Preprocessor.__call__ = watched, first
+compiled.Kernel._load, geometry.Preprocessor.__call__ = watched, first
 overrides = ["stages.capture.source=sim:%s?frames=60", "sinks={jsonl: {path: results.jsonl}}"]
 result = Runner(load_pipeline(find_pipeline("%s"), overrides)).run()
 print(result.error, len(begun) > 10, len(early) > 5, late)
@@ -41,8 +39,6 @@ print(result.error, len(begun) > 10, len(early) > 5, late)
 
 @pytest.mark.parametrize(("pipeline", "scene"), [("default", "jumps"), ("markerless", "unmarked")])
 def test_every_kernel_is_compiled_before_the_first_frame(pipeline: str, scene: str, tmp_path: Path) -> None:
-    if not compiled.active():
-        pytest.skip('numba is not here: pip install "tactflow[fast]"')
     done = subprocess.run(
         [sys.executable, "-c", RUN % (scene, pipeline)],
         cwd=tmp_path,

@@ -31,6 +31,7 @@ def _distances(first: Any, second: Any, *rest: Any) -> Any:
 
 NUMPY = _Double(np, float32=np.float64)
 OPENCV = _Double(cv2, CV_32F=cv2.CV_64F, batchDistance=_distances)
+DOUBLES = {"np": NUMPY, "cv2": OPENCV}
 
 
 @contextmanager
@@ -39,13 +40,17 @@ def in_double(*modules: ModuleType) -> Iterator[None]:
 
     Compiled kernels have fixed types, and are not used.
     """
-    before = [(module, module.np, module.cv2) for module in modules if hasattr(module, "cv2")]
+    before = [
+        (module, name, getattr(module, name))
+        for module in modules
+        for name in DOUBLES
+        if hasattr(module, name)
+    ]
     try:
-        for module in modules:
-            module.np = NUMPY  # type: ignore[attr-defined]
-            module.cv2 = OPENCV  # type: ignore[attr-defined]
+        for module, name, _ in before:
+            setattr(module, name, DOUBLES[name])
         with compiled.switched(False):
             yield
     finally:
-        for module, numpy, opencv in before:
-            module.np, module.cv2 = numpy, opencv  # type: ignore[attr-defined]
+        for module, name, single in before:
+            setattr(module, name, single)

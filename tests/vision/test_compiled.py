@@ -1,20 +1,69 @@
-"""Compiled kernels: used where numba works, and nothing lost where it does not."""
+"""Compiled kernels: what they compute, where they are kept, and who compiles them."""
 
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tactflow.vision import kernel_cache
+from tactflow.vision.compiled import helper, kernel
+
+MODULE = """
+from tactflow.vision.compiled import helper, kernel
+
+STEP = 1
+
+@helper
+def next_one(n):
+    return n + STEP
+
+@kernel("int64(int64)")
+def twice(n):
+    return 2 * n
+
+@kernel("int64(int64)")
+def thrice(n):
+    return 3 * n
+
+@kernel("int64(int64)")
+def after(n):
+    return next_one(n)
+
+@kernel("int64(int64[::1])")
+def total(values):
+    found = 0
+    for value in values:
+        found += value
+    return found
+
+@kernel("float64(float64[:, ::1])")
+def largest(values):
+    found = -1.0
+    for row in values:
+        for value in row:
+            found = max(found, value)
+    return found
+"""
+
+PROGRAM = """
+import logging
+import numpy as np
+logging.basicConfig(level="INFO")
 from tactflow.vision import compiled
-from tactflow.vision.compiled import kernel
+import loops
+before = compiled.warm_up()
+print(before, loops.twice(3), loops.thrice(5), loops.after(7),
+      loops.total(np.arange(4)), loops.largest(np.eye(3)))
+"""
 
 
 @kernel("void(float64[::1], float64[::1])")
@@ -25,29 +74,57 @@ def _running_sum(values: NDArray[np.float64], sums: NDArray[np.float64]) -> None
         sums[index] = total
 
 
+@helper
+def _scaled(value: float) -> float:
+    return value * FACTOR
+
+
+@helper
+def _shifted(value: float) -> float:
+    return _scaled(value) + 1.0
+
+
+@kernel("float64(float64)")
+def _moved(value: float) -> float:
+    return _shifted(value)
+
+
+FACTOR = 3.0
+
+
 @pytest.fixture
-def forgetful() -> Iterator[None]:
-    """Whether numba works is asked anew in this test, and again after it."""
-    compiled._works.cache_clear()
-    yield
-    compiled._works.cache_clear()
+def program(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
+    """Starts PROGRAM in a fresh folder; kernels are kept in `kept` unless said otherwise."""
+    (tmp_path / "loops.py").write_text(MODULE)
+    (tmp_path / "program.py").write_text(PROGRAM)
+
+    def start(**variables: str) -> subprocess.Popen[str]:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept"), **variables}
+        return subprocess.Popen(
+            [sys.executable, "program.py"],
+            cwd=tmp_path,
+            env={name: value for name, value in environment.items() if value},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    return start
+
+
+RESULTS = ["6", "15", "8", "6", "1.0"]
 
 
 def test_a_kernel_does_what_its_loops_say() -> None:
-    with compiled.switched(True):
-        if not compiled.active():
-            pytest.skip('numba is not here: pip install "tactflow[fast]"')
-        values = np.random.default_rng(3).normal(size=1000)
-        fast, slow = np.empty(1000), np.empty(1000)
-        _running_sum(values, fast)
-        _running_sum.plain(values, slow)
-        # Without `reorder` the operations are the same in the same order, so the bits are.
-        assert np.array_equal(fast, slow)
+    values = np.random.default_rng(3).normal(size=1000)
+    fast, slow = np.empty(1000), np.empty(1000)
+    _running_sum(values, fast)
+    _running_sum.plain(values, slow)
+    # Without `reorder` the operations are the same in the same order, so the bits are.
+    assert np.array_equal(fast, slow)
 
 
 def test_a_kernel_reads_what_must_not_be_written() -> None:
-    if not compiled.active():
-        pytest.skip('numba is not here: pip install "tactflow[fast]"')
     values, sums = np.arange(4.0), np.empty(4)
     values.setflags(write=False)
     _running_sum(values, sums)
@@ -55,82 +132,55 @@ def test_a_kernel_reads_what_must_not_be_written() -> None:
 
 
 def test_a_kernel_refuses_what_its_signature_does_not_name() -> None:
-    if not compiled.active():
-        pytest.skip('numba is not here: pip install "tactflow[fast]"')
     with pytest.raises(TypeError):
         _running_sum(np.arange(8.0)[::2], np.empty(4))
 
 
-def test_switching_acts_inside_its_block_only() -> None:
-    before = compiled.active()
-    with compiled.switched(False):
-        assert not compiled.active()
-        assert compiled.numba_version() is None
-    assert compiled.active() == before
+def test_a_kernel_calls_helpers_of_its_file_which_call_others() -> None:
+    assert _moved(2.0) == 7.0
+    assert _moved.plain(2.0) == 7.0
 
 
-@pytest.mark.parametrize("value", ["0", "off", "No", " false "])
-def test_the_environment_switches_kernels_off(value: str) -> None:
-    code = (
-        "from tactflow.vision import compiled; import sys; print(compiled.active(), 'numba' in sys.modules)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, compiled.VARIABLE: value},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.split() == ["False", "False"]
+def test_compiling_is_announced_once_and_not_again_when_it_is_on_disk(
+    program: Callable[..., subprocess.Popen[str]],
+) -> None:
+    first, second = (program().communicate() for _ in range(2))
+    assert first[0].split()[1:] == second[0].split()[1:] == RESULTS
+    assert first[1].count("compiling") == 1
+    assert second == (" ".join(["0", *RESULTS]) + "\n", "")
 
 
-@pytest.mark.usefixtures("forgetful")
-def test_where_numba_is_missing_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, "find_spec", lambda _: None)
-    with compiled.switched(True):
-        assert not compiled.active()
+def test_two_processes_that_start_together_compute_the_same(
+    program: Callable[..., subprocess.Popen[str]],
+) -> None:
+    both = [program(), program()]
+    ends = [process.communicate() for process in both]
+    assert [end[0].split()[1:] for end in ends] == [RESULTS] * 2, ends
+    # What one of them has compiled, the other has found.
+    assert sum(int(end[0].split()[0]) for end in ends) <= 5
 
 
-@pytest.mark.usefixtures("forgetful")
-def test_a_broken_numba_is_reported_and_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(_: str) -> SimpleNamespace:
-        raise ImportError("Numba needs NumPy 1.0 or less")
-
-    monkeypatch.setattr(compiled, "find_spec", lambda _: SimpleNamespace())
-    monkeypatch.setattr(compiled, "import_module", broken)
-    with (
-        compiled.switched(True),
-        pytest.warns(RuntimeWarning, match=r"does not start \(Numba needs NumPy 1.0 or less\).*pip install"),
-    ):
-        assert not compiled.active()
-
-
-def test_compiling_is_announced_once_and_not_again_when_it_is_on_disk(tmp_path: Path) -> None:
-    if not compiled.active():
-        pytest.skip('numba is not here: pip install "tactflow[fast]"')
-    module = tmp_path / "loops.py"
-    module.write_text(
-        "import logging; logging.basicConfig(level='INFO')\n"
-        "from tactflow.vision import compiled\n"
-        "@compiled.kernel('int64(int64)')\n"
-        "def twice(n): return 2 * n\n"
-        "@compiled.kernel('int64(int64)')\n"
-        "def thrice(n): return 3 * n\n"
-        "import sys; compiled.load(sys.modules[__name__])\n"
-        "print(twice(3) + thrice(5))\n"
-    )
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
-    said = [
-        subprocess.run([sys.executable, module], env=environment, capture_output=True, text=True, check=True)
-        for _ in range(2)
-    ]
-    assert [run.stdout.strip() for run in said] == ["21", "21"]
-    assert [run.stderr.count("once") for run in said] == [1, 0]
+def test_what_a_killed_process_had_claimed_is_compiled_by_the_next(tmp_path: Path) -> None:
+    holder = textwrap.dedent(f"""
+        import time
+        from tactflow.vision.kernel_cache import claimed
+        with claimed({str(tmp_path)!r}, "loops.twice", wait=True) as mine:
+            print(mine, flush=True)
+            time.sleep(1000)
+    """)
+    with subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "True\n"
+        with kernel_cache.claimed(str(tmp_path), "loops.twice", wait=False) as mine:
+            assert not mine
+        with kernel_cache.claimed(str(tmp_path), "loops.thrice", wait=False) as mine:
+            assert mine
+        process.send_signal(signal.SIGKILL)
+    with kernel_cache.claimed(str(tmp_path), "loops.twice", wait=False) as mine:
+        assert mine
 
 
 def test_a_kernel_works_where_its_result_cannot_be_kept() -> None:
-    if not compiled.active():
-        pytest.skip('numba is not here: pip install "tactflow[fast]"')
     # Code that does not come from a file has no place beside it.
     code = (
         "from tactflow.vision.compiled import kernel\n"
@@ -141,9 +191,54 @@ def test_a_kernel_works_where_its_result_cannot_be_kept() -> None:
     assert done.stdout.strip() == "42.0"
 
 
-def test_the_switch_says_when_it_was_set_to_something_unknown() -> None:
-    assert [compiled._asked_for(word) for word in (None, "", "1", " Yes ", "0", "OFF")] == [True] * 4 + [
-        False
-    ] * 2
-    with pytest.warns(RuntimeWarning, match="TACTFLOW_COMPILED=nope: required 1 or 0"):
-        assert compiled._asked_for("nope")
+def test_where_numba_may_write_nowhere_kernels_are_kept_among_the_temporary_files(
+    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    # A file where a folder would have to be: not even root can write into it.
+    (tmp_path / "__pycache__").write_text("")
+    (tmp_path / "home").write_text("")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    place = {"NUMBA_CACHE_DIR": "", "HOME": str(tmp_path / "home"), "TMPDIR": str(temporary)}
+    place["XDG_CACHE_HOME"] = str(tmp_path / "home" / "cache")
+    first, second = (program(**place).communicate() for _ in range(2))
+    assert first[0].split()[1:] == RESULTS, first
+    assert second == (" ".join(["0", *RESULTS]) + "\n", "")
+    (folder,) = temporary.iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_folder_that_others_can_write_to_is_not_trusted(
+    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    (tmp_path / "__pycache__").write_text("")
+    (tmp_path / "home").write_text("")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    place = {"NUMBA_CACHE_DIR": "", "HOME": str(tmp_path / "home"), "TMPDIR": str(temporary)}
+    place["XDG_CACHE_HOME"] = str(tmp_path / "home" / "cache")
+    program(**place).communicate()
+    (folder,) = temporary.iterdir()
+    folder.chmod(0o777)
+    out, said = program(**place).communicate()
+    assert out.split()[1:] == RESULTS
+    assert "belongs to somebody else" in said
+
+
+def test_a_damaged_cache_is_said_and_compiled_around(
+    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    program().communicate()
+    (index,) = (tmp_path / "kept").rglob("loops.twice*.nbi")
+    index.write_bytes(b"")
+    out, said = program().communicate()
+    assert out.split()[1:] == RESULTS, said
+    assert "cannot be kept or read" in said
+
+
+def test_without_the_compiler_kernels_run_as_plain_python_and_say_so(
+    program: Callable[..., subprocess.Popen[str]],
+) -> None:
+    out, said = program(NUMBA_DISABLE_JIT="1").communicate()
+    assert out.split() == ["0", *RESULTS], said
+    assert "very slow" in said

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.geometry.hull import axis_direction
+from tactflow.vision.geometry.direction import axis_direction
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers
 

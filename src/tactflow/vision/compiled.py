@@ -1,96 +1,116 @@
-"""Loops compiled by numba where it is installed (`pip install "tactflow[fast]"`).
+"""Kernels: loops over pixels, markers and outlines that numba compiles for this processor.
 
-What is costly in a vision method is written twice: once with numpy and OpenCV, which is what runs without
-numba, and once as plain loops over pixels that numba compiles. Both give the same numbers, to the rounding
-that the method states. A method looks like this:
+A kernel stands beside its caller and gives the types of what it takes, so that no call has to find them out:
 
     @kernel("void(uint8[:, ::1], float32[::1])")
-    def _sums(picture, sums): ...            # loops
+    def _column_sums(picture, sums):
+        for row in range(picture.shape[0]):
+            _add(picture[row], sums)
 
-    def column_sums(picture):
-        if compiled.active():
-            sums = np.zeros(picture.shape[1], np.float32)
-            _sums(picture, sums)
-            return sums
-        return picture.sum(axis=0, dtype=np.float32)
+    @helper
+    def _add(line, sums):
+        for column in range(sums.size):
+            sums[column] += line[column]
 
-Kernels are compiled on their first call, or by `load`, which the constructor of a stage calls so that no
-frame has to wait; numba keeps the result on disk, so this costs seconds once and milliseconds later. They run
-without Python's lock: several segments of a pipeline work at the same time.
+A long kernel is split into helpers: functions of the same file, typed by their use, compiled into each kernel
+that calls them and with its options. Constants that a kernel uses stand in its own file, too: numba compiles
+a kernel again when its file has changed, and looks at no other.
 
-Constants that a kernel uses stand in its own file: numba compiles it again when that file has changed, and
-does not look at others.
+A kernel is compiled on its first call, or by `load`, which the constructor of a stage calls so that no frame
+has to wait. The first one that is not on disk yet starts the compiling of all that are imported, on all
+processors; what is compiled is kept on disk (see `kernel_cache`). Kernels run without Python's lock: several
+segments of a pipeline work at the same time.
 
-`TACTFLOW_COMPILED=0` in the environment switches them off.
+`NUMBA_DISABLE_JIT=1` runs them as plain Python, slowly, for a debugger.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import subprocess
+import sys
 import threading
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import cache, cached_property
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
+
+from tactflow.vision.kernel_cache import claimed, dispatcher_of
 
 logger = logging.getLogger("tactflow")
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-VARIABLE = "TACTFLOW_COMPILED"
-"""Environment variable; 0, off, no or false: numba is not used although it is there."""
-
-_ON = ("1", "on", "yes", "true", "")
-_OFF = ("0", "off", "no", "false")
+Report = Callable[[int, int], None]
+"""Told, while kernels are compiled, how many are ready, and how many there are."""
 
 _REASSOCIATED = {"reassoc", "contract", "arcp", "nsz"}
 """Freedoms of the compiler: sums in any order. It must still respect NaN and infinity."""
 
-_lock = threading.Lock()
+_MOST_PROCESSES = 4
+"""Processes that compile. Chosen by hand: the longest kernel takes a tenth of the whole."""
+_LEAST_SHARED = 4
+"""Kernels for which others are started; to start one takes as long as to compile two. Chosen by hand."""
 
-
-def _asked_for(value: str | None) -> bool:
-    """What the environment variable says; without it, and if it says something else, kernels are used."""
-    word = "1" if value is None else value.strip().lower()
-    if word not in (*_ON, *_OFF):
-        warnings.warn(
-            f"{VARIABLE}={value}: required 1 or 0; numba is used where it is installed",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-    return word not in _OFF
-
-
-_wanted = _asked_for(os.environ.get(VARIABLE))
+_lock = threading.RLock()
+_known: dict[str, Kernel[..., Any]] = {}
+_reports: list[Report] = []
 
 
 class Kernel(Generic[P, R]):
     """A function that numba compiles when it is first needed.
 
+    plain : the Python function.
     signature : numba's, so that no call has to find out its types. C-contiguous arrays are `[:, ::1]`.
     reorder : whether sums of floats may be taken in any order, which lets them run in parallel lanes; if not,
         operations are those of the Python code, in its order.
+    compiled_here : whether this process has compiled it, rather than found it on disk.
+    kept : whether it has a place on disk.
+
+    >>> @kernel("float64(float64[::1])")
+    ... def total(values):
+    ...     found = 0.0
+    ...     for value in values:
+    ...         found += value
+    ...     return found
+    >>> total(np.array([1.0, 2.0]))
+    3.0
     """
 
-    def __init__(self, function: Callable[P, R], signature: str, reorder: bool) -> None:
-        self.plain = function
+    def __init__(self, plain: Callable[P, R], signature: str, reorder: bool) -> None:
+        self.plain = plain
+        self.compiled_here = self.kept = False
         self._signature = signature
-        self._reorder = reorder
+        self._options: dict[str, Any] = {
+            "nogil": True,
+            "error_model": "numpy",
+            "fastmath": _REASSOCIATED if reorder else False,
+        }
         self._compiled: Callable[P, R] | None = None
-        self.__doc__ = function.__doc__
-        self.__name__ = function.__name__
+        self.__doc__ = plain.__doc__
+        self.__name__ = plain.__name__
+        _known[self.name] = self
+
+    @property
+    def name(self) -> str:
+        """Dotted name."""
+        return f"{self.plain.__module__}.{self.__name__}"
+
+    @property
+    def ready(self) -> bool:
+        """Whether it can be called at once."""
+        return self._compiled is not None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         if self._compiled is None:
-            self.load()
+            _make_ready([self])
             assert self._compiled is not None
         try:
             return self._compiled(*args, **kwargs)
@@ -99,30 +119,37 @@ class Kernel(Generic[P, R]):
             given: Any = [_writable(value) for value in args]
             return self._compiled(*given, **kwargs)
 
-    def load(self) -> None:
-        """Compile now, or take what is on disk; nothing happens where kernels are not active."""
-        if self._compiled is not None or not active():
-            return
+    def load(self, *, wait: bool = True) -> bool:
+        """Compile, or take what is on disk; returns whether it is ready.
+
+        wait : for another process that is compiling it; otherwise it is left to that one.
+        """
         with _lock:
             if self._compiled is None:
-                self._compiled = self._compile()
+                self._compiled = self._load(wait)
+            return self.ready
 
-    def _compile(self) -> Callable[P, R]:
-        options: dict[str, Any] = {
-            "nogil": True,
-            "error_model": "numpy",
-            "fastmath": _REASSOCIATED if self._reorder else False,
-        }
-        njit: Any = import_module("numba").njit
-        try:
-            found: Any = njit(self._signature, cache=True, **options)(self.plain)
-        except (RuntimeError, OSError):
-            # No place on disk where numba could keep the result.
-            found = njit(self._signature, **options)(self.plain)
-        if found.stats.cache_misses:
-            _tell_once()
-        compiled_function: Callable[P, R] = found
-        return compiled_function
+    def _load(self, wait: bool) -> Callable[P, R] | None:
+        numba = import_module("numba")
+        if numba.config.DISABLE_JIT:
+            _warn_once("NUMBA_DISABLE_JIT is set: kernels run as plain Python, which is very slow")
+            return self.plain
+        function = _with_helpers(self.plain, self._options)
+        found = dispatcher_of(function, self._options)
+        with claimed(found.stats.cache_path, self.name, wait) as mine:
+            if not mine:
+                return None
+            try:
+                found.compile(self._signature)
+            except (OSError, EOFError, ValueError) as error:
+                _warn_once(f"compiled loops cannot be kept or read ({error}); they are compiled in each run")
+                found = numba.njit(**self._options)(function)
+                found.compile(self._signature)
+        found.disable_compile()
+        self.kept = found.stats.cache_path is not None
+        self.compiled_here = bool(found.stats.cache_misses) or not self.kept
+        compiled: Callable[P, R] = found
+        return compiled
 
 
 def kernel(signature: str, *, reorder: bool = False) -> Callable[[Callable[P, R]], Kernel[P, R]]:
@@ -134,71 +161,158 @@ def kernel(signature: str, *, reorder: bool = False) -> Callable[[Callable[P, R]
     return wrap
 
 
-class Inlined(Generic[P, R]):
-    """A helper of kernels in the same file: numba puts its body where it is called."""
+class Helper(Generic[P, R]):
+    """A function that kernels of its file call; called from elsewhere, it is plain Python."""
 
-    def __init__(self, function: Callable[P, R], reorder: bool) -> None:
-        self.plain = function
-        self._reorder = reorder
-        self.__doc__ = function.__doc__
-        self.__name__ = function.__name__
+    def __init__(self, plain: Callable[P, R]) -> None:
+        self.plain = plain
+        self.__doc__ = plain.__doc__
+        self.__name__ = plain.__name__
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """Run as Python, uncompiled."""
         return self.plain(*args, **kwargs)
 
-    @cached_property
-    def _numba_type_(self) -> Any:
-        """What numba asks of a global that it does not know; asked for only while a kernel is compiled."""
-        numba: Any = import_module("numba")
-        fastmath = _REASSOCIATED if self._reorder else False
-        return numba.types.Dispatcher(
-            numba.njit(error_model="numpy", fastmath=fastmath, forceinline=True)(self.plain)
-        )
 
+def helper(function: Callable[P, R]) -> Helper[P, R]:
+    """Decorator of a function that is compiled into the kernels of its file that call it.
 
-def inlined(*, reorder: bool = False) -> Callable[[Callable[P, R]], Inlined[P, R]]:
-    """Decorator of a part of a kernel; see `Inlined`. `reorder` as for `kernel`, and to be as there."""
-
-    def wrap(function: Callable[P, R]) -> Inlined[P, R]:
-        return Inlined(function, reorder)
-
-    return wrap
+    >>> @helper
+    ... def square(value):
+    ...     return value * value
+    >>> square(3.0)
+    9.0
+    """
+    return Helper(function)
 
 
 def load(*modules: ModuleType) -> None:
-    """Load all kernels of some modules."""
-    for module in modules:
-        for value in vars(module).values():
-            if isinstance(value, Kernel):
-                value.load()
+    """Make all kernels of some modules ready."""
+    _make_ready([value for module in modules for value in vars(module).values() if isinstance(value, Kernel)])
 
 
-def active() -> bool:
-    """Whether kernels are used: numba is there, works, and is not switched off."""
-    return _wanted and _works()
+def known() -> list[Kernel[..., Any]]:
+    """The kernels of all modules that are imported."""
+    return list(_known.values())
 
 
-def numba_version() -> str | None:
-    """Version of numba if kernels are used, else None."""
-    return str(import_module("numba").__version__) if active() else None
+def warm_up() -> int:
+    """Make all kernels of the imported modules ready; returns how many of them had to be compiled."""
+    before = [kernel for kernel in known() if not kernel.ready]
+    _make_ready(before)
+    return sum(kernel.compiled_here for kernel in before)
 
 
 @contextmanager
-def switched(on: bool) -> Iterator[None]:
-    """Use kernels, or do not, in this block; for comparisons. Acts on the whole process."""
-    global _wanted
-    before = _wanted
-    _wanted = on
+def reporting(report: Report) -> Iterator[None]:
+    """Have `report` called while kernels are compiled in this block."""
+    _reports.append(report)
     try:
         yield
     finally:
-        _wanted = before
+        _reports.remove(report)
+
+
+def numba_version() -> str:
+    """Version of numba."""
+    return str(import_module("numba").__version__)
+
+
+def _make_ready(kernels: Sequence[Kernel[..., Any]]) -> None:
+    """Load kernels; after the first that was not on disk, compile all that are imported."""
+    with _lock:
+        # The shortest first: the others wait until it is clear that they must be compiled.
+        for kernel in sorted(kernels, key=_length):
+            if not kernel.ready:
+                kernel.load()
+                if kernel.compiled_here:
+                    _compile([other for other in (known() if kernel.kept else kernels) if not other.ready])
+
+
+def _compile(pending: list[Kernel[..., Any]]) -> None:
+    """Make kernels ready, if they have a place on disk together with other processes."""
+    if not pending:
+        return
+    total = len(pending) + 1
+    logger.info("compiling %d loops for this processor, once", total)
+    pending.sort(key=_length, reverse=True)
+    workers = _start_workers(pending)
+    try:
+        while pending:
+            done = next((kernel for kernel in pending if kernel.load(wait=False)), None)
+            if done is None:
+                # Other processes are at all that are left.
+                done = pending[0]
+                done.load()
+            pending.remove(done)
+            for report in _reports:
+                report(total - len(pending), total)
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.wait()
+
+
+def _length(kernel: Kernel[..., Any]) -> int:
+    """Bytes of its code, helpers left out: roughly in proportion to the time that compiling takes."""
+    return len(kernel.plain.__code__.co_code)
+
+
+def _start_workers(kernels: Sequence[Kernel[..., Any]]) -> list[subprocess.Popen[bytes]]:
+    """Processes that compile these kernels, too; each takes those that no other has claimed."""
+    if sys.platform == "win32" or not sys.executable or len(kernels) < _LEAST_SHARED:
+        # There are no claims on Windows.
+        return []
+    processors = os.cpu_count() or 1
+    if sys.platform == "linux":
+        processors = len(os.sched_getaffinity(0))
+    order = {"path": sys.path, "kernels": [(kernel.plain.__module__, kernel.name) for kernel in kernels]}
+    # In sessions of their own, so that Ctrl-C does not reach them: this process ends them.
+    return [
+        subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                "from tactflow.vision import compiled; compiled._work()",
+                json.dumps(order),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        for _ in range(min(processors, _MOST_PROCESSES) - 1)
+    ]
+
+
+def _work() -> None:
+    """What a worker does: compile what nobody else is at."""
+    order = json.loads(sys.argv[1])
+    sys.path[:] = order["path"]
+    for module, name in order["kernels"]:
+        with suppress(ImportError):
+            import_module(module)
+        if name in _known:
+            _known[name].load(wait=False)
+
+
+def _with_helpers(function: Callable[P, R], options: dict[str, Any]) -> Callable[P, R]:
+    """The function, its helpers replaced by what numba can compile into it."""
+    helpers = {
+        name: import_module("numba").njit(**options)(_with_helpers(value.plain, options))
+        for name, value in function.__globals__.items()
+        if name in function.__code__.co_names and isinstance(value, Helper)
+    }
+    if not helpers:
+        return function
+    linked: Callable[P, R] = FunctionType(
+        function.__code__, {**function.__globals__, **helpers}, function.__name__, function.__defaults__
+    )
+    return linked
 
 
 @cache
-def _tell_once() -> None:
-    logger.info("compiling loops for this processor: takes some seconds, once")
+def _warn_once(text: str) -> None:
+    logger.warning("%s", text)
 
 
 def _writable(value: object) -> object:
@@ -206,18 +320,19 @@ def _writable(value: object) -> object:
     return value.copy() if isinstance(value, np.ndarray) and not value.flags.writeable else value
 
 
-@cache
-def _works() -> bool:
-    if find_spec("numba") is None:
-        return False
+_wanted = True
+
+
+def active() -> bool:
+    return _wanted
+
+
+@contextmanager
+def switched(on: bool) -> Iterator[None]:
+    global _wanted
+    before = _wanted
+    _wanted = on
     try:
-        import_module("numba")
-    except Exception as error:
-        warnings.warn(
-            f"numba is installed but does not start ({error}); going on without it, more slowly. "
-            f"`pip install -U numba` may mend it, {VARIABLE}=0 silences this.",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        return False
-    return True
+        yield
+    finally:
+        _wanted = before

@@ -25,10 +25,35 @@ ORANGE: Final[Colour] = (40, 150, 255)
 MAGENTA: Final[Colour] = (255, 120, 255)
 DARK: Final[Colour] = (25, 25, 25)
 
-# Drawing coordinates carry 4 binary digits after the point: 1/16 px.
 _SHIFT: Final = 4
-# Coordinates are cut here, in px, far outside any picture, to stay within 32 bits.
+"""Binary digits after the point in drawing coordinates: they are exact to 1/16 px."""
 _FAR: Final = 1e5
+"""Largest drawing coordinate, px: far outside any picture, and within 32 bits with `_SHIFT` digits."""
+_UNIT_SIDE: Final = 300
+"""Shorter side of a picture, px, up to which everything is drawn at the sizes below; in larger pictures they
+grow with it. All of these sizes are chosen by eye."""
+_LINE: Final = 1.2
+"""Width of lines, px."""
+_DARK_LINE: Final = 2.6
+"""Width of the dark line below a coloured one, px."""
+_HALO: Final = 1.4
+"""How much wider than the coloured one the dark arrow below it is, px."""
+_SHORTEST_ARROW: Final = 2.0
+"""Length, px, below which an arrow is a dot."""
+_HEAD: Final = (0.45, 5.0)
+"""Length of an arrow's head: as a fraction of the arrow, and at most, px."""
+_OVERHANG: Final = 14
+"""Length of the principal axis beyond the hull, px."""
+_CENTROID: Final = (4.0, 2.8)
+"""Radii of the dark and of the coloured dot on the centroid, px."""
+_DASHES: Final = 12
+"""Dashes of an ellipse; each takes half of its share of the outline."""
+_TEXT: Final = 11
+"""Size of the text, px."""
+_LINE_SPACING: Final = 14
+"""Distance of two lines of text, px."""
+_WEIGHT: Final = 400
+"""Weight of the font: regular."""
 _STATUS_COLOURS: Final = (
     (MarkerStatus.LOST, GRAY),
     (MarkerStatus.INFERRED, WHITE),
@@ -49,6 +74,13 @@ class Annotator:
     the principal axis orange with a dot on the centroid and its angle beside it.
 
     Raises ValueError for values out of range. Not to be shared between threads: it owns a font with a cache.
+
+    >>> image = np.zeros((300, 400, 3), np.uint8)
+    >>> hull = np.array([[100.0, 100], [200, 100], [200, 180]])
+    >>> contact = Contact(4000.0, (166.0, 127.0), -38.7, 0.8, hull, None)
+    >>> picture = Annotator(text=False)(image, contact=contact)
+    >>> bool(picture[100, 150].any())
+    True
     """
 
     def __init__(
@@ -95,7 +127,7 @@ class Annotator:
                 markers = self._inside(markers, contact_mask)
         else:
             picture = image.copy()
-        unit = max(1.0, min(image.shape[:2]) / 300)
+        unit = max(1.0, min(image.shape[:2]) / _UNIT_SIDE)
         if contact is not None and len(contact.hull):
             draw_polygon(picture, contact.hull, GREEN, unit)
             if self._ellipse and contact.ellipse is not None:
@@ -136,12 +168,12 @@ class Annotator:
             theta = math.radians(contact.angle)
             along = np.array([math.cos(theta), -math.sin(theta)])
             spread = (contact.hull - center) @ along
-            overhang = 14 * unit
+            overhang = _OVERHANG * unit
             ends = center + along * [[spread.min() - overhang], [spread.max() + overhang]]
-            _strokes(picture, [ends], DARK, 2.6 * unit)
-            _strokes(picture, [ends], ORANGE, 1.2 * unit)
-        _dots(picture, center[None], DARK, 4.0 * unit)
-        _dots(picture, center[None], ORANGE, 2.8 * unit)
+            _strokes(picture, [ends], DARK, _DARK_LINE * unit)
+            _strokes(picture, [ends], ORANGE, _LINE * unit)
+        for colour, radius in zip((DARK, ORANGE), _CENTROID, strict=True):
+            _dots(picture, center[None], colour, radius * unit)
         if self._text and contact.angle is not None:
             label = _signed(contact.angle, 1) + "°"
             x, y = ends[1] + along * 3 * unit
@@ -175,31 +207,31 @@ class Annotator:
         return lines
 
     def _write(self, picture: NDArray[np.uint8], lines: Sequence[tuple[str, Colour]], unit: float) -> None:
-        size = round(11 * unit)
-        step = round(14 * unit)
+        size = round(_TEXT * unit)
+        step = round(_LINE_SPACING * unit)
         height, width = picture.shape[:2]
         longest = 0
         for text, _ in lines:
-            box = cv2.getTextSize((width, height), text, (0, 0), self._font, size, 400)
+            box = cv2.getTextSize((width, height), text, (0, 0), self._font, size, _WEIGHT)
             longest = max(longest, box[2])
         bar: NDArray[Any] = picture[: min(height, step * len(lines) + round(5 * unit)), : longest + step]
         bar[...] = bar // 3
         for index, (text, colour) in enumerate(lines):
             place = (round(5 * unit), round(2 * unit) + step * (index + 1) - round(3 * unit))
-            cv2.putText(picture, text, place, colour, self._font, size, 400)
+            cv2.putText(picture, text, place, colour, self._font, size, _WEIGHT)
 
     def _halo_text(
         self, picture: NDArray[np.uint8], text: str, place: tuple[int, int], colour: Colour, unit: float
     ) -> None:
         """Text kept inside the picture, on a shade."""
-        size = round(11 * unit)
+        size = round(_TEXT * unit)
         height, width = picture.shape[:2]
-        _, _, wide, tall = cv2.getTextSize((width, height), text, (0, 0), self._font, size, 400)
+        _, _, wide, tall = cv2.getTextSize((width, height), text, (0, 0), self._font, size, _WEIGHT)
         x = min(max(place[0], 2), max(2, width - wide - 3))
         y = min(max(place[1], tall + 2), max(tall + 2, height - 3))
         shade: NDArray[Any] = picture[max(0, y - tall - 1) : y + 3, max(0, x - 2) : x + wide + 3]
         shade[...] = shade // 3
-        cv2.putText(picture, text, (x, y), colour, self._font, size, 400)
+        cv2.putText(picture, text, (x, y), colour, self._font, size, _WEIGHT)
 
 
 def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0, unit: float = 1.0) -> None:
@@ -207,6 +239,12 @@ def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0
 
     picture : (H, W, 3) uint8, changed. scale : arrow length over displacement. unit : line width, px.
     Tracked markers are yellow, inferred white, lost dim gray; a displacement too short for a head is a dot.
+
+    >>> picture = np.zeros((40, 60, 3), np.uint8)
+    >>> origin = np.array([[10.0, 20.0]])
+    >>> draw_arrows(picture, Markers(origin, origin + [30, 0], np.zeros(1, np.uint8), np.zeros(1)))
+    >>> bool(picture[20, 25].any())
+    True
     """
     for status, colour in _STATUS_COLOURS:
         chosen = markers.status == status
@@ -215,46 +253,62 @@ def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0
         tail = np.asarray(markers.origin[chosen], np.float64)
         moved = (np.asarray(markers.position[chosen], np.float64) - tail) * scale
         length = np.hypot(moved[:, 0], moved[:, 1])
-        long = length >= 2.0 * unit
+        long = length >= _SHORTEST_ARROW * unit
         along = moved[long] / length[long, None]
         across = along[:, ::-1] * [-1.0, 1.0]
         tip = tail[long] + moved[long]
-        back = np.minimum(0.45 * length[long], 5.0 * unit)[:, None]
+        back = np.minimum(_HEAD[0] * length[long], _HEAD[1] * unit)[:, None]
         neck = tip - along * back
         left, right = neck + across * back * 0.5, neck - across * back * 0.5
         shafts = np.stack([tail[long], neck], axis=1)
         heads = np.stack([tip, left, right], axis=1)
-        for paint, extra in ((DARK, 1.4 * unit), (colour, 0.0)):
+        for paint, extra in ((DARK, _HALO * unit), (colour, 0.0)):
             if status == MarkerStatus.LOST and extra:
                 continue
-            _strokes(picture, shafts, paint, 1.2 * unit + extra)
+            _strokes(picture, shafts, paint, _LINE * unit + extra)
             if extra:
                 _strokes(picture, heads, paint, extra, closed=True)
             _fill(picture, heads, paint)
-            _dots(picture, tail[~long], paint, 1.2 * unit + extra / 2)
+            _dots(picture, tail[~long], paint, _LINE * unit + extra / 2)
 
 
 def draw_polygon(
     picture: NDArray[np.uint8], vertices: NDArray[np.float64], colour: Colour = GREEN, unit: float = 1.0
 ) -> None:
-    """Draw a closed outline into `picture`; vertices (N, 2), px, to 1/16 px; unit is the line width, px."""
-    _strokes(picture, [vertices], DARK, 2.6 * unit, closed=True)
-    _strokes(picture, [vertices], colour, 1.2 * unit, closed=True)
+    """Draw a closed outline into `picture`, to 1/16 px.
+
+    picture : (H, W, 3) uint8, changed. vertices : (N, 2) float64, px. unit : line width, px.
+
+    >>> picture = np.zeros((40, 60, 3), np.uint8)
+    >>> draw_polygon(picture, np.array([[10.0, 10], [50, 10], [50, 30]]))
+    >>> bool(picture[10, 30].any())
+    True
+    """
+    _strokes(picture, [vertices], DARK, _DARK_LINE * unit, closed=True)
+    _strokes(picture, [vertices], colour, _LINE * unit, closed=True)
 
 
 def draw_ellipse(
     picture: NDArray[np.uint8], ellipse: Ellipse, colour: Colour = MAGENTA, unit: float = 1.0
 ) -> None:
-    """Draw an ellipse into `picture`, dashed, to 1/16 px; unit is the line width, px."""
+    """Draw an ellipse into `picture`, dashed, to 1/16 px.
+
+    picture : (H, W, 3) uint8, changed. unit : line width, px.
+
+    >>> picture = np.zeros((40, 60, 3), np.uint8)
+    >>> draw_ellipse(picture, Ellipse((30.0, 20.0), (40.0, 20.0), 0.0))
+    >>> bool(picture[20, 50].any())
+    True
+    """
     theta = math.radians(ellipse.angle or 0.0)
     turn = np.array([[math.cos(theta), -math.sin(theta)], [math.sin(theta), math.cos(theta)]])
-    # Twelve dashes of half the outline; the ends of both axes lie in the middle of one.
-    step = np.arange(12)[:, None] * 8 + np.arange(-2, 3)
-    around = step.ravel() * (2 * math.pi / 96)
+    # Of eight parts for each dash, four are drawn; the ends of both axes lie in the middle of a dash.
+    step = np.arange(_DASHES)[:, None] * 8 + np.arange(-2, 3)
+    around = step.ravel() * (2 * math.pi / (8 * _DASHES))
     outline = np.column_stack([np.cos(around) * ellipse.axes[0] / 2, np.sin(around) * ellipse.axes[1] / 2])
-    dashes = (outline @ turn + ellipse.center).reshape(12, 5, 2)
-    _strokes(picture, dashes, DARK, 2.6 * unit)
-    _strokes(picture, dashes, colour, 1.2 * unit)
+    dashes = (outline @ turn + ellipse.center).reshape(_DASHES, 5, 2)
+    _strokes(picture, dashes, DARK, _DARK_LINE * unit)
+    _strokes(picture, dashes, colour, _LINE * unit)
 
 
 def _fixed(points: NDArray[Any]) -> NDArray[np.int32]:

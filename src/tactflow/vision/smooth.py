@@ -6,6 +6,7 @@ import dataclasses
 import math
 from typing import Literal, Protocol
 
+from tactflow.vision.geometry.direction import VERTICAL
 from tactflow.vision.types import Contact
 
 Method = Literal["one_euro", "alpha_beta"]
@@ -29,6 +30,10 @@ class OneEuro:
     period : of a value that wraps round, in its unit (180 for the angle of an axis); 0 for one that does not.
         Differences are then the shortest way round, so nothing happens at the seam, and results lie in
         (-period / 2, period / 2].
+
+    >>> smooth = OneEuro(min_cutoff=1.0)
+    >>> [round(smooth.update(value, dt=0.1), 3) for value in (0.0, 1.0, 1.0)]
+    [0.0, 0.404, 0.64]
     """
 
     def __init__(
@@ -67,10 +72,14 @@ class OneEuro:
 class AlphaBeta:
     """The alpha-beta filter: a constant-velocity Kalman filter in its steady state.
 
-    alpha : (0, 1], share of a surprise that corrects the value; lower is steadier and slower.
-    beta : [0, 2), share that corrects the velocity; None takes alpha^2 / (2 - alpha), the choice with least
-        variance and overshoot together (Benedict and Bordner, 1962).
+    alpha : (0, 1], fraction of the innovation that corrects the value; lower is steadier and slower.
+    beta : [0, 2), fraction of it that corrects the velocity; None takes alpha^2 / (2 - alpha), the choice
+        with least variance and overshoot together (Benedict and Bordner, 1962).
     period : as for `OneEuro`.
+
+    >>> smooth = AlphaBeta(alpha=0.5)
+    >>> [round(smooth.update(value, dt=0.1), 3) for value in (0.0, 1.0, 1.0)]
+    [0.0, 0.5, 0.833]
     """
 
     def __init__(self, alpha: float = 0.5, beta: float | None = None, period: float = 0.0) -> None:
@@ -92,9 +101,9 @@ class AlphaBeta:
             self._value = value
             return value
         predicted = self._value + self._velocity * dt
-        surprise = _difference(value, predicted, self._period)
-        self._velocity += self._beta * surprise / dt
-        self._value = _wrap(predicted + self._alpha * surprise, self._period)
+        innovation = _difference(value, predicted, self._period)
+        self._velocity += self._beta * innovation / dt
+        self._value = _wrap(predicted + self._alpha * innovation, self._period)
         return self._value
 
 
@@ -107,6 +116,14 @@ class ContactSmoother:
 
     The angle is that of an axis: it is filtered with period 180 degrees, so +89 and -89 are 2 degrees apart.
     The first contact after none starts afresh, and so does the angle after a frame without direction.
+
+    >>> import numpy as np
+    >>> smoother = ContactSmoother("alpha_beta", alpha=0.5)
+    >>> for t, angle in enumerate((80.0, -80.0)):
+    ...     contact = Contact(9.0, (5.0, 5.0), angle, None, np.zeros((3, 2)), None)
+    ...     smoothed = smoother.update(contact, t / 60)
+    >>> smoothed.angle
+    90.0
     """
 
     def __init__(
@@ -152,7 +169,7 @@ class ContactSmoother:
         if self._angle is None:
             self._angle = self._make(180.0)
         angle = self._angle.update(contact.angle, dt)
-        slope = None if abs(angle) > 90 - 6e-6 else -math.tan(math.radians(angle)) + 0.0
+        slope = None if abs(angle) > 90 - VERTICAL else -math.tan(math.radians(angle)) + 0.0
         return dataclasses.replace(contact, center=(x, y), angle=angle, slope=slope)
 
     def _make(self, period: float) -> Filter:

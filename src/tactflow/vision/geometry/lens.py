@@ -35,10 +35,10 @@ class Lens:
     fisheye : which of the two models.
 
     >>> lens = Lens(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), np.array([-0.2, 0, 0, 0]))
-    >>> lens.distort(np.array([[0.0, 0.0]])).round(2)
-    array([[40.96, 30.72]])
-    >>> lens.undistort(np.array([[40.96, 30.72]])).round(6)
-    array([[0., 0.]])
+    >>> lens.distort(np.array([[100.0, 100.0]])).round(2)
+    array([[111.97, 107.62]])
+    >>> lens.undistort(lens.distort(np.array([[100.0, 100.0]]))).round(6)
+    array([[100., 100.]])
     """
 
     camera_matrix: FloatArray

@@ -1,6 +1,8 @@
-"""Compiled loop of `hull`: what it computes is done with OpenCV there."""
+"""Moments of a region: its bounding box and the sums that centre, area and direction follow from."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +12,70 @@ from tactflow.vision.compiled import kernel
 Whole = NDArray[np.int64]
 
 
+class Box(NamedTuple):
+    """A bounding box, px: its first column and row, its width and height; all 0 for an empty region."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+class Moments(NamedTuple):
+    """Sums over the pixels of a region, relative to some pixel; whole numbers, so exact.
+
+    pixels : how many. x, y : sums of the coordinates, px. xx, xy, yy : sums of their products, px^2.
+    """
+
+    pixels: int
+    x: int
+    y: int
+    xx: int
+    xy: int
+    yy: int
+
+    def central(self) -> tuple[int, int, int]:
+        """Second central moments xx, xy, yy times the number of pixels; exact."""
+        count, x, y, xx, xy, yy = self
+        return count * xx - x * x, count * xy - x * y, count * yy - y * y
+
+    def moved(self, right: int, down: int) -> Moments:
+        """The same region with its coordinates increased by (right, down) px."""
+        count, x, y, xx, xy, yy = self
+        return Moments(
+            count,
+            x + right * count,
+            y + down * count,
+            xx + 2 * right * x + right * right * count,
+            xy + right * y + down * x + right * down * count,
+            yy + 2 * down * y + down * down * count,
+        )
+
+
+def region_moments(mask: NDArray[np.uint8]) -> tuple[Box, Moments]:
+    """Bounding box of the non-zero pixels, and their moments relative to its corner.
+
+    mask : (H, W) uint8, H and W >= 1.
+
+    >>> mask = np.zeros((5, 8), np.uint8)
+    >>> mask[2, 3:6] = 255
+    >>> region_moments(mask)
+    (Box(left=3, top=2, width=3, height=1), Moments(pixels=3, x=3, y=0, xx=5, xy=0, yy=0))
+    """
+    found = np.empty(10, np.int64)
+    measure_region(np.ascontiguousarray(mask), found)
+    numbers = found.tolist()
+    return Box(*numbers[:4]), Moments(*numbers[4:])
+
+
 @kernel("void(uint8[:, ::1], int64[::1])")
 def measure_region(mask: NDArray[np.uint8], found: Whole) -> None:
-    """Set `found`: left, top, width and height of the bounding box of the non-zero pixels; their number; the
-    sums of x, y, x^2, x y and y^2 over them, relative to the corner of the box. All 0 where there are none.
+    """Set `found` as `region_moments` returns it, in one row. All 0 where no pixel is set.
+
+    mask : (H, W) uint8. found : (10,) int64.
     """
     height, width = mask.shape
-    # Additions of what is there are done many at once, multiplications are not.
+    # Squares from a table: the compiler adds many numbers at once, but multiplies one by one.
     squares = np.empty(width, np.int64)
     columns = np.zeros(width, np.uint8)
     for x in range(width):

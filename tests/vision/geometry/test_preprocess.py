@@ -137,7 +137,6 @@ def test_the_pyramid_is_the_original_bit_for_bit(size: tuple[int, int]) -> None:
     np.testing.assert_array_equal(result, original)
 
 
-@pytest.mark.usefixtures("each_way")
 @pytest.mark.parametrize("rotate", [0, 90, 180, 270])
 def test_area_averages_blocks_of_the_cropped_and_rotated_picture(rotate: int) -> None:
     image = noise(41, 30)
@@ -147,7 +146,6 @@ def test_area_averages_blocks_of_the_cropped_and_rotated_picture(rotate: int) ->
     np.testing.assert_array_equal(result, np.rot90(mean, -rotate // 90))
 
 
-@pytest.mark.usefixtures("each_way")
 def test_repeated_halving_is_the_mean_within_a_rounding_each() -> None:
     image = noise(64, 32)
     result = Preprocessor((64, 32), downsample=4, rotate=90)(image)

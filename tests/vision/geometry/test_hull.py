@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -14,13 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
 from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Contact
 
 Mask = NDArray[np.uint8]
-
-pytestmark = pytest.mark.usefixtures("each_way")
 
 
 def blank(width: int = 120, height: int = 100) -> Mask:
@@ -455,35 +451,3 @@ def test_a_large_frame_loses_no_precision() -> None:
 def test_bad_input_is_refused_with_a_reason(mask: Any, kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         contact_geometry(mask, **kwargs)
-
-
-def test_with_numba_and_without_it_the_contact_is_the_same() -> None:
-    with compiled.switched(True):
-        if not compiled.active():
-            pytest.skip('numba is not here: pip install "tactflow[fast]"')
-    rng = np.random.default_rng(9)
-    for size in [(1, 1), (1, 37), (41, 1), (2, 3), (63, 65), (150, 180), (260, 333)] * 12:
-        mask = blank(size[1], size[0])
-        for _ in range(rng.integers(0, 4)):
-            center = int(rng.integers(-3, size[1] + 3)), int(rng.integers(-3, size[0] + 3))
-            axes = int(rng.integers(0, size[1])), int(rng.integers(0, size[0]))
-            value = int(rng.choice([0, 1, 2, 128, 255]))
-            cv2.ellipse(
-                mask, center, axes, float(rng.uniform(0, 180)), 0, 360, value, int(rng.choice([-1, 2]))
-            )
-        mask[rng.random(size) < 0.001] = 7
-        if rng.random() < 0.3:
-            mask = np.asfortranarray(mask)
-        elif rng.random() < 0.3:
-            mask.setflags(write=False)
-        for options in ({}, {"min_area": 20.0, "max_gap": 3.0}):
-            with compiled.switched(True):
-                fast = contact_geometry(mask, **options)
-            with compiled.switched(False):
-                slow = contact_geometry(mask, **options)
-            assert (fast is None) == (slow is None)
-            if fast is None or slow is None:
-                continue
-            # Sums of whole numbers: the same to the last bit, and so is all that follows from them.
-            np.testing.assert_array_equal(fast.hull, slow.hull)
-            assert replace(fast, hull=slow.hull) == slow

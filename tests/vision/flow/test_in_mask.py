@@ -12,11 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.types import Flow, Markers, MarkerStatus
-
-pytestmark = pytest.mark.usefixtures("each_way")
 
 GRID = np.stack(np.meshgrid(np.arange(10, 200, 15.0), np.arange(10, 160, 15.0)), axis=-1).reshape(-1, 2)
 EVERYWHERE = np.full((160, 200), 255, np.uint8)
@@ -220,34 +217,6 @@ def test_inside_is_the_same_as_looking_up_the_distance(
         squared = (columns - x) ** 2 + (rows - y) ** 2
         expected[k] = bool(len(squared)) and squared.min() <= dilate**2 + 1e-9
     np.testing.assert_array_equal(inside_mask(points, mask, dilate), expected)
-
-
-def test_with_numba_and_without_it_the_flow_is_the_same() -> None:
-    with compiled.switched(True):
-        if not compiled.active():
-            pytest.skip('numba is not here: pip install "tactflow[fast]"')
-    rng = np.random.default_rng(5)
-    for count in [1, 2, 3, 4, 5, 9, 40] * 6:
-        origin = rng.uniform(5, 150, (count, 2))
-        if rng.random() < 0.2:
-            origin[:, 1] = origin[:, 0]
-        position = origin + rng.normal(0, 2, (count, 2))
-        given = markers(position, np.asfortranarray(origin), rng.choice(3, count, p=[0.7, 0.2, 0.1]))
-        found = []
-        for on in (True, False):
-            with compiled.switched(on):
-                found.append(flow_in_mask(given, EVERYWHERE, dilate=9))
-        fast, slow = found
-        assert (fast.count, fast.rotation is None) == (slow.count, slow.rotation is None)
-        if slow.mean is None:
-            assert fast.mean is None
-            continue
-        # Derived: sums of 40 numbers of up to 2e2 px in doubles, in another order; squares of them.
-        assert fast.mean == pytest.approx(slow.mean, abs=1e-12)
-        assert fast.stderr == pytest.approx(slow.stderr, abs=1e-10)
-        assert fast.rotation == pytest.approx(slow.rotation, abs=1e-9)
-        assert fast.divergence == pytest.approx(slow.divergence, abs=1e-11)
-        assert fast.residual == pytest.approx(slow.residual, abs=1e-10)
 
 
 def test_the_inputs_stay_as_they_are() -> None:

@@ -1,0 +1,70 @@
+"""Downsampling by two: the same bits as OpenCV's block averages."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.vision.geometry import Preprocessor
+from tactflow.vision.geometry.downsample import halved
+from tests.oracles.downsample import plain_halved
+
+Image = NDArray[np.uint8]
+
+ROTATIONS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+
+
+def noise(height: int, width: int) -> Image:
+    return np.random.default_rng(4).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("far", [False, True])
+@pytest.mark.parametrize("size", [(2, 2), (3, 5), (8, 7), (64, 131), (150, 401)], ids=str)
+def test_halves_are_those_of_opencv_to_the_bit(size: tuple[int, int], far: bool) -> None:
+    picture = noise(*size)
+    # Sums of which every remainder occurs, also with the largest values.
+    picture[:1, :, 0], picture[1:, :, 0] = 255, 254
+    assert np.array_equal(halved(picture, far=far), plain_halved(picture))
+
+
+def test_a_block_is_halved_as_if_it_were_cut_out_first() -> None:
+    picture = noise(40, 60)
+    block = slice(3, 32), slice(5, 48)
+    expected = plain_halved(picture[block])
+    assert np.array_equal(halved(picture, block), expected)
+    strided = np.dstack([picture, picture])[:, :, ::2]
+    assert np.array_equal(halved(strided, block), plain_halved(strided[block]))
+    into = np.zeros_like(expected)
+    assert halved(picture, block, into=into) is into
+    assert np.array_equal(into, expected)
+
+
+@pytest.mark.parametrize("rotate", [0, 90, 180, 270])
+@pytest.mark.parametrize("downsample", [2, 4])
+@pytest.mark.parametrize("crop", [None, (0, 0, 9, 8), (3, 5, 68, 41), (70, 50, 9, 11)])
+def test_a_processed_frame_is_cropped_halved_and_turned(
+    rotate: int, downsample: int, crop: tuple[int, int, int, int] | None
+) -> None:
+    frame = noise(61, 79)
+    frame.setflags(write=False)
+    strided = np.dstack([frame, frame])[:, :, ::2]
+    x, y, width, height = crop or (0, 0, 79, 61)
+    for raw in (frame, strided):
+        expected = raw[y : y + height - height % downsample, x : x + width - width % downsample]
+        for _ in range(downsample.bit_length() - 1):
+            expected = plain_halved(expected)
+        if rotate:
+            expected = np.asarray(cv2.rotate(expected, ROTATIONS[rotate]), np.uint8)
+        processed = Preprocessor((79, 61), rotate=rotate, downsample=downsample, crop=crop)(raw)
+        assert np.array_equal(processed, expected)
+
+
+def test_a_processed_frame_stays_when_the_next_one_comes() -> None:
+    for rotate in (0, 90):
+        preprocess = Preprocessor((64, 48), rotate=rotate, downsample=2)
+        first = preprocess(noise(48, 64))
+        kept = first.copy()
+        preprocess(255 - noise(48, 64))
+        assert np.array_equal(first, kept)
