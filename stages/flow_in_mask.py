@@ -13,7 +13,7 @@ from tactflow.vision.types import Flow, Markers
 
 
 class FlowInMask(Stage):
-    """Mean displacement, twist and press of the markers inside the contact."""
+    """Mean displacement, rotation and divergence of the markers inside the contact."""
 
     memory = "pure"
 

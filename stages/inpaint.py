@@ -10,7 +10,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
-from tactflow.vision.markers import inpaint_kernels
+from tactflow.vision.markers import inpaint
 from tactflow.vision.markers.inpaint import RADIUS, remove_markers
 
 
@@ -29,7 +29,7 @@ class Inpaint(Stage):
 
     def __init__(self, params: Params) -> None:
         if params.method == "normalized":
-            compiled.load(downsample, inpaint_kernels)
+            compiled.load(downsample, inpaint)
         self._params = params
 
     def process(self, image: Image, marker_mask: MarkerMask) -> Unmarked:

@@ -11,7 +11,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
-from tactflow.vision.markers import mask_kernels
+from tactflow.vision.markers import mask
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 
 
@@ -33,7 +33,7 @@ class MarkerMaskStage(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        compiled.load(downsample, mask_kernels)
+        compiled.load(downsample, mask)
         self._params = params
         self._dot: Dot | None = None
         self._looked = False

@@ -12,7 +12,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Image
 from tactflow.vision import compiled
-from tactflow.vision.markers import matching, template_kernels, tracking_kernels
+from tactflow.vision.markers import field, matching, spots, template, tracking
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers
@@ -41,7 +41,7 @@ class Tracker(Stage):
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(template_kernels, matching, tracking_kernels)
+        compiled.load(template, tracking, field, spots, matching)
         self.reset()
 
     def reset(self) -> None:

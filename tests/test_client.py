@@ -19,16 +19,17 @@ from tactflow.cli import listen
 from tactflow.client import Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.clock import ManualClock
+from tests.clock import PATIENCE, ManualClock
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 CONTACT = Contact(5123.5, (150.2, 201.7), -12.31, 0.218, np.zeros((3, 2)), None)
 FLOW = Flow((1.214, -0.33), 9)
 MARKERS = Markers(np.zeros((3, 2)), np.zeros((3, 2)), np.array([0, 0, 2], np.uint8), np.zeros(3))
-LONG = 30.0
-"""s; only a broken test waits so long."""
+LONG = PATIENCE
+"""How long a test waits for what must happen, s."""
 
 
 class Publisher:
@@ -48,7 +49,9 @@ class Publisher:
     def send(self, *seqs: int, contact: Contact | None = None) -> None:
         for seq in seqs:
             flow = None if contact is None else FLOW
-            self.sink.write(Tick(Frame(self.sensor, seq, seq / 10, IMAGE)), IMAGE, contact, flow, MARKERS)
+            self.sink.write(
+                Tick(Frame(self.sensor, seq, seq / 10, IMAGE)), Results(IMAGE, contact, flow, MARKERS)
+            )
 
 
 @pytest.fixture
@@ -182,7 +185,7 @@ def test_a_subscriber_may_start_before_the_publisher_and_survives_its_restart() 
         sink = Zmq(Zmq.Params(endpoint=endpoint, wait_for_subscriber=LONG))
         sink.open()
         for seq in seqs:
-            sink.write(Tick(Frame("main", seq, 0.0, IMAGE)), IMAGE, None, None, None)
+            sink.write(Tick(Frame("main", seq, 0.0, IMAGE)), Results(IMAGE))
         sink.close()
 
     with Subscriber(endpoint, timeout=LONG) as messages:

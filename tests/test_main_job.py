@@ -19,6 +19,7 @@ import yaml
 import zmq
 
 from tactflow.message import message_schema
+from tests.clock import PATIENCE, until
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHIPPED = yaml.safe_load((REPOSITORY / "pipeline.yaml").read_text())
@@ -51,7 +52,7 @@ def subscriber() -> Iterator[zmq.Socket[bytes]]:
     """A subscriber that binds nothing and connects when the test says where."""
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.SUBSCRIBE, b"tactflow.")
-        socket.rcvtimeo = 20_000
+        socket.rcvtimeo = round(PATIENCE * 1000)
         socket.linger = 0
         yield socket
 
@@ -126,7 +127,7 @@ def test_a_subscriber_in_another_process_gets_every_message_of_a_run(
             topic, _, body = subscriber.recv().partition(b" ")
             assert topic == b"tactflow.main"
             got.append(json.loads(body))
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE) == 0
     assert [message["seq"] for message in got] == list(range(50))
     jsonschema.validate(got[-1], message_schema())
     assert json.loads(stats.read_text())["sinks"]["zmq"]["counters"]["serialised"] == 50
@@ -178,10 +179,8 @@ def started(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
         text=True,
     )
     out = cwd / "out.jsonl"
-    deadline = time.monotonic() + 60
-    while not (out.exists() and out.stat().st_size) and time.monotonic() < deadline:
-        assert process.poll() is None, process.communicate()[1]
-        time.sleep(0.02)
+    until(lambda: process.poll() is not None or (out.exists() and out.stat().st_size))
+    assert process.poll() is None, process.communicate()[1]
     return process
 
 
@@ -189,7 +188,7 @@ def started(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
 def test_one_signal_drains_and_finalises(number: int, tmp_path: Path) -> None:
     process = started("--stats", "stats.json", cwd=tmp_path)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
     stats = json.loads((tmp_path / "stats.json").read_text())
     assert stats["end"] == "signal"
@@ -199,12 +198,14 @@ def test_one_signal_drains_and_finalises(number: int, tmp_path: Path) -> None:
 
 SLOW = """
 import time
+from pathlib import Path
 from tactflow.engine.contract import Stage
 from tactflow.ports import Image
 
 class Slow(Stage):
     memory = "pure"
     def process(self, image: Image) -> Image:
+        Path("began").touch()
         time.sleep(60)
         return image
 """
@@ -219,15 +220,13 @@ def test_a_second_signal_ends_at_once_with_130(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "tactflow", "run"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
     )
-    while not (tmp_path / "out.jsonl").exists():
-        assert process.poll() is None, process.communicate()[1]
-        time.sleep(0.02)
-    time.sleep(0.5)
+    until(lambda: process.poll() is not None or (tmp_path / "began").exists())
+    assert process.poll() is None, process.communicate()[1]
     process.send_signal(signal.SIGINT)
     time.sleep(0.5)
     assert process.poll() is None, "one signal waits for the frame under way"
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=10)
+    process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
 
 

@@ -8,9 +8,11 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import Console
 
-from tactflow.bench.quantities import QUANTITIES
-from tactflow.bench.report import Point, format_number, html, pareto, points, scatter
+from tactflow.bench.pareto import Point, pareto, points
+from tactflow.bench.quantities import QUANTITIES, format_number
+from tactflow.bench.report import html
 from tactflow.bench.results import Measurement, Result, Target
+from tactflow.bench.scatter import scatter
 from tactflow.bench.table import print_result
 
 

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.bench.markdown import markdown
-from tactflow.bench.pipelines import ORIGINAL, PLAIN
+from tactflow.bench.pipelines import ORIGINAL
 from tactflow.bench.results import Measurement, Result
 from tactflow.bench.run import Plan, run_bench
 from tactflow.bench.scenes import FULL, Case
@@ -16,7 +15,6 @@ from tactflow.bench.targets import judge
 from tactflow.cli.main import main
 from tactflow.cli.pipelines import find_pipeline
 from tactflow.engine.errors import ConfigError
-from tactflow.vision import compiled
 
 FILES = {name: find_pipeline(name) for name in ("default", "classic")}
 
@@ -130,7 +128,7 @@ def test_the_command_writes_results_and_fails_when_something_got_worse(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tactflow.cli.bench.run_bench", lambda _plan, _progress: result)
-    files = ["--json", "b.json", "--html", "b.html", "--errors", "e.json"]
+    files = ["--json", "b.json", "--html", "b.html", "--write-baseline", "e.json"]
     assert main(["bench", "--quick", *files]) == 0
     out, err = capsys.readouterr()
     assert "Whole pipelines" in out
@@ -144,22 +142,6 @@ def test_the_command_writes_results_and_fails_when_something_got_worse(
     (tmp_path / "e.json").write_text(json.dumps(stored))
     assert main(["bench", "--quick", "--against", "e.json"]) == 3
     assert "pipeline/default/bright_cable: marker displacement error" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(not compiled.active(), reason='numba is not here: pip install "tactflow[fast]"')
-def test_a_whole_run_measures_the_default_pipeline_without_numba_too() -> None:
-    case = Case("bright_cable", 14)
-    plan = Plan(
-        FILES, memory=False, scenes=frozenset({case.label}), cases=(case,), stage_cases=(Case("press", 2),)
-    )
-    made = run_bench(plan)
-    fast, plain = (made.of("pipeline", name)[0] for name in ("default", PLAIN))
-    assert plain.failure is None
-    # The same to the rounding of single precision: a pixel of an outline, a ten thousandth of one of a mark.
-    for name, value in fast.errors.items():
-        assert plain.errors[name] == pytest.approx(value, rel=0.02, abs=2e-3), name
-    assert "without numba" in markdown(made, "default")
-    assert compiled.active()
 
 
 def test_pictures_show_the_worst_frame_of_every_pipeline(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from websockets.sync.server import serve as websockets_serve  # noqa: E402
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGE = REPOSITORY / "src" / "tactflow" / "view" / "page"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-PATIENCE = 30_000
+PATIENCE = 60_000
 """ms; how long a test waits for what must happen. Nothing is asserted about the time it takes."""
 
 FLAGS = [

@@ -23,6 +23,7 @@ from tactflow.cli.main import main
 from tactflow.sim import open_scene
 from tactflow.sources import open_source
 from tests.cli.kill_me import image
+from tests.clock import until
 
 QUIET = ["--quiet", "--set", "sinks.zmq=null", "--set", "sinks.jsonl=null", "--set", "sinks.view=null"]
 
@@ -192,8 +193,7 @@ def test_a_kill_at_any_moment_loses_no_frame_that_was_written(tmp_path: Path) ->
             path, counter = tmp_path / f"{number}.mcap", tmp_path / f"{number}.count"
             print(path, counter, file=helper.stdin, flush=True)
             child = int(helper.stdout.readline())
-            while not counter.exists() or not counter.stat().st_size:
-                time.sleep(0.001)
+            until(lambda counter=counter: counter.exists() and counter.stat().st_size)
             time.sleep(moments.uniform(0, 0.05))
             os.kill(child, signal.SIGKILL)
             assert int(helper.stdout.readline()) == path.stat().st_size

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 
 import pytest
 from hypothesis import given, settings
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 
 from tactflow.engine.graph import FullPolicy
 from tactflow.engine.link import Link
+from tests.clock import PATIENCE, until
 
 POLICIES: tuple[FullPolicy, ...] = ("block", "latest", "drop_oldest")
 
@@ -45,8 +45,7 @@ def test_blocking_loses_nothing_and_measures_the_wait() -> None:
     link: Link[int] = Link("l", 2, "block")
     thread = threading.Thread(target=lambda: ([link.put(i) for i in range(50)], link.close()))
     thread.start()
-    while link.stats().offered < 3:
-        time.sleep(0.001)
+    until(lambda: link.stats().offered >= 3)
     assert drain(link) == list(range(50))
     thread.join()
     assert link.stats().drops == 0
@@ -126,7 +125,7 @@ def test_an_aborted_link_frees_its_producer_and_counts_what_it_dropped() -> None
     thread = threading.Thread(target=link.put, args=(1,))
     thread.start()
     link.abort()
-    thread.join(5)
+    thread.join(PATIENCE)
     assert not thread.is_alive()
     link.put(2)
     assert link.get() is None

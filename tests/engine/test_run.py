@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +12,7 @@ import pytest
 
 from tactflow.engine import run
 from tactflow.engine.run import Runner, RunResult
+from tests.clock import PATIENCE, until
 
 MakeRunner = Callable[..., Runner]
 
@@ -485,10 +485,9 @@ def test_stopping_drains_what_is_under_way(toy_runner: MakeRunner) -> None:
     done: list[RunResult] = []
     thread = threading.Thread(target=lambda: done.append(runner.run()))
     thread.start()
-    while runner.progress().frames < 20:
-        time.sleep(0.005)
+    until(lambda: runner.progress().frames >= 20)
     runner.stop("signal")
-    thread.join(20)
+    thread.join(PATIENCE)
     assert done[0].exit_code == 0
     assert done[0].stats["end"] == "signal"
     got = [row[0] for row in rows(runner)]
@@ -502,12 +501,11 @@ def test_a_paused_recording_waits_and_steps_frame_by_frame(toy_runner: MakeRunne
     thread.start()
     for count in (1, 2, 3):
         runner.step()
-        while "out" not in runner.nodes or len(rows(runner)) < count:
-            time.sleep(0.001)
+        until(lambda count=count: "out" in runner.nodes and len(rows(runner)) >= count)
         assert [row[0] for row in rows(runner)] == list(range(count))
     assert runner.paused
     runner.pause(False)
-    thread.join(10)
+    thread.join(PATIENCE)
     assert [row[0] for row in rows(runner)] == list(range(12)), "nothing is lost by pausing"
     assert runner.snapshot()["frames"] == 12
 
@@ -518,7 +516,7 @@ def test_a_paused_run_can_be_stopped(toy_runner: MakeRunner) -> None:
     thread = threading.Thread(target=runner.run)
     thread.start()
     runner.stop()
-    thread.join(10)
+    thread.join(PATIENCE)
     assert not thread.is_alive()
 
 
@@ -530,7 +528,7 @@ def test_a_stage_that_hangs_is_named(toy_runner: MakeRunner, monkeypatch: pytest
     assert "compute (in join) hangs" in str(result.error)
     runner.nodes["join"].instance.release.set()
     for thread in runner._threads.values():
-        thread.join(5)
+        thread.join(PATIENCE)
 
 
 # -- the graph --------------------------------------------------------------------------------------------

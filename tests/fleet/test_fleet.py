@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import zmq
 
 from tactflow.cli.main import main
 from tactflow.fleet import supervisor
+from tests.clock import PATIENCE, until
 
 GRAPH = """
 opencv_threads: 1
@@ -84,7 +84,7 @@ def test_all_sensors_publish_at_one_address(folder: Path) -> None:
         port = finder.bind_to_random_port("tcp://127.0.0.1")
         finder.unbind(f"tcp://127.0.0.1:{port}")
         socket.linger = 0
-        socket.rcvtimeo = 20_000
+        socket.rcvtimeo = round(PATIENCE * 1000)
         socket.subscribe("tactflow.")
         socket.connect(f"tcp://127.0.0.1:{port}")
         process = subprocess.Popen(
@@ -99,7 +99,7 @@ def test_all_sensors_publish_at_one_address(folder: Path) -> None:
         counts: Counter[bytes] = Counter()
         while sum(counts.values()) < 70:
             counts[socket.recv().partition(b" ")[0]] += 1
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE) == 0
     assert counts == {b"tactflow.left": 40, b"tactflow.right": 30}
 
 
@@ -250,11 +250,10 @@ def test_one_signal_soon_after_the_start_ends_all_sensors_well(
     process = subprocess.Popen(
         [sys.executable, "-m", "tactflow", "run"], cwd=folder, stderr=subprocess.PIPE, text=True
     )
-    while not all(file.exists() for file in files):
-        assert process.poll() is None
-        time.sleep(0.02)
+    until(lambda: process.poll() is not None or all(file.exists() for file in files))
+    assert process.poll() is None
     process.send_signal(number)
-    _, errors = process.communicate(timeout=40)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == code, errors
     assert "Traceback" not in errors
     assert errors.count("was ended by signal 9") == (2 if code else 0)
@@ -300,7 +299,7 @@ def test_the_run_goes_on_when_nobody_reads_its_lines_any_more(folder: Path) -> N
     process.stdout.close()
     with process.stderr as stream:
         errors = stream.read()
-    assert process.wait(40) == 0
+    assert process.wait(PATIENCE) == 0
     assert errors == b""
     assert len(rows(folder / "out-left.jsonl")) == 40
     assert len(rows(folder / "out-right.jsonl")) == 30
@@ -340,11 +339,10 @@ def test_one_signal_ends_all_sensors_well(folder: Path) -> None:
         [sys.executable, "-m", "tactflow", "run"], cwd=folder, stderr=subprocess.PIPE, text=True
     )
     files = [folder / "out-left.jsonl", folder / "out-right.jsonl"]
-    while not all(file.exists() and file.stat().st_size for file in files):
-        assert process.poll() is None
-        time.sleep(0.05)
+    until(lambda: process.poll() is not None or all(file.exists() and file.stat().st_size for file in files))
+    assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=40)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
     assert errors.count("(signal)") == 2
     for file in files:

@@ -21,6 +21,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
 from tactflow.sinks import jsonl as jsonl_module
 from tactflow.sinks.jsonl import Jsonl
+from tests.clock import PATIENCE
 
 IMAGE = np.zeros((3, 4, 3), np.uint8)
 
@@ -242,4 +243,4 @@ print("more text that nobody reads")
     assert child.stderr is not None
     assert child.stderr.read() == b""
     child.stderr.close()
-    assert child.wait(30) == 0
+    assert child.wait(PATIENCE) == 0

@@ -33,10 +33,9 @@ from tactflow.message import Results, build_message
 from tactflow.sinks.view import View
 from tactflow.view.address import address, bind, is_loopback
 from tactflow.vision.types import Contact, Markers
+from tests.clock import PATIENCE, until
 
 SECRET = "a-secret-of-some-length"
-PATIENCE = 10.0
-"""s; how long a test waits for what must happen. Nothing is asserted about the time it takes."""
 
 
 class FakeRun:
@@ -167,17 +166,9 @@ def tick(seq: int = 0) -> Tick:
     return Tick(Frame("main", seq, seq / 60, picture(), time.perf_counter()), {"contact": "no_contact"})
 
 
-def wait_for(condition: Callable[[], object]) -> None:
-    """Wait until something holds; it must."""
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.002)
-
-
 def write(sink: View, seq: int) -> None:
     """Have a frame shown, as the engine does: when the sink wants one."""
-    wait_for(sink.wants)
+    until(sink.wants)
     sink.write(tick(seq), Results(picture(), None, None, None))
 
 
@@ -215,7 +206,7 @@ def test_a_page_is_sent_nothing_more_until_it_has_drawn(
     browser = page(sink)
     write(sink, 0)
     first, _ = browser.next("frame")
-    wait_for(lambda: not sink.wants())
+    until(lambda: not sink.wants())
     sink.write(tick(1), Results(picture(), None, None, None))
     assert sink.counters()["encoded"] == 1
     browser.say(ack=first["number"])
@@ -230,7 +221,7 @@ def test_a_slow_page_gets_the_newest_frame_and_holds_up_nobody(
     fast, slow = page(sink), page(sink)
     for browser in (fast, slow):
         browser.next("hello")
-    wait_for(lambda: sink.counters()["pages"] == 2)
+    until(lambda: sink.counters()["pages"] == 2)
     held: Any = None
     for seq in range(10):
         write(sink, seq)
@@ -250,10 +241,10 @@ def test_a_page_that_reads_nothing_holds_up_neither_writing_nor_closing(
     # It says that it drew, but its receive buffer is full and stays so.
     deaf = page(sink, max_queue=1, close_timeout=0.1)
     fast = page(sink)
-    wait_for(lambda: sink.counters()["pages"] == 2)
+    until(lambda: sink.counters()["pages"] == 2)
     noise = np.random.default_rng(1).integers(0, 256, (800, 800, 3)).astype(np.uint8)
     for number in range(1, 60):
-        wait_for(sink.wants)
+        until(sink.wants)
         sink.write(tick(number), Results(noise, None, None, None))
         fast.say(ack=fast.next("frame")[0]["number"])
         deaf.say(ack=number)
@@ -267,7 +258,7 @@ def test_max_fps_bounds_what_is_encoded(view: Callable[..., View], page: Callabl
     browser = page(sink)
     write(sink, 0)
     browser.say(ack=browser.next("frame")[0]["number"])
-    wait_for(lambda: "screen_p50_ms" in sink.counters())
+    until(lambda: "screen_p50_ms" in sink.counters())
     # The page is ready, but the next frame is due in 50 s.
     assert not sink.wants()
     sink.write(tick(1), Results(picture(), None, None, None))
@@ -279,7 +270,7 @@ def test_a_large_picture_is_reduced_and_its_coordinates_are_not(
 ) -> None:
     sink = view(max_size=64)
     browser = page(sink)
-    wait_for(sink.wants)
+    until(sink.wants)
     sink.write(tick(), Results(picture(100, 200), None, None, None))
     header, jpeg = browser.next("frame")
     shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
@@ -293,7 +284,7 @@ def test_without_a_processed_image_the_raw_one_is_shown(
 ) -> None:
     sink = view()
     browser = page(sink)
-    wait_for(sink.wants)
+    until(sink.wants)
     sink.write(tick(), Results())
     assert browser.next("frame")[0]["message"]["size"] == [60, 80]
 
@@ -342,7 +333,7 @@ def test_buttons_reach_the_run_and_every_page_learns_of_it(
     one.say(do="pause", value=False)
     other.until("state", lambda state: not state["paused"])
     one.say(do="stop")
-    wait_for(lambda: len(run.calls) == 5)
+    until(lambda: len(run.calls) == 5)
     assert run.calls == [("pause", True), "step", "reference", ("pause", False), ("stop", "signal")]
 
 
@@ -459,7 +450,7 @@ def test_what_is_only_drawn_is_sent_in_tenths_of_a_pixel(
     contact = Contact(200.123456, (23.3, 26.7), None, None, hull, None)
     origin = np.array([[1.04, 2.06], [-3.14159, 40.0], [5.0, 6.0]])
     markers = Markers(origin, origin + 0.5, np.array([0, 1, 2], np.uint8), np.full(3, np.nan))
-    wait_for(sink.wants)
+    until(sink.wants)
     sink.write(tick(), Results(picture(), contact, None, markers))
     header, _ = browser.next("frame")
     assert header["markers"] == {
@@ -651,7 +642,7 @@ def test_the_browser_is_opened_only_on_request(
     monkeypatch.setattr("tactflow.sinks.view.webbrowser.open", opened.append)
     view()
     asked = view(open_browser=True)
-    wait_for(lambda: opened)
+    until(lambda: opened)
     assert opened == [asked.description]
 
 
@@ -743,7 +734,7 @@ def test_a_page_pauses_steps_and_ends_a_run(tmp_path: Path, stack: ExitStack) ->
     thread.start()
     stack.callback(thread.join)
     stack.callback(runner.stop)
-    wait_for(lambda: "view" in runner.nodes and runner.nodes["view"].instance.description)
+    until(lambda: "view" in runner.nodes and runner.nodes["view"].instance.description)
     browser = Page(runner.nodes["view"].instance.description, stack)
     header, _ = browser.next("frame")
     browser.say(do="pause", value=True)

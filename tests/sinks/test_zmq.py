@@ -16,11 +16,12 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Markers
+from tests.clock import PATIENCE
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 MANY = Markers(np.zeros((140, 2)), np.full((140, 2), 1 / 3), np.zeros(140, np.uint8), np.zeros(140))
-WAIT = 10_000
-"""ms; only a broken test waits so long."""
+WAIT = round(PATIENCE * 1000)
+"""How long a test waits for what must happen, ms."""
 
 
 def tick(seq: int, sensor: str = "main") -> Tick:
@@ -158,7 +159,7 @@ def test_a_subscriber_that_never_reads_neither_blocks_the_run_nor_its_end(subscr
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
-    assert done.wait(60)
+    assert done.wait(PATIENCE)
     assert sink.counters()["serialised"] == 2000
 
 

@@ -20,7 +20,7 @@ def _modules() -> Iterator[str]:
         yield from (f"{package.__name__}.{module.name}" for module in pkgutil.iter_modules(package.__path__))
 
 
-@pytest.mark.parametrize("name", _modules())
+@pytest.mark.parametrize("name", list(_modules()))
 def test_examples_in_docstrings_show_what_they_say(name: str) -> None:
     flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
     assert doctest.testmod(importlib.import_module(name), optionflags=flags).failed == 0

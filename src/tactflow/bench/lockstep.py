@@ -214,6 +214,7 @@ class LockstepPipeline:
 
 
 _COLLECT = "bench"
+"""Id of the sink that takes each frame's results."""
 
 
 def _lockstep_source(cls: type, turns: _Turns) -> type:

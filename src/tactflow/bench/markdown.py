@@ -7,9 +7,10 @@ from pathlib import Path
 from statistics import median
 
 from tactflow.bench.methods import CLASSIC
-from tactflow.bench.pipelines import ORIGINAL, PLAIN
-from tactflow.bench.quantities import QUANTITIES
-from tactflow.bench.report import PRIMARY, TITLES, format_number, limit_of
+from tactflow.bench.pareto import limit_of
+from tactflow.bench.pipelines import ORIGINAL
+from tactflow.bench.quantities import QUANTITIES, format_number
+from tactflow.bench.report import PRIMARY, TITLES
 from tactflow.bench.results import RECORDING, Measurement, Result
 
 BEGIN = "<!-- tables of tactflow bench: written by --markdown -->"
@@ -94,27 +95,24 @@ def _value(measurement: Measurement | None, keys: Sequence[str]) -> str:
 def _scenes(result: Result, default: str) -> str:
     by_key = {m.key: m for m in result.of("pipeline")}
     scenes = dict.fromkeys(m.scene for m in result.of("pipeline") if not m.scene.startswith(RECORDING))
-    compared = bool(result.of("pipeline", PLAIN))
     rows = []
     for scene in scenes:
-        others = (CLASSIC, ORIGINAL, PLAIN)
+        others = (CLASSIC, ORIGINAL)
         own = [m for m in result.of("pipeline") if m.scene == scene and m.method not in others]
         mine = by_key.get(f"pipeline/{default}/{scene}", own[0] if own else None)
-        classic, script, plain = (by_key.get(f"pipeline/{name}/{scene}") for name in others)
+        classic, script = (by_key.get(f"pipeline/{name}/{scene}") for name in others)
         times = []
-        for measurement in (script, classic, mine, plain) if compared else (script, classic, mine):
+        for measurement in (script, classic, mine):
             time = measurement.time if measurement else {}
             chosen = time.get("contact", time.get("idle"))
             times.append(format_number(chosen["cpu_ms_p50"]) if chosen else "-")
         cells = [f"{_value(classic, keys)}, {_value(mine, keys)}" for _, keys in _PER_SCENE]
         rows.append([scene, *times, *cells])
-    without = ["without numba"] if compared else []
     header = [
         "scene",
         "script",
         f"`{CLASSIC}`",
         f"`{default}`",
-        *without,
         *(title for title, _ in _PER_SCENE),
     ]
     return _table(header, rows)

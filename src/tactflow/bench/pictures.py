@@ -13,8 +13,13 @@ from tactflow.sim import Truth
 from tactflow.vision.types import MarkerStatus
 
 _SCALE = 2
+"""Pixels of the picture for each of the processed frame, so that lines stay apart."""
+
 _TRUE, _FOUND, _MARKER, _LOST = (80, 220, 60), (60, 60, 240), (255, 255, 255), (0, 165, 255)
+"""Colours, BGR grey levels: green, red, white, orange."""
+
 _CAPTION = 24
+"""Height of the line of text at the top, px."""
 
 
 def draw(outcome: Outcome, truth: Truth, caption: str) -> NDArray[np.uint8] | None:

@@ -24,7 +24,6 @@ from tactflow.classic.functions import contact_mask, difference, inpaint, mask_m
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
-from tactflow.vision import compiled
 from tactflow.vision.geometry import PixelMapping
 
 
@@ -102,12 +101,11 @@ class Times:
     stages: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
-PLAIN = "default-plain"
-"""Name under which the default pipeline runs without compiled kernels, where they would be used."""
 ORIGINAL = "original script"
 """The yardstick plus what the script repeats in every frame without need."""
 
 _REPEATS_EVERY = 5
+"""Frames from one to the next on which the repeats are timed: one takes as long as the rest of the script."""
 
 
 class OriginalRepeats:
@@ -196,9 +194,7 @@ def take_turns(
                 longest = 0
                 for name in list(active):
                     try:
-                        # A pipeline waits outside of its turn, so that this acts on no other.
-                        with compiled.switched(compiled.active() and name != PLAIN):
-                            outcomes = running[name].block(block)
+                        outcomes = running[name].block(block)
                     except TactflowError as error:
                         failures[name] = str(error)
                         active.remove(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -83,3 +84,14 @@ _ALL = [
 
 QUANTITIES: Mapping[str, Quantity] = {quantity.key: quantity for quantity in _ALL}
 """Every quantity by its key."""
+
+
+def format_number(value: float) -> str:
+    """Three significant digits without an exponent where it stays readable."""
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e5:
+        return f"{value:.1e}"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    text = f"{value:.{digits}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text

@@ -29,6 +29,7 @@ CONTACT_FORCE = 0.75
 """Grip force from which on there is contact, N."""
 
 WEDGE_DOTS = 140
+"""Dots printed on the Wedge's gel: 10 x 14."""
 
 RECTIFY = {
     "from": [[33, 58], [208, 61], [56, 250], [185, 244]],
@@ -38,6 +39,7 @@ RECTIFY = {
 """The gel's corners in the picture of the Wedge, and the rectangle they belong to."""
 
 _MARKER_STAGES = frozenset({"tracker", "flow_in_mask", "visualize"})
+"""Ids of the stages that need markers."""
 
 Step = Callable[[], None]
 

@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 
 import cv2
@@ -16,12 +17,11 @@ import numpy as np
 from tactflow.bench import recordings
 from tactflow.bench.methods import CLASSIC, measure_methods
 from tactflow.bench.pictures import draw
-from tactflow.bench.pipelines import PLAIN, Worst, growth, measure_pipelines, peak_memory_mb
-from tactflow.bench.results import Measurement, Result
+from tactflow.bench.pipelines import Worst, growth, measure_pipelines, peak_memory_mb
+from tactflow.bench.results import Result
 from tactflow.bench.scenes import (
     FULL,
     FULL_STAGES,
-    NOMINAL,
     QUICK,
     QUICK_STAGES,
     Case,
@@ -33,11 +33,19 @@ from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
-from tactflow.vision import compiled
 
 DEFAULT = "default"
 MARKERLESS = "markerless"
 WEDGE = "wedge"
+
+GROWTH_FRAMES = 60
+"""Frames on which it is measured how time grows with the picture: one press."""
+
+MEMORY_FRAMES = 20
+"""Frames that a process runs whose peak memory is taken; chosen by hand."""
+
+STAGES_COMPARED = 7
+"""Stages whose methods are measured alone, one step of the progress each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +105,7 @@ def machine() -> dict[str, str]:
         "Python": platform.python_version(),
         "OpenCV": cv2.__version__,
         "numpy": np.__version__,
-        "numba": compiled.numba_version() or "not used",
+        "numba": metadata.version("numba"),
     }
 
 
@@ -124,65 +132,116 @@ def run_bench(plan: Plan, progress: Callable[[str, int, int], None] = lambda *_:
         If a pipeline file is wrong, a scene is unknown, or there are no recordings where they should be.
     """
     began = time.perf_counter()
-    whole, alone = plan.chosen()
-    if plan.data is not None:
-        recordings.check(plan.data)
-    loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
-    general = {name: p for name, p in loaded.items() if not _needs_rectifying(p) and name != MARKERLESS}
-    # For gels without markers: the pipeline made for them, else the default one without its tracker.
-    bare = {name: recordings.without_markers(loaded[name]) for name in (DEFAULT, CLASSIC)}
-    if MARKERLESS in loaded:
-        bare = {MARKERLESS: loaded[MARKERLESS], CLASSIC: bare[CLASSIC]}
-    compared = not plan.quick and compiled.active()
-    total = sum(case.frames for case in whole) + 7 * len(alone) + (1 if plan.quick else 60)
-    if plan.memory:
-        total += 20 * len(general)
-    if plan.data is not None:
-        total += recordings.frame_count(plan.data)
-    done = 0
-    doing = "rendering"
-
-    def step(count: int = 1) -> None:
-        nonlocal done
-        done += count
-        progress(doing, min(done, total), total)
-
-    result = Result(quick=plan.quick, machine=machine())
-    unit = CopyUnit()
-    unit.take(20)
-    grown: float | None = None
-    with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as name:
-        scratch = Path(name)
-        for rendered in render_all(whole, scratch):
-            doing = f"pipelines on {rendered.case.label}"
-            suited = general if len(rendered.scene.layout.rest) else bare
-            if compared and rendered.case.label in NOMINAL:
-                suited = {**suited, PLAIN: loaded[DEFAULT]}
-            worst = _keeper(plan.pictures, rendered.case.label)
-            result.measurements += measure_pipelines(suited, rendered, scratch, unit, step, worst)
-        for rendered in render_all(alone, scratch):
-            doing = f"methods on {rendered.case.label}"
-            result.measurements += measure_methods(general, rendered, unit, step)
-        if not plan.quick and plan.scenes is None:
-            doing = "growth with size"
-            rendered = Rendered(Case("press", 60), scratch)
-            grown = growth(loaded[DEFAULT], rendered, scratch, unit)
-            rendered.path.unlink()
-            step(60)
-        if plan.memory:
-            doing = "peak memory"
-            _peak_memory(plan, general, result.measurements, scratch, step)
-        if plan.data is not None:
-            doing = "recordings"
-            wedge = {WEDGE: loaded[WEDGE], **general} if WEDGE in loaded else general
-            for measured in recordings.measure_recordings(wedge, bare, plan.data, scratch, unit, step):
-                result.measurements += measured
-    result.copy_ms, result.touch_ms = unit.copy_ms, unit.touch_ms
-    markerless, wedge_name = (name if name in loaded else DEFAULT for name in (MARKERLESS, WEDGE))
-    result.targets = judge(result, DEFAULT, grown, wedge=wedge_name, markerless=markerless)
+    run = _Run(plan, progress)
+    with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
+        scratch = Path(folder)
+        run.scenes(scratch)
+        growth = run.growth(scratch)
+        run.peak_memory(scratch)
+        run.recordings(scratch)
+    result = run.finished(growth)
     result.wall_s = time.perf_counter() - began
-    progress("done", total, total)
     return result
+
+
+class _Run:
+    """A run of the bench: what it measures with, what it has found, and how far it is.
+
+    general : pipelines for gels with markers. bare : for gels without.
+    """
+
+    def __init__(self, plan: Plan, progress: Callable[[str, int, int], None]) -> None:
+        self.plan, self.progress = plan, progress
+        self.whole, self.alone = plan.chosen()
+        if plan.data is not None:
+            recordings.check(plan.data)
+        self.loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
+        self.general = {
+            name: pipeline
+            for name, pipeline in self.loaded.items()
+            if not _needs_rectifying(pipeline) and name != MARKERLESS
+        }
+        # For gels without markers: the pipeline made for them, else the default one without its tracker.
+        self.bare = {name: recordings.without_markers(self.loaded[name]) for name in (DEFAULT, CLASSIC)}
+        if MARKERLESS in self.loaded:
+            self.bare = {MARKERLESS: self.loaded[MARKERLESS], CLASSIC: self.bare[CLASSIC]}
+        self.result = Result(quick=plan.quick, machine=machine())
+        self.unit = CopyUnit()
+        self.unit.take(20)
+        self.doing, self.done, self.total = "rendering", 0, self._steps()
+
+    def _steps(self) -> int:
+        """Steps of the whole run: about one for each frame of a whole pipeline."""
+        steps = sum(case.frames for case in self.whole) + STAGES_COMPARED * len(self.alone)
+        steps += 1 if self.plan.quick else GROWTH_FRAMES
+        if self.plan.memory:
+            steps += MEMORY_FRAMES * len(self.general)
+        if self.plan.data is not None:
+            steps += recordings.frame_count(self.plan.data)
+        return steps
+
+    def step(self, count: int = 1) -> None:
+        """Say that so many steps more are done."""
+        self.done += count
+        self.progress(self.doing, min(self.done, self.total), self.total)
+
+    def scenes(self, scratch: Path) -> None:
+        """Whole pipelines, then methods alone, on simulated scenes."""
+        found = self.result.measurements
+        for rendered in render_all(self.whole, scratch):
+            self.doing = f"pipelines on {rendered.case.label}"
+            suited = self.general if len(rendered.scene.layout.rest) else self.bare
+            worst = _keeper(self.plan.pictures, rendered.case.label)
+            found += measure_pipelines(suited, rendered, scratch, self.unit, self.step, worst)
+        for rendered in render_all(self.alone, scratch):
+            self.doing = f"methods on {rendered.case.label}"
+            found += measure_methods(self.general, rendered, self.unit, self.step)
+
+    def growth(self, scratch: Path) -> float | None:
+        """What `pipelines.growth` says of the default pipeline; None in a run that leaves it out."""
+        if self.plan.quick or self.plan.scenes is not None:
+            return None
+        self.doing = "growth with size"
+        rendered = Rendered(Case("press", GROWTH_FRAMES), scratch)
+        grown = growth(self.loaded[DEFAULT], rendered, scratch, self.unit)
+        rendered.path.unlink()
+        self.step(GROWTH_FRAMES)
+        return grown
+
+    def peak_memory(self, scratch: Path) -> None:
+        """The peak memory of each pipeline, in a process of its own."""
+        if not self.plan.memory:
+            return
+        self.doing = "peak memory"
+        rendered = Rendered(Case("press", MEMORY_FRAMES), scratch)
+        for name, pipeline in self.general.items():
+            sinks = [sink.id for sink in pipeline.sinks]
+            peak = peak_memory_mb(self.plan.files[name], rendered.path, sinks)
+            for measurement in self.result.of("pipeline", name):
+                measurement.peak_mb = peak
+            self.step(MEMORY_FRAMES)
+        rendered.path.unlink()
+
+    def recordings(self, scratch: Path) -> None:
+        """Whole pipelines on the real recordings."""
+        if self.plan.data is None:
+            return
+        self.doing = "recordings"
+        wedge = {WEDGE: self.loaded[WEDGE], **self.general} if WEDGE in self.loaded else self.general
+        measured = recordings.measure_recordings(
+            wedge, self.bare, self.plan.data, scratch, self.unit, self.step
+        )
+        for measurements in measured:
+            self.result.measurements += measurements
+
+    def finished(self, growth: float | None) -> Result:
+        """The result, its promises judged."""
+        result = self.result
+        result.copy_ms, result.touch_ms = self.unit.copy_ms, self.unit.touch_ms
+        markerless, wedge = (name if name in self.loaded else DEFAULT for name in (MARKERLESS, WEDGE))
+        result.targets = judge(result, DEFAULT, growth, wedge=wedge, markerless=markerless)
+        self.progress("done", self.total, self.total)
+        return result
 
 
 def _keeper(folder: Path | None, scene: str) -> Callable[[str, Worst], None]:
@@ -198,20 +257,3 @@ def _keeper(folder: Path | None, scene: str) -> Callable[[str, Worst], None]:
             cv2.imwrite(str(folder / f"{scene}-{pipeline.replace('/', '_')}.png"), picture)
 
     return keep
-
-
-def _peak_memory(
-    plan: Plan,
-    pipelines: Mapping[str, Pipeline],
-    measurements: list[Measurement],
-    scratch: Path,
-    step: Callable[[int], None],
-) -> None:
-    rendered = Rendered(Case("press", 20), scratch)
-    for name, pipeline in pipelines.items():
-        peak = peak_memory_mb(plan.files[name], rendered.path, [sink.id for sink in pipeline.sinks])
-        for measurement in measurements:
-            if (measurement.group, measurement.method) == ("pipeline", name):
-                measurement.peak_mb = peak
-        step(20)
-    rendered.path.unlink()

@@ -62,10 +62,15 @@ LARGEST = 1.5
 most: that is a largest value as well, and other frames of the same scene have another one."""
 
 _SECOND_DIFFERENCE = math.sqrt(6)
+"""Deviation of a second difference of three results over that of one; derived, see the top of this file."""
+
 _LARGEST_BEND = math.sqrt(3)
+"""Largest of the second differences over the largest difference of two results; derived, as above."""
+
 _MEDIAN_DEVIATION = 0.6745
 """Median of the absolute value of a standard normal deviate."""
 _OUTLIER = 5.0
+"""Second differences above so many deviations are motion, not noise; chosen by hand."""
 _ENOUGH = 20
 """Differences from which a noise or an RMS is told: it is then known to about a fifth."""
 

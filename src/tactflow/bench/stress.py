@@ -39,7 +39,10 @@ processed frame in a hundred would be 360 MB in 100 000 frames."""
 LARGEST_SLOWDOWN = 1.25
 """CPU time of the last blocks over that of the first: a processor's clock varies by a tenth or two."""
 _SIGNIFICANT = 4.0
+"""Standard errors by which a marker error has risen; chosen by hand."""
 _NEGLIGIBLE = 0.01
+"""Part of its own size by which the error may rise, and part of the markers by which more may be lost, in any
+case; chosen by hand."""
 
 
 @dataclass(slots=True)

@@ -7,8 +7,9 @@ from statistics import median
 from rich.console import Console
 from rich.table import Table
 
-from tactflow.bench.quantities import QUANTITIES
-from tactflow.bench.report import PRIMARY, TITLES, format_number, limit_of, pareto, points
+from tactflow.bench.pareto import limit_of, pareto, points
+from tactflow.bench.quantities import QUANTITIES, format_number
+from tactflow.bench.report import PRIMARY, TITLES
 from tactflow.bench.results import RECORDING, Measurement, Result
 
 

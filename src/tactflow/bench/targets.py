@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from statistics import median
 
-from tactflow.bench.pipelines import ORIGINAL, PLAIN
+from tactflow.bench.pipelines import ORIGINAL
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import RECORDING, Measurement, Result, Target
 from tactflow.bench.scenes import NOMINAL
@@ -14,9 +14,13 @@ DIRECTED = frozenset({"cable", "bright_cable", "edge"})
 """Scenes whose contacts are at least twice as long as wide."""
 
 HARD_MARKERS = frozenset({"jumps", "jumps_worn"})
+"""Scenes in which markers jump by nearly a pitch, or are worn away."""
 
 ALWAYS = frozenset({"idle", "drift", "flicker", "noisy"})
 """Scenes that tempt a method to see contacts."""
+
+MOST_GROWTH = 4.4
+"""Promise: times as long as before that a frame of 4 times the pixels and markers takes at most."""
 
 
 def judge(result: Result, default: str, growth: float | None, *, wedge: str, markerless: str) -> list[Target]:
@@ -30,69 +34,64 @@ def judge(result: Result, default: str, growth: float | None, *, wedge: str, mar
     """
     simulated = [m for m in result.of("pipeline", default) if not m.scene.startswith(RECORDING)]
     nominal = [m for m in simulated if m.scene in NOMINAL]
+    return [
+        *_times(result, nominal),
+        *_marker_errors(simulated, nominal),
+        *_contact_errors(simulated, nominal),
+        _growth(growth),
+        *_recordings(result, wedge, markerless),
+    ]
+
+
+def _times(result: Result, nominal: Collection[Measurement]) -> list[Target]:
     script = {m.scene: m for m in result.of("pipeline", ORIGINAL)}
     copies = f"copies of a raw frame ({result.copy_ms:.3f} ms here)"
     return [
         _time("frame with contact", nominal, script, "contact", 13, 60, copies),
         _time("frame without contact", nominal, script, "idle", 5, 150, copies),
-        *_without_numba(result, script, copies),
-        _worst(
-            "marker displacement: RMS; 99th percentile",
-            nominal,
-            [("displacement_rms", 0.03), ("displacement_p99", 0.1)],
-        ),
-        _wrong("identities", nominal, 0.1),
-        _wrong("identities: jumps of 0.9 pitch; 5 % worn, missing", _of(simulated, HARD_MARKERS), 0.5),
-        _worst(
-            "contact: hull IoU; centre; area",
-            nominal,
-            [("hull_iou", 0.88), ("center_error", 1.0), ("area_error", 8.0)],
-        ),
-        _worst(
-            "direction: mean; maximum", _of(simulated, DIRECTED), [("angle_mean", 0.7), ("angle_max", 2.5)]
-        ),
-        _worst(
-            "mean flow in contact; without frames that chance decides",
-            nominal,
-            [("flow_error", 0.15), ("flow_decided", 0.15)],
-        ),
-        _worst(
-            "idle frames called contact; half-depth contacts missed",
-            _of(simulated, NOMINAL | ALWAYS),
-            [("false_contacts", 0.0), ("missed_half_depth", 0.0)],
-        ),
-        Target(
-            "4 times the pixels and markers",
-            "<= 4.4 times the time",
-            "-" if growth is None else f"{growth:.2f} times",
-            None if growth is None else growth <= 4.4,
-            "press, mirrored to twice its width and height",
-        ),
-        _recording(
-            result,
-            wedge,
-            "wedge_ball",
-            [("found_percent", 100.0), ("label_center_p50", 2.0), ("label_center_p95", 4.8)],
-        ),
-        _recording(
-            result,
-            wedge,
-            "wedge_roll",
-            [("markers_short", 0.0), ("shared_dots", 0.0), ("flow_jumps", 0.0)],
-        ),
-        _tracker_time(result, wedge),
-        _recording(result, markerless, "wedge_grasp", [("force_right", 98.0)]),
     ]
 
 
-def _without_numba(result: Result, script: Mapping[str, Measurement], copies: str) -> list[Target]:
-    """What the default pipeline takes where numba is not installed; nothing if that was not measured."""
-    measured = result.of("pipeline", PLAIN)
-    kinds = {"contact": ("frame with contact", 13, 60), "idle": ("frame without contact", 5, 150)}
+def _marker_errors(simulated: Collection[Measurement], nominal: Collection[Measurement]) -> list[Target]:
+    limits = [("displacement_rms", 0.03), ("displacement_p99", 0.1)]
     return [
-        _time(f"{title}, without numba", measured, script, kind, most, faster, copies)
-        for kind, (title, most, faster) in kinds.items()
-        if measured
+        _worst("marker displacement: RMS; 99th percentile", nominal, limits),
+        _wrong("identities", nominal, 0.1),
+        _wrong("identities: jumps of 0.9 pitch; 5 % worn, missing", _of(simulated, HARD_MARKERS), 0.5),
+    ]
+
+
+def _contact_errors(simulated: Collection[Measurement], nominal: Collection[Measurement]) -> list[Target]:
+    directed, tempting = _of(simulated, DIRECTED), _of(simulated, NOMINAL | ALWAYS)
+    hull = [("hull_iou", 0.88), ("center_error", 1.0), ("area_error", 8.0)]
+    flow = [("flow_error", 0.15), ("flow_decided", 0.15)]
+    decisions = [("false_contacts", 0.0), ("missed_half_depth", 0.0)]
+    return [
+        _worst("contact: hull IoU; centre; area", nominal, hull),
+        _worst("direction: mean; maximum", directed, [("angle_mean", 0.7), ("angle_max", 2.5)]),
+        _worst("mean flow in contact; without frames that chance decides", nominal, flow),
+        _worst("idle frames called contact; half-depth contacts missed", tempting, decisions),
+    ]
+
+
+def _growth(growth: float | None) -> Target:
+    return Target(
+        "4 times the pixels and markers",
+        f"<= {MOST_GROWTH:g} times the time",
+        "-" if growth is None else f"{growth:.2f} times",
+        None if growth is None else growth <= MOST_GROWTH,
+        "press, mirrored to twice its width and height",
+    )
+
+
+def _recordings(result: Result, wedge: str, markerless: str) -> list[Target]:
+    ball = [("found_percent", 100.0), ("label_center_p50", 2.0), ("label_center_p95", 4.8)]
+    roll = [("markers_short", 0.0), ("shared_dots", 0.0), ("flow_jumps", 0.0)]
+    return [
+        _recording(result, wedge, "wedge_ball", ball),
+        _recording(result, wedge, "wedge_roll", roll),
+        _tracker_time(result, wedge),
+        _recording(result, markerless, "wedge_grasp", [("force_right", 98.0)]),
     ]
 
 

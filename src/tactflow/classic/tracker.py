@@ -18,6 +18,22 @@ MAX_VISITS: Final = 5000
 A limit in visits instead of milliseconds gives the same answer on every run and every machine."""
 
 
+_REACH: Final = 0.6
+"""How far a centre may be from where the neighbours' motion expects it, as a part of the spacing; chosen by
+hand: beyond a half it may be the neighbour's."""
+
+_TRIED: Final = 3
+"""Centres that a node tries before it stays empty; chosen by hand."""
+
+_LONGEST_LINK: Final = 1.6
+"""Length of a link over the median distance of nearest centres, at most: more than the diagonal of a square,
+so that a bent grid stays linked, and less than two spacings."""
+
+_OBLIQUE: Final = 0.6
+"""Shorter over longer component of a link, at most: the diagonal of a square has 1, a row tilted by 31
+degrees has 0.6."""
+
+
 class GridFlow(NamedTuple):
     """The flow as the original returns it: five arrays of shape (rows, columns).
 
@@ -124,10 +140,10 @@ class Matcher:
         for index, center in enumerate(self._centers):
             move = center - place
             surprise = abs(move - expected)
-            if index not in used and surprise < 0.6 * self._spacing:
+            if index not in used and surprise < _REACH * self._spacing:
                 found.append((surprise**2, index, move))
         found.sort(key=lambda option: option[:2])
-        return [*found[:3], (empty_price, -1, expected)]
+        return [*found[:_TRIED], (empty_price, -1, expected)]
 
     def get_flow(self) -> GridFlow:
         """The result of the last `run`; nodes without a centre follow their neighbours."""
@@ -216,10 +232,10 @@ def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
     nearest = float(np.median(np.sqrt(squared.min(axis=1))))
     links: dict[int, list[tuple[int, int, int]]] = {}
     lengths = []
-    for first, second in neighbour_graph(centers, 1.6 * nearest).tolist():
+    for first, second in neighbour_graph(centers, _LONGEST_LINK * nearest).tolist():
         step = centers[second] - centers[first]
         along, across = np.abs(step).max(), np.abs(step).min()
-        if across > 0.6 * along:
+        if across > _OBLIQUE * along:
             continue
         lengths.append(float(np.hypot(*step)))
         sign = 1 if step[np.argmax(np.abs(step))] > 0 else -1

@@ -85,7 +85,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         help="compare the errors with a stored result; exit code 3 if one got worse than its tolerance",
     )
     parser.add_argument(
-        "--errors", type=Path, metavar="PATH", help="write the errors alone, to be used with --against"
+        "--write-baseline", type=Path, metavar="FILE", help="write the errors alone, for --against"
     )
 
 
@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
         return _skipping(args.pipelines, args.skipping, args.data)
     if args.against is not None:
         load_comparable(args.against, args.quick)
-    for path in (args.json, args.html, args.errors, args.markdown):
+    for path in (args.json, args.html, args.write_baseline, args.markdown):
         _refuse_unwritable(path)
     plan = Plan(
         files=_files(args.pipelines),
@@ -211,7 +211,7 @@ def _refuse_unwritable(path: Path | None) -> None:
 def _write(args: argparse.Namespace, result: Result) -> None:
     writers: list[tuple[Path | None, Callable[[Path], object]]] = [
         (args.json, result.save),
-        (args.errors, result.save_errors),
+        (args.write_baseline, result.save_errors),
         (args.html, lambda path: path.write_text(html(result), encoding="utf-8")),
         (args.markdown, lambda path: write_markdown(result, path, DEFAULT)),
     ]

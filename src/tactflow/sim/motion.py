@@ -11,12 +11,25 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.sim.gel import Press
 from tactflow.sim.shapes import Shape
 
+_REST = 0.1
+"""Part of a recording at its start in which nothing touches the gel; chosen by hand."""
+
 _LONGEST_REST = 120
+"""The same at most, frames: 2 s at 60 frames a second."""
+
+_LAST_REST = 30
+"""One frame of so many is left untouched at the end of a recording; chosen by hand."""
+
 _LARGEST_CREEP = 60.0
+"""Farthest that a creeping gel is dragged before it turns back, px; chosen by hand."""
+
+_LARGEST_JUMP = 0.45
+"""Farthest that a jumping gel is from its middle, pitches: jumps of up to 0.9 pitches from place to place."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +70,11 @@ class _Plan:
     sign: float
     depth: float
 
+    @property
+    def ahead(self) -> NDArray[np.float64]:
+        """Unit vector (2,) of the direction of motion."""
+        return np.array([np.cos(self.direction), np.sin(self.direction)])
+
 
 @lru_cache(maxsize=256)
 def _plan(programme: Programme, seed: int, cycle: int, size: tuple[int, int]) -> _Plan:
@@ -81,6 +99,59 @@ def _smooth(value: float) -> float:
     return value * value * (3.0 - 2.0 * value)
 
 
+@dataclass(frozen=True, slots=True)
+class _Timing:
+    """Where in its contacts a programme is.
+
+    cycle : number of the contact. phase : frames since it began. rise : frames from touch to full depth.
+    envelope : depth now over full depth, 0 to 1. progress : part of the hold that is over, 0 to 1.
+    """
+
+    cycle: int
+    phase: float
+    rise: float
+    envelope: float
+    progress: float
+
+
+def _timing(programme: Programme, moment: int, frames: int) -> _Timing | None:
+    """The contact at a frame of a recording of so many frames; None where nothing touches the gel."""
+    start = min(max(1, round(_REST * frames)), _LONGEST_REST)
+    usable = frames - start - max(1, frames // _LAST_REST)
+    if moment < start or usable < 1:
+        return None
+    cycles = 1 if programme.single else max(1, usable // programme.period)
+    # A recording shorter than one contact shows a faster one.
+    stretch = usable / programme.period if programme.single or usable < programme.period else 1.0
+    period = programme.period * stretch
+    rise, hold = programme.rise * stretch, max(programme.hold * stretch, 1.0)
+    elapsed = moment - start
+    cycle = int(elapsed // period)
+    phase = elapsed - cycle * period
+    if cycle >= cycles or phase >= 2 * rise + hold:
+        return None
+    if phase < rise:
+        envelope = _smooth((phase + 1.0) / (rise + 1.0))
+    elif phase < rise + hold:
+        envelope = 1.0
+    else:
+        envelope = _smooth((2 * rise + hold - phase) / (rise + 1.0))
+    return _Timing(cycle, phase, rise, envelope, min(max((phase - rise) / hold, 0.0), 1.0))
+
+
+def _jump(timing: _Timing, seed: int, pitch: float) -> NDArray[np.float64]:
+    """Displacement (2,), px, drawn anew every third frame: up to 0.45 pitches from the middle."""
+    draw = np.random.default_rng([seed, timing.cycle, int(timing.phase // 3), 0x6A75])
+    angle, radius = draw.uniform(0, 2 * np.pi), _LARGEST_JUMP * pitch * np.sqrt(draw.uniform(0.3, 1))
+    return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
+
+
+def _creep(programme: Programme, timing: _Timing) -> float:
+    """How far the gel has been dragged, px: to and fro, so that the contact stays on it for ever."""
+    way = programme.creep * max(timing.phase - timing.rise, 0.0) % (2 * _LARGEST_CREEP)
+    return _LARGEST_CREEP - abs(way - _LARGEST_CREEP)
+
+
 def presses(
     programme: Programme,
     shapes: tuple[Shape, ...],
@@ -102,64 +173,37 @@ def presses(
         gel is dragged at most. twist : degrees by which it is turned at most.
     sink, rim : of the gel, see `Press`.
     """
-    start = min(max(1, round(0.1 * frames)), _LONGEST_REST)
-    usable = frames - start - max(1, frames // 30)
-    if moment < start or usable < 1:
+    timing = _timing(programme, moment, frames)
+    if timing is None:
         return (), -1
-    cycles = 1 if programme.single else max(1, usable // programme.period)
-    # A recording shorter than one contact shows a faster one.
-    stretch = usable / programme.period if programme.single or usable < programme.period else 1.0
-    period = programme.period * stretch
-    rise, hold = programme.rise * stretch, max(programme.hold * stretch, 1.0)
-    elapsed = moment - start
-    cycle = int(elapsed // period)
-    if cycle >= cycles:
-        return (), -1
-    phase = elapsed - cycle * period
-    if phase >= 2 * rise + hold:
-        return (), -1
-    plan = _plan(programme, seed, cycle, size)
-    if phase < rise:
-        envelope = _smooth((phase + 1.0) / (rise + 1.0))
-    elif phase < rise + hold:
-        envelope = 1.0
-    else:
-        envelope = _smooth((2 * rise + hold - phase) / (rise + 1.0))
-    progress = min(max((phase - rise) / hold, 0.0), 1.0)
-    ahead = np.array([np.cos(plan.direction), np.sin(plan.direction)])
-    drag = np.zeros(2)
-    travelled = np.zeros(2)
+    plan = _plan(programme, seed, timing.cycle, size)
+    swing = float(np.sin(np.pi * _smooth(timing.progress)))
     if programme.jumps:
-        draw = np.random.default_rng([seed, cycle, int(phase // 3), 0x6A75])
-        angle, radius = draw.uniform(0, 2 * np.pi), 0.45 * pitch * np.sqrt(draw.uniform(0.3, 1))
-        drag = radius * np.array([np.cos(angle), np.sin(angle)])
-        travelled = drag
+        drag = travelled = _jump(timing, seed, pitch)
     elif programme.creep:
-        # To and fro, so that the contact stays on the gel however long the recording is.
-        way = programme.creep * max(phase - rise, 0.0) % (2 * _LARGEST_CREEP)
-        drag = travelled = (_LARGEST_CREEP - abs(way - _LARGEST_CREEP)) * ahead
+        drag = travelled = _creep(programme, timing) * plan.ahead
     elif programme.travel:
         # Stick until the gel has been dragged as far as friction holds it, then slip.
-        way = programme.travel * progress
-        drag = min(way, shear * pitch) * ahead
-        travelled = way * ahead
+        way = programme.travel * timing.progress
+        drag, travelled = min(way, shear * pitch) * plan.ahead, way * plan.ahead
     elif shear:
-        drag = travelled = shear * pitch * float(np.sin(np.pi * _smooth(progress))) * ahead
-    turn = np.radians(twist) * plan.sign * float(np.sin(np.pi * _smooth(progress)))
-    made = []
-    for shape, (offset_x, offset_y) in zip(shapes, programme.offsets, strict=True):
-        made.append(
-            Press(
-                shape,
-                plan.x + offset_x + float(travelled[0]),
-                plan.y + offset_y + float(travelled[1]),
-                plan.angle + float(turn),
-                envelope * plan.depth * depth * shape.depth,
-                (float(drag[0]), float(drag[1])),
-                float(turn),
-                programme.dilation * pitch,
-                sink,
-                rim,
-            )
+        drag = travelled = shear * pitch * swing * plan.ahead
+    else:
+        drag = travelled = np.zeros(2)
+    turn = np.radians(twist) * plan.sign * swing
+    made = [
+        Press(
+            shape,
+            plan.x + offset_x + float(travelled[0]),
+            plan.y + offset_y + float(travelled[1]),
+            plan.angle + float(turn),
+            timing.envelope * plan.depth * depth * shape.depth,
+            (float(drag[0]), float(drag[1])),
+            float(turn),
+            programme.dilation * pitch,
+            sink,
+            rim,
         )
-    return tuple(made), cycle
+        for shape, (offset_x, offset_y) in zip(shapes, programme.offsets, strict=True)
+    ]
+    return tuple(made), timing.cycle

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import cv2
@@ -134,64 +134,66 @@ def measure(
     mapping : see `Scene.truth`. clean : renders the raw frame without markers and noise.
     """
     to = pixel_mapping(mapping)
-    gel_x, gel_y, seen = _pixel_centres(camera, size, to)
-    height, width = gel_x.shape
-    mask = np.zeros((height, width), dtype=np.bool_)
-    top, bottom, left, right = _window(pressed, gel_x, gel_y)
-    part = in_contact(pressed, gel_x[top:bottom, left:right], gel_y[top:bottom, left:right])
-    part &= seen[top:bottom, left:right]
-    mask[top:bottom, left:right] = part
-    center = angle = None
-    hull, area = np.empty((0, 2)), 0.0
-    touching = bool(part.any())
+    mask, columns, rows = _contact(pressed, camera, size, to)
+    touching = len(rows) > 0
+    hull = np.empty((0, 2))
     if touching:
-        rows, columns = np.nonzero(part)
-        rows, columns = rows + top, columns + left
-        center = (float(columns.mean()), float(rows.mean()))
-        angle = principal_angle(columns, rows)
         points = np.stack([columns, rows], axis=1).astype(np.int32)
         hull = cv2.convexHull(points).reshape(-1, 2).astype(np.float64)
-        area = float(cv2.contourArea(hull.astype(np.float32)))
     places = _around(position, to)
     if to is not None:
         origin = np.asarray(to.to_processed(origin), dtype=np.float64)
         position = np.asarray(to.to_processed(position), dtype=np.float64)
     nearest = np.rint(position).astype(np.int64)
+    height, width = mask.shape
     visible = shown & np.all((nearest >= 0) & (nearest < (width, height)), axis=1)
     gel = camera.to_gel(places.reshape(-1, 2)).astype(np.float32)
     reached = in_contact(pressed, gel[:, 0], gel[:, 1]).reshape(places.shape[:2])
     inside = visible & reached[0]
-    at_rim = visible & (reached.any(axis=0) != reached.all(axis=0))
     mean_flow = None
     if inside.any():
         moved = (position - origin)[inside].mean(axis=0)
         mean_flow = (float(moved[0]), float(moved[1]))
-
-    def render() -> NDArray[np.uint8]:
-        image = clean()
-        if mapping is None:
-            return image
-        if callable(mapping):
-            return np.array(mapping(image), dtype=np.uint8)
-        return _resampled(image, mapping)
-
-    depth = max((press.depth for press in pressed), default=0.0) if touching else 0.0
     return Truth(
-        touching,
-        mask,
-        center,
-        angle,
-        hull,
-        area,
-        origin,
-        position,
-        visible,
-        inside,
-        at_rim,
-        mean_flow,
-        depth,
-        render,
+        touching=touching,
+        contact_mask=mask,
+        center=(float(columns.mean()), float(rows.mean())) if touching else None,
+        angle=principal_angle(columns, rows) if touching else None,
+        hull=hull,
+        area=float(cv2.contourArea(hull.astype(np.float32))) if touching else 0.0,
+        origin=origin,
+        position=position,
+        visible=visible,
+        inside=inside,
+        at_rim=visible & (reached.any(axis=0) != reached.all(axis=0)),
+        mean_flow=mean_flow,
+        depth=max((press.depth for press in pressed), default=0.0) if touching else 0.0,
+        _render=partial(_processed, clean, mapping),
     )
+
+
+def _contact(
+    pressed: Sequence[Press], camera: Camera, size: tuple[int, int], to: Any
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """The contact mask (H, W), and x and y (n,) of its pixels, line by line."""
+    gel_x, gel_y, seen = _pixel_centres(camera, size, to)
+    mask = np.zeros(gel_x.shape, dtype=np.bool_)
+    top, bottom, left, right = _window(pressed, gel_x, gel_y)
+    part = in_contact(pressed, gel_x[top:bottom, left:right], gel_y[top:bottom, left:right])
+    part &= seen[top:bottom, left:right]
+    mask[top:bottom, left:right] = part
+    rows, columns = np.nonzero(part)
+    return mask, columns + left, rows + top
+
+
+def _processed(clean: Callable[[], NDArray[np.uint8]], mapping: Any) -> NDArray[np.uint8]:
+    """The frame that `clean` renders, in processed pixels."""
+    image = clean()
+    if mapping is None:
+        return image
+    if callable(mapping):
+        return np.array(mapping(image), dtype=np.uint8)
+    return _resampled(image, mapping)
 
 
 def _around(position: NDArray[np.float64], to: Any) -> NDArray[np.float64]:

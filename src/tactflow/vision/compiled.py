@@ -298,7 +298,7 @@ def _work() -> None:
 def _with_helpers(function: Callable[P, R], options: dict[str, Any]) -> Callable[P, R]:
     """The function, its helpers replaced by what numba can compile into it."""
     helpers = {
-        name: import_module("numba").njit(**options)(_with_helpers(value.plain, options))
+        name: import_module("numba").njit(forceinline=True, **options)(_with_helpers(value.plain, options))
         for name, value in function.__globals__.items()
         if name in function.__code__.co_names and isinstance(value, Helper)
     }

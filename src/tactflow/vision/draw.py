@@ -24,6 +24,7 @@ GREEN: Final[Colour] = (90, 230, 60)
 ORANGE: Final[Colour] = (40, 150, 255)
 MAGENTA: Final[Colour] = (255, 120, 255)
 DARK: Final[Colour] = (25, 25, 25)
+"""Colours, blue, green, red."""
 
 _SHIFT: Final = 4
 """Binary digits after the point in drawing coordinates: they are exact to 1/16 px."""
@@ -47,7 +48,7 @@ _OVERHANG: Final = 14
 _CENTROID: Final = (4.0, 2.8)
 """Radii of the dark and of the coloured dot on the centroid, px."""
 _DASHES: Final = 12
-"""Dashes of an ellipse; each takes half of its share of the outline."""
+"""Dashes of an ellipse; they are as long as the gaps between them."""
 _TEXT: Final = 11
 """Size of the text, px."""
 _LINE_SPACING: Final = 14
@@ -59,6 +60,7 @@ _STATUS_COLOURS: Final = (
     (MarkerStatus.INFERRED, WHITE),
     (MarkerStatus.TRACKED, YELLOW),
 )
+"""Colours of the arrows, in the order in which they are drawn: what is known best comes last, on top."""
 
 
 class Annotator:

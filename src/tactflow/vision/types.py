@@ -72,7 +72,12 @@ class Markers:
     position : (N, 2) float64, position in this frame, px. Finite for every status.
     status : (N,) uint8, values of `MarkerStatus`.
     stderr : (N,) float64, standard error of each coordinate of `position`, px; NaN where unknown.
-    radius : of a mark in the reference frame, px; None where the method does not know it.
+    radius : of a marker in the reference frame, px; None where the method does not know it.
+
+    >>> origin = np.array([[10.0, 20.0]])
+    >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(1, np.uint8), np.array([0.01]))
+    >>> markers.displacement
+    array([[1. , 0.5]])
     """
 
     origin: NDArray[np.float64]

@@ -31,8 +31,8 @@ from tactflow.vision.change.noise import QUANTISATION, WARM_UP, NoiseModel
 from tactflow.vision.change.tiles import Sample, Tiling
 
 _MEAN = 4
-"""Unchanged frames before the anchor, itself included, over which its sums are averaged, at most. Chosen by
-hand."""
+"""Unchanged frames since the last change, the first ones, over which the anchor's sums are averaged, at most.
+Chosen by hand."""
 _CALM = 0.1
 """Fraction of still frames that are not calm, 1. Chosen by hand."""
 _EVERY = 16
@@ -50,10 +50,15 @@ class ChangeProbe:
         frame's work; a smaller share lets larger changes pass unseen.
     tile : edge of a tile, px >= 8. Smaller tiles see smaller contacts and cost more.
 
-    Raises
-    ------
-    ValueError : a frame is not an image of uint8, its size differs from the first one's, or a parameter is
-        out of range.
+    Raises ValueError if a frame is not an image of uint8, if its size differs from the first one's, or for a
+    parameter out of range.
+
+    >>> still = np.full((48, 64, 3), 100, np.uint8)
+    >>> probe = ChangeProbe(still)
+    >>> [probe.look(still) for _ in range(8)]
+    [True, True, True, True, True, True, False, False]
+    >>> probe.look(still + np.uint8(9))
+    True
     """
 
     def __init__(self, frame: NDArray[np.uint8], *, false_alarms: float = 1e-3, tile: int = 40) -> None:
@@ -65,8 +70,8 @@ class ChangeProbe:
         self._tiling = tiling = Tiling(frame, tile)
         noise = self._noise = NoiseModel(tiling)
         self.bound, self._calm = (
-            -NormalDist().inv_cdf(share / (2 * (noise.tests + 2)))
-            for share in (false_alarms, max(false_alarms, _CALM))
+            -NormalDist().inv_cdf(fraction / (2 * (noise.tests + 2)))
+            for fraction in (false_alarms, max(false_alarms, _CALM))
         )
         """What the strongest test value must exceed, in standard deviations."""
         self.strongest = float("inf")
@@ -107,10 +112,8 @@ class ChangeProbe:
 
         frame : same shape and dtype as the first. It is kept while it is the anchor or the last one, and must
             not be written to meanwhile.
-
-        Returns
-        -------
-        True if the frame differs from the anchor by more than noise, or while the noise is not known yet.
+        Returns True if the frame differs from the anchor by more than noise, or while the noise is not known
+        yet.
         """
         if _checked(frame).shape != self._shape:
             raise ValueError(f"required a frame of shape {self._shape}, got {frame.shape}")

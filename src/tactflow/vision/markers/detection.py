@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -12,18 +13,94 @@ from numpy.typing import NDArray
 Polarity = Literal["auto", "dark", "bright"]
 FloatArray = NDArray[np.float64]
 
-_SCALE_RATIO: Final = 1.6
-# A difference of Gaussians with widths s and 1.6 s answers a disc of radius r most strongly at s = r / 1.83
-# (measured on rendered discs of radius 2 to 12 px).
-_RADIUS_PER_SIGMA: Final = 1.83
-_MOST_PEAKS: Final = 3000
-# Scales from here on are looked at in a smaller picture, px.
-_LARGEST_SIGMA: Final = 4.0
-# Nearest marks are at least so many radii apart.
-_OVERLAP: Final = 1.3
-# Score of the weakest family that is believed to be a grid (see `_score`). Real and simulated gels score 100
-# and more; dust, reflections and noise on gels without marks at most 14.
-_LEAST_SCORE: Final = 25.0
+SCALE_RATIO: Final = 1.6
+"""Width of the wider Gaussian of a difference of Gaussians over that of the narrower: closest to the
+Laplacian of a Gaussian (Marr and Hildreth 1980)."""
+
+RADIUS_PER_SIGMA: Final = 1.83
+"""Radius of the disc that such a difference answers most strongly, over the narrower width. Measured on
+rendered discs of radius 2 to 12 px."""
+
+LEAST_SIGMA: Final = 0.9
+"""Smallest scale that is looked at, px: marks of radius 1.6. Chosen by hand."""
+
+SIGMA_STEP: Final = 1.2
+"""Ratio of neighbouring scales. Chosen by hand."""
+
+LARGEST_MARK: Final = 1 / 16
+"""Largest scale that is looked at, over the shorter side of the image. Chosen by hand."""
+
+FULL_SIZE_SIGMA: Final = 4.0
+"""Scales from here on are looked at in a smaller picture, px: it gives the same peaks at a cost that does not
+grow."""
+
+LEAST_RESPONSE: Final = 1.0
+"""Response of a peak, grey levels, at least: below it is rounding."""
+
+MOST_PEAKS: Final = 3000
+"""Peaks of one scale, the strongest ones: bounds the time on a textured picture."""
+
+RING: Final = 1.9
+"""Radius of the ring around a mark that is compared with it, in radii of the mark. Chosen by hand."""
+
+RING_POINTS: Final = 8
+"""Points of that ring. Chosen by hand."""
+
+RING_CONTRAST: Final = 0.3
+"""Contrast of a spot with all but one point of the ring, at least, over the median contrast. Chosen by
+hand."""
+
+OVERLAP: Final = 1.3
+"""Distance of neighbouring marks at least, in radii: spots closer than that are ridges of a pattern."""
+
+BORDER_MARGIN: Final = 0.8
+"""Distance of a mark from the border of the image at least, in radii: others are cut by it."""
+
+FAMILY_STRENGTH: Final = 0.35
+"""Response of a mark over that of the typical one, at least. Chosen by hand: dirt and grain are a tail."""
+
+LEAST_STRENGTH: Final = 2.0
+"""Response of a mark, grey levels, at least. Chosen by hand."""
+
+BETWEEN: Final = 0.55
+"""Distance, pitches, below which the weaker of two spots lies between marks. Chosen by hand."""
+
+LONELY: Final = 2.3
+"""Distance of the second nearest mark, pitches, beyond which a spot is lonely. Chosen by hand."""
+
+ENOUGH_MARKS: Final = 100
+"""Marks from which on more make a family no better. Chosen by hand."""
+
+LEAST_SCORE: Final = 25.0
+"""Score of the weakest family that is believed to be marks (see `_score`). Real and simulated gels score 100
+and more; dust, reflections and noise on gels without marks at most 14 (measured)."""
+
+LONGEST_LINK: Final = 2.6
+"""Distance of neighbours at most, pitches. Chosen by hand."""
+
+LONE_PITCH: Final = 8.0
+"""Pitch of a single mark, in radii. Chosen by hand."""
+
+CENTROID_WINDOW: Final = 1.6
+"""Radius of the window of a centroid, in radii of the mark. Chosen by hand: it holds the mark's border."""
+
+SURROUNDINGS: Final = (1.4, 1.9)
+"""Inner and outer radius of the ring that gives the level around a mark, in radii of the mark; the outer one
+is 1.5 px wider. Chosen by hand."""
+
+CENTROID_ROUNDS: Final = 4
+"""Steps of a centroid's window, at most. Chosen by hand."""
+
+CENTROID_CONVERGED: Final = 1e-3
+"""Step of all windows, px, below which they have converged."""
+
+BLOCKING: Final = 1.1
+"""Sum of squares, over the squared distance of two marks, below which a third one between them blocks their
+link. A right angle has 1; a tenth more keeps a skewed square free of diagonals."""
+
+GRAPH_CANDIDATES: Final = 12
+"""Nearest marks among which neighbours are looked for. Chosen by hand."""
+
 _NO_MARKERS: Final = "0 markers found: is the sensor marker-less? then use pipelines/markerless.yaml"
 _FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels)"
 
@@ -60,7 +137,11 @@ def require_image(image: NDArray[np.uint8]) -> None:
 
 
 def to_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 BGR, or (H, W) uint8, to (H, W) uint8 luma; raises ValueError on anything else."""
+    """(H, W, 3) uint8 BGR, or (H, W) uint8, to (H, W) uint8 luma; raises ValueError on anything else.
+
+    >>> to_gray(np.full((2, 2, 3), 7, np.uint8)).tolist()
+    [[7, 7], [7, 7]]
+    """
     require_image(image)
     if image.ndim == 2:
         return np.ascontiguousarray(image)
@@ -101,6 +182,13 @@ def detect_markers(
     ----------
     Lindeberg, "Feature detection with automatic scale selection", IJCV 30 (1998); Lowe, "Distinctive image
     features from scale-invariant keypoints", IJCV 60 (2004), for the difference of Gaussians.
+
+    Examples
+    --------
+    >>> from tactflow.sim import open_scene
+    >>> found = detect_markers(open_scene("press?frames=2").frame(0))
+    >>> found.polarity, found.centers.shape[1]
+    ('dark', 2)
     """
     gray = to_gray(image).astype(np.float32)
     shortest = min(gray.shape)
@@ -110,42 +198,52 @@ def detect_markers(
         raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
     if shortest < 8:
         raise NoMarkersError(_NO_MARKERS)
-    polarities: tuple[Literal["dark", "bright"], ...] = (
-        ("dark", "bright") if polarity == "auto" else (polarity,)
-    )
-    best: tuple[float, float, Literal["dark", "bright"], FloatArray] | None = None
+    best: _Family | None = None
     for sigma in _sigmas(dot_radius, shortest):
-        # Large scales hold no detail: a smaller picture gives the same peaks at a cost that does not grow.
-        factor = 1
-        while sigma >= factor * _LARGEST_SIGMA:
-            factor *= 2
-        fine = sigma / factor
-        narrow, wide = _blurred(_shrunk(gray, factor), fine)
-        for sign in polarities:
-            peaks, strength = _peaks(wide - narrow if sign == "dark" else narrow - wide, fine)
-            spots = _surrounded(narrow if sign == "dark" else -narrow, peaks, fine * _RADIUS_PER_SIGMA)
-            peaks, strength = peaks[spots] * factor + (factor - 1) / 2, strength[spots]
-            kept = _family(peaks, strength, gray.shape, sigma * _RADIUS_PER_SIGMA)
-            if len(kept) == 0:
-                continue
-            score = _score(peaks[kept], strength[kept])
-            if best is None or score > best[0]:
-                best = (score, sigma, sign, peaks[kept])
-    if best is None or (dot_radius is None and best[0] < _LEAST_SCORE):
+        for family in _families(gray, sigma, ("dark", "bright") if polarity == "auto" else (polarity,)):
+            if best is None or family.score > best.score:
+                best = family
+    if best is None or (dot_radius is None and best.score < LEAST_SCORE):
         raise NoMarkersError(_NO_MARKERS + ("" if best is None else _FEW_MARKERS))
-    _, sigma, found, peaks = best
-    radius = sigma * _RADIUS_PER_SIGMA
-    centers = refine_centers(gray if found == "dark" else 255 - gray, peaks, radius)
+    radius = best.sigma * RADIUS_PER_SIGMA
+    centers = refine_centers(gray if best.polarity == "dark" else 255 - gray, best.peaks, radius)
     centers = centers[_reading_order(centers, radius)]
     distances = _nearest(centers, 1)[0]
-    pitch = float(np.median(distances[:, 0])) if len(centers) > 1 else 8 * radius
-    return Detection(centers, radius, found, pitch, neighbour_graph(centers, 2.6 * pitch))
+    pitch = float(np.median(distances[:, 0])) if len(centers) > 1 else LONE_PITCH * radius
+    return Detection(centers, radius, best.polarity, pitch, neighbour_graph(centers, LONGEST_LINK * pitch))
+
+
+class _Family(NamedTuple):
+    """Spots that look like marks of one gel: how much so, at which scale and polarity, and where."""
+
+    score: float
+    sigma: float
+    polarity: Literal["dark", "bright"]
+    peaks: FloatArray
+
+
+def _families(
+    gray: NDArray[np.float32], sigma: float, polarities: Sequence[Literal["dark", "bright"]]
+) -> Iterator[_Family]:
+    """The family of each polarity at one scale, if there is one."""
+    factor = 1
+    while sigma >= factor * FULL_SIZE_SIGMA:
+        factor *= 2
+    fine = sigma / factor
+    narrow, wide = _blurred(_shrunk(gray, factor), fine)
+    for sign in polarities:
+        peaks, strength = _peaks(wide - narrow if sign == "dark" else narrow - wide, fine)
+        spots = _surrounded(narrow if sign == "dark" else -narrow, peaks, fine * RADIUS_PER_SIGMA)
+        peaks, strength = peaks[spots] * factor + (factor - 1) / 2, strength[spots]
+        kept = _members(peaks, strength, gray.shape, sigma * RADIUS_PER_SIGMA)
+        if len(kept):
+            yield _Family(_score(peaks[kept], strength[kept]), sigma, sign, peaks[kept])
 
 
 def refine_centers(gray: NDArray[np.float32], centers: FloatArray, radius: float) -> FloatArray:
     """Centroid of what is darker than its surroundings, in a window that follows it.
 
-    The surroundings are a plane through the rim of the window, so a slope of the light does not pull.
+    The surroundings are a plane fitted to a ring around the mark, so a slope of the light does not pull.
 
     Parameters
     ----------
@@ -157,15 +255,23 @@ def refine_centers(gray: NDArray[np.float32], centers: FloatArray, radius: float
     -------
     centers : (N, 2) float64, px; where there is nothing dark, the starting point. Whole grey levels are
         exact in float32, and everything after is float64.
+
+    Examples
+    --------
+    >>> gray = np.full((30, 30), 200, np.float32)
+    >>> gray[12:17, 10:15] = 50
+    >>> refine_centers(gray, np.array([[11.0, 15.0]]), 2.5).round(3)
+    array([[12., 14.]])
     """
-    reach = int(np.ceil(1.9 * radius + 1.5))
+    inner, outer = SURROUNDINGS[0] * radius, SURROUNDINGS[1] * radius + 1.5
+    reach = int(np.ceil(outer))
     axis = np.arange(-reach, reach + 1)
     grid_x, grid_y = (part.ravel().astype(np.float64) for part in np.meshgrid(axis, axis))
     padded = cv2.copyMakeBorder(gray, reach, reach, reach, reach, cv2.BORDER_REPLICATE).astype(np.float64)
     height, width = gray.shape
     result = np.array(centers, np.float64)
     limits = np.array([width - 1, height - 1])
-    for _ in range(4):
+    for _ in range(CENTROID_ROUNDS):
         corner = np.clip(np.rint(result).astype(np.int64), 0, limits)
         patches = padded[
             corner[:, 1, None] + (grid_y + reach).astype(np.int64),
@@ -174,20 +280,20 @@ def refine_centers(gray: NDArray[np.float32], centers: FloatArray, radius: float
         x = grid_x + corner[:, :1] - result[:, :1]
         y = grid_y + corner[:, 1:] - result[:, 1:]
         distance = np.hypot(x, y)
-        rim = np.clip(distance - 1.4 * radius, 0, 1) * np.clip(1.9 * radius + 1.5 - distance, 0, 1)
+        ring = np.clip(distance - inner, 0, 1) * np.clip(outer - distance, 0, 1)
         basis = np.stack([np.ones_like(x), x, y], axis=1)
-        weighted = basis * rim[:, None]
+        weighted = basis * ring[:, None]
         normal = weighted @ basis.transpose(0, 2, 1)
         plane = np.linalg.solve(normal, weighted @ patches[:, :, None])
         darkness = np.maximum((basis.transpose(0, 2, 1) @ plane)[:, :, 0] - patches, 0)
-        darkness *= np.clip(1.6 * radius + 0.5 - distance, 0, 1)
+        darkness *= np.clip(CENTROID_WINDOW * radius + 0.5 - distance, 0, 1)
         total = darkness.sum(axis=1)
         good = total > 1e-3
         move = np.zeros_like(result)
         move[good, 0] = (darkness * x).sum(axis=1)[good] / total[good]
         move[good, 1] = (darkness * y).sum(axis=1)[good] / total[good]
         result += np.clip(move, -radius, radius)
-        if np.abs(move).max(initial=0) < 1e-3:
+        if np.abs(move).max(initial=0) < CENTROID_CONVERGED:
             break
     return result
 
@@ -211,15 +317,20 @@ def neighbour_graph(centers: FloatArray, longest: float) -> NDArray[np.int64]:
     ----------
     Gabriel and Sokal, "A new statistical approach to geographic variation analysis", Systematic Zoology 18
     (1969); Kirkpatrick and Radke, "A framework for computational morphology" (1985).
+
+    Examples
+    --------
+    >>> square = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
+    >>> neighbour_graph(square, 20.0).tolist()
+    [[0, 1], [0, 2], [1, 3], [2, 3]]
     """
     count = len(centers)
     if count < 2:
         return np.zeros((0, 2), np.int64)
-    distances, near = _nearest(centers, min(12, count - 1))
+    distances, near = _nearest(centers, min(GRAPH_CANDIDATES, count - 1))
     squared = distances**2
     between = ((centers[near][:, :, None] - centers[near][:, None, :]) ** 2).sum(axis=3)
-    # A tenth more than a right angle's sum of squares still blocks: a skewed square has no diagonals then.
-    blocked = squared[:, None, :] + between < 1.1 * squared[:, :, None]
+    blocked = squared[:, None, :] + between < BLOCKING * squared[:, :, None]
     blocked &= ~np.eye(near.shape[1], dtype=bool)
     # Of marks in one place, the nearest may be the mark itself.
     keep = ~blocked.any(axis=2) & (distances <= longest) & (distances > 0)
@@ -230,10 +341,10 @@ def neighbour_graph(centers: FloatArray, longest: float) -> NDArray[np.int64]:
 
 def _sigmas(dot_radius: float | None, shortest: int) -> list[float]:
     if dot_radius is not None:
-        return [dot_radius / _RADIUS_PER_SIGMA]
-    largest = max(1.2, shortest / 16)
-    count = 1 + int(np.floor(np.log(largest / 0.9) / np.log(1.2)))
-    return [0.9 * 1.2**index for index in range(count)]
+        return [dot_radius / RADIUS_PER_SIGMA]
+    largest = max(SIGMA_STEP, shortest * LARGEST_MARK)
+    count = 1 + int(np.floor(np.log(largest / LEAST_SIGMA) / np.log(SIGMA_STEP)))
+    return [LEAST_SIGMA * SIGMA_STEP**index for index in range(count)]
 
 
 def _shrunk(gray: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
@@ -248,7 +359,7 @@ def _shrunk(gray: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
 def _blurred(gray: NDArray[np.float32], sigma: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The image at a scale and at the next coarser one; their difference answers to spots of the scale."""
     narrow = cv2.GaussianBlur(gray, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-    step = sigma * float(np.sqrt(_SCALE_RATIO**2 - 1.0))
+    step = sigma * float(np.sqrt(SCALE_RATIO**2 - 1.0))
     wide = cv2.GaussianBlur(narrow, (0, 0), step, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(narrow, np.float32), np.asarray(wide, np.float32)
 
@@ -260,24 +371,24 @@ def _surrounded(smooth: NDArray[np.float32], peaks: FloatArray, radius: float) -
     """
     if len(peaks) == 0:
         return np.zeros(0, np.int64)
-    angles = np.arange(8) * (np.pi / 4)
-    ring = peaks[:, None] + 1.9 * radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    angles = np.arange(RING_POINTS) * (2 * np.pi / RING_POINTS)
+    ring = peaks[:, None] + RING * radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     limits = np.array([smooth.shape[1] - 1, smooth.shape[0] - 1])
     column, row = np.clip(np.rint(ring).astype(np.int64), 0, limits).transpose(2, 0, 1)
     own_column, own_row = np.clip(np.rint(peaks).astype(np.int64), 0, limits).T
     above = np.sort(smooth[row, column] - smooth[own_row, own_column][:, None], axis=1)
-    return np.flatnonzero(above[:, 1] > 0.3 * above[:, 4])
+    return np.flatnonzero(above[:, 1] > RING_CONTRAST * above[:, RING_POINTS // 2])
 
 
 def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, FloatArray]:
     """Local maxima, refined to sub-pixels by a parabola along each axis: positions (N, 2), strengths (N,)."""
-    # Marks do not overlap: peaks that are nearer to each other are the rim of one spot of a larger scale.
-    size = 2 * max(1, round(_OVERLAP * _RADIUS_PER_SIGMA * sigma)) + 1
+    # Marks do not overlap: peaks that are nearer to each other are the border of one spot of a larger scale.
+    size = 2 * max(1, round(OVERLAP * RADIUS_PER_SIGMA * sigma)) + 1
     highest = cv2.dilate(response, np.ones((size, size), np.uint8))
-    rows, columns = np.nonzero((response >= highest) & (response > 1.0))
+    rows, columns = np.nonzero((response >= highest) & (response > LEAST_RESPONSE))
     inside = (rows > 0) & (columns > 0) & (rows < response.shape[0] - 1) & (columns < response.shape[1] - 1)
     rows, columns = rows[inside], columns[inside]
-    strongest = np.argsort(-response[rows, columns], kind="stable")[:_MOST_PEAKS]
+    strongest = np.argsort(-response[rows, columns], kind="stable")[:MOST_PEAKS]
     rows, columns = rows[strongest], columns[strongest]
     value = response[rows, columns].astype(np.float64)
     points = np.column_stack([columns, rows]).astype(np.float64)
@@ -289,18 +400,18 @@ def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, Flo
     return points, value
 
 
-def _family(
+def _members(
     peaks: FloatArray, strength: FloatArray, shape: tuple[int, ...], radius: float
 ) -> NDArray[np.int64]:
     """Indices of the peaks that belong to one family of marks."""
     if len(peaks) == 0:
         return np.zeros(0, np.int64)
     height, width = shape
-    margin = 0.8 * radius
+    margin = BORDER_MARGIN * radius
     inside = (peaks[:, 0] >= margin) & (peaks[:, 0] <= width - 1 - margin)
     inside &= (peaks[:, 1] >= margin) & (peaks[:, 1] <= height - 1 - margin)
     kept = np.flatnonzero(inside)
-    order = kept[np.argsort(-strength[kept], kind="stable")][:4000]
+    order = kept[np.argsort(-strength[kept], kind="stable")]
     if len(order) == 0:
         return order
     # Strengths of marks are alike, those of dirt and grain are a tail: cut at a part of the typical one,
@@ -308,23 +419,23 @@ def _family(
     ranked = strength[order]
     typical = ranked[0]
     for _ in range(8):
-        members = ranked[ranked > 0.35 * typical]
+        members = ranked[ranked > FAMILY_STRENGTH * typical]
         typical = float(np.median(members))
-    kept = order[(ranked > 0.35 * typical) & (ranked > 2.0)]
+    kept = order[(ranked > FAMILY_STRENGTH * typical) & (ranked > LEAST_STRENGTH)]
     if len(kept) < 3:
         return np.asarray(kept, np.int64)
     for _ in range(3):
         distances, near = _nearest(peaks[kept], min(4, len(kept) - 1))
         pitch = float(np.median(distances[:, 0]))
-        between = (distances[:, 0] < 0.55 * pitch) & (strength[kept] < strength[kept][near[:, 0]])
-        lonely = distances[:, min(1, distances.shape[1] - 1)] > 2.3 * pitch
+        between = (distances[:, 0] < BETWEEN * pitch) & (strength[kept] < strength[kept][near[:, 0]])
+        lonely = distances[:, min(1, distances.shape[1] - 1)] > LONELY * pitch
         if not (between | lonely).any():
             break
         kept = kept[~(between | lonely)]
         if len(kept) < 3:
             break
     # Evenly spaced spots that overlap are the ridges of a pattern.
-    if len(kept) > 1 and float(np.median(_nearest(peaks[kept], 1)[0])) < _OVERLAP * radius:
+    if len(kept) > 1 and float(np.median(_nearest(peaks[kept], 1)[0])) < OVERLAP * radius:
         return np.zeros(0, np.int64)
     return np.asarray(kept, np.int64)
 
@@ -338,7 +449,7 @@ def _score(peaks: FloatArray, strength: FloatArray) -> float:
         nearest = _nearest(peaks, 1)[0][:, 0]
         pitch = float(np.median(nearest))
         even = 1.0 / (1.0 + 4.0 * float(np.mean(np.minimum(np.abs(nearest / pitch - 1.0), 1.0))))
-    return typical * even**2 * float(np.sqrt(min(count, 100)))
+    return typical * even**2 * float(np.sqrt(min(count, ENOUGH_MARKS)))
 
 
 def _nearest(points: FloatArray, count: int) -> tuple[FloatArray, NDArray[np.int64]]:

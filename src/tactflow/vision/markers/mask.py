@@ -1,4 +1,4 @@
-"""Where markers cover the gel: spots unlike their surroundings on all sides, by two votes of three."""
+"""Where markers cover the gel: spots that differ from their surroundings on all sides."""
 
 from __future__ import annotations
 
@@ -6,27 +6,32 @@ import math
 import threading
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Final, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
-from tactflow.vision.geometry.downsample import halve_block, halved
+from tactflow.vision.compiled import kernel
+from tactflow.vision.geometry.downsample import halve_block
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers
-from tactflow.vision.markers.mask_kernels import contrast_with_circle, cover_spots
 
+Bytes = NDArray[np.uint8]
 Polarity = Literal["dark", "bright"]
 
-_DIRECTIONS = 12
-"""Points on the circle around a spot that are compared with it."""
-_RIM = 1.5
-"""Soft rim of a dot that is covered too, pixels at half resolution: all that touch it, also by a corner."""
-_SHARE = 0.25
-"""Part of the dots' median contrast from which on something is a dot: worn dots keep that much."""
-_LEAST = 6.0
-"""Least contrast of a dot, grey levels: what the original script's threshold of 120 / 20 lets through."""
+CIRCLE_POINTS: Final = 12
+"""Points on the circle around a spot that it is compared with; `contrast_with_circle` spells them out.
+Chosen by hand."""
+
+SHARPEST_CIRCLE: Final = 4.0
+"""px; the circle lies at least this far outside a dot, so that the blurred border of a small dot is not taken
+for the gel. Chosen by hand."""
+
+CONTRAST_FRACTION: Final = 0.25
+"""Fraction of the dots' median contrast from which on a spot is a dot. Worn dots keep that much."""
+
+LEAST_CONTRAST: Final = 6.0
+"""Least contrast of a dot, grey levels: 120 / 20, the threshold of the original script over its gain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +44,7 @@ class Dot:
 
     radius: float
     polarity: Polarity = "dark"
-    contrast: float = _LEAST
+    contrast: float = LEAST_CONTRAST
 
     def __post_init__(self) -> None:
         if not (self.radius > 0 and math.isfinite(self.radius)):
@@ -51,31 +56,47 @@ class Dot:
 
 
 def find_dot(
-    image: NDArray[np.uint8],
+    image: Bytes,
     *,
     radius: float | None = None,
     polarity: Literal["dark", "bright", "auto"] = "auto",
 ) -> Dot | None:
     """Size, polarity and contrast of the markers of a gel, from a picture of the untouched gel.
 
-    image : (H, W, 3) uint8, BGR grey levels. radius : px, if it is known. Returns None where there are none.
+    Parameters
+    ----------
+    image : (H, W, 3) uint8, BGR grey levels.
+    radius : of a marker, px, if it is known.
+    polarity : of the markers; "auto" takes the stronger family of spots.
+
+    Returns
+    -------
+    dot : what the markers look like; None where there are none.
+
+    Examples
+    --------
+    >>> from tactflow.sim import open_scene
+    >>> dot = find_dot(open_scene("press?frames=2").frame(0))
+    >>> dot.polarity
+    'dark'
     """
     try:
         found = detect_markers(image, dot_radius=radius, polarity=polarity)
     except NoMarkersError:
         return None
-    response = _response(halved(_even(image)), found.dot_radius, found.polarity)
+    contrast = _median_contrast(_even(image), found.dot_radius, found.polarity)
     columns, rows = np.clip(np.rint((found.centers - 0.5) / 2).astype(int).T, 0, None)
-    at = response[np.minimum(rows, response.shape[0] - 1), np.minimum(columns, response.shape[1] - 1)]
-    return Dot(found.dot_radius, found.polarity, max(_LEAST, _SHARE * float(np.median(at))))
+    at = contrast[np.minimum(rows, contrast.shape[0] - 1), np.minimum(columns, contrast.shape[1] - 1)]
+    least = max(LEAST_CONTRAST, CONTRAST_FRACTION * float(np.median(at)))
+    return Dot(found.dot_radius, found.polarity, least)
 
 
-def marker_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
-    """Mask of spots of a given size, with their soft rims, without shift.
+def marker_mask(image: Bytes, dot: Dot) -> Bytes:
+    """Mask of spots of a given size and their soft borders.
 
-    A difference of two scales, as in a difference of Gaussians, but its outer scale is the *least*
-    contrast on a circle around the spot instead of a mean: so the edge of a contact, dark on one side only
-    or along a line, is not taken for a marker. Works at half resolution.
+    A spot differs by `dot.contrast` from every point on a circle around it, in at least two of the three
+    channels. A difference of Gaussians compares with the mean of the surroundings instead; the least
+    difference keeps the edge of a contact, dark on one side or along a line, out of the mask.
 
     Parameters
     ----------
@@ -84,41 +105,34 @@ def marker_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
 
     Returns
     -------
-    mask : (H, W) uint8, 255 on markers and their rims, else 0.
+    mask : (H, W) uint8, 255 on markers, else 0. It is computed at half resolution, so it consists of blocks
+        of 2 x 2 px, and every spot is dilated by one block to cover its soft border.
 
     Raises
     ------
-    ValueError : if the image is not of that kind.
+    ValueError : the image is not of that kind.
 
-    References
-    ----------
+    Examples
+    --------
+    >>> import cv2
+    >>> gel = np.full((60, 80, 3), 150, np.uint8)
+    >>> mask = marker_mask(cv2.circle(gel, (40, 30), 5, (30, 30, 30), -1), Dot(radius=5))
+    >>> int(mask[30, 40]), int(mask[30, 60])
+    (255, 0)
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise ValueError(
             f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
         )
-    height, width = image.shape[:2]
     whole = _even(image)
-    if compiled.active():
-        mask = _compiled_mask(whole, dot)
-    else:
-        response = _response(halved(whole), dot.radius, dot.polarity)
-        _, cores = cv2.threshold(response, dot.contrast, 255, cv2.THRESH_BINARY)
-        grown = cv2.dilate(cores, _disc(_RIM))
-        # Every pixel twice along a line, then every line twice: a quarter of the time of `cv2.resize`.
-        mask = doubled(np.asarray(cv2.merge([grown, grown]).reshape(len(grown), -1), np.uint8))
-    return np.ascontiguousarray(mask[:height, :width])
+    own = _contrast(whole, dot.radius, dot.polarity)
+    mask = np.empty(whole.shape[:2], np.uint8)
+    threshold = min(255, math.floor(dot.contrast))
+    cover_spots(own.contrast, threshold, own.reach, _corner(dot.radius), own.spots, own.doubled, mask)
+    return np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
 
 
-def doubled(lines: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Every line twice: (h, w) or (h, w, C) uint8 -> twice as high."""
-    twice = np.empty((len(lines), 2, *lines.shape[1:]), np.uint8)
-    twice[:, 0] = lines
-    twice[:, 1] = lines
-    return twice.reshape(2 * len(lines), *lines.shape[1:])
-
-
-def halved_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def halved_mask(mask: Bytes) -> Bytes:
     """255 where any of 2 x 2 pixels is not 0, else 0: (h, w) uint8, h and w even -> half as high and wide."""
     # A pixel of 255 in four leaves 64, and one of 1 none: so the mask is spread to 0 and 255 first.
     full = cv2.threshold(mask, 0, 255, cv2.THRESH_BINARY)[1]
@@ -126,7 +140,7 @@ def halved_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.threshold(small, 0, 255, cv2.THRESH_BINARY)[1], np.uint8)
 
 
-def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _even(image: Bytes) -> Bytes:
     """The image with its last row and column repeated where their number is odd."""
     bottom, right = image.shape[0] % 2, image.shape[1] % 2
     if bottom or right:
@@ -135,13 +149,14 @@ def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class _Buffers:
-    """What `_compiled_mask` computes in; the half-size picture has a margin as wide as the circle."""
+    """What `_contrast` computes in. Pictures at half size have a margin of `reach` px, the circle's."""
 
     def __init__(self, height: int, width: int, radius: float, polarity: Polarity) -> None:
-        rows, columns = _around(_outer(radius))
-        reach = self.reach = len(_circle(_outer(radius))) // 2
+        outer = _circle_radius(radius)
+        rows, columns = _circle_points(outer)
+        reach = self.reach = math.ceil(outer)
         high, wide = height + 2 * reach, width + 2 * reach
-        # Outside the frame nothing is as dark as a dot, or as bright.
+        # Nothing outside the frame is as dark as a dot, or as bright.
         self.half = np.full((high, 3 * wide), 255 if polarity == "dark" else 0, np.uint8)
         self.inverted = np.empty_like(self.half)
         self.steps = 3 * (rows * wide + columns)
@@ -154,35 +169,28 @@ _kept = threading.local()
 """The buffers of each thread, for frames of one size and one kind of dot."""
 
 
-def _compiled_mask(image: NDArray[np.uint8], dot: Dot) -> NDArray[np.uint8]:
-    """`marker_mask` of an image of even height and width."""
-    height, width = image.shape[0] // 2, image.shape[1] // 2
-    kind = (height, width, dot.radius, dot.polarity)
+def _contrast(whole: Bytes, radius: float, polarity: Polarity) -> _Buffers:
+    """Buffers whose `contrast` is that of an image of even height and width, at half resolution."""
+    height, width = whole.shape[0] // 2, whole.shape[1] // 2
+    kind = (height, width, radius, polarity)
     if getattr(_kept, "kind", None) != kind:
         _kept.kind, _kept.buffers = kind, _Buffers(*kind)
     own: _Buffers = _kept.buffers
-    reach, picture = own.reach, own.half
-    halve_block(image.reshape(len(image), -1), 0, 0, own.half, reach, reach, height, width, False)
-    if dot.polarity == "bright":
+    picture = own.half
+    halve_block(whole.reshape(len(whole), -1), 0, 0, picture, own.reach, own.reach, height, width, False)
+    if polarity == "bright":
         # A bright dot is a dark one in the negative.
         picture = np.invert(own.half, out=own.inverted)
-    contrast_with_circle(picture, reach, own.steps, own.contrast)
-    limit = min(255, math.floor(dot.contrast))
-    mask = np.empty((2 * height, 2 * width), np.uint8)
-    cover_spots(own.contrast, limit, reach, _corner(dot.radius), own.spots, own.doubled, mask)
-    return mask
+    contrast_with_circle(picture, own.reach, own.steps, own.contrast)
+    return own
 
 
-def _response(half: NDArray[np.uint8], radius: float, polarity: Polarity) -> NDArray[np.uint8]:
-    """Contrast of each pixel with the least different one on a circle around it; median of the channels."""
-    circle = _circle(_outer(radius))
-    if polarity == "dark":
-        contrast = cv2.subtract(cv2.erode(half, circle), half)
-    else:
-        contrast = cv2.subtract(half, cv2.dilate(half, circle))
-    first, second, third = cv2.split(contrast)
-    median = np.asarray(cv2.max(cv2.min(first, second), cv2.min(cv2.max(first, second), third)), np.uint8)
-    # In a corner of the frame most of the circle is missing: any dark corner would be a spot.
+def _median_contrast(whole: Bytes, radius: float, polarity: Polarity) -> Bytes:
+    """Median contrast of the three channels, half as high and wide; 0 in the corners of the frame."""
+    own = _contrast(whole, radius, polarity)
+    reach, (high, wide) = own.reach, own.spots.shape
+    channels = own.contrast.reshape(high, wide, 3)[reach : high - reach, reach : wide - reach]
+    median = np.sort(channels, axis=2)[:, :, 1]
     side = _corner(radius)
     for rows in (slice(0, side), slice(-side, None)):
         median[rows, :side] = 0
@@ -190,34 +198,90 @@ def _response(half: NDArray[np.uint8], radius: float, polarity: Polarity) -> NDA
     return median
 
 
-def _outer(radius: float) -> float:
+def _circle_radius(radius: float) -> float:
     """Radius at half resolution of the circle that a dot of a radius at full resolution is compared with."""
-    return (radius + max(radius, 4.0) + 1) / 2
+    return (radius + max(radius, SHARPEST_CIRCLE) + 1) / 2
 
 
 def _corner(radius: float) -> int:
-    """Side of the squares in the corners of the half-size frame in which no dot is looked for."""
-    return len(_circle(_outer(radius))) // 4
+    """Side, px, of the squares in the corners of the half-size frame in which no dot is looked for.
+
+    Most of the circle is missing there, so any dark corner would be a spot.
+    """
+    return (2 * math.ceil(_circle_radius(radius)) + 1) // 4
 
 
 @lru_cache(maxsize=32)
-def _around(radius: float) -> NDArray[np.int64]:
-    """Rows and columns of the places of a circle, from its centre: (2, _DIRECTIONS)."""
-    turn = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
+def _circle_points(radius: float) -> NDArray[np.int64]:
+    """Rows and columns of the points of a circle, from its centre: (2, CIRCLE_POINTS)."""
+    turn = np.arange(CIRCLE_POINTS) * (2 * np.pi / CIRCLE_POINTS)
     return np.rint(radius * np.stack([np.sin(turn), np.cos(turn)])).astype(np.int64)
 
 
-@lru_cache(maxsize=32)
-def _circle(radius: float) -> NDArray[np.uint8]:
-    reach = int(np.ceil(radius))
-    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
-    rows, columns = _around(radius) + reach
-    kernel[rows, columns] = 1
-    return kernel
+# The kernels run over pictures as one long line. Shifted by a fixed number of bytes, such a line is what each
+# pixel has beside it in some direction, so every loop is one over whole vectors of bytes. What wraps from the
+# end of a row to the start of the next lies in the margin, which is 255 and never a spot.
 
 
-@lru_cache(maxsize=32)
-def _disc(radius: float) -> NDArray[np.uint8]:
-    reach = int(radius)
-    y, x = np.ogrid[-reach : reach + 1, -reach : reach + 1]
-    return np.asarray(x * x + y * y <= radius * radius, np.uint8)
+@kernel("void(uint8[:, ::1], int64, int64[::1], uint8[::1])")
+def contrast_with_circle(picture: Bytes, reach: int, steps: NDArray[np.int64], contrast: Bytes) -> None:
+    """How much darker each value is than the least of twelve places around it; 0 where it is not.
+
+    picture : (h + 2 reach, 3 (w + 2 reach)), with a margin of 255. steps : (12,), from a value to the twelve
+    of its circle, in bytes; none leads out of a frame of `reach` px. contrast : as long as the picture;
+    its first and last `reach` rows and px are left as they are.
+    """
+    values = picture.reshape(-1)
+    start = reach * (picture.shape[1] + 3)
+    count = values.size - 2 * start
+    here, out = values[start : start + count], contrast[start : start + count]
+    # One name for each of the twelve: a loop over them would go through memory for every one.
+    a, b = values[start + steps[0] :][:count], values[start + steps[1] :][:count]
+    c, d = values[start + steps[2] :][:count], values[start + steps[3] :][:count]
+    e, f = values[start + steps[4] :][:count], values[start + steps[5] :][:count]
+    g, h = values[start + steps[6] :][:count], values[start + steps[7] :][:count]
+    i, j = values[start + steps[8] :][:count], values[start + steps[9] :][:count]
+    k, m = values[start + steps[10] :][:count], values[start + steps[11] :][:count]
+    for at in range(count):
+        least = min(min(min(a[at], b[at]), min(c[at], d[at])), min(min(e[at], f[at]), min(g[at], h[at])))
+        least = min(least, min(min(i[at], j[at]), min(k[at], m[at])))
+        out[at] = max(least, here[at]) - here[at]
+
+
+@kernel("void(uint8[::1], int64, int64, int64, uint8[:, ::1], uint8[::1], uint8[:, ::1])")
+def cover_spots(
+    contrast: Bytes, threshold: int, reach: int, corner: int, spots: Bytes, doubled: Bytes, mask: Bytes
+) -> None:
+    """255 on and next to every px whose median contrast exceeds a threshold, at twice the size.
+
+    contrast : of `contrast_with_circle`. threshold : grey levels, 0 to 255. corner : px; squares of that side
+    in the picture's corners hold no spot. spots : (h + 2 reach, w + 2 reach), reach >= 1, and doubled, of
+    twice its length, are written over. mask : (2 h, 2 w) is filled.
+    """
+    wide, flat = spots.shape[1], spots.reshape(-1)
+    least = np.uint8(threshold)
+    for at in range(flat.size):
+        first, second, third = contrast[3 * at], contrast[3 * at + 1], contrast[3 * at + 2]
+        median = max(min(first, second), min(max(first, second), third))
+        flat[at] = 255 if median > least else 0
+    height, width = mask.shape[0] // 2, mask.shape[1] // 2
+    side = min(corner, width)
+    for y in range(min(corner, height)):
+        for row in (reach + y, reach + height - 1 - y):
+            spots[row, reach : reach + side] = 0
+            spots[row, reach + width - side : reach + width] = 0
+    start = reach * wide
+    count = flat.size - 2 * start
+    above, here, below = flat[start - wide - 1 :], flat[start - 1 :], flat[start + wide - 1 :]
+    for x in range(count):
+        near = above[x] | here[x] | below[x]
+        near |= above[x + 1] | here[x + 1] | below[x + 1]
+        near |= above[x + 2] | here[x + 2] | below[x + 2]
+        doubled[2 * x] = near
+        doubled[2 * x + 1] = near
+    # Copied value by value, which becomes whole vectors; a slice assigned to a slice does not.
+    for y in range(height):
+        line, upper, lower = doubled[2 * (y * wide + reach) :], mask[2 * y], mask[2 * y + 1]
+        for x in range(2 * width):
+            upper[x] = line[x]
+            lower[x] = line[x]

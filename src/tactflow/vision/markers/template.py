@@ -1,199 +1,210 @@
-"""Measure marks against their own look in the reference frame."""
+"""Align marks with their templates: what each looks like in the reference frame."""
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
-from tactflow.vision.markers import template_kernels
-from tactflow.vision.markers.detection import to_gray
-from tactflow.vision.markers.template_kernels import ALIKE_GAIN, ALIKE_SHARE, LEAST_DIVISOR, LEAST_REST
+from tactflow.vision.compiled import helper, kernel
 
 FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
-# Sub-pixel phases per axis at which the reference look is kept: an eighth of a pixel is the farthest an
-# estimate lies from one of them, where the linear model errs by far less than the noise.
-_PHASES: Final = 4
-# A step is repeated, so many times at most, while it was longer than this, px: from there the linear model
-# leaves less than 0.005 px.
-_CONVERGED: Final = 0.25
-_ROUNDS: Final = 3
-# Error that remains without noise, px: edges sharper than the pixels allow cannot be interpolated exactly
-# (measured on rendered dots with edges of 0.5 to 0.7 px standard deviation: 0.003 to 0.005 px).
-_SAMPLING: Final = 0.004
-_LANES: Final = 32
+PHASES: Final = 4
+"""Sub-pixel phases per axis at which templates are kept. An estimate then lies at most an eighth of a pixel
+from one of them, where the linear model errs by far less than the noise."""
+
+CONVERGED: Final = 0.25
+"""Length of a step, px, after which another one is made: below it the linear model leaves less than
+0.005 px."""
+
+ROUNDS: Final = 3
+"""Steps after the first one, at most. Chosen by hand."""
+
+SAMPLING_ERROR: Final = 0.004
+"""Error that remains without noise, px: edges sharper than the pixels allow cannot be interpolated exactly.
+Measured on rendered dots with edges of 0.5 to 0.7 px standard deviation: 0.003 to 0.005 px."""
+
+PATCH_SCALE: Final = 1.55
+"""Radius of a template over that of its mark: it holds the mark's border and gel around it. Chosen by
+hand."""
+
+PATCH_MARGIN: Final = 1.2
+"""What a template extends farther, px: shifts of a phase and a step stay inside. Chosen by hand."""
+
+RIDGE: Final = 1e-6
+"""Ridge of the normal equations, relative to their trace: keeps marks without contrast solvable. Such marks
+are never trusted."""
+
+LANES: Final = 32
+"""Rows of weights are padded to multiples of so many values: whole vector registers."""
+
+LEAST_RESIDUAL: Final = np.float32(1e-3)
+"""Sum of squares, grey levels^2, that always counts as unexplained: keeps r_squared below 1 and errors
+above 0."""
+
+LEAST_DIVISOR: Final = np.float32(0.15)
+"""Gain by which a step is divided at least: a step of a faint mark would be all noise. Chosen by hand."""
+
+STEP_R_SQUARED: Final = np.float32(0.3)
+"""Another step is made only where the template explains this much: elsewhere it leads nowhere. Chosen by
+hand."""
+
+STEP_GAIN: Final = np.float32(0.2)
+"""Another step is made only where the contrast is this fraction of the template's. Chosen by hand."""
 
 
-class MarkerAppearance:
-    """Measures marks against their own look in the reference, by least squares in the image as it is.
+class Alignment(NamedTuple):
+    """Where marks are.
 
-    A patch of the frame is modelled as light * reference mark, shifted, + a constant, where the light is a
-    plane: at the edge of a contact it has a slope, and a dark mark dims this slope as it dims all light, so
-    that a plane that is *added* to the mark pulls it, by up to 0.2 px. To a bright mark, whose level is its
-    own, the slope is added. (Lucas and Kanade 1981 with the illumination model of Hager and Belhumeur 1998,
-    in the inverse form of Baker and Matthews 2004: all that is costly is done once for the reference.) The
-    frame is only ever read at whole pixels; it is the noise-free side, the reference, that is interpolated.
-
-    reference : (H, W) float32, grey levels. origin : (N, 2) float64, px. radius : of a mark, px.
-    dark : whether marks are darker than the gel.
+    position : (n, 2) float64, px. gain : (n,) float32, contrast over that of the template. r_squared : (n,)
+    float32, fraction of the patch's contrast that the template explains. stderr : (n,) float32, standard
+    error of each coordinate, px.
     """
 
-    def __init__(
-        self, reference: NDArray[np.float32], origin: FloatArray, radius: float, dark: bool = True
-    ) -> None:
-        self.radius = radius
-        reach = int(np.ceil(1.55 * radius + 1.2))
-        self.pad = reach + 1
-        self.shape = reference.shape
+    position: FloatArray
+    gain: Float32Array
+    r_squared: Float32Array
+    stderr: Float32Array
+
+
+class MarkerTemplates:
+    """Aligns each mark of a frame with its template, by least squares in the image as it is.
+
+    A patch of the frame is modelled as gain * template, shifted, times a plane of illumination, plus a
+    constant. The plane is needed at the edge of a contact, where the light has a slope. A dark mark dims this
+    slope as it dims all light, so a plane that is merely *added* pulls the mark by up to 0.2 px. A bright
+    mark has a level of its own, so to it the slope is added. The frame is only read at whole pixels; the
+    reference, which has less noise, is interpolated, once.
+
+    Parameters
+    ----------
+    reference : (H, W) float32, grey levels.
+    origin : (N, 2) float64, centres of the marks in the reference, px.
+    radius : of a mark, px.
+    dark : whether marks are darker than the gel.
+
+    References
+    ----------
+    Lucas and Kanade (1981); Hager and Belhumeur, "Efficient region tracking with parametric models of
+    geometry and illumination", PAMI 20 (1998), for the illumination; Baker and Matthews, "Lucas-Kanade 20
+    years on", IJCV 56 (2004), for the inverse form, whose costly part is done once for the reference.
+
+    Examples
+    --------
+    >>> frame = np.full((40, 40), 150, np.uint8)
+    >>> frame = cv2.GaussianBlur(cv2.circle(frame, (20, 20), 4, 40, -1), (0, 0), 1.0)
+    >>> templates = MarkerTemplates(frame.astype(np.float32), np.array([[20.0, 20.0]]), 4.0)
+    >>> moved = np.roll(frame, 1, axis=1)
+    >>> templates.align(moved, np.array([[20.0, 20.0]])).position.round(1)
+    array([[21., 20.]])
+    """
+
+    def __init__(self, reference: Float32Array, origin: FloatArray, radius: float, dark: bool = True) -> None:
+        extent = PATCH_SCALE * radius + PATCH_MARGIN
+        reach = int(np.ceil(extent))
         axis = np.arange(-reach, reach + 1)
         grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
-        disc = np.hypot(grid_x, grid_y) <= 1.55 * radius + 1.2
-        width = reference.shape[1] + 2 * self.pad
-        self._strides = np.array([1, width])
-        self._first = self.pad * (width + 1)
-        self.pixels = int(disc.sum())
+        disc = np.hypot(grid_x, grid_y) <= extent
         self._disc = np.array([grid_x[disc], grid_y[disc]], np.int64)
-        x, y = grid_x[disc] / radius, grid_y[disc] / radius
+        pixels, count = int(disc.sum()), len(origin)
+        steps = ((np.arange(PHASES) + 0.5) / PHASES - 0.5).tolist()
+        # The pixels after the patch's own weigh nothing.
+        length = -(-pixels // LANES) * LANES
+        weights = np.zeros((PHASES, PHASES, count, 6, length), np.float32)
+        gram = np.empty((PHASES, PHASES, count, 3, 3), np.float32)
+        variance = np.empty((PHASES, PHASES, count), np.float32)
+        sampler = _Sampler(reference, origin, reach, disc)
+        scaled = self._disc / radius
+        for row, phase_y in enumerate(steps):
+            for column, phase_x in enumerate(steps):
+                model = _normal_equations(*sampler.with_slopes(phase_x, phase_y), scaled, dark)
+                weights[row, column, :, :, :pixels] = model[0]
+                gram[row, column], variance[row, column] = model[1:]
+        self._all = np.arange(count)
+        self._weights = weights.reshape(PHASES * PHASES * count, 6, length)
+        self._gram = gram.reshape(PHASES * PHASES * count, 3, 3)
+        self._variance = variance.reshape(PHASES * PHASES * count) / np.float32(max(pixels - 6, 1))
+        self._whole = np.array([reach, PHASES, ROUNDS])
+        self._real = np.array([radius, CONVERGED, SAMPLING_ERROR])
 
-        count = len(origin)
-        self._rows = np.arange(count)
-        steps = (np.arange(_PHASES) + 0.5) / _PHASES - 0.5
-        # Rows of whole vector registers: the pixels after the patch's own weigh nothing.
-        length = -(-self.pixels // _LANES) * _LANES
-        self._offsets = np.zeros(length, np.int64)
-        self._offsets[: self.pixels] = self._disc[1] * width + self._disc[0]
-        weights = np.zeros((_PHASES, _PHASES, count, 6, length), np.float32)
-        gram = np.empty((_PHASES, _PHASES, count, 3, 3), np.float32)
-        spread = np.empty((_PHASES, _PHASES, count), np.float32)
-        # A slope spans the phases on either side, in binary fractions: most looks serve several times.
-        half = 1 / _PHASES
-        looks: dict[tuple[float, float], FloatArray] = {}
+    def align(self, image: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None) -> Alignment:
+        """Find marks from starting points that are right to about a radius.
 
-        def look(right: float, down: float) -> FloatArray:
-            if (right, down) not in looks:
-                looks[right, down] = _resample(reference, origin - (right, down), reach)[:, disc]
-            return looks[right, down]
-
-        for row, phase_y in enumerate(steps.tolist()):
-            for column, phase_x in enumerate(steps.tolist()):
-                mark = look(phase_x, phase_y)
-                slope_x = (look(phase_x + half, phase_y) - look(phase_x - half, phase_y)) / (2 * half)
-                slope_y = (look(phase_x, phase_y + half) - look(phase_x, phase_y - half)) / (2 * half)
-                lit = mark if dark else np.ones_like(mark)
-                plane, _ = np.linalg.qr(np.stack([np.ones_like(lit), lit * x, lit * y], axis=2))
-                basis = np.stack([mark, slope_x, slope_y], axis=1)
-                basis -= (basis @ plane) @ plane.transpose(0, 2, 1)
-                products = basis @ basis.transpose(0, 2, 1)
-                # A trace of ridge keeps marks without contrast solvable; they are never trusted anyway.
-                ridge = 1e-6 * np.trace(products, axis1=1, axis2=2) + 1e-6
-                inverse = np.linalg.inv(products + ridge[:, None, None] * np.eye(3))
-                weights[row, column, :, :3, : self.pixels] = inverse @ basis
-                weights[row, column, :, 3:, : self.pixels] = plane.transpose(0, 2, 1)
-                gram[row, column] = products
-                spread[row, column] = 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
-        # Of each mark at each phase: what gives gain and shift, and the light's plane, orthonormal.
-        self._weights = weights.reshape(_PHASES * _PHASES * count, 6, length)
-        self._gram = gram.reshape(_PHASES * _PHASES * count, 3, 3)
-        self._spread = spread.reshape(_PHASES * _PHASES * count) / np.float32(max(self.pixels - 6, 1))
-        self._phase_strides = np.array([count, _PHASES * count])
-        self._limits = np.array([reference.shape[1] - 1, reference.shape[0] - 1], np.float64)
-        self._whole = np.array([reach, _PHASES, _ROUNDS])
-        self._real = np.array([radius, _CONVERGED, _SAMPLING])
-
-    def view(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """What `measure` wants of an image (H, W, 3) BGR or (H, W) grey.
-
-        Compiled, it reads the pixels around the marks, (H, W, channels); otherwise all are made grey, with a
-        rim, so that patches may reach over the border, flat.
+        image : (H, W, 3) uint8 BGR or (H, W) uint8. start : (n, 2) float64, px. marks : (n,) int64, which
+        marks these are; None for all.
         """
-        if compiled.active():
-            return np.ascontiguousarray(image if image.ndim == 3 else image[:, :, None])
-        pad = self.pad
-        return np.asarray(
-            cv2.copyMakeBorder(to_gray(image), pad, pad, pad, pad, cv2.BORDER_REPLICATE), np.uint8
-        ).ravel()
-
-    def measure(
-        self, view: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None
-    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Measure marks from starting points (n, 2), right to about a radius.
-
-        view : of the frame. marks : (n,) which marks these are; None for all.
-        Returns positions (n, 2), gain (n,), explained share of the contrast (n,), standard error (n,).
-        """
-        marks = self._rows if marks is None else marks
-        if view.ndim == 3:
-            return self._measure_compiled(view, start, marks)
-        position, gain, share, stderr = self._step(view, start, marks)
-        for _ in range(_ROUNDS):
-            again = _longer(position - start, _CONVERGED) & (share > ALIKE_SHARE) & (gain > ALIKE_GAIN)
-            active = np.flatnonzero(again)
-            if len(active) == 0:
-                break
-            start = position.copy()
-            position[active], gain[active], share[active], stderr[active] = self._step(
-                view, position[active], marks[active]
-            )
-        return position, gain, share, stderr
-
-    def _measure_compiled(
-        self, view: NDArray[np.uint8], start: FloatArray, marks: IntArray
-    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
-        position = np.empty((len(marks), 2))
-        found = np.empty((3, len(marks)), np.float32)
-        template_kernels.measure(
+        marks = self._all if marks is None else marks
+        view = np.ascontiguousarray(image if image.ndim == 3 else image[:, :, None])
+        position, found = np.empty((len(marks), 2)), np.empty((3, len(marks)), np.float32)
+        align_marks(
             view,
             np.ascontiguousarray(start),
             marks,
             self._weights,
             self._gram,
-            self._spread,
+            self._variance,
             self._disc,
             self._whole,
             self._real,
             position,
             found,
+            np.empty(1, np.int64),
         )
-        return position, found[0], found[1], found[2]
-
-    def _step(
-        self, flat: NDArray[np.uint8], start: FloatArray, marks: IntArray
-    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """One least-squares step from the phase nearest to the starting points."""
-        # Quarters of a pixel: whole pixels above, the phase below.
-        inside = np.minimum(np.maximum(start, 0.0), self._limits)
-        quarter = (inside * _PHASES + _PHASES / 2).astype(np.int64)
-        index = quarter // _PHASES @ self._strides + self._first
-        which = quarter % _PHASES @ self._phase_strides + marks
-        patch = flat.take(index[:, None] + self._offsets).astype(np.float32)
-        # Far from zero, sums of squares would lose digits.
-        patch -= np.float32(128)
-        patch[:, self.pixels :] = 0
-        sums = np.matmul(self._weights.take(which, axis=0), patch[:, :, None])
-        theta, level = sums[:, :3], sums[:, 3:, 0]
-        seen = np.vecdot(np.matmul(self._gram.take(which, axis=0), theta)[:, :, 0], theta[:, :, 0])
-        gain = theta[:, 0, 0]
-        safe = np.maximum(gain, LEAST_DIVISOR)
-        step = theta[:, 1:, 0] / safe[:, None]
-        np.minimum(np.maximum(step, -self.radius, out=step), self.radius, out=step)
-        position = (quarter + 0.5) / _PHASES - 0.5 + step
-        contrast = np.vecdot(patch, patch) - np.vecdot(level, level)
-        rest = np.maximum(contrast - seen, LEAST_REST)
-        stderr = np.sqrt(rest * self._spread.take(which) / (safe * safe) + np.float32(_SAMPLING**2))
-        return position, gain, seen / (seen + rest), stderr
+        return Alignment(position, found[0], found[1], found[2])
 
 
-def _longer(vectors: FloatArray, length: float) -> BoolArray:
-    return np.asarray(np.einsum("ni,ni->n", vectors, vectors) > length * length, np.bool_)
+class _Sampler:
+    """Templates at sub-pixel shifts, each interpolated once. Shifts are binary fractions, so most serve as
+    the template of one phase and as neighbours, for the slope, of others."""
+
+    def __init__(
+        self, reference: Float32Array, origin: FloatArray, reach: int, disc: NDArray[np.bool_]
+    ) -> None:
+        self._reference, self._origin, self._reach, self._disc = reference, origin, reach, disc
+        self._known: dict[tuple[float, float], FloatArray] = {}
+
+    def at(self, right: float, down: float) -> FloatArray:
+        """(N, p) float64, templates of marks that lie so far right of and below a pixel's centre, px."""
+        if (right, down) not in self._known:
+            patches = _interpolate(self._reference, self._origin - (right, down), self._reach)
+            self._known[right, down] = patches[:, self._disc]
+        return self._known[right, down]
+
+    def with_slopes(self, right: float, down: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The template, and its central differences along x and y over the phases on either side."""
+        half = 1 / PHASES
+        slope_x = (self.at(right + half, down) - self.at(right - half, down)) / (2 * half)
+        slope_y = (self.at(right, down + half) - self.at(right, down - half)) / (2 * half)
+        return self.at(right, down), slope_x, slope_y
 
 
-def _resample(image: NDArray[np.float32], points: FloatArray, reach: int) -> FloatArray:
+def _normal_equations(
+    template: FloatArray, slope_x: FloatArray, slope_y: FloatArray, disc: FloatArray, dark: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What least squares need of templates (N, p) at one phase.
+
+    disc : (2, p), x and y of the pixels, in radii.
+    Returns weights (N, 6, p): products with a patch give gain and shift x, y times gain, and the three
+    coefficients of the illumination in an orthonormal basis; Gram matrices (N, 3, 3) of gain and shifts;
+    variances (N,) of a coordinate at unit noise and gain.
+    """
+    lit = template if dark else np.ones_like(template)
+    plane, _ = np.linalg.qr(np.stack([np.ones_like(lit), lit * disc[0], lit * disc[1]], axis=2))
+    basis = np.stack([template, slope_x, slope_y], axis=1)
+    basis -= (basis @ plane) @ plane.transpose(0, 2, 1)
+    gram = basis @ basis.transpose(0, 2, 1)
+    ridge = RIDGE * np.trace(gram, axis1=1, axis2=2) + RIDGE
+    inverse = np.linalg.inv(gram + ridge[:, None, None] * np.eye(3))
+    weights = np.concatenate([inverse @ basis, plane.transpose(0, 2, 1)], axis=1)
+    return weights, gram, 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
+
+
+def _interpolate(image: Float32Array, points: FloatArray, reach: int) -> FloatArray:
     """Patches (N, 2 reach + 1, 2 reach + 1) centred on sub-pixel points, by a windowed sinc of six taps."""
     pad = reach + 4
     padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
@@ -217,3 +228,166 @@ def _lanczos(fraction: FloatArray) -> FloatArray:
     distance = fraction[:, None] - np.arange(-2, 4)
     weights = np.sinc(distance) * np.sinc(distance / 3)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float64)
+
+
+@helper
+def touch_patches(flat: NDArray[np.uint8], shape: Any, start: FloatArray, reach: int) -> int:
+    """Read the ends of all rows of all patches, which brings them into the cache; a number without meaning.
+
+    Patches lie far apart in memory, and waiting for one after the other takes longer than all arithmetic;
+    reads that do not depend on each other are done many at a time.
+    """
+    height, width, channels = shape
+    touched = 0
+    for n in range(len(start)):
+        left = min(max(int(start[n, 0]) - reach, 0), width - 1) * channels
+        right = min(max(int(start[n, 0]) + reach, 0), width - 1) * channels
+        top = min(max(int(start[n, 1]), 0), height - 1)
+        for row in range(max(top - reach, 0), min(top + reach + 1, height)):
+            touched += flat[np.uintp(row * width * channels + left)]
+            touched += flat[np.uintp(row * width * channels + right)]
+    return touched
+
+
+@helper
+def read_patch(
+    flat: NDArray[np.uint8],
+    shape: Any,
+    left: int,
+    top: int,
+    reach: int,
+    disc: IntArray,
+    offsets: IntArray,
+    words: NDArray[np.int32],
+) -> None:
+    """Pixels of a patch into `words` (p,), blue in the lowest byte; beyond the border those of the border."""
+    height, width, channels = shape
+    byte, two_bytes, three_bytes = np.int32(8), np.int32(16), np.int32(24)
+    # Unsigned indices spare numba the question whether they count from the end.
+    one, two, three = np.uintp(1), np.uintp(2), np.uintp(3)
+    # With the pixel after it, which is read too, the patch is inside the image.
+    if left >= reach and top >= reach and left + reach + 1 < width and top + reach < height:
+        base = (top * width + left) * channels
+        for p in range(len(words)):
+            i = np.uintp(base + offsets[p])
+            if channels == 3:
+                # Four bytes, so that the compiler makes one load of them.
+                word = np.int32(flat[i]) | np.int32(flat[i + one]) << byte
+                word |= np.int32(flat[i + two]) << two_bytes
+                words[p] = word | np.int32(flat[i + three]) << three_bytes
+            else:
+                words[p] = np.int32(flat[i])
+        return
+    for p in range(len(words)):
+        row = min(max(top + disc[1, p], 0), height - 1)
+        column = min(max(left + disc[0, p], 0), width - 1)
+        i = np.uintp((row * width + column) * channels)
+        words[p] = np.int32(flat[i])
+        if channels == 3:
+            words[p] |= np.int32(flat[i + one]) << byte
+            words[p] |= np.int32(flat[i + two]) << two_bytes
+
+
+@helper
+def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Float32Array) -> None:
+    """Grey levels as OpenCV makes them of BGR, less 128: far from zero, sums of squares would lose digits."""
+    blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
+    bits, middle, low = np.int32(15), np.int32(128), np.int32(255)
+    byte, two_bytes = np.int32(8), np.int32(16)
+    if channels == 3:
+        for p in range(len(words)):
+            level = blue * (words[p] & low) + green * ((words[p] >> byte) & low)
+            level += red * ((words[p] >> two_bytes) & low) + half
+            patch[p] = np.float32((level >> bits) - middle)
+    else:
+        for p in range(len(words)):
+            patch[p] = np.float32(words[p] - middle)
+
+
+@helper
+def fit_template(weight: Float32Array, product: Float32Array, patch: Float32Array) -> Any:
+    """Gain, shift x and y times gain, and the explained and the unexplained sum of squares of a patch."""
+    gain = shift_x = shift_y = light = slope_x = slope_y = contrast = np.float32(0.0)
+    for p in range(len(patch)):
+        value = patch[p]
+        gain += weight[0, p] * value
+        shift_x += weight[1, p] * value
+        shift_y += weight[2, p] * value
+        light += weight[3, p] * value
+        slope_x += weight[4, p] * value
+        slope_y += weight[5, p] * value
+        contrast += value * value
+    explained = gain * (product[0, 0] * gain + product[0, 1] * shift_x + product[0, 2] * shift_y)
+    explained += shift_x * (product[1, 0] * gain + product[1, 1] * shift_x + product[1, 2] * shift_y)
+    explained += shift_y * (product[2, 0] * gain + product[2, 1] * shift_x + product[2, 2] * shift_y)
+    contrast -= light * light + slope_x * slope_x + slope_y * slope_y
+    return gain, shift_x, shift_y, explained, max(contrast - explained, LEAST_RESIDUAL)
+
+
+@kernel(
+    "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], float32[:, :, ::1],"
+    "float32[:, :, ::1], float32[::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1],"
+    "float32[:, ::1], int64[::1])",
+    reorder=True,
+)
+def align_marks(
+    image: NDArray[np.uint8],
+    start: FloatArray,
+    marks: IntArray,
+    weights: Float32Array,
+    gram: Float32Array,
+    variance: Float32Array,
+    disc: IntArray,
+    whole: IntArray,
+    real: FloatArray,
+    position: FloatArray,
+    found: Float32Array,
+    touched: IntArray,
+) -> None:
+    """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
+
+    image : (H, W, 3) BGR or (H, W, 1) grey. start : (n, 2). marks : (n,), of those in `weights`.
+    weights : (phases^2 N, 6, P), `gram` and `variance` alike, as `MarkerTemplates` holds them.
+    disc : (2, p) dx and dy of the pixels of a patch, p <= P; the other weights are zero.
+    whole : reach of a patch, phases per axis, rounds after the first step. real : radius, px, length of a
+    step that calls for another, px, and the sampling error, px.
+    touched : (1,), takes a number without meaning: what goes nowhere would not be read.
+    """
+    height, width, channels = image.shape
+    reach, phases, rounds = whole[0], whole[1], whole[2]
+    radius, converged, sampling = np.float32(real[0]), real[1] * real[1], np.float32(real[2] * real[2])
+    count = weights.shape[0] // (phases * phases)
+    flat = image.reshape(-1)
+    offsets = np.empty(disc.shape[1], np.int64)
+    for p in range(len(offsets)):
+        offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
+    words, patch = np.empty(len(offsets), np.int32), np.zeros(weights.shape[2], np.float32)
+    touched[0] = touch_patches(flat, image.shape, start, reach)
+    for n in range(len(marks)):
+        x, y = start[n, 0], start[n, 1]
+        seen_left = seen_top = -1
+        for number in range(rounds + 1):
+            # Written so that NaN, too, becomes a place inside the image.
+            inside_x = min(x, width - 1.0) if x > 0.0 else 0.0
+            inside_y = min(y, height - 1.0) if y > 0.0 else 0.0
+            # In units of a phase: whole pixels above, the phase below.
+            phase_x, phase_y = int(inside_x * phases + phases / 2), int(inside_y * phases + phases / 2)
+            left, top = phase_x // phases, phase_y // phases
+            which = (phase_x % phases + phase_y % phases * phases) * count + marks[n]
+            # A step of less than a pixel often sees the same patch from another phase.
+            if left != seen_left or top != seen_top:
+                seen_left, seen_top = left, top
+                read_patch(flat, image.shape, left, top, reach, disc, offsets, words)
+                to_centred_gray(words, channels, patch)
+            gain, shift_x, shift_y, explained, rest = fit_template(weights[which], gram[which], patch)
+            safe = max(gain, LEAST_DIVISOR)
+            r_squared = explained / (explained + rest)
+            now_x = (phase_x + 0.5) / phases - 0.5 + min(max(shift_x / safe, -radius), radius)
+            now_y = (phase_y + 0.5) / phases - 0.5 + min(max(shift_y / safe, -radius), radius)
+            far = (now_x - x) ** 2 + (now_y - y) ** 2 > converged
+            x, y = now_x, now_y
+            if number == rounds or not (far and r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
+                break
+        position[n, 0], position[n, 1] = x, y
+        found[0, n], found[1, n] = gain, r_squared
+        found[2, n] = np.sqrt(rest * variance[which] / (safe * safe) + sampling)

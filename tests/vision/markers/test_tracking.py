@@ -16,8 +16,6 @@ from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers, MarkerStatus
 from tests.vision.dots import FloatArray, grid, rectified, render
 
-pytestmark = pytest.mark.usefixtures("each_way")
-
 SIZE = (300, 400)
 PITCH = 34.0
 RADIUS = 4.6

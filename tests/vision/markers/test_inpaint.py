@@ -16,8 +16,6 @@ from tactflow.vision.markers.mask import find_dot, marker_mask
 Image = NDArray[np.uint8]
 METHODS: tuple[InpaintMethod, ...] = get_args(InpaintMethod)
 
-pytestmark = pytest.mark.usefixtures("each_way")
-
 
 def _gel(shape: tuple[int, int] = (120, 96)) -> Image:
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]]

@@ -1,8 +1,7 @@
-"""Marker mask and inpainting with compiled kernels: the same numbers as with OpenCV."""
+"""Marker mask and inpainting: the kernels do what OpenCV and numpy do, for pictures of any size."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, get_args
 
@@ -12,29 +11,23 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
-from tactflow.vision import compiled
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, Polarity, find_dot, marker_mask
+from tests.oracles import inpaint, mask
+from tests.oracles.plain import plain
 
 Image = NDArray[np.uint8]
 SIZES = [(1, 1), (1, 8), (9, 1), (2, 2), (3, 5), (13, 200), (31, 64), (40, 131), (100, 76)]
 
 
-@pytest.fixture(autouse=True)
-def _with_numba() -> None:
-    with compiled.switched(True):
-        if not compiled.active():
-            pytest.skip('numba is not here: pip install "tactflow[fast]"')
+def _plain_mask(picture: Image, dot: Dot) -> Image:
+    with plain(mask):
+        return marker_mask(picture, dot)
 
 
-def _each_way(compute: Callable[[], Image]) -> tuple[Image, Image]:
-    with compiled.switched(True):
-        fast = compute()
-    with compiled.switched(False):
-        plain = compute()
-    assert fast.shape == plain.shape
-    assert fast.dtype == plain.dtype
-    return fast, plain
+def _plain_filled(picture: Image, covered: Image, radius: float = 7.0) -> Image:
+    with plain(inpaint):
+        return remove_markers(picture, covered, radius=radius)
 
 
 def _picture(height: int, width: int, seed: int) -> Image:
@@ -60,9 +53,9 @@ def test_marker_masks_are_equal_to_the_bit(
     for seed, contrast in enumerate([0.5, 6.0, 25.9, 80.0, 254.0, 300.0]):
         picture, dot = _picture(*size, seed=seed), Dot(radius, polarity, contrast)
         picture.setflags(write=False)
-        fast, plain = _each_way(lambda picture=picture, dot=dot: marker_mask(picture, dot))  # type: ignore[misc]
-        assert np.array_equal(fast, plain)
-        found += int(np.count_nonzero(fast))
+        found_mask = marker_mask(picture, dot)
+        assert np.array_equal(found_mask, _plain_mask(picture, dot))
+        found += int(np.count_nonzero(found_mask))
     # There is something to compare, where the circle leaves room between the frame's corners.
     assert found or min(size) < 40
 
@@ -105,18 +98,22 @@ def test_inpainted_pictures_are_what_float64_gives_rounded(size: tuple[int, int]
     for seed, share in enumerate([0.0, 0.003, 0.1, 0.4, 0.98, 1.0]):
         picture = _picture(*size, seed=seed)
         spots = (rng.random(size) < share).astype(np.uint8) * np.uint8(1 + 254 * (seed % 2))
-        for mask in (spots, np.asarray(cv2.dilate(spots, np.ones((5, 7), np.uint8)), np.uint8).reshape(size)):
-            mask.setflags(write=False)
-            both = _each_way(
-                lambda picture=picture, mask=mask: remove_markers(picture, mask, radius=radius)  # type: ignore[misc]
+        for covered in (
+            spots,
+            np.asarray(cv2.dilate(spots, np.ones((5, 7), np.uint8)), np.uint8).reshape(size),
+        ):
+            covered.setflags(write=False)
+            both = (
+                remove_markers(picture, covered, radius=radius),
+                _plain_filled(picture, covered, radius),
             )
             with np.errstate(invalid="ignore"):
-                expected = _inpainted(picture, mask, radius)
+                expected = _inpainted(picture, covered, radius)
             if np.isnan(expected).any():
                 expected = picture.astype(np.float64)
             for unmarked in both:
-                assert np.array_equal(unmarked[mask == 0], picture[mask == 0])
-                error = np.abs(unmarked - expected)[mask > 0]
+                assert np.array_equal(unmarked[covered == 0], picture[covered == 0])
+                error = np.abs(unmarked - expected)[covered > 0]
                 # Half a level of rounding, and what float32 leaves of 255 after some ten operations. Derived:
                 # 10 * 2**-24 * 255 = 1.5e-4.
                 assert error.max(initial=0) <= 0.5 + 2e-4
@@ -129,28 +126,26 @@ def test_simulated_frames_come_out_equal(scene: str) -> None:
     assert dot is not None
     for index in (0, 25):
         image = recording.frame(index)
-        fast, plain = _each_way(lambda image=image: marker_mask(image, dot))  # type: ignore[misc]
-        assert np.array_equal(fast, plain)
-        fast, plain = _each_way(lambda image=image, mask=plain: remove_markers(image, mask))  # type: ignore[misc]
+        covered = marker_mask(image, dot)
+        assert np.array_equal(covered, _plain_mask(image, dot))
+        filled, expected = remove_markers(image, covered), _plain_filled(image, covered)
         # A value within float32's last digits of a half may be rounded either way. Measured: none, or one
         # value of a block of 2 x 2 px, in some 110 000.
-        assert np.count_nonzero(fast != plain) <= 40
-        assert np.abs(fast.astype(int) - plain).max() <= 1
+        assert np.count_nonzero(filled != expected) <= 40
+        assert np.abs(filled.astype(int) - expected).max() <= 1
 
 
 def test_frames_of_different_sizes_and_dots_may_take_turns() -> None:
     pictures = [_picture(*size, seed=1) for size in ((40, 60), (60, 40), (41, 60))]
     dots = [Dot(3.0), Dot(5.0), Dot(5.0, "bright")]
-    with compiled.switched(False):
-        masks = [[marker_mask(picture, dot) for dot in dots] for picture in pictures]
-        filled = [remove_markers(picture, mask[0]) for picture, mask in zip(pictures, masks, strict=True)]
-    with compiled.switched(True):
-        for _ in range(2):
-            for picture, known, unmarked in zip(pictures, masks, filled, strict=True):
-                for dot, mask in zip(dots, known, strict=True):
-                    assert np.array_equal(marker_mask(picture, dot), mask)
-                difference = remove_markers(picture, known[0]).astype(int) - unmarked
-                assert np.abs(difference).max() <= 1
+    masks = [[_plain_mask(picture, dot) for dot in dots] for picture in pictures]
+    filled = [_plain_filled(picture, known[0]) for picture, known in zip(pictures, masks, strict=True)]
+    for _ in range(2):
+        for picture, known, unmarked in zip(pictures, masks, filled, strict=True):
+            for dot, expected in zip(dots, known, strict=True):
+                assert np.array_equal(marker_mask(picture, dot), expected)
+            difference = remove_markers(picture, known[0]).astype(int) - unmarked
+            assert np.abs(difference).max() <= 1
 
 
 def test_threads_do_not_disturb_each_other() -> None:
@@ -158,13 +153,12 @@ def test_threads_do_not_disturb_each_other() -> None:
     pictures += [picture[::-1].copy() for picture in pictures]
 
     def both(picture: Image) -> tuple[Image, Image]:
-        mask = marker_mask(picture, Dot(4.0))
-        return mask, remove_markers(picture, mask)
+        covered = marker_mask(picture, Dot(4.0))
+        return covered, remove_markers(picture, covered)
 
-    with compiled.switched(True):
-        alone = [both(picture) for picture in pictures]
-        with ThreadPoolExecutor(4) as threads:
-            together = list(threads.map(both, pictures * 50))
-    for index, (mask, unmarked) in enumerate(together):
-        assert np.array_equal(mask, alone[index % 4][0])
+    alone = [both(picture) for picture in pictures]
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(both, pictures * 50))
+    for index, (covered, unmarked) in enumerate(together):
+        assert np.array_equal(covered, alone[index % 4][0])
         assert np.array_equal(unmarked, alone[index % 4][1])

@@ -12,8 +12,6 @@ from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 
 Image = NDArray[np.uint8]
 
-pytestmark = pytest.mark.usefixtures("each_way")
-
 
 def _dots(
     shape: tuple[int, int] = (200, 160), radius: float = 5.0, pitch: int = 30, dark: bool = True

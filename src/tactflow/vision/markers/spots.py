@@ -1,0 +1,201 @@
+"""Spots of the marks' size, anywhere in a frame, and which points lie near which others."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.compiled import kernel
+from tactflow.vision.markers.detection import RADIUS_PER_SIGMA, SCALE_RATIO, Detection
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+
+LARGEST_RADIUS: Final = 2.3
+"""Radius of a mark, px, from which the frame is halved: less is needed to find it than to measure it. Chosen
+by hand."""
+
+LEAST_SIGMA: Final = 0.8
+"""Width of the narrower Gaussian, px, at least: below it is no filter of its own. Chosen by hand."""
+
+PEAK_REACH: Final = 0.7
+"""Half the side of the square in which a peak is the highest, in radii of a mark. Chosen by hand."""
+
+MARGIN: Final = 3.0
+"""Frame around a searched window that is filtered too, in radii of a mark: the reach of the filter."""
+
+CELL: Final = 0.12
+"""Side of the cells in which nearness is judged, pitches. Chosen by hand."""
+
+ROOM: Final = 1024
+"""Peaks for which there is room at first; where it does not do, the search is made again."""
+
+
+class SpotFinder:
+    """Finds spots of the marks' size: peaks of a difference of Gaussians at low resolution.
+
+    reference : (H, W) uint8, grey levels of the untouched gel. detection : its marks.
+
+    References
+    ----------
+    Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60 (2004).
+    """
+
+    def __init__(self, reference: NDArray[np.uint8], detection: Detection) -> None:
+        self._factor = 1
+        while detection.dot_radius / self._factor >= LARGEST_RADIUS:
+            self._factor *= 2
+        radius = detection.dot_radius / self._factor
+        self._narrow = max(radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
+        self._wide = float(np.sqrt(SCALE_RATIO**2 - 1.0) * self._narrow)
+        self._sign = 1.0 if detection.polarity == "dark" else -1.0
+        self._reach = max(1, round(PEAK_REACH * radius))
+        self._margin = MARGIN * detection.dot_radius + 2 * self._factor
+        response = self._response(reference)
+        shrunk = (detection.centers - (self._factor - 1) / 2) / self._factor
+        limits = np.array([response.shape[1] - 1, response.shape[0] - 1])
+        column, row = np.clip(np.rint(shrunk).astype(np.int64), 0, limits).T
+        self._typical = max(float(np.median(response[row, column])), 1.0)
+
+    def find(
+        self, image: NDArray[np.uint8], least: float, low: FloatArray, high: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Spots between two corners.
+
+        image : (H, W, 3) uint8 BGR or (H, W) uint8. least : strength of a spot. low, high : (2,), corners of
+        the window, px.
+        Returns spots (M, 2) float64, px, and their strengths (M,) float64, 1 for a typical mark.
+        """
+        factor = self._factor
+        left, top = (max(int((side - self._margin) // factor) * factor, 0) for side in low.tolist())
+        right, bottom = (max(int(side + self._margin), 0) for side in high.tolist())
+        image = image[top:bottom, left:right]
+        if min(image.shape[:2]) < 3 * factor:
+            return np.zeros((0, 2)), np.zeros(0)
+        gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+        points, value = find_peaks(self._response(gray), least * self._typical, self._reach)
+        strength = np.asarray(value / self._typical, np.float64)
+        return points * factor + ((factor - 1) / 2 + left, (factor - 1) / 2 + top), strength
+
+    def _response(self, gray: NDArray[np.uint8]) -> Float32Array:
+        """Difference of Gaussians at low resolution, positive on marks."""
+        factor = self._factor
+        if factor > 1:
+            height, width = gray.shape[0] // factor, gray.shape[1] // factor
+            cut = gray[: height * factor, : width * factor]
+            gray = np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        narrow = cv2.GaussianBlur(
+            gray.astype(np.float32), (0, 0), self._narrow, borderType=cv2.BORDER_REPLICATE
+        )
+        wide = cv2.GaussianBlur(narrow, (0, 0), self._wide, borderType=cv2.BORDER_REPLICATE)
+        response = cv2.subtract(wide, narrow) if self._sign > 0 else cv2.subtract(narrow, wide)
+        return np.asarray(response, np.float32)
+
+
+def find_peaks(response: Float32Array, least: float, reach: int) -> tuple[FloatArray, Float32Array]:
+    """Pixels above `least` that are the highest in a square of side 2 reach + 1.
+
+    Returns (M, 2) float64, each the vertex of a parabola along each axis, at most half a pixel away, and the
+    response (M,) float32.
+    """
+    room = ROOM
+    while True:
+        points, value = np.empty((room, 2)), np.empty(room, np.float32)
+        count = local_maxima(response, least, reach, points, value)
+        if count <= room:
+            return points[:count], value[:count]
+        room = count
+
+
+class NearPoints:
+    """Says which points have others near them, by a raster, so that the cost does not grow with the product
+    of their numbers.
+
+    shape : (height, width) of the frame, px. pitch : of the marks, px.
+    """
+
+    def __init__(self, shape: tuple[int, ...], pitch: float) -> None:
+        self._pitch = pitch
+        self._cell = CELL * pitch
+        self._shape = tuple(int(side / self._cell) + 2 for side in shape)
+
+    def disc(self, distance: float) -> NDArray[np.uint8]:
+        """The cells within so many pitches of a cell."""
+        size = 2 * round(distance * self._pitch / self._cell) + 1
+        return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
+
+    def near(self, points: FloatArray, others: FloatArray, disc: NDArray[np.uint8]) -> BoolArray:
+        """(n,) bool, which points (n, 2) have one of the others (m, 2) in a disc, to a tenth of a pitch."""
+        if len(points) == 0 or len(others) == 0:
+            return np.zeros(len(points), bool)
+        found = np.empty(len(points), np.bool_)
+        near_others(points, others, 1 / self._cell, disc, np.zeros(self._shape, np.uint8), found)
+        return found
+
+
+@kernel("int64(float32[:, ::1], float64, int64, float64[:, ::1], float32[::1])")
+def local_maxima(
+    response: Float32Array, least: float, reach: int, points: FloatArray, height: Float32Array
+) -> int:
+    """What `find_peaks` finds, into `points` and `height`; returns how many there are.
+
+    Only as many as there is room for are written.
+    """
+    count, rows, columns = 0, response.shape[0], response.shape[1]
+    half, flat, floor = np.float32(0.5), np.float32(-1e-6), np.float32(least)
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            value = response[row, column]
+            if not value > floor:
+                continue
+            highest = True
+            for y in range(max(row - reach, 0), min(row + reach + 1, rows)):
+                for x in range(max(column - reach, 0), min(column + reach + 1, columns)):
+                    highest = highest and not response[y, x] > value
+                if not highest:
+                    break
+            if not highest:
+                continue
+            if count < len(points):
+                before, after = response[row, column - 1], response[row, column + 1]
+                offset = half * (before - after) / min(before + after - (value + value), flat)
+                points[count, 0] = column + min(max(offset, -half), half)
+                before, after = response[row - 1, column], response[row + 1, column]
+                offset = half * (before - after) / min(before + after - (value + value), flat)
+                points[count, 1] = row + min(max(offset, -half), half)
+                height[count] = value
+            count += 1
+    return count
+
+
+@kernel("void(float64[:, ::1], float64[:, ::1], float64, uint8[:, ::1], uint8[:, ::1], boolean[::1])")
+def near_others(
+    points: FloatArray,
+    others: FloatArray,
+    scale: float,
+    disc: NDArray[np.uint8],
+    raster: NDArray[np.uint8],
+    found: BoolArray,
+) -> None:
+    """Which points have one of the others within the disc around their cell.
+
+    scale : cells per px. raster : zeros, is written over.
+    """
+    height, width = raster.shape
+    for n in range(len(others)):
+        column = min(max(int(others[n, 0] * scale + 0.5), 0), width - 1)
+        row = min(max(int(others[n, 1] * scale + 0.5), 0), height - 1)
+        raster[row, column] = 1
+    reach = disc.shape[0] // 2
+    for n in range(len(points)):
+        column = min(max(int(points[n, 0] * scale + 0.5), 0), width - 1)
+        row = min(max(int(points[n, 1] * scale + 0.5), 0), height - 1)
+        found[n] = False
+        for y in range(max(row - reach, 0), min(row + reach + 1, height)):
+            for x in range(max(column - reach, 0), min(column + reach + 1, width)):
+                if raster[y, x] and disc[y - row + reach, x - column + reach]:
+                    found[n] = True

@@ -1,0 +1,84 @@
+"""Plain version of the kernel that aligns marks with their templates."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.markers.template import (
+    LEAST_DIVISOR,
+    LEAST_RESIDUAL,
+    STEP_GAIN,
+    STEP_R_SQUARED,
+    align_marks,
+)
+from tests.oracles.gains import Gain
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+
+
+def plain_align_marks(
+    image: NDArray[np.uint8],
+    start: FloatArray,
+    marks: IntArray,
+    weights: Float32Array,
+    gram: Float32Array,
+    variance: Float32Array,
+    disc: IntArray,
+    whole: IntArray,
+    real: FloatArray,
+    position: FloatArray,
+    found: Float32Array,
+    touched: IntArray,
+) -> None:
+    """Steps of all marks together, as products of matrices; those that are done take part no longer."""
+    del touched
+    gray = image[:, :, 0] if image.shape[2] == 1 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    models, rounds = (weights, gram, variance, disc, whole, real), int(whole[2])
+    position[:], found[:] = _step(gray, start, marks, *models)
+    active = np.arange(len(marks))
+    start = start.copy()
+    for _ in range(rounds):
+        far = ((position[active] - start[active]) ** 2).sum(axis=1) > real[1] ** 2
+        active = active[far & (found[1, active] > STEP_R_SQUARED) & (found[0, active] > STEP_GAIN)]
+        start[active] = position[active]
+        position[active], found[:, active] = _step(gray, start[active], marks[active], *models)
+
+
+def _step(
+    gray: NDArray[np.uint8],
+    start: FloatArray,
+    marks: IntArray,
+    weights: Float32Array,
+    gram: Float32Array,
+    variance: Float32Array,
+    disc: IntArray,
+    whole: IntArray,
+    real: FloatArray,
+) -> tuple[FloatArray, Float32Array]:
+    """One least-squares step from the phase nearest to the starting points."""
+    phases, radius = int(whole[1]), np.float32(real[0])
+    count, pixels = len(weights) // phases**2, disc.shape[1]
+    limits = np.array([gray.shape[1] - 1, gray.shape[0] - 1])
+    phase = (np.clip(start, 0, limits) * phases + phases / 2).astype(np.int64)
+    which = phase % phases @ np.array([1, phases]) * count + marks
+    at = np.clip(phase[:, :, None] // phases + disc, 0, limits[:, None])
+    patch = np.zeros((len(marks), weights.shape[2]), np.float32)
+    patch[:, :pixels] = gray[at[:, 1], at[:, 0]].astype(np.float32) - np.float32(128)
+    sums = np.matmul(weights[which], patch[:, :, None])[:, :, 0]
+    theta, plane = sums[:, :3], sums[:, 3:]
+    explained = np.vecdot(np.matmul(gram[which], theta[:, :, None])[:, :, 0], theta)
+    safe = np.maximum(theta[:, 0], LEAST_DIVISOR)
+    step = np.clip(theta[:, 1:] / safe[:, None], -radius, radius)
+    contrast = np.vecdot(patch, patch) - np.vecdot(plane, plane)
+    rest = np.maximum(contrast - explained, LEAST_RESIDUAL)
+    stderr = np.sqrt(rest * variance[which] / (safe * safe) + np.float32(real[2] ** 2))
+    found = np.stack([theta[:, 0], explained / (explained + rest), stderr]).astype(np.float32)
+    return (phase + 0.5) / phases - 0.5 + step, found
+
+
+# Sums of some hundred products in float32, in another order: relative errors of 1e-6.
+GAINS = [Gain(align_marks, plain_align_marks, tolerance=2e-5, scratch=("touched",))]
