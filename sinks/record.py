@@ -363,7 +363,7 @@ class Record(Recorder):
         facts = {
             "tactflow": __version__,
             "numpy": np.__version__,
-            "numba": compiled.numba_version() or "not used",
+            "numba": compiled.numba_version(),
             "opencv": cv2.__version__,
             "python": platform.python_version(),
             "machine": f"{platform.system()} {platform.machine()}",

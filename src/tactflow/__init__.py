@@ -1,5 +1,95 @@
-"""tactflow: from camera frames of a tactile sensor to contact geometry and marker flow."""
+"""tactflow: from camera frames of a tactile sensor to contact geometry and marker flow.
+
+>>> import tactflow
+>>> for result in tactflow.stream(source="sim:press", max_frames=60):
+...     if result.contact is not None:
+...         print(f"{result.t:.2f} s: contact of {result.contact.area:.0f} px^2")
+...         break
+0.53 s: contact of 491 px^2
+
+What `__all__` lists is public and changes only with a line in CHANGELOG.md. Nothing is imported before it is
+used.
+"""
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tactflow.api import check as check
+    from tactflow.api import load as load
+    from tactflow.api import run as run
+    from tactflow.api import stage as stage
+    from tactflow.client import Subscriber as Subscriber
+    from tactflow.engine.contract import Sink as Sink
+    from tactflow.engine.contract import Source as Source
+    from tactflow.engine.contract import Stage as Stage
+    from tactflow.engine.contract import StageParams as StageParams
+    from tactflow.engine.errors import ConfigError as ConfigError
+    from tactflow.engine.errors import TactflowError as TactflowError
+    from tactflow.engine.frame import Absent as Absent
+    from tactflow.engine.frame import Frame as Frame
+    from tactflow.engine.frame import Tick as Tick
+    from tactflow.message import Results as Results
+    from tactflow.sim.scenes import open_scene as open_scene
+    from tactflow.streaming import Result as Result
+    from tactflow.streaming import stream as stream
+    from tactflow.vision.types import Contact as Contact
+    from tactflow.vision.types import Flow as Flow
+    from tactflow.vision.types import Markers as Markers
+    from tactflow.vision.types import MarkerStatus as MarkerStatus
+
 __version__ = "0.1.0"
+
+_HOMES = {
+    "tactflow.api": ("load", "check", "run", "stage"),
+    "tactflow.streaming": ("stream", "Result"),
+    "tactflow.client": ("Subscriber",),
+    "tactflow.sim.scenes": ("open_scene",),
+    "tactflow.vision.types": ("Contact", "Flow", "Markers", "MarkerStatus"),
+    "tactflow.engine.contract": ("Stage", "Sink", "Source", "StageParams"),
+    "tactflow.engine.frame": ("Frame", "Tick", "Absent"),
+    "tactflow.message": ("Results",),
+    "tactflow.engine.errors": ("TactflowError", "ConfigError"),
+}
+"""Module -> the public names that live there."""
+
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Absent",
+    "ConfigError",
+    "Contact",
+    "Flow",
+    "Frame",
+    "MarkerStatus",
+    "Markers",
+    "Result",
+    "Results",
+    "Sink",
+    "Source",
+    "Stage",
+    "StageParams",
+    "Subscriber",
+    "TactflowError",
+    "Tick",
+    "check",
+    "load",
+    "open_scene",
+    "run",
+    "stage",
+    "stream",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"tactflow has no {name}; public are {', '.join(__all__)}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -60,6 +60,12 @@ class Subscriber:
     ------
     ValueError
         If the endpoint is no address.
+
+    Examples
+    --------
+    >>> with Subscriber("tcp://127.0.0.1:5556", latest=True, timeout=5) as messages:
+    ...     messages.received, messages.lost  # `for message in messages:` waits for them
+    (0, 0)
     """
 
     def __init__(

@@ -34,6 +34,9 @@ class Results(NamedTuple):
     """What the pipeline found in one frame, for sinks: `def write(self, tick: Tick, results: Results)`.
 
     image : the processed frame. Each is None where it was not computed or nothing was found.
+
+    >>> Results().contact is None
+    True
     """
 
     image: Image | None = None

@@ -9,8 +9,8 @@ from pydantic import Field
 from tactflow.bench.methods import alternatives, measure_methods, methods_of
 from tactflow.bench.scenes import FULL, FULL_STAGES, NOMINAL, QUICK, QUICK_STAGES, Case, Rendered
 from tactflow.bench.timing import CopyUnit
-from tactflow.cli.pipelines import find_pipeline
 from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import scene_names

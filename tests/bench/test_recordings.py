@@ -15,8 +15,8 @@ from tactflow.bench.recordings import (
     without_markers,
 )
 from tactflow.bench.timing import CopyUnit
-from tactflow.cli.pipelines import find_pipeline
 from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 

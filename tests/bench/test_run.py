@@ -13,7 +13,7 @@ from tactflow.bench.run import Plan, run_bench
 from tactflow.bench.scenes import FULL, Case
 from tactflow.bench.targets import judge
 from tactflow.cli.main import main
-from tactflow.cli.pipelines import find_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 
 FILES = {name: find_pipeline(name) for name in ("default", "classic")}

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactflow.cli.pipelines import find_pipeline
 from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.run import Runner
 from tactflow.vision.compiled import Kernel
 

@@ -11,7 +11,7 @@ import pytest
 RUN = """
 import sys
 
-from tactflow.cli.pipelines import find_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.config.load import load_pipeline
 from tactflow.engine.run import Runner
 from tactflow.vision import compiled, geometry

@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.api import make_runner
 from tactflow.config.registry import resolve
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue, Ref
 from tactflow.engine.ports import Parameter, Port, Ports
-from tactflow.engine.run import Runner, RunResult
+from tactflow.engine.run import RunResult
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Flow, Markers
 
@@ -132,7 +133,7 @@ class LockstepPipeline:
     def __init__(self, pipeline: Pipeline, jsonl: Path | None) -> None:
         self._turns = _Turns(self._keep)
         self._outcomes: list[Outcome] = []
-        self._runner = Runner(_rewired(pipeline, jsonl, self._turns))
+        self._runner = make_runner(_rewired(pipeline, jsonl, self._turns))
         self._result: RunResult | None = None
         self._thread = threading.Thread(target=self._run, name="tactflow-bench", daemon=True)
         self._thread.start()

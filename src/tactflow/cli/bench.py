@@ -23,8 +23,8 @@ from tactflow.bench.skipping import Pipelines, compare_all, print_comparisons
 from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
 from tactflow.bench.timing import CopyUnit
-from tactflow.cli.pipelines import find_pipeline, packaged_pipelines
 from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError
 
 WORSE = 3

@@ -6,8 +6,8 @@ import argparse
 
 from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline, load_plan
-from tactflow.cli.pipelines import find_pipeline
 from tactflow.config.load import sensor_names
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan

@@ -22,6 +22,7 @@ COMMANDS = {
     "stages": "list the stages and sinks that can be used, their ports and parameters",
     "listen": "print what a running tactflow publishes",
     "bench": "measure run time against error, per method and for whole pipelines",
+    "warmup": "compile what `run` would compile on its first use",
     "record": "run a pipeline and record its frames and results",
     "repair": "give a recording that was cut off its index",
     "cameras": "list the cameras that are plugged in, with names that stay the same",

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tactflow.cli.pipelines import find_pipeline
 from tactflow.cli.statistics import read_statistics
 from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan, make_plan
 

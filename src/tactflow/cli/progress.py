@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from tactflow.cli.node_summary import share
 from tactflow.engine.run import Progress as RunProgress
 from tactflow.engine.run import Runner, RunResult
+from tactflow.vision import compiled
 
 _COSTLIEST = 4
 """Stages named in a line of statistics."""
@@ -40,7 +41,13 @@ def progress_display(
             rate = now.frames / now.elapsed_s if now.elapsed_s > 0 else 0.0
             display.update(task, completed=now.frames, total=total, rate=rate, dropped=now.dropped)
 
-        yield update
+        def compiling(ready: int, total: int) -> None:
+            done = ready == total
+            text = runner.pipeline.sensor if done else f"compiling loops, {ready} of {total}"
+            display.update(task, description=text)
+
+        with compiled.reporting(compiling):
+            yield update
 
 
 def with_statistics(

@@ -16,11 +16,12 @@ from typing import Any
 from rich.console import Console
 from rich.logging import RichHandler
 
+from tactflow.api import make_runner
 from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline
-from tactflow.cli.pipelines import find_pipeline
 from tactflow.cli.progress import progress_display, summary, with_statistics
 from tactflow.config.load import load_pipeline, sensor_names
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
@@ -156,7 +157,7 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     """Run one sensor's pipeline in this process."""
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     trace = None if args.trace is None else Trace(f"tactflow {pipeline.sensor}")
-    runner = Runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
+    runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
     _refuse_unwritable("--stats", args.stats)
     _refuse_unwritable("--trace", args.trace)
     with _logging_to(console), _signals(runner):

@@ -43,7 +43,14 @@ WhenLive = Literal["block", "latest"]
 
 
 class StageParams(BaseModel):
-    """Base of all parameters: frozen, unknown keys refused, finite numbers only."""
+    """Base of all parameters: frozen, unknown keys refused, finite numbers only.
+
+    >>> from pydantic import Field
+    >>> class Params(StageParams):
+    ...     strength: float = Field(1.0, ge=0, le=1, description="0 keeps the image, 1 inverts it")
+    >>> Params(strength=0.5)
+    Params(strength=0.5)
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
@@ -100,6 +107,15 @@ class Stage(Part):
       `Absent("reason")` instead; `None` is `Absent("none")`.
 
     What a stage returns it must not change later; what it receives it must not change at all.
+
+    >>> from tactflow.ports import Image
+    >>> class Invert(Stage):
+    ...     memory = "pure"
+    ...     def process(self, image: Image) -> Image:
+    ...         return 255 - image
+    >>> import numpy as np
+    >>> Invert(Invert.Params()).process(np.zeros((1, 1, 3), np.uint8)).ravel()
+    array([255, 255, 255], dtype=uint8)
     """
 
     memory: ClassVar[Memory]
@@ -136,6 +152,13 @@ class Sink(Part):
 
     Its inputs are read from the annotations of `write`, which every sink defines and which returns nothing;
     as for a stage, and a parameter `tick: Tick` is given the frame and the reasons of what is missing.
+
+    >>> from tactflow import Results, Tick
+    >>> class Print(Sink):
+    ...     def write(self, tick: Tick, results: Results) -> None:
+    ...         print(tick.frame.seq, results.contact)
+    >>> Print(Print.Params()).observer
+    False
     """
 
     threaded: ClassVar[bool] = False
@@ -224,6 +247,15 @@ class Source(Part):
     """Where frames come from: the first stage of a pipeline.
 
     It defines `frames(self) -> Iterator[Frame]`, an iterator that ends where the source ends.
+
+    >>> import numpy as np
+    >>> class Black(Source):
+    ...     def frames(self) -> Iterator[Frame]:
+    ...         for seq in range(3):
+    ...             yield Frame("main", seq, seq / 30, np.zeros((4, 6, 3), np.uint8), reference=seq == 0)
+    >>> [frame.seq for frame in Black(Black.Params()).frames()]
+    [0, 1, 2]
+
     `live` and `total` are known once it is open.
     """
 

@@ -10,7 +10,11 @@ from __future__ import annotations
 
 
 class TactflowError(Exception):
-    """An error with a message for the user: what is wrong, what was expected, what to try."""
+    """An error with a message for the user: what is wrong, what was expected, what to try.
+
+    >>> issubclass(ConfigError, TactflowError), SourceError.exit_code
+    (True, 4)
+    """
 
     exit_code = 3
 
@@ -19,6 +23,9 @@ class ConfigError(TactflowError):
     """The command line or the pipeline file is wrong; nothing was started.
 
     mistakes : each a text for the user; all are reported at once.
+
+    >>> ConfigError("pipeline.yaml:3:1  colour: unknown key").mistakes
+    ('pipeline.yaml:3:1  colour: unknown key',)
     """
 
     exit_code = 2

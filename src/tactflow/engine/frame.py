@@ -22,6 +22,9 @@ class Frame:
     captured : monotonic clock (`time.perf_counter`) when the source handed the frame over, s.
     reference : True if this frame shows the untouched gel that later frames are compared with.
     epoch : grows by one each time a new reference is taken; stages are reset between epochs.
+
+    >>> Frame("main", 36, 1.2, np.zeros((600, 800, 3), np.uint8)).seq
+    36
     """
 
     sensor: str
@@ -35,7 +38,13 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Absent:
-    """Stands in the place of a value that this tick does not have; `reason` is a short snake_case word."""
+    """Stands in the place of a value that this tick does not have.
+
+    reason : a short snake_case word.
+
+    >>> Absent("no_contact")
+    Absent(reason='no_contact')
+    """
 
     reason: str
 
@@ -46,6 +55,10 @@ class Tick:
 
     frame : the captured frame (its image is the raw one).
     skipped : input port of this sink -> reason, for values that were not computed in this tick.
+
+    >>> frame = Frame("main", 0, 0.0, np.zeros((4, 6, 3), np.uint8))
+    >>> Tick(frame, {"contact": "no_contact"}).skipped["contact"]
+    'no_contact'
     """
 
     frame: Frame

@@ -36,11 +36,15 @@ CLOSE_SECONDS = 10.0
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """How a run ended. error : None, or why it stopped. stats : as in the statistics file."""
+    """How a run ended.
+
+    error : None, or why it stopped; failure : the same as an exception. stats : as in the statistics file.
+    """
 
     exit_code: int
     error: str | None
     stats: Mapping[str, Any]
+    failure: TactflowError | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +141,9 @@ class Runner:
         error = self._error
         if self._interrupted:
             return RunResult(INTERRUPTED, None, stats)
-        return RunResult(error.exit_code if error else 0, str(error) if error else None, stats)
+        if error is not None:
+            return RunResult(error.exit_code, str(error), stats, error)
+        return RunResult(0, None, stats)
 
     def stop(self, reason: str = "signal") -> None:
         """End the run soon: no more frames are captured, those under way are finished. From any thread."""

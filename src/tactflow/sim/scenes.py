@@ -191,6 +191,13 @@ def open_scene(spec: str) -> Scene:
     Raises
     ------
     ValueError : an unknown name or key, or a value that makes no sense, with what was expected.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press?frames=60&seed=7")
+    >>> len(scene), scene.frame(0).shape
+    (60, (600, 800, 3))
     """
     name, _, query = spec.partition("?")
     if name not in _SCENES:

@@ -17,7 +17,11 @@ FloatArray = NDArray[np.floating[Any]]
 
 
 class MarkerStatus(IntEnum):
-    """How a marker's position is known."""
+    """How a marker's position is known.
+
+    >>> MarkerStatus(1).name
+    'INFERRED'
+    """
 
     TRACKED = 0
     """Seen in this frame."""
@@ -52,6 +56,10 @@ class Contact:
     ellipse : fitted ellipse, or None where none can be fitted.
     confidence : of the direction, in [0, 1]: 0 for a disc, towards 1 for a line.
     region_area : number of pixels of the region, px^2.
+
+    >>> square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+    >>> Contact(4.0, (1.0, 1.0), None, None, square, None).center
+    (1.0, 1.0)
     """
 
     area: float
@@ -103,6 +111,9 @@ class Flow:
         None with fewer than 3 markers or where they do not span a plane.
     divergence : relative areal growth of the marker pattern (press), 1; None where rotation is None.
     residual : RMS of what mean, rotation and divergence leave unexplained, px; None where rotation is None.
+
+    >>> Flow((1.2, -0.3), 9).mean
+    (1.2, -0.3)
     """
 
     mean: tuple[float, float] | None

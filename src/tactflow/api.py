@@ -1,0 +1,165 @@
+"""Pipelines from Python: load, check and run one, call a single stage. What `import tactflow` offers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+from pydantic import ValidationError
+
+from tactflow.config.load import load_pipeline
+from tactflow.config.registry import resolve
+from tactflow.config.shipped import find_pipeline
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Pipeline
+from tactflow.engine.run import Runner, RunResult
+
+Settings = Mapping[str, Any]
+"""Values of the pipeline file to replace, as in `{"stages.preprocess.rotate": 0, "sinks.zmq": None}`."""
+
+
+def load(
+    pipeline: str | Path | None = None,
+    *,
+    source: str | None = None,
+    settings: Settings | None = None,
+    sensor: str | None = None,
+    realtime: bool = False,
+) -> Pipeline:
+    """Read and check a pipeline file.
+
+    Parameters
+    ----------
+    pipeline : a file, or the name of a shipped pipeline such as "markerless"; None: `./pipeline.yaml`, else
+        the shipped default.
+    source : replaces the source of the capture stage, as `--source` does: "video.avi", "sim:press", "0" ...
+    settings : values to replace, as `--set` does; None for a whole stage or sink removes it.
+    sensor : which sensor of a file with `sensors:`; None is the first.
+    realtime : play a recording at its own pace, dropping frames like a camera.
+
+    Raises
+    ------
+    ConfigError : the message holds every mistake with file, line and column.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> pipeline = tactflow.load("markerless", source="sim:unmarked", settings={"sinks.zmq": None})
+    >>> list(pipeline.nodes)[:3]
+    ['capture', 'probe', 'preprocess']
+    """
+    values: dict[str, Any] = {} if source is None else {"source": str(source)}
+    if realtime:
+        values["realtime"] = True
+    overrides = [f"{key}={json.dumps(value)}" for key, value in (settings or {}).items()]
+    file = find_pipeline(None if pipeline is None else str(pipeline))
+    return load_pipeline(file, overrides, source_values=values, sensor=sensor)
+
+
+def check(pipeline: str | Path | None = None, *, settings: Settings | None = None) -> list[str]:
+    """Every mistake in a pipeline file, each a text with its place; empty if it can be run.
+
+    pipeline, settings : as for `load`.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> tactflow.check("markerless")
+    []
+    >>> print(tactflow.check("markerless", settings={"stages.hull.min_aera": 5})[0])
+    --set stages.hull.min_aera=5: stages.hull.min_aera: unknown parameter; did you mean min_area?
+    """
+    try:
+        load(pipeline, settings=settings)
+    except ConfigError as error:
+        return list(error.mistakes)
+    return []
+
+
+def run(
+    pipeline: str | Path | Pipeline | None = None,
+    *,
+    source: str | None = None,
+    settings: Settings | None = None,
+    sensor: str | None = None,
+    realtime: bool = False,
+    max_frames: int | None = None,
+) -> RunResult:
+    """Run a pipeline with its sinks to the end of its source, in this process; like `tactflow run`.
+
+    Parameters
+    ----------
+    pipeline : what `load` returned, or what it takes; then the other parameters are those of `load`.
+    max_frames : stop after so many.
+
+    Returns
+    -------
+    How it ended; `stats` are those of the statistics file.
+
+    Raises
+    ------
+    ConfigError : the pipeline file is wrong; nothing was started.
+    TactflowError : a stage, a sink or the source failed.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> no_sinks = {"sinks": {}}
+    >>> tactflow.run("markerless", source="sim:unmarked", settings=no_sinks, max_frames=5).stats["frames"]
+    5
+    """
+    if not isinstance(pipeline, Pipeline):
+        pipeline = load(pipeline, source=source, settings=settings, sensor=sensor, realtime=realtime)
+    result = make_runner(pipeline, max_frames=max_frames).run()
+    if result.failure is not None:
+        raise result.failure
+    return result
+
+
+def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
+    """A run of a pipeline, after OpenCV was given the threads that the pipeline sets.
+
+    options : of `Runner`.
+    """
+    if pipeline.opencv_threads is not None:
+        cv2.setNumThreads(pipeline.opencv_threads)
+    return Runner(pipeline, **options)
+
+
+def stage(use: str, /, **params: Any) -> Any:
+    """One stage by itself, to be called without the engine: `stage("hull").process(mask)`.
+
+    Parameters
+    ----------
+    use : what `use:` says in a pipeline file: "hull", "package.module:Class", "./file.py:Class".
+    params : its parameters, as in a pipeline file.
+
+    Returns
+    -------
+    The stage, opened. Its `process` takes and returns what `tactflow stages NAME` says.
+
+    Raises
+    ------
+    ConfigError : there is no such stage, or a parameter is wrong.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import tactflow
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> mask[20:40, 10:50] = 255
+    >>> contact = tactflow.stage("hull").process(mask)
+    >>> contact.center, contact.angle
+    ((29.5, 29.5), 0.0)
+    """
+    component = resolve(use, "stages", Path())
+    try:
+        instance = component.cls(component.params.model_validate(params))
+    except ValidationError as error:
+        mistakes = [f"{use}.{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        raise ConfigError(*mistakes) from None
+    instance.open()
+    return instance

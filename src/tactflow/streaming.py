@@ -1,0 +1,173 @@
+"""Results in the process that computes them: `for result in tactflow.stream("pipeline.yaml"): ...`."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.api import Settings, load, make_runner
+from tactflow.engine.conformance import component
+from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.frame import Tick
+from tactflow.engine.graph import Mark, Node, Pipeline, Ref
+from tactflow.engine.link import Link
+from tactflow.engine.run import Runner, RunResult
+from tactflow.ports import ContactMask, Image
+from tactflow.vision.types import Contact, Flow, Markers
+
+_WAITING = 2
+"""Results that may wait for the loop: one is computed while another is looked at."""
+
+_SINK = "stream"
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What was found in one frame; pixels are those of the processed frame.
+
+    seq : index of the frame at the source, from 0; a dropped frame leaves a gap.
+    t : capture time, s: from the start of a recording, or Unix time of a live source.
+    contact, flow, markers : None where there is none, or no stage of the pipeline makes it.
+    contact_mask : (H, W) uint8, 255 in contact; None without a contact.
+    skipped : port -> why it was not computed in this frame: `unchanged` repeats the last value.
+    image : (H, W, 3) uint8 BGR, the processed frame. frame : the raw one. Both None unless asked for, because
+        a list of results would hold them all in memory.
+
+    >>> result = next(stream(source="sim:press", max_frames=1))
+    >>> result.seq, result.contact, len(result.markers.position)
+    (0, None, 80)
+    """
+
+    sensor: str
+    seq: int
+    t: float
+    contact: Contact | None
+    flow: Flow | None
+    markers: Markers | None
+    contact_mask: NDArray[np.uint8] | None
+    skipped: Mapping[str, str]
+    image: NDArray[np.uint8] | None = None
+    frame: NDArray[np.uint8] | None = None
+
+
+def stream(
+    pipeline: str | Path | Pipeline | None = None,
+    *,
+    source: str | None = None,
+    settings: Settings | None = None,
+    sensor: str | None = None,
+    realtime: bool = False,
+    max_frames: int | None = None,
+    images: bool = False,
+    sinks: bool = False,
+) -> Iterator[Result]:
+    """Run a pipeline and iterate over its results.
+
+    The run goes on in the background while the loop works on a result. A recording waits for the loop, so
+    nothing is lost; of a live source the loop always gets the newest result. Leaving the loop ends the run.
+
+    Parameters
+    ----------
+    pipeline, source, settings, sensor, realtime : as for `tactflow.load`, or a loaded pipeline.
+    max_frames : stop after so many frames.
+    images : give `image` and `frame` with each result.
+    sinks : let the pipeline's own sinks work too: files, ZeroMQ, the live page.
+
+    Raises
+    ------
+    ConfigError : at once, if the pipeline file is wrong.
+    TactflowError : from the loop, if a stage or the source failed.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> areas = [r.contact.area for r in tactflow.stream(source="sim:press", max_frames=50) if r.contact]
+    >>> len(areas) > 10
+    True
+    """
+    if not isinstance(pipeline, Pipeline):
+        pipeline = load(pipeline, source=source, settings=settings, sensor=sensor, realtime=realtime)
+    link: Link[Result] = Link(_SINK, _WAITING, "block")
+    runner = make_runner(_with_hand(pipeline, link, images=images, sinks=sinks), max_frames=max_frames)
+    return _results(runner, link)
+
+
+def _results(runner: Runner, link: Link[Result]) -> Iterator[Result]:
+    ended: list[RunResult] = []
+
+    def work() -> None:
+        try:
+            ended.append(runner.run())
+        finally:
+            link.close()
+
+    thread = threading.Thread(target=work, name="tactflow-stream", daemon=True)
+    thread.start()
+    try:
+        while (result := link.get()) is not None:
+            yield result
+    finally:
+        runner.stop()
+        link.abort()
+        thread.join()
+    if ended and ended[0].failure is not None:
+        raise ended[0].failure
+
+
+class _Inputs(NamedTuple):
+    image: Image | None
+    contact: Contact | None
+    flow: Flow | None
+    markers: Markers | None
+    contact_mask: ContactMask | None
+
+
+class _Hand(Sink):
+    """Hands results over to the loop."""
+
+    threaded = True
+    when_live = "latest"
+    link: Link[Result]
+    images: bool
+
+    def write(self, tick: Tick, inputs: _Inputs) -> None:
+        frame = tick.frame
+        self.link.put(
+            Result(
+                sensor=frame.sensor,
+                seq=frame.seq,
+                t=frame.t,
+                contact=inputs.contact,
+                flow=inputs.flow,
+                markers=inputs.markers,
+                contact_mask=inputs.contact_mask,
+                skipped=dict(tick.skipped),
+                image=inputs.image if self.images else None,
+                frame=frame.image if self.images else None,
+            )
+        )
+
+
+def _with_hand(pipeline: Pipeline, link: Link[Result], *, images: bool, sinks: bool) -> Pipeline:
+    """The pipeline with a sink for the loop, and with or without its own."""
+    values: dict[str, Any] = {"link": link, "images": images, "__annotations__": {}}
+    hand = component(type("Hand", (_Hand,), values), _SINK, "tactflow.stream", ())
+    kept = {id_: node for id_, node in pipeline.nodes.items() if sinks or node.component.kind != "sink"}
+    inputs = {port.name: _last_output(kept, port.name) for port in hand.ports.inputs}
+    kept[_SINK] = Node(_SINK, hand, StageParams(), inputs, Mark("tactflow.stream", 0, 0))
+    return replace(pipeline, nodes=kept)
+
+
+def _last_output(nodes: Mapping[str, Node], port: str) -> Ref | None:
+    """The port of that name which comes last, as a sink at the end of the file would see it."""
+    last = None
+    for node in nodes.values():
+        if any(output.name == port for output in node.component.ports.outputs):
+            last = Ref(node.id, port)
+    return last
