@@ -33,3 +33,6 @@ Touching = Annotated[bool, SignalPort("touching", closed="no_contact")]
 
 Changed = Annotated[bool, SignalPort("changed", closed="unchanged", otherwise="repeat")]
 """True when the frame differs from the last one that was worked on by more than the sensor's noise."""
+
+Held = Annotated[bool, SignalPort("held", closed=None)]
+"""Another signal, held true for longer."""

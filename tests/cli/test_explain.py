@@ -20,7 +20,7 @@ stages:
   prepare: {use: './parts.py:Prepare'}
   unused: {use: './parts.py:Needy', path: a}
   compare: {use: './parts.py:Compare', segment: heavy, queue: {capacity: 2, when_full: drop_oldest}}
-  outline: {use: './parts.py:Outline', when: {signal: touching, hold: 3, at_least_every: 60}}
+  outline: {use: './parts.py:Outline', when: touching}
   refine: {use: './parts.py:Refine', in: {flow: null}}
 sinks:
   out: {use: './parts.py:Publish', max_rate: 5}
@@ -90,8 +90,7 @@ def test_each_stage_says_when_it_is_skipped(capsys: pytest.CaptureFixture[str]) 
     main(["explain"])
     facts = paragraphs(capsys.readouterr().out)
     assert facts["outline"]["skipped when"] == (
-        "compare.touching is false for more than 3 frames (its outputs are absent: no_contact), "
-        "but it runs at least every 60 frames; compare gives no contact_mask"
+        "compare.touching is false (its outputs are absent: no_contact); compare gives no contact_mask"
     )
     assert facts["refine"]["skipped when"] == "outline gives no contact"
     assert "skipped when" not in facts["prepare"]

@@ -70,7 +70,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
         ["stagse: unknown key", "did you mean stages?"],
     ),
     "unknown top-level key": (HEAD + SINK + "§colour: red\n", ["colour: unknown key", "sensor, sensors"]),
-    "no stages": ("§sensor: main\n", ["stages is missing"]),
+    "no stages": ("§sensor: main\n", ["stages: required, but not given", "id -> stage"]),
     "stages that are a list": (
         "stages:\n  §- capture\n" + SINK,
         ["stages: expected a mapping", "got a list"],
@@ -238,7 +238,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
     ),
     "misspelled choice": (
         HEAD + "  p: {use: './parts.py:Prepare', method: §pyramide}\n" + SINK,
-        ["expected 'area' or 'pyramid', got 'pyramide'; did you mean pyramid?"],
+        ["expected area or pyramid, got 'pyramide'; did you mean pyramid?"],
     ),
     "scalar for a list": (
         HEAD + "  p: {use: './parts.py:Prepare', corners: §3}\n" + SINK,
@@ -403,20 +403,24 @@ CASES: dict[str, tuple[str, list[str]]] = {
         ["a source cannot be gated"],
     ),
     "gate without a signal": (
-        COMPARE + "  o: {use: './parts.py:Outline', when: §{hold: 3}}\n" + SINK,
-        ["stages.o.when: signal is missing"],
+        COMPARE + "  o: {use: './parts.py:Outline', when: §{otherwise: repeat}}\n" + SINK,
+        ["stages.o.when.signal: required, but not given", "bool port"],
     ),
     "gate that is a number": (
         COMPARE + "  o: {use: './parts.py:Outline', when: §5}\n" + SINK,
         ["when: expected the name of a signal", "got 5"],
     ),
     "unknown gate setting": (
-        COMPARE + "  o: {use: './parts.py:Outline', when: {signal: touching, §holds: 3}}\n" + SINK,
-        ["when.holds: unknown key; did you mean hold?"],
+        COMPARE + "  o: {use: './parts.py:Outline', when: {signal: touching, §otherwize: repeat}}\n" + SINK,
+        ["when.otherwize: unknown key; did you mean otherwise?"],
     ),
-    "negative hold": (
-        COMPARE + "  o: {use: './parts.py:Outline', when: {signal: touching, hold: §-3}}\n" + SINK,
-        ["when.hold: expected a whole number >= 0, got -3"],
+    "gate with a memory": (
+        COMPARE + "  o: {use: './parts.py:Outline', when: {signal: touching, §hold: 3}}\n" + SINK,
+        ["when.hold: unknown key; a gate has no memory", "the stage hold", "{use: hold, hold: 3"],
+    ),
+    "gate that opens now and then": (
+        COMPARE + "  o: {use: './parts.py:Outline', when: [{signal: touching, §at_least_every: 9}]}\n" + SINK,
+        ["when.0.at_least_every: unknown key; a gate has no memory", "{use: hold, at_least_every: 3"],
     ),
     "bad gate in a list": (
         COMPARE + "  o: {use: './parts.py:Outline', when: [touching, §nothing]}\n" + SINK,
@@ -542,6 +546,17 @@ def test_aliases_that_unfold_without_end_are_refused(
     (folder / "bad.yaml").write_text("\n".join(lines))
     assert main(["check", "bad.yaml"]) == 2
     assert "unfolds to more than" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["long.yaml", "/dev/zero"])
+def test_a_file_without_end_is_not_read_to_the_end(
+    name: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if not Path("/dev/zero").exists():
+        pytest.skip("there is no /dev/zero on this system")
+    (folder / "long.yaml").write_text("stages:\n" + "- a\n" * 100_000)
+    assert main(["check", name]) == 2
+    assert f"{name} is larger than 256 KiB" in capsys.readouterr().err
 
 
 def test_endless_nesting_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

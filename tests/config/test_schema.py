@@ -19,8 +19,8 @@ PIPELINES = [*sorted(ROOT.glob("pipelines/*.yaml")), ROOT / "pipeline.yaml"]
 @pytest.fixture(scope="module")
 def validator() -> Draft202012Validator:
     """Of pipeline files."""
-    from tactflow.cli.schema import pipeline_schema
     from tactflow.config.registry import available
+    from tactflow.config.schema import pipeline_schema
 
     schema = pipeline_schema(available())
     Draft202012Validator.check_schema(schema)
@@ -46,7 +46,7 @@ def test_every_shipped_pipeline_fits_the_schema(path: Path, validator: Draft2020
         "stages: {own: {use: './a.py:B', whatever: 3}}",
         "stages: {own: {use: 'a.b:C', whatever: 3}}",
         "{stages: {hull: {use: capture, source: a}}, sinks: }",
-        "stages: {hull: {when: [touching, {signal: a.b, hold: 3}], queue: {capacity: 2}}}",
+        "stages: {hull: {when: [touching, {signal: a.b, otherwise: repeat}], queue: {capacity: 2}}}",
         "stages: {hull: {on_error: disable, segment: heavy, in: {contact_mask: a.b}}}",
         "{stages: {capture: }, sinks: {jsonl: {max_rate: 5, on_error: {action: skip_frame, budget: 3}}}}",
     ],
@@ -70,7 +70,11 @@ def test_right_pipelines_fit(text: str, validator: Draft202012Validator) -> None
         ("stages: {a: {use: jsonl}}", "$.stages.a.use"),
         ("stages: {hull: {queue: {when_full: lates}}}", "$.stages.hull.queue.when_full"),
         ("stages: {hull: {max_rate: 5}}", "$.stages.hull"),
-        ("stages: {hull: {when: {hold: 3}}}", "$.stages.hull.when"),
+        ("stages: {hull: {when: {otherwise: repeat}}}", "$.stages.hull.when"),
+        ("stages: {hull: {when: {signal: a.b, hold: 3}}}", "$.stages.hull.when"),
+        ("{stages: {capture: }, sensors: {}}", "$.sensors"),
+        ("{stages: {capture: }, sensors: {a b: }}", "$.sensors"),
+        ("{stages: {capture: }, sensors: {a: {stage: }}}", "$.sensors.a"),
         ("{stages: {capture: }, sinks: {jsonl: {max_rate: 0}}}", "$.sinks.jsonl.max_rate"),
     ],
 )

@@ -90,14 +90,10 @@ def _demand(node: Node) -> str:
 
 def _gate(gate: Gate) -> str:
     text = f"{gate.signal} is false"
-    if gate.hold:
-        text += f" for more than {gate.hold} frames"
     if gate.otherwise == "repeat":
         text += " (its last outputs are repeated)"
     else:
         text += f" (its outputs are absent: {gate.reason})"
-    if gate.at_least_every is not None:
-        text += f", but it runs at least every {gate.at_least_every} frames"
     return text
 
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from tactflow.config.envelope import is_word
+from tactflow.config.models import is_word
 from tactflow.config.registry import Section, catalogue, did_you_mean, names, resolve
 from tactflow.config.yamlmap import shown
 from tactflow.engine.errors import ConfigError

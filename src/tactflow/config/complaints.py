@@ -1,12 +1,14 @@
-"""Turns what pydantic finds wrong with parameters into plain words at the place in the file."""
+"""Turns what pydantic finds wrong with a part of a file into plain words at its place."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from tactflow.config.registry import closest, did_you_mean
@@ -48,8 +50,10 @@ _EXPECTED = {
     "too_long": "at most {max_length} items",
 }
 
+_QUOTED = re.compile("'([A-Za-z_][A-Za-z0-9_-]*)'")
 
 _MANY = 1000
+"""Mistakes in a member of a union that was not meant at all; more than a member that was meant may have."""
 
 
 @dataclass(slots=True)
@@ -73,13 +77,17 @@ def complain(
     model: type[BaseModel],
     item: Item,
     path: str,
-    other_keys: Sequence[str],
     problems: Problems,
+    *,
+    noun: str = "key",
+    other_keys: Sequence[str] = (),
+    advice: Mapping[str, str] | None = None,
 ) -> None:
     """Report each error of a validation at its own value.
 
-    model : the parameters that were validated. item : the mapping they were read from. path : its name.
-    other_keys : keys that may stand beside the parameters, for suggestions.
+    model : what was validated. item : the mapping it was read from. path : its name, "" for a whole file.
+    noun : what a key of the mapping is called. other_keys : keys that may stand beside those of the model.
+    advice : unknown key -> what to say about it in place of a suggestion.
     """
     found = [(detail, _spot(item, path, detail)) for detail in error.errors(include_url=False)]
     # A union of scalars reports one error per member; together they are one mistake.
@@ -88,14 +96,17 @@ def complain(
         groups.setdefault((spot.mark, spot.path), []).append((detail, spot))
     for (mark, name), members in groups.items():
         detail, spot = members[0]
+        loc = detail["loc"]
         if detail["type"] == "extra_forbidden":
-            known = _field_names(model, detail["loc"][:-1])
-            known += other_keys if len(detail["loc"]) == 1 else []
-            key = str(detail["loc"][-1])
-            hint = did_you_mean(key, known, "there are ")
-            problems.add(spot.key_mark, f"{name}: unknown parameter{hint}")
-            continue
-        problems.add(mark, f"{name}: {_words(members)}")
+            known = [*_fields(model, loc[:-1]), *(other_keys if len(loc) == 1 else ())]
+            key = str(loc[-1])
+            hint = (advice or {}).get(key) or did_you_mean(key, known, "there are ")
+            problems.add(spot.key_mark, f"{name}: unknown {noun}{hint}")
+        else:
+            field = _fields(model, loc[:-1]).get(str(loc[-1])) if detail["type"] == "missing" else None
+            about = f" ({field.description})" if field and field.description else ""
+            place = spot.key_mark if loc[-1:] == ("[key]",) else mark
+            problems.add(place, f"{name}: {_words(members)}{about}")
 
 
 def _meant(found: list[tuple[ErrorDetails, _Spot]]) -> list[tuple[ErrorDetails, _Spot]]:
@@ -122,20 +133,24 @@ def _spot(item: Item, path: str, detail: ErrorDetails) -> _Spot:
         content = spot.item.content if spot.item is not None else None
         if isinstance(content, dict) and part in content:
             entry = content[part]
-            spot = _Spot(entry.item, entry.item.mark, entry.mark, f"{spot.path}.{part}")
+            spot = _Spot(entry.item, entry.item.mark, entry.mark, _joined(spot.path, part))
             inside = union is not None
         elif isinstance(content, list) and isinstance(part, int) and part < len(content):
             inner = content[part]
-            spot = _Spot(inner, inner.mark, inner.mark, f"{spot.path}.{part}")
+            spot = _Spot(inner, inner.mark, inner.mark, _joined(spot.path, part))
             inside = union is not None
         elif index == 0 or (index == last and detail["type"] == "missing"):
-            spot = _Spot(None, spot.mark, spot.key_mark, f"{spot.path}.{part}")
+            spot = _Spot(None, spot.mark, spot.key_mark, _joined(spot.path, part))
             inside = union is not None
         elif union is None:
             # Not part of the file: the name of the member of a union that was tried.
             union = (spot.path, str(part))
     spot.union, spot.inside = union, inside
     return spot
+
+
+def _joined(path: str, part: int | str) -> str:
+    return f"{path}.{part}" if path else str(part)
 
 
 def _words(members: Sequence[tuple[ErrorDetails, _Spot]]) -> str:
@@ -148,8 +163,12 @@ def _words(members: Sequence[tuple[ErrorDetails, _Spot]]) -> str:
             return "required, but not given"
         if kind in ("value_error", "assertion_error"):
             return str(context.get("error")) or "not accepted"
-        if kind in _EXPECTED:
-            expected.append(_EXPECTED[kind].format_map(_Numbers(context)))
+        if kind == "expected":
+            expected.append(detail["msg"])
+        elif kind in _EXPECTED:
+            words = _EXPECTED[kind].format_map(_Numbers(context))
+            # Choices are written as in YAML.
+            expected.append(_QUOTED.sub(r"\1", words) if kind in ("literal_error", "enum") else words)
         else:
             message = detail["msg"]
             return f"{message[0].lower()}{message[1:]}, got {_got(members[0])}"
@@ -180,19 +199,21 @@ def _choices(detail: ErrorDetails) -> list[str]:
     return [part.strip(" '") for part in str(detail["ctx"]["expected"]).replace(" or ", ",").split(",")]
 
 
-def _field_names(model: type[BaseModel], loc: Iterable[int | str]) -> list[str]:
-    """Names of the fields of the (nested) model at `loc`."""
+def _fields(model: type[BaseModel], loc: Sequence[int | str]) -> dict[str, FieldInfo]:
+    """The fields of the (nested) model at `loc`, by the names they have in a file."""
     choices: list[type[BaseModel]] = [model]
     for part in loc:
         named = [choice for choice in choices if choice.__name__ == part]
-        fields = {
-            field.alias or key: field for choice in choices for key, field in choice.model_fields.items()
-        }
+        fields = _named_fields(choices)
         if named:
             choices = named
         elif isinstance(part, str) and part in fields:
             choices = _models_in(fields[part].annotation)
-    return [field.alias or key for choice in choices for key, field in choice.model_fields.items()]
+    return _named_fields(choices)
+
+
+def _named_fields(models: Sequence[type[BaseModel]]) -> dict[str, FieldInfo]:
+    return {field.alias or key: field for model in models for key, field in model.model_fields.items()}
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

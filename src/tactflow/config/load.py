@@ -10,19 +10,26 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from tactflow.config import envelope, sensors, wiring
+from tactflow.config import sensors, wiring
 from tactflow.config.complaints import complain
-from tactflow.config.registry import RESERVED, Section, code_place, did_you_mean, resolve
+from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
+from tactflow.config.overrides import add_sinks, apply, replaced
+from tactflow.config.registry import Section, code_place, did_you_mean, resolve
 from tactflow.config.wiring import Draft
-from tactflow.config.yamlmap import Entry, Item, Problems, read_value, read_yaml, wrap
+from tactflow.config.yamlmap import Item, Problems, read_yaml, wrap
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import ErrorAction, FullPolicy, Mark, Node, OnError, Pipeline, Queue
+from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
 from tactflow.files import is_device
 
-TOP_LEVEL = ("sensor", "sensors", "skipping", "opencv_threads", "realtime_priority", "stages", "sinks")
 _SECTIONS: tuple[Section, ...] = get_args(Section)
+
+_NO_MEMORY = (
+    "; a gate has no memory: put the stage hold behind the signal, as in "
+    "held: {{use: hold, {key}: 3, in: {{signal: difference.touching}}}}, and write when: held"
+)
+_ADVICE = {key: _NO_MEMORY.format(key=key) for key in ("hold", "at_least_every")}
 
 
 def load_pipeline(
@@ -48,41 +55,36 @@ def load_pipeline(
     ConfigError : the message holds every mistake with file, line, column, source line and a caret.
     """
     problems = Problems()
-    root = _read(path, overrides, problems)
-    root = _add_sinks(root, extra_sinks or {})
-    envelope.check_keys(root.entries, TOP_LEVEL, "", problems)
-    runs = max(1, len(sensors.names(root)))
+    root = add_sinks(_read(path, overrides, problems), extra_sinks or {})
     root, name = sensors.select(root, sensor, problems)
-    drafts = [draft for section in _SECTIONS for draft in _drafts(root, section, problems)]
-    _check_ids(drafts, problems)
-    for draft in drafts:
-        _resolve(draft, path.parent, problems)
+    file = _envelope(root, problems)
+    drafts = _drafts(root, path.parent, problems)
     source = _source(root, drafts, problems)
     values = {id_: dict(given) for id_, given in (extra_stage_values or {}).items()}
     if source is not None:
         values.setdefault(source.id, {}).update(source_values or {})
     _set_values(drafts, values, problems)
-    params = {draft.id: _params(draft, problems) for draft in drafts}
-    drafts = _one_writer_each(drafts, params, extra_sinks or {}, problems)
+    for draft in drafts:
+        draft.params = _params(draft, problems)
+    drafts = _one_writer_each(drafts, extra_sinks or {}, problems)
     wiring.connect(drafts, problems)
-    nodes: dict[str, Node] = {}
-    for draft in wiring.ordered(drafts, problems):
-        node = _node(draft, params[draft.id], problems)
-        if node is not None:
-            nodes[draft.id] = node
+    drafts = wiring.ordered(drafts, problems)
+    _check_needs(drafts, problems)
+    problems.raise_if_any()
+    assert file is not None, "what is wrong with it was raised"
+    entries: dict[str, Entry] = {**file.stages, **file.sinks}
     pipeline = Pipeline(
         file=str(path),
         directory=path.parent,
         sensor=name,
-        nodes=nodes,
-        skipping=_flag(root.entries, "skipping", True, problems),
-        opencv_threads=envelope.whole(root.entries, "opencv_threads", 0, "", problems),
-        realtime_priority=_flag(root.entries, "realtime_priority", False, problems),
-        runs=runs,
+        nodes={draft.id: _node(draft, entries[draft.id]) for draft in drafts},
+        skipping=file.skipping,
+        opencv_threads=file.opencv_threads,
+        realtime_priority=file.realtime_priority,
+        runs=max(1, len(sensors.names(root))),
         warnings=_warnings(root, drafts),
         settings=_settings(root, name, drafts),
     )
-    problems.raise_if_any()
     for mark, message in plan_problems(pipeline):
         problems.add(mark, message)
     problems.raise_if_any()
@@ -112,188 +114,59 @@ def _read(path: Path, overrides: Sequence[str], problems: Problems) -> Item:
     if not isinstance(root.content, dict):
         problems.raise_if_any()
     for text in overrides:
-        root = _override(root, text, problems)
+        root = apply(root, text, problems)
     return root
 
 
-def _override(root: Item, text: str, problems: Problems) -> Item:
-    mark = Mark(f"--set {text}", 0, 0)
-    path, equals, value_text = text.partition("=")
-    keys = [key.strip() for key in path.split(".")]
-    if not equals or not all(keys):
-        problems.add(mark, "expected a.b.c=VALUE, as in stages.hull.min_area=50")
-        return root
-    value = read_value(value_text, mark, problems)
-    if value is None:
-        return root
-    if value.content is None and len(keys) == 2 and keys[0] in _SECTIONS:
-        return _remove(root, keys[0], keys[1], mark, problems)
+def _envelope(root: Item, problems: Problems) -> PipelineFile | None:
+    """The file as its model describes it; None if something in it is wrong."""
     try:
-        return _replaced(root, keys, value, mark)
-    except ConfigError as error:
-        problems.add(mark, str(error))
-        return root
+        return PipelineFile.model_validate(root.plain())
+    except ValidationError as error:
+        complain(error, PipelineFile, root, "", problems, advice=_ADVICE)
+        return None
 
 
-def _remove(root: Item, section: str, id_: str, mark: Mark, problems: Problems) -> Item:
-    held = root.entries.get(section)
-    entries = dict(held.item.entries) if held else {}
-    if held is None or id_ not in entries:
-        problems.add(mark, f"there is no {section[:-1]} {id_!r} to remove{did_you_mean(id_, entries)}")
-        return root
-    del entries[id_]
-    content = root.entries | {section: Entry(held.mark, Item(entries, held.item.mark))}
-    return Item(content, root.mark)
-
-
-def _replaced(item: Item | None, keys: Sequence[str], value: Item, mark: Mark, path: str = "") -> Item:
-    """A copy of `item` in which one value is replaced; parts that an alias shares stay as they are."""
-    if not keys:
-        return value
-    key, rest = keys[0], keys[1:]
-    inner = f"{path}.{key}" if path else key
-    if item is not None and isinstance(item.content, list):
-        if not key.isdecimal() or int(key) >= len(item.content):
-            raise ConfigError(f"{path} is a list with {len(item.content)} items, counted from 0")
-        parts = list(item.content)
-        parts[int(key)] = _replaced(parts[int(key)], rest, value, mark, inner)
-        return Item(parts, item.mark)
-    if item is not None and not item.is_mapping:
-        raise ConfigError(f"{path} is {item.words()}, so it has no {key}")
-    entries = dict(item.entries) if item else {}
-    old = entries.get(key)
-    entries[key] = Entry(
-        old.mark if old else mark, _replaced(old.item if old else None, rest, value, mark, inner)
-    )
-    return Item(entries, item.mark if item else mark)
-
-
-def _add_sinks(root: Item, extra: Mapping[str, Mapping[str, Any]]) -> Item:
-    for option, settings in extra.items():
-        wanted = option.lstrip("-")
-        mark = Mark(f"--{wanted}", 0, 0)
-        taken = {
-            id_
-            for section in _SECTIONS
-            if section in root.entries
-            for id_ in root.entries[section].item.entries
-        }
-        count = 2
-        id_ = wanted
-        while id_ in taken:
-            id_ = f"{wanted}_{count}"
-            count += 1
-        root = _replaced(root, ["sinks", id_], wrap({"use": wanted} | dict(settings), mark), mark)
-    return root
-
-
-def _one_writer_each(
-    drafts: Sequence[Draft],
-    params: Mapping[str, StageParams | None],
-    options: Collection[str],
-    problems: Problems,
-) -> list[Draft]:
-    """The drafts without those that an option adds for a file that is written anyway, just as it asks.
-
-    Any other two sinks that would write the same file are a mistake.
-    """
-    kept: list[Draft] = []
-    writers: dict[str, Draft] = {}
-    for draft in drafts:
-        place = _written(draft, params.get(draft.id))
-        other = None if place is None else writers.setdefault(place, draft)
-        if other is None or other is draft:
-            kept.append(draft)
-        elif draft.mark.file not in options or not _does_as_much(other, draft):
-            kept.append(draft)
-            problems.add(
-                draft.mark,
-                f"sinks.{draft.id}: {other.id} ({other.mark}) writes {place} already; choose another path",
-            )
-    return kept
-
-
-def _does_as_much(there: Draft, added: Draft) -> bool:
-    """Whether a sink writes all that one without settings of its own would write."""
-    if there.component is None or added.component is None:
-        return False
-    return there.component.cls is added.component.cls and "max_rate" not in there.item.entries
-
-
-def _written(draft: Draft, params: StageParams | None) -> str | None:
-    """The file or folder that a sink writes, however it is spelled; None for what is not one."""
-    cls = draft.component.cls if draft.component else None
-    declared = cls.outputs(params) if cls is not None and issubclass(cls, Sink) and params is not None else ()
-    for output in declared:
-        # No file has a name with NUL; the sink will say so.
-        if "\0" not in str(output.path) and not is_device(str(output.path)):
-            return os.path.realpath(output.path)
-    return None
-
-
-def _drafts(root: Item, section: Section, problems: Problems) -> list[Draft]:
-    entry = root.entries.get(section)
-    if entry is None:
-        return []
-    if not entry.item.is_mapping:
-        what = f"expected a mapping of id -> {section[:-1]}, got {entry.item.words()}"
-        problems.add(entry.item.mark, f"{section}: {what}")
-        return []
-    drafts = []
-    for id_, given in entry.item.entries.items():
-        if not envelope.is_word(id_):
-            problems.add(given.mark, f"{section}.{id_}: an id is a word of letters, digits, _ and -")
-        elif not given.item.is_mapping:
-            what = f"expected a mapping of settings, as in {{use: {id_}}}, got {given.item.words()}"
-            problems.add(given.item.mark, f"{section}.{id_}: {what}")
-            drafts.append(Draft(id_, section, given.mark, Item(None, given.mark)))
-        else:
-            drafts.append(Draft(id_, section, given.mark, given.item))
-    return drafts
-
-
-def _check_ids(drafts: list[Draft], problems: Problems) -> None:
-    seen: dict[str, Draft] = {}
-    for draft in list(drafts):
-        if draft.id in seen:
-            other = seen[draft.id]
-            problems.add(
-                draft.mark, f"{draft.path}: the id {draft.id} is taken by {other.path} ({other.mark})"
-            )
-            drafts.remove(draft)
-        seen.setdefault(draft.id, draft)
+def _drafts(root: Item, directory: Path, problems: Problems) -> list[Draft]:
+    """The stages and sinks of the file; what `_envelope` refuses of them is left out here."""
+    drafts: dict[str, Draft] = {}
+    for section in _SECTIONS:
+        entries = root.entries[section].item.entries if section in root.entries else {}
+        for id_, entry in entries.items():
+            item = entry.item if entry.item.is_mapping else Item(None, entry.mark)
+            draft = Draft(id_, section, entry.mark, item)
+            if id_ in drafts:
+                other = drafts[id_]
+                taken = f"the id {id_} is taken by {other.path} ({other.mark})"
+                problems.add(draft.mark, f"{draft.path}: {taken}")
+            elif is_word(id_):
+                drafts[id_] = draft
+                _resolve(draft, directory, problems)
+    return list(drafts.values())
 
 
 def _resolve(draft: Draft, directory: Path, problems: Problems) -> None:
     entry = draft.item.entries.get("use")
-    use: Any = draft.id if entry is None else entry.item.content
-    mark = draft.mark if entry is None else entry.item.mark
-    if entry is not None and not isinstance(use, str):
-        problems.add(
-            mark, f"{draft.path}.use: expected the name of a {draft.section[:-1]}, got {entry.item.words()}"
-        )
+    use = draft.id if entry is None else entry.item.content
+    if not isinstance(use, str):
         return
     try:
         draft.component = resolve(use, draft.section, directory)
     except ConfigError as error:
-        problems.add(mark, f"{draft.path}{'.use' if entry else ''}: {error}")
+        mark, path = (draft.mark, draft.path) if entry is None else (entry.item.mark, f"{draft.path}.use")
+        problems.add(mark, f"{path}: {error}")
 
 
 def _source(root: Item, drafts: Sequence[Draft], problems: Problems) -> Draft | None:
-    entry = root.entries.get("stages")
-    if entry is None:
-        problems.add(root.mark, "stages is missing; it is a mapping of id -> stage and begins with a source")
-        return None
+    """The source of frames; that there is none, or more than one, is a mistake."""
     stages = [draft for draft in drafts if draft.section == "stages"]
     sources = [draft for draft in stages if draft.component and draft.component.kind == "source"]
-    if not sources and entry.item.is_mapping and all(draft.component for draft in stages):
+    entry = root.entries.get("stages")
+    if not sources and entry and entry.item.is_mapping and all(draft.component for draft in stages):
         problems.add(entry.mark, "stages: there is no source of frames; add the stage capture")
     for other in sources[1:]:
-        first = sources[0]
-        problems.add(
-            other.mark,
-            f"{other.path}: a pipeline has one source, but {first.id} ({first.mark}) is one already",
-        )
+        first = f"{sources[0].id} ({sources[0].mark})"
+        problems.add(other.mark, f"{other.path}: a pipeline has one source, but {first} is one already")
     return sources[0] if sources else None
 
 
@@ -306,36 +179,31 @@ def _set_values(drafts: Sequence[Draft], values: Mapping[str, Mapping[str, Any]]
                 problems.add(mark, f"there is no stage {id_!r}{did_you_mean(id_, by_id)}")
                 continue
             draft = by_id[id_]
-            draft.item = _replaced(draft.item, [name], wrap(value, mark), mark)
-
-
-def _keys(section: Section) -> frozenset[str]:
-    return RESERVED if section == "sinks" else RESERVED - {"max_rate"}
+            draft.item = replaced(draft.item, [name], wrap(value, mark), mark)
 
 
 def _params(draft: Draft, problems: Problems) -> StageParams | None:
+    """What the component's own model makes of the parameters; None if it refuses them."""
     if draft.component is None:
         return None
-    keys = _keys(draft.section)
-    given = {key: entry for key, entry in draft.item.entries.items() if key not in keys}
-    item = Item(given, draft.mark)
     model = draft.component.params
-    strange = [entry for entry in given.values() if not _is_text(entry.item.plain())]
-    for entry in strange:
-        problems.add(entry.item.mark, f"{draft.path}: {entry.item.plain()!r} is not UTF-8; rename the file")
+    keys = {key for key in RESERVED if key != "max_rate" or draft.section == "sinks"}
+    given = {key: entry for key, entry in draft.item.entries.items() if key not in keys}
+    strange = [entry.item for entry in given.values() if not _is_text(entry.item.plain())]
+    for item in strange:
+        problems.add(item.mark, f"{draft.path}: {item.plain()!r} is not UTF-8; rename the file")
     if strange:
         return None
+    whole = Item(given, draft.mark)
     try:
         # JSON, because pydantic's strict rules for it fit YAML too: a list may become a tuple, but text or a
         # boolean never becomes a number.
-        return model.model_validate_json(json.dumps(item.plain()), strict=True)
+        return model.model_validate_json(json.dumps(whole.plain()), strict=True)
     except ValidationError as error:
-        complain(error, model, item, draft.path, sorted(keys), problems)
+        complain(error, model, whole, draft.path, problems, noun="parameter", other_keys=sorted(keys))
     except Exception as error:
-        place = code_place(error.__traceback__)
-        problems.add(
-            draft.mark, f"{draft.path}: the parameters fail: {type(error).__name__}: {error} ({place})"
-        )
+        reason = f"{type(error).__name__}: {error} ({code_place(error.__traceback__)})"
+        problems.add(draft.mark, f"{draft.path}: the parameters fail: {reason}")
     return None
 
 
@@ -348,102 +216,95 @@ def _is_text(value: Any) -> bool:
     return True
 
 
-def _node(draft: Draft, params: StageParams | None, problems: Problems) -> Node | None:
-    entries, path = draft.item.entries, draft.path
-    queue = _queue(entries, path, problems)
-    on_error = _on_error(draft, problems)
-    segment = envelope.word(entries, "segment", path, problems)
-    max_rate = _max_rate(entries, path, problems) if draft.section == "sinks" else None
-    if draft.component is None or params is None:
-        return None
-    # Another mistake may be why an input is not connected.
-    for port, name in {} if problems.found else params.needed_inputs().items():
-        if draft.inputs.get(port) is None:
-            mark = entries[name].item.mark if name in entries else draft.mark
-            value = getattr(params, name)
-            problems.add(
-                mark, f"{path}.{name}: {value} needs {port}, which no stage gives; add a stage that does"
-            )
+def _one_writer_each(drafts: Sequence[Draft], options: Collection[str], problems: Problems) -> list[Draft]:
+    """The drafts without those that an option adds for a file that is written anyway, just as it asks.
+
+    Any other two sinks that would write the same file are a mistake.
+    """
+    kept: list[Draft] = []
+    writers: dict[str, Draft] = {}
+    for draft in drafts:
+        places = _written(draft)
+        place = next((place for place in places if place in writers), None)
+        other = writers[place] if place is not None else None
+        if other and draft.mark.file in options and _does_as_much(other, draft):
+            continue
+        kept.append(draft)
+        if other:
+            there = f"{other.id} ({other.mark}) writes {place} already; choose another path"
+            problems.add(draft.mark, f"{draft.path}: {there}")
+        writers |= {place: draft for place in places if place not in writers}
+    return kept
+
+
+def _does_as_much(there: Draft, added: Draft) -> bool:
+    """Whether a sink writes all that one without settings of its own would write."""
+    if there.component is None or added.component is None:
+        return False
+    return there.component.cls is added.component.cls and "max_rate" not in there.item.entries
+
+
+def _written(draft: Draft) -> list[str]:
+    """The files and folders that a sink writes, however they are spelled; no devices."""
+    cls = draft.component.cls if draft.component else None
+    if cls is None or not issubclass(cls, Sink) or draft.params is None:
+        return []
+    paths = [str(output.path) for output in cls.outputs(draft.params)]
+    # No file has a name with NUL; the sink will say so.
+    return [os.path.realpath(path) for path in paths if "\0" not in path and not is_device(path)]
+
+
+def _check_needs(drafts: Sequence[Draft], problems: Problems) -> None:
+    """Report parameters that need an input which is not connected."""
+    if problems.found:
+        # Another mistake may be why it is not connected.
+        return
+    for draft in drafts:
+        for port, name in draft.params.needed_inputs().items() if draft.params else ():
+            if draft.inputs.get(port) is None:
+                entry = draft.item.entries.get(name)
+                what = f"{getattr(draft.params, name)} needs {port}, which no stage gives"
+                problems.add(
+                    entry.item.mark if entry else draft.mark,
+                    f"{draft.path}.{name}: {what}; add a stage that does",
+                )
+
+
+def _node(draft: Draft, entry: Entry) -> Node:
+    """The node that a right draft describes."""
+    assert draft.component is not None, "a stage without one was reported"
+    assert draft.params is not None, "parameters that are wrong were reported"
+    cls, entries = draft.component.cls, draft.item.entries
+    # A picture for people must never stop the run.
+    on_error = OnError("disable" if issubclass(cls, Sink) and cls.observer else "stop")
+    if entry.on_error:
+        on_error = OnError(entry.on_error.action, entry.on_error.budget)
+    gates = [
+        Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
+        for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
+    ]
     return Node(
         id=draft.id,
         component=draft.component,
-        params=params,
+        params=draft.params,
         inputs=draft.inputs,
         mark=draft.mark,
-        gates=tuple(draft.gates),
-        segment=segment,
-        queue=queue,
+        gates=tuple(gates),
+        segment=entry.segment,
+        queue=Queue(entry.queue.capacity, entry.queue.when_full),
         on_error=on_error,
-        max_rate=max_rate,
+        max_rate=entry.max_rate if isinstance(entry, SinkEntry) else None,
         marks={key: entries[key].item.mark for key in ("segment", "queue") if key in entries},
     )
 
 
-def _queue(entries: Mapping[str, Entry], path: str, problems: Problems) -> Queue:
-    entry = entries.get("queue")
-    if entry is None:
-        return Queue()
-    path = f"{path}.queue"
-    if not entry.item.is_mapping:
-        what = f"expected a mapping, as in {{capacity: 4, when_full: block}}, got {entry.item.words()}"
-        problems.add(entry.item.mark, f"{path}: {what}")
-        return Queue()
-    settings = entry.item.entries
-    envelope.check_keys(settings, ["capacity", "when_full"], path, problems)
-    policies: tuple[FullPolicy, ...] = get_args(FullPolicy)
-    name = envelope.choice(settings, "when_full", policies, path, problems)
-    policy = next((known for known in policies if known == name), None)
-    return Queue(envelope.whole(settings, "capacity", 1, path, problems), policy)
-
-
-def _on_error(draft: Draft, problems: Problems) -> OnError:
-    actions: tuple[ErrorAction, ...] = get_args(ErrorAction)
-    entry = draft.item.entries.get("on_error")
-    if entry is None:
-        # A picture for people must never stop the run.
-        observer = draft.component is not None and getattr(draft.component.cls, "observer", False)
-        return OnError("disable" if observer else "stop")
-    path = f"{draft.path}.on_error"
-    if isinstance(entry.item.content, dict):
-        settings = entry.item.content
-        envelope.check_keys(settings, ["action", "budget"], path, problems)
-        name = envelope.choice(settings, "action", actions, path, problems)
-        budget = envelope.whole(settings, "budget", 0, path, problems)
-    else:
-        name = envelope.choice({"on_error": entry}, "on_error", actions, draft.path, problems)
-        budget = None
-    action: ErrorAction = next((known for known in actions if known == name), "stop")
-    return OnError(action) if budget is None else OnError(action, budget)
-
-
-def _max_rate(entries: Mapping[str, Entry], path: str, problems: Problems) -> float | None:
-    entry = entries.get("max_rate")
-    if entry is None or entry.item.content is None:
-        return None
-    value = entry.item.content
-    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf"):
-        return float(value)
-    problems.add(entry.item.mark, f"{path}.max_rate: expected a rate in Hz, > 0, got {entry.item.words()}")
-    return None
-
-
-def _flag(entries: Mapping[str, Entry], key: str, default: bool, problems: Problems) -> bool:
-    entry = entries.get(key)
-    if entry is None:
-        return default
-    value = entry.item.content
-    if isinstance(value, bool):
-        return value
-    problems.add(entry.item.mark, f"{key}: expected true or false, got {entry.item.words()}")
-    return default
-
-
 def _settings(root: Item, sensor: str, drafts: Sequence[Draft]) -> dict[str, Any]:
-    plain = {key: entry.item.plain() for key, entry in root.entries.items() if key not in _SECTIONS}
+    """What the file and all that changes it come to, for one sensor."""
     sections = {
         section: {draft.id: draft.item.plain() for draft in drafts if draft.section == section}
         for section in _SECTIONS
     }
+    plain = {key: entry.item.plain() for key, entry in root.entries.items() if key != "sensors"}
     return plain | {"sensor": sensor} | sections
 
 

@@ -17,14 +17,12 @@ from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any, Literal, get_args
 
+from tactflow.config.models import RESERVED
 from tactflow.engine.conformance import component, kind_of
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 
 Section = Literal["stages", "sinks"]
-
-RESERVED = frozenset({"use", "in", "when", "segment", "queue", "on_error", "max_rate"})
-"""Keys of a stage or sink that belong to the engine and so cannot be names of parameters."""
 
 
 def resolve(use: str, section: Section, directory: Path) -> Component:

@@ -10,16 +10,11 @@ parameter. `{sensor}` in any text of a sink stands for the sensor's name.
 
 from __future__ import annotations
 
-from tactflow.config import envelope
+from tactflow.config.models import Changes, is_word
 from tactflow.config.registry import did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems
-from tactflow.engine.graph import Mark
-
-CHANGEABLE = ("skipping", "opencv_threads", "realtime_priority", "stages", "sinks")
-"""What a sensor may change."""
 
 PLACEHOLDER = "{sensor}"
-RESERVED = "stats"
 
 
 def names(root: Item) -> list[str]:
@@ -34,53 +29,23 @@ def select(root: Item, chosen: str | None, problems: Problems) -> tuple[Item, st
     chosen : a name of `sensors:`, or None for the first one, or for the only one of a file without it.
     """
     entry = root.entries.get("sensors")
+    single = root.entries.get("sensor")
     if entry is None:
-        own = envelope.word(root.entries, "sensor", "", problems) or "main"
-        _refuse_reserved(own, root.entries["sensor"].mark if own == RESERVED else root.mark, problems)
-        if chosen is not None and chosen != own:
-            problems.add(root.mark, f"there is no sensor {chosen!r}; the file's only sensor is {own}")
-        return _named(root, own), own
-    _check(root, entry, problems)
+        own = single.item.content if single else None
+        name = own if isinstance(own, str) and is_word(own) else "main"
+        if chosen is not None and chosen != name:
+            problems.add(root.mark, f"there is no sensor {chosen!r}; the file's only sensor is {name}")
+        return _named(root, name), name
+    if single is not None:
+        there = f"the names stand under sensors ({entry.mark}) already; leave this one out"
+        problems.add(single.mark, f"sensor: {there}")
     known = names(root)
     if chosen is not None and chosen not in known:
         problems.add(entry.mark, f"sensors: there is no {chosen!r}{did_you_mean(chosen, known)}")
     name = chosen if chosen in known else known[0] if known else "main"
-    changes = entry.item.entries.get(name)
-    rest = Item({key: value for key, value in root.entries.items() if key != "sensors"}, root.mark)
-    # A name with nothing behind it changes nothing.
-    merged = _laid_over(rest, changes.item) if changes and isinstance(changes.item.content, dict) else rest
-    return _named(merged, name), name
-
-
-def _refuse_reserved(name: str, mark: Mark, problems: Problems) -> None:
-    if name == RESERVED:
-        problems.add(mark, f"{name} is the topic of a run's statistics; give the sensor another name")
-
-
-def _check(root: Item, entry: Entry, problems: Problems) -> None:
-    if not isinstance(entry.item.content, dict) or not entry.item.content:
-        problems.add(
-            entry.item.mark,
-            f"sensors: expected a mapping of name -> changes, as in {{left: {{stages: ...}}}}, got "
-            f"{entry.item.words()}",
-        )
-    if "sensor" in root.entries:
-        problems.add(
-            root.entries["sensor"].mark,
-            f"sensor: the names stand under sensors ({entry.mark}) already; leave this one out",
-        )
-    for name, changes in entry.item.entries.items():
-        _refuse_reserved(name, changes.mark, problems)
-        if not envelope.is_word(name):
-            problems.add(changes.mark, f"sensors.{name}: a name is a word of letters, digits, _ and -")
-        elif not changes.item.is_mapping:
-            problems.add(
-                changes.item.mark,
-                f"sensors.{name}: expected a mapping of changes, as in {{stages: {{capture: ...}}}}, got "
-                f"{changes.item.words()}",
-            )
-        else:
-            envelope.check_keys(changes.item.entries, CHANGEABLE, f"sensors.{name}", problems)
+    given = entry.item.entries[name].item.entries if known else {}
+    changes = {key: value for key, value in given.items() if key in Changes.model_fields}
+    return _named(_laid_over(root, Item(changes, entry.mark)), name), name
 
 
 def _laid_over(base: Item, changes: Item, depth: int = 0) -> Item:

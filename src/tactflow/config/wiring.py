@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
-from tactflow.config import envelope
 from tactflow.config.registry import Section, catalogue, did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems
-from tactflow.engine.graph import Component, Gate, Mark, Ref
+from tactflow.engine.contract import StageParams
+from tactflow.engine.graph import Component, Mark, Ref
 from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
 
 
@@ -18,7 +17,8 @@ class Draft:
     """A stage or sink of the file before its inputs are connected.
 
     component : None when `use` could not be resolved; what depends on it is then not judged.
-    inputs, gates : filled by `connect`.
+    params : None when they are wrong.
+    inputs, gates : filled by `connect`; for each gate the port, and the signal that says what closed means.
     edges : every output it takes, with the place that says so.
     """
 
@@ -27,8 +27,9 @@ class Draft:
     mark: Mark
     item: Item
     component: Component | None = None
+    params: StageParams | None = None
     inputs: dict[str, Ref | None] = field(default_factory=dict)
-    gates: list[Gate] = field(default_factory=list)
+    gates: list[tuple[Ref, SignalPort]] = field(default_factory=list)
     edges: list[tuple[Ref, Mark]] = field(default_factory=list)
 
     @property
@@ -52,6 +53,8 @@ def connect(drafts: Sequence[Draft], problems: Problems) -> None:
     for draft in drafts:
         if draft.component is not None:
             wiring.connect_inputs(draft, draft.component)
+    for draft in drafts:
+        if draft.component is not None:
             wiring.connect_gates(draft, draft.component)
 
 
@@ -131,17 +134,17 @@ class _Wiring:
             return
         several = isinstance(entry.item.content, list)
         for index, item in enumerate(entry.item.content if several else [entry.item]):
-            self._gate(item, f"{path}.{index}" if several else path, draft)
+            inner = f"{path}.{index}" if several else path
+            if isinstance(item.content, str):
+                self._gate(item, inner, draft)
+            elif "signal" in item.entries:
+                self._gate(item.entries["signal"].item, f"{inner}.signal", draft)
 
     def _explicit(self, draft: Draft, component: Component) -> Mapping[str, Entry]:
         entry = draft.item.entries.get("in")
         if entry is None:
             return {}
         path = f"{draft.path}.in"
-        if not entry.item.is_mapping:
-            expected = "expected a mapping of input -> stage.port"
-            self._problems.add(entry.item.mark, f"{path}: {expected}, got {entry.item.words()}")
-            return {}
         names = [port.name for port in component.ports.inputs]
         for name, given in entry.item.entries.items():
             if name not in names:
@@ -153,8 +156,7 @@ class _Wiring:
         """The output that `stage.port`, `stage`, or (with `by_port`) the name of a port means."""
         text = item.content
         if not isinstance(text, str):
-            expected = "the name of a signal or stage.port" if by_port else "stage.port"
-            self._problems.add(item.mark, f"{path}: expected {expected}, got {item.words()}")
+            # The model of the file reports it.
             return None
         stage, dot, port = text.partition(".")
         if by_port and not dot:
@@ -231,23 +233,7 @@ class _Wiring:
         return text + (f"; it comes from the stage {' or '.join(makers)}" if makers else "")
 
     def _gate(self, item: Item, path: str, draft: Draft) -> None:
-        settings = item.entries
-        if isinstance(item.content, dict):
-            known = ["signal", "otherwise", "hold", "at_least_every", "reason"]
-            envelope.check_keys(settings, known, path, self._problems)
-            if "signal" not in settings:
-                self._problems.add(
-                    item.mark, f"{path}: signal is missing; it names the port that opens the gate"
-                )
-                return
-            item, signal_path = settings["signal"].item, f"{path}.signal"
-        else:
-            signal_path = path
-        chosen = envelope.choice(settings, "otherwise", ["absent", "repeat"], path, self._problems)
-        hold = envelope.whole(settings, "hold", 0, path, self._problems)
-        at_least_every = envelope.whole(settings, "at_least_every", 1, path, self._problems)
-        reason = envelope.word(settings, "reason", path, self._problems)
-        ref = self._reference(item, signal_path, draft, by_port=True)
+        ref = self._reference(item, path, draft, by_port=True)
         if ref is None:
             return
         signal = self._signal(ref)
@@ -256,12 +242,18 @@ class _Wiring:
             kind = describe_type(giver.outputs[ref.port].annotation)
             self._problems.add(
                 item.mark,
-                f"{signal_path}: a gate takes a signal (a bool port such as touching), but {ref} "
+                f"{path}: a gate takes a signal (a bool port such as touching), but {ref} "
                 f"({giver.mark}) gives {kind}",
             )
             return
-        otherwise: Literal["absent", "repeat"] = "repeat" if chosen == "repeat" else "absent"
-        if chosen is None:
-            otherwise = signal.otherwise
-        draft.gates.append(Gate(ref, reason or signal.closed, otherwise, hold or 0, at_least_every))
+        draft.gates.append((ref, self._meaning(ref, signal)))
         draft.edges.append((ref, item.mark))
+
+    def _meaning(self, ref: Ref, signal: SignalPort, seen: Sequence[str] = ()) -> SignalPort:
+        """The signal that says what a closed gate means: for one that only holds another, that other one."""
+        giver = self._by_id[ref.node]
+        for source in giver.inputs.values() if signal.closed is None and giver.id not in seen else ():
+            held = self._signal(source) if source else None
+            if source and held:
+                return self._meaning(source, held, [*seen, giver.id])
+        return signal

@@ -14,6 +14,8 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Mark
 
 _LINE_BREAK = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
+_MAX_BYTES = 256 * 1024
+"""Size of a pipeline file; a hundred times the longest of ours. Reading such a file takes some seconds."""
 _MAX_VALUES = 100_000
 _MAX_SHOWN = 150
 _MAX_MESSAGE = 2000
@@ -91,12 +93,11 @@ class Problems:
     """
 
     lines: dict[str, list[str]] = field(default_factory=dict)
-    found: list[tuple[Mark, str]] = field(default_factory=list)
+    found: dict[tuple[Mark, str], None] = field(default_factory=dict)
 
     def add(self, mark: Mark, message: str) -> None:
-        """Record one mistake."""
-        if (mark, message) not in self.found:
-            self.found.append((mark, message))
+        """Record one mistake; one that is known already is not told twice."""
+        self.found[mark, message] = None
 
     def raise_if_any(self) -> None:
         """Raise a ConfigError that holds every mistake, in the order of the file."""
@@ -153,12 +154,16 @@ def read_yaml(path: Path, problems: Problems) -> Item:
     if path.is_dir():
         raise ConfigError(f"{file} is a folder; required: a pipeline file (YAML)")
     try:
-        data = path.read_bytes()
+        with path.open("rb") as stream:
+            # A device such as /dev/zero has no end.
+            data = stream.read(_MAX_BYTES + 1)
     except FileNotFoundError:
         raise ConfigError(f"there is no file {file}") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(f"cannot read {file}: {reason}") from None
+    if len(data) > _MAX_BYTES:
+        raise ConfigError(f"{file} is larger than {_MAX_BYTES // 1024} KiB; required: a pipeline file (YAML)")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

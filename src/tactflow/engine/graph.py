@@ -61,15 +61,12 @@ class Gate:
 
     signal : the boolean port. reason : why outputs are absent while it is closed.
     otherwise : "absent" makes the outputs `Absent(reason)`; "repeat" gives the last outputs again (absent if
-    there are none yet). hold : frames for which the gate stays open after the signal fell.
-    at_least_every : opens the gate anyway after this many frames closed; None for never.
+    there are none yet).
     """
 
     signal: Ref
     reason: str
     otherwise: Literal["absent", "repeat"] = "absent"
-    hold: int = 0
-    at_least_every: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,11 +38,12 @@ class SignalPort:
     """Type of a boolean port that can gate stages.
 
     closed : the reason given while it is False. otherwise : what a gated stage's outputs are then, unless its
-    `when:` says something else: "absent", or "repeat" for the last ones again.
+    `when:` says something else: "absent", or "repeat" for the last ones again. closed None: both are those of
+    the signal that the stage itself takes, for a stage that only holds another's signal.
     """
 
     name: str
-    closed: str
+    closed: str | None
     otherwise: Literal["absent", "repeat"] = "absent"
 
 
