@@ -13,7 +13,7 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONTRIBUTING = (REPOSITORY / "CONTRIBUTING.md").read_text()
-PAGES = ["CONTRIBUTING.md", "docs/architecture.md", "docs/glossary.md", "docs/pipeline-file.md"]
+PAGES = ["CONTRIBUTING.md", "docs/architecture.md", "docs/glossary.md"]
 
 ROOMS = {
     "src/tactflow/engine": ("cv2", "zmq", "numba", "tactflow.vision", "tactflow.config", "tactflow.stages"),
