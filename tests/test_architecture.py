@@ -56,7 +56,8 @@ def test_every_file_and_link_that_a_page_names_is_there(page: str) -> None:
     named = set(re.findall(r"`((?:[\w-]+/)+[\w-]*(?:\.\w+)?)`", text))
     own = {"stages/invert.py", "sinks/count.py", "tests/stages/test_invert.py", "frames/"}
     for path in named - own:
-        inside = [REPOSITORY, *(folder for folder in (REPOSITORY / "src").rglob("*") if folder.is_dir())]
+        source = REPOSITORY / "src"
+        inside = [REPOSITORY, source, *(folder for folder in source.rglob("*") if folder.is_dir())]
         assert any((place / path).exists() for place in inside), path
 
 
