@@ -24,6 +24,8 @@ lint: $(VENV)/.installed-test
 
 types: $(VENV)/.installed-test
 	$(PY) -m mypy
+	$(PY) -m mypy --platform darwin
+	$(PY) -m mypy --platform win32
 
 kernels: $(VENV)/.installed-test
 	$(PY) -m tests.oracles

@@ -36,21 +36,21 @@ class MarkerMaskStage(Stage):
         compiled.load(downsample, mask)
         self._params = params
         self._dot: Dot | None = None
-        self._looked = False
+        self._known = False
 
     def reset(self) -> None:
-        """Look at the dots again; a new reference follows."""
-        self._dot, self._looked = None, False
+        """Forget the dots; a new reference follows."""
+        self._dot, self._known = None, False
 
     def process(self, image: Image) -> MarkerMask:
         """255 where a marker covers the gel; all 0 where the first frame showed no markers."""
-        if not self._looked:
-            self._dot, self._looked = self._look(image), True
+        if not self._known:
+            self._dot, self._known = self._find(image), True
         if self._dot is None:
             return np.zeros(image.shape[:2], np.uint8)
         return marker_mask(image, self._dot)
 
-    def _look(self, image: Image) -> Dot | None:
+    def _find(self, image: Image) -> Dot | None:
         params = self._params
         radius = None if params.dot == "auto" else params.dot
         found = find_dot(image, radius=radius, polarity=params.polarity)

@@ -14,9 +14,7 @@ import pytest
 import zmq
 
 from tactflow.cli.main import main
-from tactflow.engine.errors import ConfigError
 from tactflow.fleet import supervisor
-from tactflow.fleet.names import with_name
 from tests.clock import PATIENCE, until
 
 GRAPH = """
@@ -465,30 +463,47 @@ def test_added_lines_go_to_a_file_for_each_sensor(path: str, names: list[str], f
     assert [len(rows(folder / name)) for name in names] == [2, 2]
 
 
-@pytest.mark.parametrize("path", [os.devnull, "/dev/stdout", "/dev/stderr"])
-def test_devices_are_the_same_for_all_sensors(path: str) -> None:
-    assert with_name(path, "a") == path
+NOISY = """
+import sys
+
+from tactflow.stages.capture import Capture
 
 
-def test_a_named_pipe_is_the_same_for_all_sensors(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    assert with_name(str(tmp_path / "pipe"), "a") == str(tmp_path / "pipe")
+class Noisy(Capture):
+    def open(self) -> None:
+        sys.stderr.buffer.write(b"no text: \\xff\\n")
+        print("and more", file=sys.stderr, flush=True)
+        super().open()
+"""
 
 
-@pytest.mark.parametrize("path", ["", ".", "..", "x/", "x/.", "{sensor}/", "there", "in-{sensor}"])
-def test_a_folder_is_no_file_for_each_sensor(
-    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "there").mkdir()
-    (tmp_path / "in-a").mkdir()
-    with pytest.raises(ConfigError, match="required a file, not a folder"):
-        with_name(path, "a")
+def test_what_is_no_text_on_standard_error_is_passed_on_with_what_follows(folder: Path) -> None:
+    (folder / "noisy.py").write_text(NOISY)
+    text = GRAPH.replace(
+        'capture: {source: "sim:press', "capture: {use: './noisy.py:Noisy', source: \"sim:press"
+    )
+    (folder / "pipeline.yaml").write_text(text)
+    done = subprocess.run(
+        [sys.executable, "-m", "tactflow", "run", "--quiet"],
+        cwd=folder,
+        capture_output=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert b"[left] no text: \xff\n" in done.stderr
+    assert b"[left] and more\n" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("path", "expected"),
-    [("-", "-"), ("out.jsonl", "out-a.jsonl"), ("x/{sensor}/o.json", "x/a/o.json"), ("plain", "plain-a")],
-)
-def test_files_of_the_command_line_get_the_sensors_name(path: str, expected: str) -> None:
-    assert with_name(path, "a") == expected
+def test_a_file_in_the_current_folder_is_not_taken_for_a_module_of_python(folder: Path) -> None:
+    (folder / "select.py").write_text("open('taken', 'w').close()\n")
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "tactflow", "run", "--quiet"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (folder / "taken").exists()

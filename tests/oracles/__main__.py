@@ -117,8 +117,26 @@ def compile_each() -> None:
     print(json.dumps(times))
 
 
-def markdown(rows: dict[str, Measured], compile_times: dict[str, float]) -> Iterator[str]:
-    """Lines of the page."""
+def first_use() -> float:
+    """s that `tactflow warmup` takes for the default pipeline where nothing is on disk."""
+    with tempfile.TemporaryDirectory() as folder:
+        begin = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "tactflow", "warmup", "--quiet", REPOSITORY / "pipeline.yaml"],
+            env={**os.environ, "NUMBA_CACHE_DIR": folder},
+            check=True,
+        )
+        return time.perf_counter() - begin
+
+
+def markdown(
+    rows: dict[str, Measured], compile_times: dict[str, float], warm_up: float, load: float
+) -> Iterator[str]:
+    """Lines of the page.
+
+    rows, compile_times : kernel -> what was measured. warm_up : of `first_use`. load : processes that others
+    kept running meanwhile.
+    """
     yield "# What compiling gains"
     yield ""
     yield "Each kernel against its plain version of numpy and OpenCV (tests/oracles/), with the arguments"
@@ -138,6 +156,9 @@ def markdown(rows: dict[str, Measured], compile_times: dict[str, float]) -> Iter
         )
         yield f"| `{kernel.__name__}` | {code} | {cells} | {compile_times[name]:.2f} |"
     yield f"| all {len(kernels())} | | | | | {sum(compile_times.values()):.1f} |"
+    yield ""
+    yield f"First use: `tactflow warmup` took {warm_up:.1f} s for the default pipeline, with nothing on disk,"
+    yield f"on {os.cpu_count()} processors, for which {load:.1f} other processes waited on average."
 
 
 def main() -> None:
@@ -146,7 +167,9 @@ def main() -> None:
     for gain in gains():
         rows[gain.name] = measure(gain)
         print(gain.name, rows[gain.name], file=sys.stderr)
-    TABLE.write_text("\n".join(markdown(rows, first_compile())) + "\n")
+    load = os.getloadavg()[0]
+    warm_up = first_use()
+    TABLE.write_text("\n".join(markdown(rows, first_compile(), warm_up, load)) + "\n")
 
 
 if __name__ == "__main__":

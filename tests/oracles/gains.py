@@ -44,7 +44,7 @@ class Gain:
     @property
     def name(self) -> str:
         """Dotted name of the kernel."""
-        return name_of(self.kernel)
+        return self.kernel.name
 
     def typical(self) -> Arguments:
         """Arguments of a typical call; the caller may write into them."""
@@ -72,18 +72,13 @@ class Gain:
         return f"{self.name}: {name} differs in {np.sum(~near)} of {near.size} numbers, by up to {most:.3g}"
 
 
-def name_of(kernel: Kernel[..., Any]) -> str:
-    """Dotted name of a kernel."""
-    return f"{kernel.plain.__module__}.{kernel.__name__}"
-
-
 def kernels() -> dict[str, Kernel[..., Any]]:
     """Dotted name -> each kernel of the package."""
     found: dict[str, Kernel[..., Any]] = {}
     for module in _modules(tactflow):
         for value in vars(module).values():
             if isinstance(value, Kernel) and value.plain.__module__ == module.__name__:
-                found[name_of(value)] = value
+                found[value.name] = value
     return found
 
 

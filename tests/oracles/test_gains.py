@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from tests.oracles.gains import Gain, gains, kernels, name_of
+from tests.oracles.gains import Gain, gains, kernels
 
 
 def test_each_kernel_has_one_oracle() -> None:
@@ -18,6 +18,6 @@ def test_each_kernel_has_one_oracle() -> None:
     assert begun - set(entries) == set()
 
 
-@pytest.mark.parametrize("gain", gains(), ids=lambda gain: name_of(gain.kernel))
+@pytest.mark.parametrize("gain", gains(), ids=lambda gain: gain.name)
 def test_a_kernel_agrees_with_its_oracle(gain: Gain) -> None:
     assert gain.differences() == []

@@ -61,7 +61,7 @@ def _recorded(pipeline: str, scene: str, frames: int) -> dict[str, Arguments]:
     call = Kernel.__call__
 
     def recorded(self: Kernel[..., Any], *args: Any) -> Any:
-        found[f"{self.plain.__module__}.{self.__name__}"] = duplicate(args)
+        found[self.name] = duplicate(args)
         return call(self, *args)
 
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results
 from tactflow.recording.repair import repair
 from tactflow.sinks.record import Record
 from tactflow.sources import StampedReader, open_source
@@ -47,7 +48,7 @@ def record(path: Path, made: Sequence[Frame], *, cut: bool = False) -> Path:
     sink = Record(Record.Params(path=str(path), preview=0))
     sink.open()
     for frame in made:
-        sink.write(Tick(frame), None, None, None, None)
+        sink.write(Tick(frame), Results())
     if cut:
         data = path.read_bytes()
         sink.close()
@@ -188,10 +189,10 @@ def test_at_its_own_pace_references_of_before_are_not_waited_for(tmp_path: Path)
     made = frames([0, *range(10_000, 10_003)])
     sink = Record(Record.Params(path=str(tmp_path / "a.mcap"), trigger="button"))
     sink.open()
-    sink.write(Tick(made[0]), None, None, None, None)
+    sink.write(Tick(made[0]), Results())
     sink.start_recording()
     for frame in made[1:]:
-        sink.write(Tick(frame), None, None, None, None)
+        sink.write(Tick(frame), Results())
     sink.close()
     # Waiting for frame 10 000 would take 1000 s, far beyond this test's time limit.
     same(captured(tmp_path / "a-001.mcap", realtime=True), made)

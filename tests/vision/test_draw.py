@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tactflow.vision.draw import Annotator, draw_arrows, draw_ellipse, draw_polygon
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.lettering import Lettering
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
 
 GRAY = np.full((240, 320, 3), 100, np.uint8)
@@ -220,3 +221,15 @@ def test_pictures_of_another_kind_are_refused() -> None:
         Annotator()(np.zeros((4, 4), np.uint8))
     with pytest.raises(ValueError, match="contact_mask of shape"):
         Annotator(view="contact")(GRAY, contact_mask=np.zeros((4, 4), np.uint8))
+
+
+def test_letters_of_opencv_4_are_plain_but_there() -> None:
+    letters = Lettering(strokes=True)
+    picture = np.zeros((40, 200, 3), np.uint8)
+    wide, tall = letters.size(picture, "area 12 px², 3.1°", 11)
+    letters.write(picture, "area 12 px², 3.1°", (5, 25), (255, 255, 255), 11)
+    rows, columns = np.nonzero(picture.any(axis=2))
+    # Antialiasing and commas reach a little further than the box.
+    assert columns.min() >= 5
+    assert columns.max() <= 5 + wide + 2
+    assert 25 - tall - 2 <= rows.min()

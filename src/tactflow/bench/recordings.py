@@ -176,7 +176,7 @@ def label_errors(centers: NDArray[np.float64], labels: NDArray[np.float64]) -> d
     Returns
     -------
     Quantities; distances are taken after the median offset, which depends on what the labeller took for the
-    imprint's middle.
+    contact outline's middle.
     """
     found = np.isfinite(centers).all(axis=1)
     errors = {"found_percent": 100.0 * float(np.mean(found))}

@@ -52,6 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="also measure on the real recordings in DIR (wedge_ball, wedge_roll, wedge_grasp)",
     )
+    _add_outputs(parser)
+    _add_other_measurements(parser)
+
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
+    """Declare where the results are written, and what they are compared with."""
     parser.add_argument(
         "--json",
         type=Path,
@@ -81,6 +87,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--write-baseline", type=Path, metavar="FILE", help="write the errors alone, for --against"
     )
+
+
+def _add_other_measurements(parser: argparse.ArgumentParser) -> None:
+    """Declare what can be measured instead of run time against error."""
     parser.add_argument(
         "--stress",
         nargs="?",
@@ -90,7 +100,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="instead: press and release, 100000 frames unless told otherwise, through the first PIPELINE; "
         "exit code 3 if error, memory or time creep",
     )
-
     parser.add_argument(
         "--skipping",
         nargs="?",

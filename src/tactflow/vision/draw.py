@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.flow import inside_mask
+from tactflow.vision.lettering import Lettering
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
 
 View = Literal["frame", "contact"]
@@ -53,8 +54,6 @@ _TEXT: Final = 11
 """Size of the text, px."""
 _LINE_SPACING: Final = 14
 """Distance of two lines of text, px."""
-_WEIGHT: Final = 400
-"""Weight of the font: regular."""
 _STATUS_COLOURS: Final = (
     (MarkerStatus.LOST, GRAY),
     (MarkerStatus.INFERRED, WHITE),
@@ -105,7 +104,7 @@ class Annotator:
         self._ellipse = ellipse
         self._text = text
         self._dilate = dilate
-        self._font = cv2.FontFace("sans")
+        self._letters = Lettering()
 
     def __call__(
         self,
@@ -211,16 +210,13 @@ class Annotator:
     def _write(self, picture: NDArray[np.uint8], lines: Sequence[tuple[str, Colour]], unit: float) -> None:
         size = round(_TEXT * unit)
         step = round(_LINE_SPACING * unit)
-        height, width = picture.shape[:2]
-        longest = 0
-        for text, _ in lines:
-            box = cv2.getTextSize((width, height), text, (0, 0), self._font, size, _WEIGHT)
-            longest = max(longest, box[2])
+        height = picture.shape[0]
+        longest = max((self._letters.size(picture, text, size)[0] for text, _ in lines), default=0)
         bar: NDArray[Any] = picture[: min(height, step * len(lines) + round(5 * unit)), : longest + step]
         bar[...] = bar // 3
         for index, (text, colour) in enumerate(lines):
             place = (round(5 * unit), round(2 * unit) + step * (index + 1) - round(3 * unit))
-            cv2.putText(picture, text, place, colour, self._font, size, _WEIGHT)
+            self._letters.write(picture, text, place, colour, size)
 
     def _halo_text(
         self, picture: NDArray[np.uint8], text: str, place: tuple[int, int], colour: Colour, unit: float
@@ -228,12 +224,12 @@ class Annotator:
         """Text kept inside the picture, on a shade."""
         size = round(_TEXT * unit)
         height, width = picture.shape[:2]
-        _, _, wide, tall = cv2.getTextSize((width, height), text, (0, 0), self._font, size, _WEIGHT)
+        wide, tall = self._letters.size(picture, text, size)
         x = min(max(place[0], 2), max(2, width - wide - 3))
         y = min(max(place[1], tall + 2), max(tall + 2, height - 3))
         shade: NDArray[Any] = picture[max(0, y - tall - 1) : y + 3, max(0, x - 2) : x + wide + 3]
         shade[...] = shade // 3
-        cv2.putText(picture, text, (x, y), colour, self._font, size, _WEIGHT)
+        self._letters.write(picture, text, (x, y), colour, size)
 
 
 def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0, unit: float = 1.0) -> None:

@@ -1,4 +1,4 @@
-"""Marker masks: cover every dot with its rim, nothing else, without shift."""
+"""Marker masks: cover every dot with its border, nothing else, without shift."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_dots_of_any_size_and_polarity_are_found_and_covered(radius: float, dark
     # Derived: pixels changed by more than 8 of some 100 levels are those at least a twelfth covered.
     assert mask[changed].all()
     assert len(_centers(mask)) == 5 * 6
-    # Measured 2.0 to 2.6 px; the rim is 3 px at most (1.5 px at half resolution).
+    # Measured 2.0 to 2.6 px; the border is 3 px at most (1.5 px at half resolution).
     area = mask.astype(bool).sum() / 30
     assert np.sqrt(area / np.pi) < radius + 3.5
 
@@ -131,7 +131,7 @@ def test_simulated_markers_are_covered_in_contact_and_out_of_it(scene: str) -> N
         height, width = mask.shape
         inside = np.all((at > radius) & (at < [width - radius, height - radius]), axis=1)
         near = np.array([mask[y - 4 : y + 5, x - 4 : x + 5].any() for x, y in at[inside]])
-        # Measured 1.0 in all of these; a marker under the steepest rim may be missed.
+        # Measured 1.0 in all of these; a marker at the steepest edge of a contact may be missed.
         assert near.mean() > 0.97
         change = np.abs(recording.frame(index).astype(int) - truth.unmarked.astype(int)).min(axis=2)
         # Noise of 2 levels exceeds 20 in all three channels nowhere: what changes that much is a marker.

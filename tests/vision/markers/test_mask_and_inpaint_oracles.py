@@ -95,9 +95,9 @@ def _inpainted(picture: Image, mask: Image, radius: float) -> NDArray[np.float64
 @pytest.mark.parametrize("radius", [0.5, 3.0, 7.0, 100.0])
 def test_inpainted_pictures_are_what_float64_gives_rounded(size: tuple[int, int], radius: float) -> None:
     rng = np.random.default_rng(1)
-    for seed, share in enumerate([0.0, 0.003, 0.1, 0.4, 0.98, 1.0]):
+    for seed, fraction in enumerate([0.0, 0.003, 0.1, 0.4, 0.98, 1.0]):
         picture = _picture(*size, seed=seed)
-        spots = (rng.random(size) < share).astype(np.uint8) * np.uint8(1 + 254 * (seed % 2))
+        spots = (rng.random(size) < fraction).astype(np.uint8) * np.uint8(1 + 254 * (seed % 2))
         for covered in (
             spots,
             np.asarray(cv2.dilate(spots, np.ones((5, 7), np.uint8)), np.uint8).reshape(size),

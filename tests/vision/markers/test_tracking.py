@@ -235,7 +235,7 @@ def test_a_steep_slope_of_the_light_does_not_pull_dark_marks(angle: float) -> No
     now = dragged((8.0, 5.0))
     rows, columns = np.mgrid[0:400, 0:300]
     for steepness in (0.02, 0.04):
-        # Waves of light across the picture: their flanks change by 2 or 4 % a pixel, as a contact's rim does.
+        # Waves of light across the picture: their flanks change by 2 or 4 % a pixel, as an edge does.
         phase = (np.cos(angle) * columns + np.sin(angle) * rows) / 12.0
         light = 1 + 12.0 * steepness * np.sin(phase)
         lit = np.clip(np.rint(picture(now, noise=0.0) * light[..., None]), 0, 255).astype(np.uint8)
@@ -398,8 +398,8 @@ def test_a_real_rolling_ball_leaves_every_mark_its_identity(shared_data: Path) -
         _check_field(markers, edges, 19.6)
         inferred += int((markers.status == MarkerStatus.INFERRED).sum())
         # The outermost dots never move far: a field that is shifted by a whole pitch would show here.
-        rim = np.concatenate([np.arange(10), np.arange(130, 140)])
-        assert np.abs(markers.displacement[rim]).max() < 8.0
+        border = np.concatenate([np.arange(10), np.arange(130, 140)])
+        assert np.abs(markers.displacement[border]).max() < 8.0
     assert len(frames) == 300
     # By eye, in every fourth or fifth frame one dot is hidden under the ball's shadow: measured 70 in all.
     assert inferred < 150
@@ -418,9 +418,9 @@ def test_a_joint_choice_beats_the_nearest_spot() -> None:
     # A row whose dots all moved by 0.7 pitch: for each of them the nearest spot is its neighbour's.
     origin = np.column_stack([10.0 * np.arange(6), np.zeros(6)])
     edges = np.column_stack([np.arange(5), np.arange(1, 6)])
-    settled = np.zeros(6, bool)
+    inliers = np.zeros(6, bool)
     chosen = choose_spots(
-        origin, edges, np.arange(6), settled, np.zeros((6, 2)), origin[None], origin + np.array([7.0, 0.0]),
+        origin, edges, np.arange(6), inliers, np.zeros((6, 2)), origin[None], origin + np.array([7.0, 0.0]),
         np.ones(6), pitch=10.0, farthest=13.0,
     )  # fmt: skip
     assert chosen.tolist() == [0, 1, 2, 3, 4, 5]

@@ -156,16 +156,14 @@ def detect_markers(
 ) -> Detection:
     """Find the marks of a gel, whatever their size, shape and arrangement.
 
-    The image is filtered with differences of Gaussians over a range of scales; the scale and polarity with
-    the strongest family of spots (many, alike, evenly spaced) win, and spots that do not fit the family (weak
-    ones, ones between the others, lonely ones, ones cut by the border) are left out.
+    Differences of Gaussians over a range of scales give families of spots. The strongest one (many, alike,
+    evenly spaced) wins, without weak and lonely spots, ones between the others and ones cut by the border.
 
     Parameters
     ----------
     image : (H, W, 3) uint8 BGR or (H, W) uint8, grey levels.
-    dot_radius : of a mark, px, 1 to a quarter of the shorter side; None finds it, but then wants at least
-        four marks in an even arrangement, lest dust passes for them. For marks made of several spots, the
-        radius of the whole mark.
+    dot_radius : of a (whole) mark, px, 1 to a quarter of the shorter side; None finds it, but then wants at
+        least four marks in an even arrangement, lest dust passes for them.
     polarity : "dark" or "bright" against the gel; "auto" takes the stronger family.
 
     Returns
@@ -190,8 +188,7 @@ def detect_markers(
     >>> found.polarity, found.centers.shape[1]
     ('dark', 2)
     """
-    gray = to_gray(image).astype(np.float32)
-    shortest = min(gray.shape)
+    gray, shortest = to_gray(image).astype(np.float32), min(image.shape[:2])
     if dot_radius is not None and not 1.0 <= dot_radius <= max(1.0, shortest / 4):
         raise ValueError(f"required dot_radius 1 to {max(1.0, shortest / 4):g} px, got {dot_radius:g}")
     if polarity not in ("auto", "dark", "bright"):

@@ -48,18 +48,15 @@ def remove_markers(
     ----------
     image : (H, W, 3) uint8, BGR grey levels.
     mask : (H, W) uint8, non-zero where the image is to be replaced.
-    method : `normalized` takes a smooth average of the valid pixels around, in about 0.1 ms, and is closest
-        to the truth where the gel is smooth; `telea` marches inwards from the border of the mask, 10 ms and
-        more; `ns` continues lines of equal brightness by a Navier-Stokes analogy, as slow; `none` returns a
-        copy of the image.
-    radius : neighbourhood, px, > 0. For `telea` and `ns` the distance from which colours are taken. For
-        `normalized` the scale of the average: about the radius of a dot. A larger one is smoother; a much
-        smaller one leaves the middle of a dot to its far surroundings.
+    method : `normalized` takes a smooth average of the valid pixels around, in about 0.1 ms; `telea` marches
+        inwards from the border of the mask, 10 ms and more; `ns` continues lines of equal brightness, as
+        slow; `none` returns a copy of the image.
+    radius : neighbourhood, px, > 0. For `normalized` about the radius of a dot: a larger one is smoother, a
+        much smaller one leaves the middle of a dot to its far surroundings.
 
     Returns
     -------
-    unmarked : (H, W, 3) uint8, a new array; equal to `image` wherever `mask` is 0. `normalized` computes in
-        float32 and gives what float64 would, to 1 grey level.
+    unmarked : (H, W, 3) uint8, a new array; equal to `image` wherever `mask` is 0.
 
     Raises
     ------
@@ -101,7 +98,10 @@ def remove_markers(
 
 
 def _normalized(image: Bytes, mask: Bytes, radius: float) -> Bytes:
-    """Normalized convolution on means over cells: the sum of the valid ones over their weight."""
+    """Normalized convolution on means over cells: the sum of the valid ones over their weight.
+
+    Computed in float32; gives what float64 would, to 1 grey level.
+    """
     height, width = mask.shape
     bottom, right = -height % CELL, -width % CELL
     hidden = np.ascontiguousarray(mask)

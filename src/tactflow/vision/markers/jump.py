@@ -54,8 +54,8 @@ def common_displacement(
 
     Examples
     --------
-    >>> rng = np.random.default_rng(0)
-    >>> position = rng.uniform(0, 100, (20, 2))
+    >>> x, y = np.meshgrid(np.arange(0, 50, 10.0), np.arange(0, 50, 10.0))
+    >>> position = np.column_stack([x.ravel(), y.ravel()])
     >>> common_displacement(position, position + [4.0, -3.0], pitch=10.0, farthest=13.0).round(6)
     array([ 4., -3.])
     """

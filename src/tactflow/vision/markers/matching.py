@@ -2,6 +2,11 @@
 
 All costs are in one unit: a link between neighbours whose displacements differ by half their distance costs
 0.5.
+
+References
+----------
+Pearl, "Probabilistic reasoning in intelligent systems" (1988); Felzenszwalb and Huttenlocher, "Efficient
+belief propagation for early vision", IJCV 70 (2006).
 """
 
 from __future__ import annotations
@@ -79,53 +84,39 @@ def choose_spots(
 ) -> IntArray:
     """Give each free mark one of the spots, or none.
 
-    The choice minimises a sum of unary costs (distance from where a mark is expected, faint spots, marks
-    without a spot) and of costs of links between neighbours (squared strain, bounded, with a penalty for
-    folding). Inliers take part through their links. Where everybody's own best spot is not smooth already,
-    the minimum is sought by min-sum belief propagation, whose cost grows with the number of free marks.
+    The choice minimises unary costs (distance from where a mark is expected, faint spots, marks without a
+    spot) and costs of links (squared strain, bounded, with a penalty for folding), also of links to inliers.
+    Where everybody's own best is not smooth already, min-sum belief propagation seeks the minimum.
 
     Parameters
     ----------
     origin : (N, 2) float64, marks in the reference, px. edges : (E, 2) int64, neighbours.
-    free : (n,) int64, marks that choose. inliers : (N,) bool, marks whose displacement is known.
-    displacement : (N, 2) float64, px, valid for inliers.
+    free : (n,) int64, marks that choose.
+    inliers : (N,) bool, marks whose `displacement` (N, 2) float64, px, is known.
     expected : (k, n, 2) float64, k predictions of where the free marks are, px; the nearest one counts.
     spots : (M, 2) float64, px. strength : (M,) float64, 1 for a typical mark, less for faint ones.
     pitch : px. farthest : a spot no farther than this from a prediction may be chosen, px.
 
-    Returns
-    -------
-    chosen : (n,) int64, number of the spot, -1 for none. No spot is chosen twice.
-
-    Raises
-    ------
-    IndexError : `edges` or `free` name marks that there are not.
-
-    References
-    ----------
-    Pearl, "Probabilistic reasoning in intelligent systems" (1988); Felzenszwalb and Huttenlocher, "Efficient
-    belief propagation for early vision", IJCV 70 (2006).
+    Returns (n,) int64, number of the spot, -1 for none; no spot is chosen twice. Raises IndexError where
+    `edges` or `free` name marks that there are not.
 
     Examples
     --------
-    Both marks are nearest to the first spot; as neighbours they move alike.
-
     >>> origin = np.array([[0.0, 0.0], [10.0, 0.0]])
     >>> choose_spots(origin, np.array([[0, 1]]), np.array([0, 1]), np.zeros(2, bool), np.zeros((2, 2)),
     ...     origin[None], np.array([[6.0, 0.0], [16.0, 0.0]]), np.ones(2), pitch=10.0, farthest=13.0)
     array([0, 1])
     """
     count = len(free)
-    chosen = np.full(count, -1, np.int64)
     if count == 0 or len(spots) == 0:
-        return chosen
+        return np.full(count, -1, np.int64)
     origin, displacement, expected, spots, strength = (
         np.ascontiguousarray(array, np.float64) for array in (origin, displacement, expected, spots, strength)
     )
     edges, free = np.ascontiguousarray(edges, np.int64), np.ascontiguousarray(free, np.int64)
-    inliers = np.ascontiguousarray(inliers, np.bool_)
-    slot = np.empty(len(origin), np.int64)
+    inliers, slot = np.ascontiguousarray(inliers, np.bool_), np.empty(len(origin), np.int64)
     label, unary = np.empty((count, LABELS), np.int64), np.empty((count, LABELS + 1))
+    chosen = np.full(count, -1, np.int64)
     labels = unary_costs(
         origin, edges, free, inliers, displacement, expected, spots, strength, pitch, farthest,
         slot, label, unary, chosen,

@@ -356,8 +356,7 @@ def align_marks(
     height, width, channels = image.shape
     reach, phases, rounds = whole[0], whole[1], whole[2]
     radius, converged, sampling = np.float32(real[0]), real[1] * real[1], np.float32(real[2] * real[2])
-    count = weights.shape[0] // (phases * phases)
-    flat = image.reshape(-1)
+    count, flat = weights.shape[0] // (phases * phases), image.reshape(-1)
     offsets = np.empty(disc.shape[1], np.int64)
     for p in range(len(offsets)):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
