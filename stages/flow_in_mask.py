@@ -7,7 +7,7 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
 from tactflow.vision import compiled
-from tactflow.vision.contact import inside_kernels
+from tactflow.vision.contact import inside
 from tactflow.vision.flow import flow_in_mask, similarity
 from tactflow.vision.types import Flow, Markers
 
@@ -30,7 +30,7 @@ class FlowInMask(Stage):
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(similarity, inside_kernels)
+        compiled.load(similarity, inside)
 
     def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside."""

@@ -9,8 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from tactflow.vision import compiled
+from tactflow.vision.compiled import Kernel
 
 
 class _Double:
@@ -38,19 +40,19 @@ DOUBLES = {"np": NUMPY, "cv2": OPENCV}
 def in_double(*modules: ModuleType) -> Iterator[None]:
     """Inside the `with` block the functions of these modules compute in float64 where they use float32.
 
-    Compiled kernels have fixed types, and are not used.
+    Compiled kernels have fixed types: those of these modules run as the Python code that they are.
     """
-    before = [
-        (module, name, getattr(module, name))
-        for module in modules
-        for name in DOUBLES
-        if hasattr(module, name)
-    ]
-    try:
-        for module, name, _ in before:
-            setattr(module, name, DOUBLES[name])
+    names = {module.__name__ for module in modules}
+    call = Kernel.__call__
+
+    def plain(self: Kernel[..., Any], *args: Any) -> Any:
+        return self.plain(*args) if self.plain.__module__ in names else call(self, *args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in modules:
+            for name, double in DOUBLES.items():
+                if hasattr(module, name):
+                    patch.setattr(module, name, double)
+        patch.setattr(Kernel, "__call__", plain)
         with compiled.switched(False):
             yield
-    finally:
-        for module, name, single in before:
-            setattr(module, name, single)

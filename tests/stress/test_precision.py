@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from tactflow.classic import functions
 from tactflow.vision.change import ChangeProbe, noise, tiles
 from tactflow.vision.change import probe as change_probe
-from tactflow.vision.contact import background, contact_outline, illumination
+from tactflow.vision.contact import (
+    background,
+    background_kernels,
+    components,
+    contact_outline,
+    illumination,
+    resolution,
+)
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask, inside_mask
@@ -23,6 +30,8 @@ from tactflow.vision.markers import inpaint, template, tracking
 from tactflow.vision.markers import mask as marker_mask
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
 from tactflow.vision.types import Contact, Ellipse, Markers
+from tests.oracles import contact_outline as oracle
+from tests.oracles.contact_outline import change_of
 from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, SIZE, apart, axis_difference, gel
 from tests.stress.doubles import in_double
 
@@ -125,12 +134,14 @@ def both(compute: Callable[[], Any], *modules: Any) -> tuple[Any, Any]:
 def test_single_precision_costs_the_contact_nothing(method: str) -> None:
     pictures = gel(dots=False)
 
+    rooms = components, contact_outline, illumination, resolution
+
     def compute() -> contact.ContactResult:
         detector = DIFFERENCES[method]()
         detector.add_reference(pictures.reference)
         return detector.detect(pictures.touched)
 
-    single, double = both(compute, contact, background, illumination, contact_outline)
+    single, double = both(compute, contact, background, background_kernels, *rooms)
     # The bound of the docstring; measured 0 px and 1.4e-7.
     assert apart(single.mask, double.mask) <= 1
     assert single.strength == pytest.approx(double.strength, rel=1e-5)
@@ -148,9 +159,11 @@ def test_single_precision_costs_the_outline_nothing(kind: str) -> None:
         answer = np.stack([slope * np.cos(turn + phase) for phase in (0, 2.1, 4.2)], axis=-1)
     answer += np.random.default_rng(0).normal(0, 0.003, answer.shape)
     inside = (away < 26).astype(np.uint8)
-    single, double = both(
-        lambda: contact_outline.imprint(answer.astype(contact_outline.np.float32), inside), contact_outline
-    )
+
+    def compute() -> NDArray[Any]:
+        return contact_outline.contact_level(change_of(answer.astype(contact_outline.np.float32), inside))
+
+    single, double = both(compute, contact_outline, oracle)
     assert (single > 0).any()
     assert double.dtype == np.float64
     # The bound of the docstring.
@@ -164,7 +177,7 @@ def test_single_precision_costs_the_fit_of_the_light_nothing() -> None:
     )
 
     def compute() -> NDArray[Any]:
-        return illumination.LightChange(untouched, np.full_like(untouched, 0.25)).fit(touched)
+        return illumination.IlluminationModel(untouched, np.full_like(untouched, 0.25)).fit(touched)
 
     single, double = both(compute, illumination)
     assert double.dtype == np.float64

@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from tactflow.sim import open_scene
 from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold, contact_outline
 from tactflow.vision.contact import detector as contact
-from tactflow.vision.contact.contact_outline import _solid
+from tactflow.vision.contact.filling import is_solid
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import find_dot, marker_mask
 
 Image = NDArray[np.uint8]
-
-pytestmark = pytest.mark.usefixtures("each_way")
 
 
 def _gel(shape: tuple[int, int] = (160, 128)) -> NDArray[np.float64]:
@@ -98,7 +96,7 @@ def test_noise_is_measured_in_the_reference_frames() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.5, 2.0, 5.0])
-def test_the_imprint_of_a_ball_is_found_with_its_middle(noise: float) -> None:
+def test_the_contact_of_a_ball_is_found_with_its_middle(noise: float) -> None:
     gel = _gel()
     center, radius = (61.0, 83.0), 24.0
     result = _detector(_noisy(gel, 1, noise)).detect(_noisy(_pressed(gel, center, radius), 2, noise))
@@ -497,17 +495,17 @@ def test_looking_closely_only_around_a_contact_gives_what_looking_everywhere_giv
     scene: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The profile across the rim is taken from every line of a small region, but some of a large one.
-    monkeypatch.setattr(contact_outline, "_ENOUGH", 10**9)
+    monkeypatch.setattr(contact_outline, "ENOUGH_PIXELS", 10**9)
     around, everywhere = _Sensor(scene, 90), _Sensor(scene, 90)
-    windows = contact._blobs
+    windows = contact.contact_components
 
     def whole(square: NDArray[np.float32], *thresholds: Any) -> list[Any]:
         rows, columns = slice(0, square.shape[0]), slice(0, square.shape[1])
         found = []
-        for blob_rows, blob_columns, inside in windows(square, *thresholds):
+        for part_rows, part_columns, inside in windows(square, *thresholds):
             shares.append(inside.size / square.size)
             belongs = np.zeros(square.shape, np.bool_)
-            belongs[blob_rows, blob_columns] = inside
+            belongs[part_rows, part_columns] = inside
             found.append((rows, columns, belongs))
         return found
 
@@ -516,7 +514,7 @@ def test_looking_closely_only_around_a_contact_gives_what_looking_everywhere_giv
     for index in range(12, 60, 4):
         near = around.look_below_markers(index)
         with monkeypatch.context() as patch:
-            patch.setattr(contact, "_blobs", whole)
+            patch.setattr(contact, "contact_components", whole)
             far = everywhere.look_below_markers(index)
         touching += near.touching
         assert np.array_equal(near.mask, far.mask)
@@ -562,7 +560,7 @@ def test_real_presses_of_a_ball_are_all_found_where_the_labels_say(shared_data: 
         growth.append(math.sqrt(x.size / math.pi) - float(label["radius"]))
     distance = np.hypot(*(np.array(errors) - np.median(errors, axis=0)).T)
     # Measured over all 200: 2.1 px median, 5.1 px at the 95th percentile, against labels that scatter by
-    # about 2 px themselves; the imprint's radius is 2.8 px above the label's in the median.
+    # about 2 px themselves; the outline's radius is 2.8 px above the label's in the median.
     assert np.median(distance) < 2.6
     assert np.percentile(distance, 95) < 6.5
     assert abs(np.median(growth)) < 5
@@ -570,8 +568,8 @@ def test_real_presses_of_a_ball_are_all_found_where_the_labels_say(shared_data: 
 
 def test_a_region_with_a_neck_of_one_pixel_is_not_solid() -> None:
     region = np.array([[0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1], [0, 0, 1, 1]], np.uint8)
-    assert not _solid(region)
-    assert _solid(np.ones((4, 4), np.uint8))
+    assert not is_solid(region)
+    assert is_solid(np.ones((4, 4), np.uint8))
 
 
 def test_real_grasps_agree_with_the_force_of_the_grip(shared_data: Path) -> None:

@@ -12,12 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
+from tactflow.vision.contact import inside
 from tactflow.vision.contact.inside import inside_outline, outline_depth
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.types import Markers
-
-pytestmark = pytest.mark.usefixtures("each_way")
+from tests.oracles.inside import plain_outline_depths
 
 Y, X = np.mgrid[:160, :200]
 RADIUS = 4.65
@@ -56,7 +55,7 @@ def test_a_dent_or_a_bulge_below_a_mark_does_not_move_it(dent: float) -> None:
 
 
 @pytest.mark.parametrize("radius", [11.0, 14.0, 20.0, 40.0])
-def test_the_bridge_over_a_rim_is_as_round_as_the_rim(radius: float) -> None:
+def test_the_bridge_over_a_border_is_as_round_as_the_border(radius: float) -> None:
     rng = np.random.default_rng(8)
     errors = []
     for _ in range(60):
@@ -105,7 +104,7 @@ def test_where_nothing_is_hidden_the_pixels_decide(seed: int) -> None:
     np.testing.assert_array_equal(told[clear], inside_mask(points, mask)[clear])
 
 
-def test_a_mark_at_the_rim_of_a_hole_knows_its_side() -> None:
+def test_a_mark_at_the_border_of_a_hole_knows_its_side() -> None:
     mask = picture(disc(100.3, 80.2, 70) & ~disc(100.3, 80.2, 30))
     assert not inside_outline(on_circle(29), mask, HIDDEN).any()
     assert inside_outline(on_circle(31), mask, HIDDEN).all()
@@ -149,10 +148,7 @@ def scribble(rng: np.random.Generator) -> NDArray[np.uint8]:
     return mask
 
 
-def test_with_numba_and_without_it_distances_are_the_same() -> None:
-    with compiled.switched(True):
-        if not compiled.active():
-            pytest.skip('numba is not here: pip install "tactflow[fast]"')
+def test_the_loops_find_what_the_plain_version_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(11)
     bridged = 0
     for _ in range(400):
@@ -164,11 +160,11 @@ def test_with_numba_and_without_it_distances_are_the_same() -> None:
         hidden = float(rng.choice([0.0, 1.0, 3.5, 7.15, 12.0, 300.0]))
         if rng.random() < 0.3:
             mask, marks = np.asfortranarray(mask), np.asfortranarray(marks)
-        with compiled.switched(True):
-            fast = outline_depth(marks, mask, hidden, hidden + 5)
-        with compiled.switched(False):
+        fast = outline_depth(marks, mask, hidden, hidden + 5)
+        with monkeypatch.context() as patch:
+            patch.setattr(inside, "outline_depths", plain_outline_depths)
             slow = outline_depth(marks, mask, hidden, hidden + 5)
-            bridged += np.count_nonzero(slow != outline_depth(marks, mask, 0.0, hidden + 5))
+        bridged += np.count_nonzero(fast != outline_depth(marks, mask, 0.0, hidden + 5))
         # Derived: the ridge, 1e-6, and the tie, 1e-6 px, are what decides about an outline of two points
         # around a mark; all else agrees to the 16 digits of doubles times a condition of at most 1e8.
         np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-5)
@@ -192,7 +188,7 @@ def test_nobody_is_inside_of_nothing() -> None:
     assert not inside_outline(np.zeros((3, 2)), np.zeros((0, 0), np.uint8), 3.0).any()
 
 
-def test_the_flow_counts_a_mark_at_the_rim_by_the_outline_around_it() -> None:
+def test_the_flow_counts_a_mark_at_the_border_by_the_outline_around_it() -> None:
     origin = np.concatenate([on_circle(39, 6), on_circle(15, 4)])
     bent = disc(100.3, 80.2, 40)
     for x, y in origin:

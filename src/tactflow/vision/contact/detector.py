@@ -3,67 +3,78 @@
 The default method first asks *whether*, by a test against the sensor's own noise at a stated rate of false
 alarms, and then *where*, by a rule that does not depend on the noise:
 
-1. Frames are compared as means over cells of 4 x 4 px, lightly smoothed.
-2. A change of the light that is smooth over the whole frame is fitted robustly and taken out.
+1. Frames are compared as means over cells of 4 x 4 px, lightly smoothed (`background`).
+2. A change of the illumination that is smooth over the whole frame is fitted robustly and taken out.
 3. What is left, divided by its standard deviation, is chi-square distributed with three degrees of freedom
    where nothing touches. One threshold, corrected for the number of cells, says whether anything does.
 4. Beside that, changes of colour alone: lamps flicker and shadows fall in brightness, hardly in colour. A
    fainter change of colour is contact if it is wide, which neither noise nor compressed blocks are.
 5. Contact ends at the noise, or at a part of the strongest recent change, since a released gel creeps back;
    but not while it fades faster than by creeping: then it is still being unloaded.
-6. Each connected change around such a place is looked at again at half resolution; `imprint` finds its rim.
+6. Each connected change around such a place is examined again at half resolution, where `contact_outline`
+   finds its border.
 
 References
 ----------
 T. Aach, A. Kaup, R. Mester, "Statistical model-based change detection in moving video", Signal Processing 31
 (1993), for the test; K. Friston et al., "Assessing the significance of focal activations using their spatial
-extent", Human Brain Mapping 1 (1994), for the test by extent. `light` and `imprint` name the sources of
-theirs.
+extent", Human Brain Mapping 1 (1994), for the test by extent. `illumination` and `contact_outline` name the
+sources of theirs.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision import compiled
-from tactflow.vision.contact import background_kernels, contact_outline_kernels
-from tactflow.vision.contact.background import CELL, UntouchedGel
-from tactflow.vision.contact.contact_outline import fill_level, hidden_cells, outline_level
+from tactflow.vision.contact import (
+    background_kernels,
+    components,
+    contact_outline,
+    continuation,
+    illumination,
+    resolution,
+)
+from tactflow.vision.contact.background import CELL, BackgroundModel, Change
+from tactflow.vision.contact.components import Component, contact_components, union, wide_change
+from tactflow.vision.contact.contact_outline import contact_level
+from tactflow.vision.contact.resolution import draw_level, halve_mask
 from tactflow.vision.geometry import downsample
 
 ContactMethod = Literal["noise", "colour"]
 Float = NDArray[np.float32]
 
-_WEAK = 0.02
-"""Places with less of the summed squared deviation than this part of the main one's are wrinkles of it."""
-_LEAVE = 0.7
-"""Part of the threshold, in standard deviations, that is enough to stay in contact."""
-_BLOBS = 12
-"""At most so many places are outlined."""
-_LEAST = 8
-"""Cells that must change together; 128 px^2 is the halo of a ball's first touch."""
-_FADE = 0.96
-"""How fast the strongest recent change is forgotten, per frame: half in 17 frames."""
-_SLOW_FADE = 0.98
-"""The same for wide, faint changes, which a gel that creeps back shows longest."""
-_TINTED = 12.0
-"""Squared deviation of the colour from which a cell counts as part of a wide change: 1 of 400 by chance."""
-_WIDE = 0.01
+CONNECTED: Final = 0.25
+"""Part of the threshold, squared deviations, from which a cell belongs to a contact beside it: half the
+threshold in standard deviations. Chosen by hand."""
+STAY: Final = 0.7
+"""Part of the threshold, in standard deviations, that is enough to stay in contact. Chosen by hand."""
+FORGET: Final = 0.96
+"""How fast the strongest recent change is forgotten, per frame: half in 17 frames. Chosen by hand."""
+FORGET_WIDE: Final = 0.98
+"""The same for wide, faint changes, which a gel that creeps back shows longest. Chosen by hand."""
+WIDE: Final = 0.01
 """Part of the picture that a wide change covers at least: more than the noise of compression, which comes in
-blocks of 16 px of the camera."""
-_CLUSTER = 0.7
+blocks of 16 px of the camera (docs/contact-limits.md: 4 cells without contact where 48 would be contact)."""
+CLUSTER: Final = 0.7
 """Cells by which a wide change must be larger for each factor of e in the rate of false alarms: measured on
 white noise, smoothed as the cells are."""
-_GONE = 0.5
-"""A faint change of which less is left after a frame has no longer the outline that it had, and is gone."""
-_BRIDGE = 8.0
-"""Radius of the gaps in an outline that a removed marker may have left, px."""
+GONE: Final = 0.5
+"""A faint change of which less remains after a frame no longer has the outline that it had, and is gone.
+Chosen by hand."""
+BRIDGE: Final = 4.0
+"""Half the width of the gaps in an outline that a removed marker may have left, pixels at half resolution.
+Chosen by hand."""
+COLOUR_BLUR: Final = 5
+"""For `colour`: side of the square over which changes are averaged, px. Chosen by hand."""
+COLOUR_OPENING: Final = 7
+"""For `colour`: side of the smallest square that is contact, px. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +91,11 @@ class ContactResult:
 
 
 def chi_square_threshold(probability: float) -> float:
-    """Value that a chi-square variable with three degrees of freedom exceeds with a probability in (0, 1)."""
+    """Value that a chi-square variable with three degrees of freedom exceeds with a probability in (0, 1).
+
+    >>> round(chi_square_threshold(0.05), 3)
+    7.815
+    """
     if not 0 < probability < 1:
         raise ValueError(f"required a probability in (0, 1), got {probability}")
     low, high = 0.0, 1500.0
@@ -118,6 +133,17 @@ class ContactDetector:
     Raises
     ------
     ValueError : a parameter out of its range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> gel = np.full((64, 48, 3), 120, np.uint8)
+    >>> pressed = gel.copy()
+    >>> pressed[20:40, 20:40] = 180
+    >>> detector = ContactDetector()
+    >>> detector.add_reference(gel)
+    >>> detector.detect(gel).touching, detector.detect(pressed).touching
+    (False, True)
     """
 
     def __init__(
@@ -157,19 +183,27 @@ class ContactDetector:
         self._creep = creep
         self._distance = distance
         if method == "noise":
-            compiled.load(background_kernels, downsample, contact_outline_kernels)
+            compiled.load(
+                background_kernels,
+                components,
+                contact_outline,
+                continuation,
+                downsample,
+                illumination,
+                resolution,
+            )
         self.reset()
 
     def reset(self) -> None:
         """Forget the reference."""
         self._last: NDArray[np.uint8] | None = None
-        self._gel: UntouchedGel | None = None
+        self._background: BackgroundModel | None = None
         self._before: NDArray[np.bool_] | None = None
         self._limits: dict[int, float] = {}
         self._strongest = self._strongest_wide = 0.0
         self._evidence: Float | None = None
         self._suspected: NDArray[np.bool_] | None = None
-        self._outline: NDArray[np.uint8] | None = None
+        self._mask: NDArray[np.uint8] | None = None
 
     @property
     def has_reference(self) -> bool:
@@ -186,10 +220,10 @@ class ContactDetector:
         if self._method != "noise":
             self._last = image.copy()
             return
-        if self._gel is None:
-            self._gel = UntouchedGel(image, self._repeatability, self._tint, self._shift)
+        if self._background is None:
+            self._background = BackgroundModel(image, self._repeatability, self._tint, self._shift)
         else:
-            self._gel.add(image)
+            self._background.add(image)
         self._last = image
 
     def detect(self, image: NDArray[np.uint8], hidden: NDArray[np.uint8] | None = None) -> ContactResult:
@@ -221,81 +255,86 @@ class ContactDetector:
             raise ValueError(f"required the reference's shape {self._last.shape}, got {image.shape}")
 
     def _against_noise(self, image: NDArray[np.uint8], hidden: NDArray[np.uint8] | None) -> ContactResult:
-        assert self._gel is not None
+        assert self._background is not None
         before, self._before = self._before, None
-        change = self._gel.compare(image, before, self._evidence)
-        square, colour, evidence, left = change.square, change.colour, change.evidence, change.left
-        largest, largest_colour = change.largest, change.largest_colour
-        strength = math.sqrt(max(largest, largest_colour))
-        self._evidence = evidence
-        blobs = self._clear(square, largest, before, left)
-        clear = bool(blobs)
-        if clear:
-            self._suspected = None
+        change = self._background.compare(image, before, self._evidence)
+        self._evidence = change.evidence
+        strength = math.sqrt(max(change.largest, change.largest_colour))
+        found = self._clear(change, before)
+        faint = not found
+        if faint:
+            found = self._faint(change, before)
         else:
-            blobs = self._faint(colour, evidence, before, left)
-        self._strongest = max(self._strongest * _FADE, largest if blobs else 0.0)
-        self._strongest_wide = max(self._strongest_wide * _SLOW_FADE, largest_colour if blobs else 0.0)
-        if not blobs:
-            self._outline = None
+            self._suspected = None
+        self._strongest = max(self._strongest * FORGET, change.largest if found else 0.0)
+        self._strongest_wide = max(
+            self._strongest_wide * FORGET_WIDE, change.largest_colour if found else 0.0
+        )
+        if not found:
+            self._mask = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
-        self._before = _union(blobs, square.shape)
-        if not clear and left < 1 - self._creep and self._outline is not None:
-            return ContactResult(self._outline.copy(), True, strength)
+        self._before = union(found, change.squared.shape)
+        if faint and change.remaining < 1 - self._creep and self._mask is not None:
+            return ContactResult(self._mask.copy(), True, strength)
         mask = np.zeros(image.shape[:2], np.uint8)
-        for rows, columns, inside in blobs:
-            top, start = CELL * rows.start, CELL * columns.start
-            lengths = self._gel.lengths(change, rows, columns, inside)
-            below = None if hidden is None else hidden_cells(hidden, top, start, inside)
-            fill_level(outline_level(lengths, _BRIDGE / 2, below), top, start, mask)
-        self._outline = mask if cv2.countNonZero(mask) else None
-        return ContactResult(mask, self._outline is not None, strength)
+        for component in found:
+            self._draw(change, component, hidden, mask)
+        self._mask = mask if cv2.countNonZero(mask) else None
+        return ContactResult(mask, self._mask is not None, strength)
 
-    def _clear(
-        self, square: Float, largest: float, before: NDArray[np.bool_] | None, left: float
-    ) -> list[_Blob]:
+    def _draw(
+        self, change: Change, component: Component, hidden: NDArray[np.uint8] | None, mask: NDArray[np.uint8]
+    ) -> None:
+        """Set a component's contact to 255 in the mask."""
+        assert self._background is not None
+        rows, columns, inside = component
+        top, left = CELL * rows.start, CELL * columns.start
+        strength = self._background.relative_change(change, rows, columns, inside)
+        below = None if hidden is None else halve_mask(hidden, top, left, inside)
+        draw_level(contact_level(strength, BRIDGE, below), top, left, mask)
+
+    def _clear(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
         """Contact by the size of the change, so that its outline can be seen.
 
-        largest : value of `square`. before : cells in contact in the frame before. left : part of the change
-        there that is left.
+        before : cells in contact in the previous frame.
         """
-        limit, remembered = self._limit(square.size), self._relaxation**2 * self._strongest
-        start, stay = max(limit, remembered), limit * _LEAVE**2
-        if not self._relaxation < left < 1 - self._creep:
+        limit, remembered = self._limit(change.squared.size), self._relaxation**2 * self._strongest
+        start, stay = max(limit, remembered), limit * STAY**2
+        if not self._relaxation < change.remaining < 1 - self._creep:
             stay = max(stay, remembered)
-        if largest < (start if before is None else stay):
+        if change.largest < (start if before is None else stay):
             return []
-        return _blobs(square, limit / 4, start, stay, before)
+        return contact_components(change.squared, CONNECTED * limit, start, stay, before)
 
-    def _faint(
-        self, colour: Float, evidence: Float, before: NDArray[np.bool_] | None, left: float
-    ) -> list[_Blob]:
+    def _faint(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
         """Contact by the extent of a change of colour, in two frames; or one that fades while it is lifted.
 
-        before, left : as for `_clear`.
+        before : as for `_clear`.
         """
         suspected, self._suspected = self._suspected, None
-        if left <= _GONE:
+        if change.remaining <= GONE:
             return []
-        fading = left < 1 - self._creep
-        belongs = _wide_change(colour, self._extent(colour.size))
+        fading = change.remaining < 1 - self._creep
+        limit = self._limit(change.colour.size)
+        belongs = wide_change(change.colour, self._extent(change.colour.size))
         if belongs is not None:
-            if not fading and colour[belongs].max() < self._relaxation**2 * self._strongest_wide:
+            remembered = self._relaxation**2 * self._strongest_wide
+            if not fading and change.colour[belongs].max() < remembered:
                 belongs = None
             self._suspected = belongs
         if before is None:
             # One frame may be a flash, a cable's shadow, a damaged picture.
             if belongs is None or suspected is None or not (belongs & suspected).any():
                 return []
-        elif fading and evidence[before].max() >= self._limit(colour.size) * _LEAVE**2:
+        elif fading and change.evidence[before].max() >= limit * STAY**2:
             belongs = before if belongs is None else before | belongs
         if belongs is None:
             return []
-        return _blobs(evidence, self._limit(colour.size) / 4, math.inf, 0.0, belongs)
+        return contact_components(change.evidence, CONNECTED * limit, math.inf, 0.0, belongs)
 
     def _extent(self, cells: int) -> float:
         """Cells that a change of colour covers which is contact for its extent."""
-        return max(_WIDE * cells, _CLUSTER * math.log(cells / self._false_alarms))
+        return max(WIDE * cells, CLUSTER * math.log(cells / self._false_alarms))
 
     def _limit(self, cells: int) -> float:
         if cells not in self._limits:
@@ -303,80 +342,13 @@ class ContactDetector:
         return self._limits[cells]
 
 
-_Blob = tuple[slice, slice, NDArray[np.bool_]]
-
-
-def _union(blobs: list[_Blob], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """(h, w) bool: cells of all blobs."""
-    cells = np.zeros(shape, np.bool_)
-    for rows, columns, inside in blobs:
-        cells[rows, columns] |= inside
-    return cells
-
-
-def _wide_change(colour: Float, extent: float) -> NDArray[np.bool_] | None:
-    """(h, w) bool: cells of connected changes of colour that cover `extent` cells at least; None: no such."""
-    changed = (colour > _TINTED).view(np.uint8)
-    if cv2.countNonZero(changed) < extent:
-        return None
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
-    wide = stats[:, cv2.CC_STAT_AREA] >= extent
-    wide[0] = False
-    return np.asarray(wide[labels], np.bool_) if wide.any() else None
-
-
-def _closed_changes(square: Float, weak: float) -> NDArray[np.uint8]:
-    """(h, w) uint8: 1 where a squared deviation is above `weak`, after closing by 3 x 3 cells, else 0."""
-    if compiled.active():
-        closed = np.empty(square.shape, np.uint8)
-        background_kernels.close_changes(square, weak, closed)
-        return closed
-    above = (square > weak).view(np.uint8)
-    return np.asarray(cv2.morphologyEx(above, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
-
-
-def _blobs(
-    square: Float, weak: float, start: float, stay: float, before: NDArray[np.bool_] | None
-) -> list[_Blob]:
-    """Connected changes that are contact: rows and columns of a window of cells, and which of them belong.
-
-    square : (h, w) float32, squared deviations. weak : belongs to a contact if connected to it. start : makes
-    a new contact. stay : keeps one. before : the cells that were in contact in the frame before.
-    """
-    changed = _closed_changes(square, weak)
-    outlines, _ = cv2.findContours(changed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    height, width = square.shape
-    least = min(_LEAST, square.size // 4)
-    found: list[_Blob] = []
-    for outline in outlines:
-        left, top, wide, high = cv2.boundingRect(outline)
-        if wide * high < least:
-            continue
-        rows = slice(max(top - 1, 0), min(top + high + 1, height))
-        columns = slice(max(left - 1, 0), min(left + wide + 1, width))
-        inside = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
-        cv2.drawContours(inside, [outline], 0, 1, cv2.FILLED, offset=(-columns.start, -rows.start))
-        inside &= changed[rows, columns]
-        area = cv2.countNonZero(inside)
-        if area < least:
-            continue
-        belongs = inside.view(np.bool_)
-        peak = cv2.minMaxLoc(square[rows, columns], inside)[1]
-        stays = before is not None and peak >= stay and bool((before[rows, columns] & belongs).any())
-        if peak >= start or stays:
-            found.append((rows, columns, belongs))
-    if len(found) < 2:
-        return found
-    energies = [float(square[rows, columns][belongs].sum()) for rows, columns, belongs in found]
-    order = sorted(range(len(found)), key=lambda index: -energies[index])
-    return [found[index] for index in order[:_BLOBS] if energies[index] >= _WEAK * energies[order[0]]]
-
-
 def _colour_distance(
     image: NDArray[np.uint8], reference: NDArray[np.uint8], distance: float
 ) -> ContactResult:
-    change = cv2.blur(cv2.absdiff(image, reference), (5, 5)).astype(np.float32)
+    change = cv2.blur(cv2.absdiff(image, reference), (COLOUR_BLUR, COLOUR_BLUR)).astype(np.float32)
     squared = np.einsum("ijk,ijk->ij", change, change)
     mask = np.where(squared > distance**2, 255, 0).astype(np.uint8)
-    mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8)), np.uint8)
+    mask = np.asarray(
+        cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((COLOUR_OPENING, COLOUR_OPENING), np.uint8)), np.uint8
+    )
     return ContactResult(mask, bool(mask.any()))

@@ -1,131 +1,155 @@
-"""Changes of the light that are smooth over the whole frame, found although something touches the gel."""
+"""Smooth changes of the illumination over the whole frame, fitted although something touches the gel."""
 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.background_kernels import coarse_excess, fit_light
+from tactflow.vision.compiled import kernel
 
 Float = NDArray[np.float32]
 
-_BLOCK = 8
-_CLIP = 2.0
-_ROUNDS = 12
-_SETTLED = 0.05
-_RIDGE = 0.01
+BLOCK: Final = 8
+"""Side of the blocks whose means are fitted, cells. Chosen by hand."""
+CLIP: Final = 2.0
+"""Standard deviations of a cell at which a residual is clipped. Chosen by hand."""
+MAX_STEPS: Final = 12
+"""Least-squares steps at most. Chosen by hand; the fit mostly converges earlier."""
+CONVERGED: Final = 0.05
+"""The fit ends when no coefficient moves by as much, grey levels. Chosen by hand."""
+RIDGE: Final = 0.01
+"""Weight, relative to the data, that draws slopes and gain towards zero: a gain and a slope of opposite sign
+are nearly the same on a gel lit from the side, and would follow any band or spot. Chosen by hand."""
 
 
-class LightChange:
-    """Robust fit of gain, offset and plane per channel between a frame and the reference.
+class IlluminationModel:
+    """Robust fit of offset, slope and gain per channel between a frame and the untouched gel.
 
-    The four unknowns of a channel are fitted to means over blocks of 8 x 8 cells by Huber's modified
-    residuals: residuals are clipped to twice their standard deviation before each least-squares step, so
-    that a contact, however strong, pulls no harder than noise would; the matrix of the step is known
-    beforehand. The start is the median, so that a contact may cover nearly half of the frame. Planes and
-    gains are drawn towards zero a little: on a gel lit from the side they are nearly the same thing, and
-    large ones of opposite sign would follow any band or spot. Computed in float32, to 1e-3 grey levels of
-    what float64 gives.
+    The four coefficients of a channel are fitted to means over blocks of 8 x 8 cells by Huber's method of
+    modified residuals: residuals are clipped to twice their standard deviation before each least-squares
+    step, so a contact, however strong, pulls no harder than noise; the matrix of the step is constant. The
+    fit starts at the median, so a contact may cover nearly half of the frame. Computed in float32, to
+    1e-3 grey levels of what float64 gives.
+
+    Parameters
+    ----------
+    reference, variance : (3, h, w) float32, mean (grey levels) and variance of the untouched gel's cells.
 
     References
     ----------
     P. J. Huber, "Robust Statistics", 1981, chapter 7.8.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> gel = np.random.default_rng(0).uniform(90, 110, (3, 40, 32)).astype(np.float32)
+    >>> model = IlluminationModel(gel, np.ones_like(gel))
+    >>> model.fit(gel + 5)[:, 0].round(2).tolist()  # every channel is 5 grey levels brighter
+    [5.0, 5.0, 5.0]
     """
 
     def __init__(self, reference: Float, variance: Float) -> None:
-        """reference, variance : (h, w, 3) float32, mean and variance of the cells of the untouched gel."""
-        height, width = reference.shape[:2]
-        self._blocks = (max(1, width // _BLOCK), max(1, height // _BLOCK))
-        self._by_rows, self._by_columns = _shares(self._blocks[1], height), _shares(self._blocks[0], width)
-        self._center: Float = np.asarray(reference.mean(axis=(0, 1)), np.float32)
-        x = np.broadcast_to(np.linspace(-0.5, 0.5, width, dtype=np.float32), (height, width))
-        y = np.broadcast_to(np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None], (height, width))
-        shade = self.shade(reference)
-        one = np.ones_like(x)
-        channels = range(3)
-        basis = np.stack([self._coarse(np.dstack([one, x, y, shade[..., c]])).T for c in channels])
-        penalty = _RIDGE * basis.shape[2] * np.diag([0.0, 1.0, 1.0, 1.0])
+        height, width = reference.shape[1:]
+        self._row_weights = _block_weights(max(1, height // BLOCK), height)
+        self._column_weights = np.ascontiguousarray(_block_weights(max(1, width // BLOCK), width).T)
+        self._center: Float = np.asarray(reference.mean(axis=(1, 2), keepdims=True), np.float32)
+        one = np.ones((height, width), np.float32)
+        planes = np.stack([one, one * positions(width), one * positions(height)[:, None]])
+        common, gain = self._block_means(planes), self._block_means(self.gain_basis(reference))
+        basis = np.stack([np.vstack([common, gain[channel]]) for channel in range(3)])
+        penalty = RIDGE * basis.shape[2] * np.diag([0.0, 1.0, 1.0, 1.0])
         inverse = np.linalg.inv(basis @ basis.transpose(0, 2, 1) + penalty + 1e-6 * np.eye(4))
         self._basis: Float = np.ascontiguousarray(basis, np.float32)
-        self._solve: Float = np.ascontiguousarray((inverse @ basis).transpose(0, 2, 1), np.float32)
+        self._step: Float = np.ascontiguousarray(inverse @ basis, np.float32)
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
-        self._solve_planes: Float = np.ascontiguousarray(self._solve.transpose(0, 2, 1))
-        self._reference = self._coarse(reference)
-        self._planes: Float = np.ascontiguousarray(self._reference.T)
-        limit = np.float32(_CLIP) * np.sqrt(self._coarse(variance)).T[:, None, :]
-        self._limit: Float = np.ascontiguousarray(limit)
-        self._lower: Float = -self._limit
+        self._reference = self._block_means(reference)
+        self._limit: Float = np.float32(CLIP) * np.sqrt(self._block_means(variance))
 
-    def shade(self, reference: Float) -> Float:
-        """How the reference differs from its mean, relative: what a gain multiplies."""
+    def gain_basis(self, reference: Float) -> Float:
+        """What a gain multiplies: the reference less its mean, relative to the mean.
+
+        reference : (3, h, w) float32, grey levels, at any resolution. Returns the same shape.
+        """
         return np.asarray((reference - self._center) / np.maximum(self._center, 1), np.float32)
 
     def fit(self, cells: Float) -> Float:
-        """(3, 4) float32: offset, slope along x and y (per frame) and gain of each channel, grey levels.
+        """Coefficients of the change of illumination between the reference and a frame.
 
-        cells : (h, w, 3) float32, the frame. The gain acts on `shade`.
+        cells : (3, h, w) float32, the frame's cells, grey levels.
+        Returns (3, 4) float32: offset, slope along x and along y (over the whole frame), gain; grey levels.
         """
-        excess = (self._coarse(cells) - self._reference).T[:, None, :]
-        found = np.zeros((3, 1, 4), np.float32)
-        found[..., 0] = np.sort(excess, axis=2)[..., excess.shape[2] // 2]
-        for _ in range(_ROUNDS):
-            residual = excess - found @ self._basis
-            np.maximum(residual, self._lower, out=residual)
-            np.minimum(residual, self._limit, out=residual)
-            step = residual @ self._solve - found @ self._shrink
-            found += step
-            if max(float(step.max()), -float(step.min())) < _SETTLED:
-                break
-        return np.asarray(found[:, 0], np.float32)
+        excess = self._block_means(cells) - self._reference
+        coefficients = np.zeros((3, 4), np.float32)
+        coefficients[:, 0] = np.sort(excess, axis=1)[:, excess.shape[1] // 2]
+        fit_robustly(excess, self._basis, self._step, self._shrink, self._limit, coefficients)
+        return coefficients
 
-    def fit_planes(self, planes: Float) -> Float:
-        """The same by compiled loops. planes : (3, h, w) float32, the frame's channels."""
-        excess = np.empty((3, self._reference.shape[0]), np.float32)
-        coarse_excess(planes, self._by_rows, self._by_columns, self._planes, excess)
-        found = np.zeros((3, 4), np.float32)
-        found[:, 0] = np.sort(excess, axis=1)[:, excess.shape[1] // 2]
-        limit = self._limit[:, 0]
-        fit_light(excess, self._basis, self._solve_planes, self._shrink, limit, _ROUNDS, _SETTLED, found)
-        return found
-
-    def _coarse(self, cells: Float) -> Float:
-        small = cv2.resize(np.ascontiguousarray(cells), self._blocks, interpolation=cv2.INTER_AREA)
-        return np.asarray(small.reshape(-1, cells.shape[2]), np.float32)
+    def _block_means(self, planes: Float) -> Float:
+        """(n, blocks) float32: means over blocks of (n, h, w) planes; a cell may belong to two in parts."""
+        means = self._row_weights @ planes @ self._column_weights
+        return np.asarray(means.reshape(len(planes), -1), np.float32)
 
 
-def light_change(found: Float, shade: Float, rows: slice, columns: slice) -> Float:
-    """(h, w, 3) float32: the change of the light over a window of the frame, grey levels.
+def illumination_change(coefficients: Float, gain_basis: Float) -> Float:
+    """Change of the illumination, grey levels: (3, h, w) float32.
 
-    found : (3, 4) from `LightChange.fit`. shade : (H, W, 3) of the whole frame, at any resolution.
-    rows, columns : the window.
+    coefficients : (3, 4) float32, from `IlluminationModel.fit`. gain_basis : (3, h, w) float32.
     """
-    height, width = shade.shape[:2]
-    x, y = positions(width)[columns], positions(height)[rows]
-    offset, along_x, along_y, gain = found.T
-    change: Float = np.asarray(cv2.transform(shade[rows, columns], np.diag(gain)), np.float32)
-    flat = change.reshape(y.size, -1)
-    across = np.empty((2, x.size, 3), np.float32)
-    across[0] = x[:, None] * along_x + offset
-    across[1] = along_y
-    down = np.ones((y.size, 2), np.float32)
-    down[:, 1] = y
-    # In place: memory for another picture costs more to get than to fill.
-    cv2.gemm(down, across.reshape(2, -1), 1.0, flat, 1.0, dst=flat)
-    return change
+    height, width = gain_basis.shape[1:]
+    offset, slope_x, slope_y, gain = coefficients.T[:, :, None, None]
+    plane = offset + slope_y * positions(height)[:, None] + slope_x * positions(width)
+    return np.asarray(gain_basis * gain + plane, np.float32)
 
 
-def _shares(blocks: int, count: int) -> Float:
-    """(blocks, count) float32: which part of a block's mean each of `count` pixels in a row makes."""
+@lru_cache(maxsize=16)
+def positions(count: int) -> Float:
+    """(count,) float32: places of a line's pixels, -0.5 to 0.5 across the frame; not to be written."""
+    return np.linspace(-0.5, 0.5, count, dtype=np.float32)
+
+
+def _block_weights(blocks: int, count: int) -> Float:
+    """(blocks, count) float32: weight of each of `count` pixels of a line in the mean of each block."""
     edges = np.arange(blocks + 1) * (count / blocks)
     pixels = np.arange(count)
     covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
     return np.asarray(np.maximum(covered, 0) * (blocks / count), np.float32)
 
 
-@lru_cache(maxsize=16)
-def positions(count: int) -> Float:
-    """(count,) float32: where the pixels of a line are, -0.5 to 0.5; not to be written."""
-    return np.linspace(-0.5, 0.5, count, dtype=np.float32)
+@kernel(
+    "void(float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1],"
+    " float32[:, ::1])",
+    reorder=True,
+)
+def fit_robustly(
+    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
+) -> None:
+    """Least-squares steps with clipped residuals; `coefficients`, (3, 4), start and result.
+
+    excess, limit : (3, n), the data and where their residuals are clipped. basis, step : (3, 4, n), the model
+    and its pseudo-inverse. shrink : (3, 4, 4), what the ridge takes from the coefficients in a step.
+    """
+    change = np.empty(4, np.float32)
+    for _ in range(MAX_STEPS):
+        longest = np.float32(0)
+        for c in range(3):
+            f0, f1, f2, f3 = coefficients[c, 0], coefficients[c, 1], coefficients[c, 2], coefficients[c, 3]
+            s0 = s1 = s2 = s3 = np.float32(0)
+            for i in range(excess.shape[1]):
+                model = f0 * basis[c, 0, i] + f1 * basis[c, 1, i] + f2 * basis[c, 2, i] + f3 * basis[c, 3, i]
+                residual = min(max(excess[c, i] - model, -limit[c, i]), limit[c, i])
+                s0 += residual * step[c, 0, i]
+                s1 += residual * step[c, 1, i]
+                s2 += residual * step[c, 2, i]
+                s3 += residual * step[c, 3, i]
+            change[0], change[1], change[2], change[3] = s0, s1, s2, s3
+            for k in range(4):
+                for j in range(4):
+                    change[k] -= (f0, f1, f2, f3)[j] * shrink[c, j, k]
+            for k in range(4):
+                coefficients[c, k] += change[k]
+                longest = max(longest, abs(change[k]))
+        if longest < np.float32(CONVERGED):
+            break

@@ -1,0 +1,122 @@
+"""Filling a region: holes, gaps, and pockets at the border of the frame."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.contact.continuation import continued
+
+Mask = NDArray[np.uint8]
+Outlines = list[NDArray[np.int32]]
+
+BAY: Final = 2.5
+"""A region with a bay that is deeper, px at half resolution, may be a ring with a gap. A gap that is
+narrower than the ring is thick, or than a marker, is closed. Chosen by hand."""
+
+POCKET: Final = 0.8
+"""Part of an area between a region and the frame's border that the region's hull covers if it belongs to the
+region. Chosen by hand."""
+
+
+def fill(mask: Mask) -> Mask:
+    """Fill what a region encloses, alone or together with the border of the frame.
+
+    mask : (h, w) uint8, 0 or 1. Returns the same, fresh.
+
+    >>> import numpy as np
+    >>> ring = np.ones((5, 5), np.uint8)
+    >>> ring[1:4, 1:4] = 0
+    >>> int(fill(ring).sum())
+    25
+    """
+    return fill_pockets(*outlined(mask, None))
+
+
+def outlined(mask: Mask, hidden: Mask | None) -> tuple[Mask, Outlines]:
+    """The parts of a region with their holes filled, and their outlines.
+
+    mask : (h, w) uint8, 0 or 1. hidden : the same: what is not known of the mask.
+    """
+    known = mask if hidden is None else np.asarray(cv2.bitwise_or(mask, hidden), np.uint8)
+    found, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outlines = [np.asarray(outline[:, 0], np.int32) for outline in found]
+    if hidden is not None:
+        # Smoothing has carried what was painted one pixel further.
+        grown = np.asarray(cv2.dilate(hidden, np.ones((3, 3), np.uint8)), np.uint8)
+        outlines = [line for line in (continued(outline, grown) for outline in outlines) if line is not None]
+    filled = np.zeros_like(mask)
+    if outlines:
+        cv2.fillPoly(filled, outlines, (1.0,))
+    return filled, outlines
+
+
+def is_solid(filled: Mask) -> bool:
+    """Whether a region, (h, w) uint8, 0 or 1, is one piece without bays."""
+    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    outlines = [outline for outline in outlines if len(outline) > 3]
+    if len(outlines) != 1:
+        return not outlines
+    try:
+        bays = cv2.convexityDefects(outlines[0], cv2.convexHull(outlines[0], returnPoints=False))
+    except cv2.error:
+        # OpenCV refuses an outline that touches itself, at a neck of one pixel.
+        return False
+    # Depths come in 256ths of a pixel.
+    return bays is None or bool(bays.reshape(-1, 4)[:, 3].max() <= BAY * 256)
+
+
+def close_gaps(mask: Mask, reach: float) -> Mask:
+    """Morphological closing of a mask, 0 or 1, by a disc with a radius of `reach` px, by distances."""
+    margin = int(reach) + 2
+    away = cv2.copyMakeBorder(1 - mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(1.0,))
+    grown = (cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_3) <= reach).view(np.uint8)
+    inner = cv2.distanceTransform(grown, cv2.DIST_L2, cv2.DIST_MASK_3)[margin:-margin, margin:-margin]
+    return (inner > reach).view(np.uint8)
+
+
+def fill_pockets(filled: Mask, outlines: Outlines) -> Mask:
+    """Fill, perhaps in place, what a region encloses together with the border of the frame.
+
+    filled, outlines : from `outlined`.
+    """
+    border = np.concatenate([filled[0], filled[1:, -1], filled[-1, -2::-1], filled[-2:0:-1, 0]])
+    before = np.concatenate([border[-1:], border[:-1]])
+    starts = np.flatnonzero(border < before).tolist()
+    if len(starts) < 2:
+        return filled
+    ends = np.flatnonzero(border > before).tolist()
+    if ends[0] < starts[0]:
+        ends = [*ends[1:], ends[0] + len(border)]
+    height, width = filled.shape
+    hull = np.zeros_like(filled)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), (1.0,))
+    closed = False
+    for start, end in zip(starts, ends, strict=True):
+        seed = _on_border((start + end) // 2 % len(border), width, height)
+        if filled[seed[1], seed[0]] or not hull[seed[1], seed[0]]:
+            continue
+        other = filled.copy()
+        area, *_ = cv2.floodFill(other, None, seed, (2.0,))
+        pocket = (other == 2).view(np.uint8)
+        if cv2.countNonZero(cv2.bitwise_and(pocket, hull)) > POCKET * area:
+            filled |= pocket
+            closed = True
+    # What was open to both sides of a pocket is now a hole.
+    return outlined(filled, None)[0] if closed else filled
+
+
+def _on_border(index: int, width: int, height: int) -> tuple[int, int]:
+    """(x, y) of a pixel on the border, counted clockwise from the top left corner."""
+    if index < width:
+        return index, 0
+    index -= width - 1
+    if index < height:
+        return width - 1, index
+    index -= height - 1
+    if index < width:
+        return width - 1 - index, height - 1
+    return 0, height - 1 - (index - width + 1)

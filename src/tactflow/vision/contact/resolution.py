@@ -1,0 +1,83 @@
+"""Between a frame's pixels and a contact's window at half their resolution."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.compiled import kernel
+
+Float = NDArray[np.float32]
+Mask = NDArray[np.uint8]
+
+
+def halve_mask(mask: Mask, top: int, left: int, inside: NDArray[np.bool_]) -> Mask:
+    """A window of a mask at half resolution: 1 where any of 2 x 2 pixels is not 0 and counts, else 0.
+
+    mask : (H, W) uint8, over whose border the window may reach. top, left : of the window, px. inside :
+    (h, w) bool, which cells of 4 x 4 px count. Returns (2 h, 2 w) uint8.
+
+    >>> import numpy as np
+    >>> mask = np.zeros((8, 8), np.uint8)
+    >>> mask[5, 2] = 255
+    >>> halve_mask(mask, 4, 0, np.ones((1, 1), np.bool_))
+    array([[0, 1],
+           [0, 0]], dtype=uint8)
+    """
+    halved = np.empty((2 * inside.shape[0], 2 * inside.shape[1]), np.uint8)
+    halve_window(np.ascontiguousarray(mask), top, left, inside.view(np.uint8), halved)
+    return halved
+
+
+def draw_level(level: Float, top: int, left: int, mask: Mask) -> None:
+    """Set to 255 the pixels of a mask where a level set, interpolated to twice its size, is positive.
+
+    level : (h, w) float32. top, left : its place in the mask, px, over whose border it may reach. mask :
+    (H, W) uint8, changed in place.
+
+    >>> import numpy as np
+    >>> mask = np.zeros((2, 4), np.uint8)
+    >>> draw_level(np.array([[1, -1]], np.float32), 0, 0, mask)
+    >>> mask
+    array([[255, 255,   0,   0],
+           [255, 255,   0,   0]], dtype=uint8)
+    """
+    raise_mask(level, top, left, mask)
+
+
+@kernel("void(float32[:, ::1], int64, int64, uint8[:, ::1])")
+def raise_mask(level: Float, top: int, left: int, mask: Mask) -> None:
+    """What `draw_level` does."""
+    high, wide = level.shape
+    near, far = np.float32(0.75), np.float32(0.25)
+    line = np.empty(2 * wide, np.float32)
+    mixed = np.empty(wide, np.float32)
+    for y in range(min(2 * high, mask.shape[0] - top)):
+        here, other = level[y // 2], level[min(max(y // 2 + 2 * (y & 1) - 1, 0), high - 1)]
+        for x in range(wide):
+            mixed[x] = here[x] * near + other[x] * far
+        for x in range(1, wide):
+            line[2 * x] = mixed[x] * near + mixed[x - 1] * far
+            line[2 * x - 1] = mixed[x - 1] * near + mixed[x] * far
+        line[0], line[2 * wide - 1] = mixed[0], mixed[wide - 1]
+        row = mask[top + y, left:]
+        for x in range(min(2 * wide, row.size)):
+            row[x] |= np.uint8(255) if line[x] > 0 else np.uint8(0)
+
+
+@kernel("void(uint8[:, ::1], int64, int64, uint8[:, ::1], uint8[:, ::1])")
+def halve_window(mask: Mask, top: int, left: int, inside: Mask, halved: Mask) -> None:
+    """What `halve_mask` does; `halved`, (2 h, 2 w), is filled."""
+    high = min(halved.shape[0], (mask.shape[0] - top + 1) // 2)
+    wide = min(halved.shape[1], (mask.shape[1] - left + 1) // 2)
+    halved[:] = 0
+    for y in range(high):
+        first, row = top + 2 * y, halved[y]
+        upper, lower = mask[first, left:], mask[min(first + 1, mask.shape[0] - 1), left:]
+        cells = inside[y // 2]
+        whole = min(wide, upper.size // 2)
+        for x in range(whole):
+            any_of = upper[2 * x] | upper[2 * x + 1] | lower[2 * x] | lower[2 * x + 1]
+            row[x] = np.uint8((any_of != 0) & (cells[x // 2] != 0))
+        for x in range(whole, wide):
+            row[x] = np.uint8(((upper[2 * x] | lower[2 * x]) != 0) & (cells[x // 2] != 0))

@@ -1,0 +1,111 @@
+"""Plain versions of the kernels of the background model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.contact.background_kernels import (
+    BESIDE,
+    MIDDLE,
+    change_strength,
+    relative_change,
+    smooth_cells,
+    weigh_change,
+)
+from tests.oracles.gains import Gain
+
+Float = NDArray[np.float32]
+
+
+def plain_smooth_cells(cells: NDArray[np.uint8], smooth: Float) -> None:
+    """Means over 3 x 3 cells."""
+    picture = cells.reshape(smooth.shape[1], smooth.shape[2], 3).astype(np.float32)
+    smooth[:] = cv2.blur(picture, (3, 3)).reshape(picture.shape).transpose(2, 0, 1)
+
+
+def _illumination(coefficients: Float, across: Float, down: Float, gain_basis: Float) -> Float:
+    offset, slope_x, slope_y, gain = coefficients.T[:, :, None, None]
+    return np.asarray(gain_basis * gain + offset + slope_x * across + slope_y * down[:, None], np.float32)
+
+
+def plain_weigh_change(
+    smooth: Float,
+    coefficients: Float,
+    across: Float,
+    down: Float,
+    mean: Float,
+    gain_basis: Float,
+    weight: Float,
+    brightness: Float,
+    colour_factor: Float,
+    before: NDArray[np.uint8],
+    evidence_before: Float,
+    squared: Float,
+    colour: Float,
+    evidence: Float,
+    summary: NDArray[np.float64],
+) -> None:
+    """Squared length of the weighted change; of its colour, without the part along the brightness."""
+    change = smooth - (mean + _illumination(coefficients, across, down, gain_basis))
+    squared[:] = ((change * weight) ** 2).sum(axis=0)
+    colour[:] = squared * colour_factor - (change * brightness).sum(axis=0) ** 2
+    np.maximum(squared, colour, out=evidence)
+    summary[:2] = squared.max(), colour.max()
+    inside = before > 0
+    summary[2:] = (evidence[inside].sum(), evidence_before[inside].sum()) if before.size else (0, 0)
+
+
+def plain_relative_change(
+    half: NDArray[np.uint8],
+    top: int,
+    left: int,
+    coefficients: Float,
+    across: Float,
+    down: Float,
+    mean: Float,
+    gain_basis: Float,
+    scale: Float,
+    blurred: Float,
+) -> None:
+    """The change less that of the illumination, relative to the brightness, smoothed along x."""
+    high, wide = blurred.shape[1:]
+    rows, columns = slice(top, top + high), slice(left, left + wide)
+    planes = half.reshape(len(half), -1, 3)[rows, columns].transpose(2, 0, 1)
+    window = slice(None), rows, columns
+    change = planes - mean[window]
+    change -= _illumination(coefficients, across[columns], down[rows], gain_basis[window])
+    change *= scale[window]
+    weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
+    for plane, smooth in zip(change, blurred, strict=True):
+        smooth[:] = cv2.sepFilter2D(plane, cv2.CV_32F, weights, np.ones(1)).reshape(smooth.shape)
+
+
+def plain_change_strength(
+    blurred: Float,
+    inside: NDArray[np.uint8],
+    strength: Float,
+    common: Float,
+    summary: NDArray[np.float64],
+) -> None:
+    """Smoothed along y, length and mean over the channels, 0 outside."""
+    weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
+    planes = [
+        cv2.sepFilter2D(plane, cv2.CV_32F, np.ones(1), weights).reshape(plane.shape) for plane in blurred
+    ]
+    change = np.stack(planes) * (inside != 0).repeat(2, axis=0).repeat(2, axis=1)
+    strength[:] = np.sqrt((change**2).sum(axis=0))
+    common[:] = change.mean(axis=0)
+    summary[:] = common.sum(), strength.sum(), (strength.astype(np.float64) ** 2).sum()
+
+
+GAINS = [
+    Gain(smooth_cells, plain_smooth_cells, tolerance=1e-4),
+    # Squared deviations up to some thousands, to the rounding of float32; sums of thousands of them.
+    Gain(weigh_change, plain_weigh_change, tolerance=2.0),
+    Gain(relative_change, plain_relative_change, tolerance=1e-5),
+    Gain(change_strength, plain_change_strength, tolerance=1e-2),
+]

@@ -1,0 +1,27 @@
+"""Plain version of the kernel of the illumination."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.contact.illumination import CONVERGED, MAX_STEPS, fit_robustly
+from tests.oracles.gains import Gain
+
+Float = NDArray[np.float32]
+
+
+def plain_fit_robustly(
+    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
+) -> None:
+    """Least-squares steps with clipped residuals."""
+    for _ in range(MAX_STEPS):
+        model = np.einsum("ck,ckn->cn", coefficients, basis)
+        residual = np.clip(excess - model, -limit, limit)
+        change = np.einsum("cn,ckn->ck", residual, step) - np.einsum("cj,cjk->ck", coefficients, shrink)
+        coefficients += change
+        if np.abs(change).max() < CONVERGED:
+            break
+
+
+GAINS = [Gain(fit_robustly, plain_fit_robustly, tolerance=1e-3)]
