@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import venv
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -23,12 +24,23 @@ def command(*arguments: str | Path, cwd: Path) -> str:
     return done.stdout
 
 
+def modules() -> set[str]:
+    """Where the wheel holds each Python file of the package."""
+    folders = {"src/tactflow": "tactflow", "stages": "tactflow/stages", "sinks": "tactflow/sinks"}
+    return {
+        f"{inside}/{file.relative_to(REPOSITORY / folder).as_posix()}"
+        for folder, inside in folders.items()
+        for file in (REPOSITORY / folder).rglob("*.py")
+    }
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_wheel_runs_its_packaged_pipeline_in_a_fresh_environment(tmp_path: Path) -> None:
     pip = ("-m", "pip", "--disable-pip-version-check", "--no-input", "--quiet")
     command(sys.executable, *pip, "wheel", "--no-deps", "--wheel-dir", tmp_path, REPOSITORY, cwd=tmp_path)
     (wheel,) = tmp_path.glob("tactflow-*.whl")
+    assert modules() <= set(zipfile.ZipFile(wheel).namelist())
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
     constraints = REPOSITORY / "constraints.txt"

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench.lockstep import LockstepPipeline, Outcome
+from tactflow.engine.contract import Source
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
@@ -192,12 +193,11 @@ class _Truth:
 def _endless(pipeline: Pipeline, pictures: Sequence[NDArray[np.uint8]], total: int) -> Pipeline:
     """The pipeline with a source that plays the pictures again and again, with fresh noise."""
 
-    class Endless:
-        live = False
+    class Endless(Source):
         description = "press and release"
 
         def __init__(self, params: Any) -> None:
-            self.params = params
+            super().__init__(params)
             self.total = total
 
         def frames(self) -> Iterator[Frame]:

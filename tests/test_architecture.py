@@ -1,0 +1,83 @@
+"""Who may import whom, and that the pages for contributors name what is there."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+CONTRIBUTING = (REPOSITORY / "CONTRIBUTING.md").read_text()
+PAGES = ["CONTRIBUTING.md", "docs/architecture.md", "docs/glossary.md"]
+
+ROOMS = {
+    "src/tactflow/engine": ("cv2", "zmq", "numba", "tactflow.vision", "tactflow.config", "tactflow.stages"),
+    "src/tactflow/config": ("cv2", "zmq", "tactflow.vision", "tactflow.cli", "tactflow.fleet"),
+    "src/tactflow/vision": ("zmq", "tactflow.engine", "tactflow.config", "tactflow.stages"),
+    "src/tactflow/fleet": ("tactflow.cli", "tactflow.stages", "tactflow.sinks"),
+    "src/tactflow/classic": ("tactflow.stages", "tactflow.cli"),
+    "stages": ("tactflow.stages", "tactflow.config", "tactflow.cli"),
+    "sinks": ("tactflow.stages", "tactflow.config", "tactflow.cli"),
+}
+"""Folder -> what nothing in it imports."""
+
+
+def imports(file: Path) -> Iterator[str]:
+    """Every module that a file imports, anywhere in it."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_imports_nothing_that_it_must_not_know(room: str) -> None:
+    found = [
+        f"{file.relative_to(REPOSITORY)}: {module}"
+        for file in (REPOSITORY / room).rglob("*.py")
+        for module in imports(file)
+        if any(module == banned or module.startswith(f"{banned}.") for banned in ROOMS[room])
+    ]
+    assert not found
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_file_and_link_that_a_page_names_is_there(page: str) -> None:
+    text = (REPOSITORY / page).read_text()
+    folder = (REPOSITORY / page).parent
+    for link in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (folder / link).exists(), link
+    named = set(re.findall(r"`((?:[\w-]+/)+[\w-]*(?:\.\w+)?)`", text))
+    own = {"stages/invert.py", "sinks/count.py", "tests/stages/test_invert.py", "frames/"}
+    for path in named - own:
+        source = REPOSITORY / "src"
+        inside = [REPOSITORY, source, *(folder for folder in source.rglob("*") if folder.is_dir())]
+        assert any((place / path).exists() for place in inside), path
+
+
+def block(first_line: str) -> str:
+    """The code block of CONTRIBUTING.md that starts with this line."""
+    blocks = re.findall(r"```python\n(.*?)```", CONTRIBUTING, re.S)
+    (found,) = [text for text in blocks if text.startswith(first_line)]
+    return found
+
+
+def test_the_stage_and_the_sink_for_contributors_run(tmp_path: Path) -> None:
+    (tmp_path / "invert.py").write_text(block("# stages/invert.py"))
+    (tmp_path / "count.py").write_text(block("# sinks/count.py"))
+    (tmp_path / "pipeline.yaml").write_text(
+        'stages:\n  capture: {source: "sim:press?frames=40"}\n  preprocess: {rotate: 90, downsample: 2}\n'
+        "  invert: {use: ./invert.py, strength: 1.0}\n"
+        "  difference: {in: {unmarked: invert.inverted}}\n  hull: {when: touching}\n"
+        "sinks:\n  count: {use: ./count.py}\n"
+    )
+    command = [sys.executable, "-m", "tactflow", "run", "--quiet", "--check", "pipeline.yaml"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int((tmp_path / "contacts.txt").read_text()) > 0
