@@ -64,7 +64,9 @@ def test_an_observer_never_changes_values(toy_runner: MakeRunner, extra: str, sk
         "rated": {"use": "ThreadedCollect", "max_rate": 7},
         "small": {"use": "OnlyLevel"},
     }
-    gates = {"gated": {"when": {"signal": "active", "otherwise": "repeat", "hold": 1, "at_least_every": 5}}}
+    gates = held(hold=1, at_least_every=5) | {
+        "gated": {"when": {"signal": "keep.held", "otherwise": "repeat"}}
+    }
     alone = toy_runner(gates, {"out": sinks["out"]}, skipping=skipping)
     ran(alone)
     others = [name for name in sinks if name not in ("out", extra)]
@@ -76,6 +78,11 @@ def test_an_observer_never_changes_values(toy_runner: MakeRunner, extra: str, sk
             assert rows(runner) == rows(alone)
             for name in {"far", "lazy", "rated"} & set(chosen):
                 assert set(map(str, rows(runner, name))) <= set(map(str, rows(alone)))
+
+
+def held(**params: int) -> dict[str, dict[str, Any]]:
+    """A stage that holds the signal of the toy graph."""
+    return {"keep": {"use": "Hold", "in": {"signal": "pulse.active"}, **params}}
 
 
 SEGMENTS: dict[str, dict[str, dict[str, Any]]] = {
@@ -90,15 +97,19 @@ SEGMENTS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("cut", SEGMENTS)
-@pytest.mark.parametrize("gate", [{}, {"hold": 2}, {"otherwise": "repeat"}, {"at_least_every": 3}])
+@pytest.mark.parametrize("otherwise", ["absent", "repeat"])
+@pytest.mark.parametrize("hold", [{}, {"hold": 2}, {"at_least_every": 3}])
 def test_how_a_graph_is_cut_into_segments_changes_no_value(
-    toy_runner: MakeRunner, cut: str, gate: dict[str, Any]
+    toy_runner: MakeRunner, cut: str, hold: dict[str, int], otherwise: str
 ) -> None:
-    stages: dict[str, Any] = {"gated": {"when": {"signal": "active", **gate}}}
+    gate = {"signal": "keep.held" if hold else "active", "otherwise": otherwise}
+    stages: dict[str, Any] = {"gated": {"when": gate}, **(held(**hold) if hold else {})}
     default = toy_runner(stages)
     ran(default)
     for name, body in SEGMENTS[cut].items():
         stages[name] = {**stages.get(name, {}), **body}
+    if hold and cut == "one":
+        stages["keep"]["segment"] = "capture"
     runner = toy_runner(stages)
     ran(runner)
     assert rows(runner) == rows(default)

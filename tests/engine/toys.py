@@ -17,6 +17,7 @@ from tactflow.engine import contract
 from tactflow.engine.contract import Sink, Stage, StageParams
 from tactflow.engine.frame import Absent, Frame, Tick
 from tactflow.engine.ports import ArrayPort, SignalPort
+from tactflow.stages.hold import Hold as Hold
 
 Grid = Annotated[NDArray[np.uint8], ArrayPort("grid", ("H", "W"), "uint8", "1")]
 Active = Annotated[bool, SignalPort("active", closed="idle")]

@@ -8,7 +8,7 @@ from typing import Any
 
 from tactflow.engine.check import ArrayCheck
 from tactflow.engine.conformance import METHODS
-from tactflow.engine.contract import Part, Sink
+from tactflow.engine.contract import Part, Sink, Stage
 from tactflow.engine.frame import Absent, Frame, Tick
 from tactflow.engine.graph import Gate, Node
 from tactflow.engine.ports import SignalPort, port_type
@@ -93,9 +93,8 @@ class RunningNode:
     def reset(self) -> None:
         """A new reference follows: forget what was learned from the last one."""
         self.forget()
-        reset: Callable[[], None] | None = getattr(self.instance, "reset", None)
-        if reset is not None:
-            reset()
+        if isinstance(self.instance, Stage):
+            self.instance.reset()
 
     def forget(self) -> None:
         """Repeat nothing from before."""

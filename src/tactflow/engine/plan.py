@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from tactflow.engine.contract import Sink
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline
 
@@ -151,7 +152,7 @@ def _segment_names(nodes: Sequence[Node]) -> dict[str, str]:
             name = node.segment
         elif node.component.kind == "source":
             name = CAPTURE
-        elif node.component.kind == "sink" and getattr(node.component.cls, "threaded", False):
+        elif issubclass(node.component.cls, Sink) and node.component.cls.threaded:
             name = node.id
         elif last <= sources:
             name = COMPUTE
@@ -202,15 +203,15 @@ def _link(
     for node in nodes:
         capacity = capacity or node.queue.capacity
         policy = policy or node.queue.when_full
+    classes = [node.component.cls for node in nodes]
+    sinks = [cls for cls in classes if issubclass(cls, Sink)]
+    only_sinks = len(sinks) == len(classes)
     if policy is None:
-        policy = "block"
-        if live and all(node.component.kind == "sink" for node in nodes):
-            if all(getattr(node.component.cls, "when_live", "block") == "latest" for node in nodes):
-                policy = "latest"
-        elif live and producer == source:
-            policy = "latest"
+        newest = all(sink.when_live == "latest" for sink in sinks) if only_sinks else producer == source
+        policy = "latest" if live and newest else "block"
     if capacity is None:
-        capacity = max(getattr(node.component.cls, "queue_capacity", BLOCK_CAPACITY) for node in nodes)
+        capacity = max((sink.queue_capacity for sink in sinks), default=BLOCK_CAPACITY)
+        capacity = capacity if only_sinks else max(capacity, BLOCK_CAPACITY)
     return LinkPlan(producer, consumer, capacity, policy)
 
 

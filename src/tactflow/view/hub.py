@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, Protocol
 
 import orjson
 
+from tactflow.engine.contract import Source
 from tactflow.engine.control import Control
 from tactflow.engine.stats import Durations
 
@@ -233,9 +234,9 @@ class Hub:
     def state(self) -> str:
         """The message that says what the run is doing, and which buttons work (null) or why not."""
         control = self.control
-        source = getattr(control, "source", None)
+        source = None if control is None else control.source
         paused = bool(control and control.paused)
-        condition = _words(source, "state")
+        condition = None if source is None else source.state
         recorder = None if control is None else control.recorder()
         return _text(
             type="state",
@@ -245,9 +246,9 @@ class Hub:
             end=self._end,
             neighbours=self.neighbours(),
             source={
-                "description": _words(source, "description"),
-                "live": bool(getattr(source, "live", False)),
-                "total": getattr(source, "total", None),
+                "description": None if source is None else source.description,
+                "live": source is not None and source.live,
+                "total": None if source is None else source.total,
                 "state": "paused" if paused and condition == "running" else condition,
             },
             refused={name: self._refusal(name) for name in self._commands},
@@ -346,10 +347,10 @@ class Hub:
             return "the run cannot be controlled" if control is None else "the run has ended"
         source = control.source
         if name == "step":
-            if getattr(source, "live", False):
+            if source is not None and source.live:
                 return "a live source cannot be stepped"
             return None if control.paused else "pause first"
-        if name == "reference" and not hasattr(source, "retake"):
+        if name == "reference" and (source is None or type(source).retake is Source.retake):
             return "this source cannot take a new reference"
         if name == "record" and control.recorder() is None:
             return "no record sink in this pipeline"
@@ -389,11 +390,6 @@ class Hub:
         except RuntimeError:
             # The run is still opening its sinks: its tables grew while they were read. The next one is whole.
             return {}
-
-
-def _words(thing: Any, name: str) -> str | None:
-    value = getattr(thing, name, None)
-    return value if isinstance(value, str) else None
 
 
 def _text(**fields: Any) -> str:
