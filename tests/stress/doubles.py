@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.vision import compiled
 from tactflow.vision.compiled import Kernel
 
 
@@ -54,5 +53,4 @@ def in_double(*modules: ModuleType) -> Iterator[None]:
                 if hasattr(module, name):
                     patch.setattr(module, name, double)
         patch.setattr(Kernel, "__call__", plain)
-        with compiled.switched(False):
-            yield
+        yield
