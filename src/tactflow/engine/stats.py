@@ -29,8 +29,8 @@ class Durations:
     def __init__(self) -> None:
         self._bins = np.zeros(_BINS, np.int64)
         self._total = 0.0
-        # To sort durations into their bins together costs a tenth of doing it one by one, in every stage of
-        # every frame. They wait for it in here, and not all histograms of a run do it in the same frame.
+        # Sorted into their bins together: 0.4 us for each instead of 1.0 one by one (Python 3.11), for every
+        # stage of every frame. Not all histograms of a run do it in the same frame.
         self._new: deque[float] = deque()
         self._limit = _WAITING + next(_number) % 32 * 8
         self._lock = threading.Lock()

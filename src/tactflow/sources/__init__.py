@@ -89,10 +89,7 @@ def open_source(
         return Simulated(spec)
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]+)://", spec)
     if scheme is not None:
-        if scheme[1].lower() in _STREAMS:
-            return _live(partial(Stream, spec, ArrivalClock()), watch, public_address(spec))
-        hint = f"; for a file, leave out {scheme[0]}" if scheme[1].lower() == "file" else ""
-        raise SourceError(f"{spec}: unknown kind of source {scheme[0]}{hint}; required one of: {KINDS}")
+        return _open_stream(spec, scheme[1], watch)
     if spec.isdecimal() or spec.startswith(("/dev/video", "/dev/v4l/")):
         return _live(partial(Camera, spec, camera, ArrivalClock()), watch, f"camera {spec}")
     if re.search(r"\.mcap($|\?)", spec, re.IGNORECASE) and not glob.has_magic(spec.partition("?")[0]):
@@ -100,6 +97,13 @@ def open_source(
 
         return Recording(spec, directory)
     return open_recording(spec, directory, fps)
+
+
+def _open_stream(spec: str, scheme: str, watch: Watch | None) -> FrameReader:
+    if scheme.lower() in _STREAMS:
+        return _live(partial(Stream, spec, ArrivalClock()), watch, public_address(spec))
+    hint = f"; for a file, leave out {scheme}://" if scheme.lower() == "file" else ""
+    raise SourceError(f"{spec}: unknown kind of source {scheme}://{hint}; required one of: {KINDS}")
 
 
 def _live(opener: Callable[[], FrameReader], watch: Watch | None, name: str) -> FrameReader:
