@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.vision import compiled
 from tactflow.vision.compiled import Kernel
 
 
@@ -36,6 +35,20 @@ OPENCV = _Double(cv2, CV_32F=cv2.CV_64F, batchDistance=_distances)
 DOUBLES = {"np": NUMPY, "cv2": OPENCV}
 
 
+def _run_plain(kernel: Kernel[..., Any], args: tuple[Any, ...]) -> Any:
+    """Run a kernel as Python, whole numbers in 64 bits, as numba adds them: bytes of numpy overflow."""
+    wide = [value.astype(np.int64) if _is_narrow(value) else value for value in args]
+    result = kernel.plain(*wide)
+    for given, filled in zip(args, wide, strict=True):
+        if given is not filled and given.flags.writeable:
+            given[...] = filled
+    return result
+
+
+def _is_narrow(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "iu" and value.dtype.itemsize < 8
+
+
 @contextmanager
 def in_double(*modules: ModuleType) -> Iterator[None]:
     """Inside the `with` block the functions of these modules compute in float64 where they use float32.
@@ -46,7 +59,7 @@ def in_double(*modules: ModuleType) -> Iterator[None]:
     call = Kernel.__call__
 
     def plain(self: Kernel[..., Any], *args: Any) -> Any:
-        return self.plain(*args) if self.plain.__module__ in names else call(self, *args)
+        return _run_plain(self, args) if self.plain.__module__ in names else call(self, *args)
 
     with pytest.MonkeyPatch.context() as patch:
         for module in modules:
@@ -54,5 +67,4 @@ def in_double(*modules: ModuleType) -> Iterator[None]:
                 if hasattr(module, name):
                     patch.setattr(module, name, double)
         patch.setattr(Kernel, "__call__", plain)
-        with compiled.switched(False):
-            yield
+        yield

@@ -318,21 +318,3 @@ def _warn_once(text: str) -> None:
 def _writable(value: object) -> object:
     """A copy of an array that must not be written; anything else as it is."""
     return value.copy() if isinstance(value, np.ndarray) and not value.flags.writeable else value
-
-
-_wanted = True
-
-
-def active() -> bool:
-    return _wanted
-
-
-@contextmanager
-def switched(on: bool) -> Iterator[None]:
-    global _wanted
-    before = _wanted
-    _wanted = on
-    try:
-        yield
-    finally:
-        _wanted = before
