@@ -18,11 +18,10 @@ from tactflow.vision.compiled import Kernel
 Arguments = tuple[Any, ...]
 
 RUNS = (
-    # The last of these frames is in the deepest part of the press: 300 x 400 px, 140 dots, a contact.
-    ("default", "press?frames=300", 150),
+    # The last of these frames is in the deepest part of the first press: 300 x 400 px, 80 dots.
+    ("default", "press?frames=300", 60),
     # Marks that are lost are searched for.
     ("default", "jumps?frames=300", 300),
-    ("markerless", "unmarked?frames=300", 150),
 )
 """Pipeline, scene, and number of frames, in the order in which they are asked."""
 
