@@ -25,10 +25,12 @@ log = logging.getLogger("tactflow")
 
 CODECS = {".avi": "MJPG", ".mkv": "mp4v", ".mp4": "mp4v", ".m4v": "mp4v", ".mov": "mp4v"}
 LOSSLESS_CODECS = {".avi": ("HFYU", "FFV1"), ".mkv": ("HFYU", "FFV1")}
-# The rate of the frames is not known before some have come; so many are held back to measure it.
 FRAMES_TO_MEASURE_RATE = 12
+"""Frames held back at the start, because their rate is not known before. Chosen by hand."""
 MIN_FREE_BYTES = 16 << 20
+"""Free space, bytes, at which the disk counts as full: some 50 uncompressed frames of 400 x 300. By hand."""
 FRAMES_BETWEEN_DISK_CHECKS = 50
+"""Frames after which the disk is looked at again. Chosen by hand."""
 
 
 class Video(Sink):

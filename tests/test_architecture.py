@@ -61,6 +61,46 @@ def test_every_file_and_link_that_a_page_names_is_there(page: str) -> None:
         assert any((place / path).exists() for place in inside), path
 
 
+def wordless_numbers(file: Path) -> Iterator[str]:
+    """Numeric constants of a module with no words under them or under the group that they stand in."""
+    group: list[str] = []
+    for statement in ast.parse(file.read_text()).body:
+        targets = statement.targets if isinstance(statement, ast.Assign) else []
+        targets = [statement.target] if isinstance(statement, ast.AnnAssign) else targets
+        names = [t.id for t in targets if isinstance(t, ast.Name) and t.id.strip("_").isupper()]
+        value = getattr(statement, "value", None)
+        numbers = value is not None and any(
+            isinstance(part, ast.Constant) and type(part.value) in (int, float) for part in ast.walk(value)
+        )
+        if names and numbers and not isinstance(value, ast.Dict):
+            group += names
+        elif isinstance(value, ast.Constant) and isinstance(value.value, str) and not names:
+            group = []
+        elif not names:
+            yield from group
+            group = []
+    yield from group
+
+
+def test_every_number_with_a_name_says_what_it_means() -> None:
+    folders = [REPOSITORY / name for name in ("src", "stages", "sinks")]
+    files = [file for folder in folders for file in folder.rglob("*.py")]
+    found = [f"{file.relative_to(REPOSITORY)}: {name}" for file in files for name in wordless_numbers(file)]
+    assert not found
+
+
+def test_every_function_fits_on_a_screen() -> None:
+    long = []
+    for folder in ("src", "stages", "sinks"):
+        for file in (REPOSITORY / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno is not None:
+                    lines = node.end_lineno - node.lineno + 1
+                    if lines > 60:
+                        long.append(f"{file.relative_to(REPOSITORY)}: {node.name} has {lines} lines")
+    assert not long
+
+
 def block(first_line: str) -> str:
     """The code block of CONTRIBUTING.md that starts with this line."""
     blocks = re.findall(r"```python\n(.*?)```", CONTRIBUTING, re.S)

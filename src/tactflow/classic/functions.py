@@ -36,6 +36,7 @@ _THINNEST_AXIS: Final = 1e-3
 
 _FIVE = np.ones((5, 5), np.uint8)
 _NINE = np.ones((9, 9), np.uint8)
+"""Squares of 5 and 9 px, with which the script erodes and dilates."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.plan import Plan
 
 _COSTLY = 0.1
+"""Part of all the time, from which a stage is drawn as a costly one. Chosen by hand."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -17,8 +17,10 @@ _LINE_BREAK = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 _MAX_BYTES = 256 * 1024
 """Size of a pipeline file; a hundred times the longest of ours. Reading such a file takes some seconds."""
 _MAX_VALUES = 100_000
+"""Values of a document, aliases written out: more is a bomb, not a pipeline. Chosen by hand."""
 _MAX_SHOWN = 150
 _MAX_MESSAGE = 2000
+"""Characters of a source line, and of a whole message, that are shown. Chosen by hand."""
 
 
 @dataclass(slots=True)

@@ -20,6 +20,7 @@ from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline
 CAPTURE = "capture"
 COMPUTE = "compute"
 BLOCK_CAPACITY = 4
+"""Frames that may wait in front of a segment of stages: enough to even out uneven ones. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)

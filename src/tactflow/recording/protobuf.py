@@ -26,6 +26,7 @@ _TYPE_NUMBERS: dict[FieldType, int] = {
     "sint64": 18,
 }
 _OPTIONAL = 1
+"""Label of a field, as protobuf's `descriptor.proto` numbers it."""
 _TIMESTAMP_FILE = "google/protobuf/timestamp.proto"
 
 

@@ -18,9 +18,10 @@ Points = NDArray[np.float64]
 NOISE_UNIT = 4096.0
 """Integer steps of the noise bank per standard deviation."""
 _BANK_SPAN = 1 << 22
-# An odd step near span / golden ratio visits all 2**22 offsets before it repeats one, and keeps any two of
-# the first n offsets at least span / (2.7 n) elements apart.
 _BANK_STEP = 2592173
+"""Offsets into the noise bank, elements, and the step from one frame's to the next. An odd step near span /
+golden ratio visits all 2**22 offsets before it repeats one, and keeps any two of the first n at least
+span / (2.7 n) apart."""
 
 
 class Camera:

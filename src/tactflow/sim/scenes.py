@@ -57,6 +57,7 @@ def _pair(_bend: float) -> tuple[shapes.Shape, ...]:
 
 _PRESS = motion.Programme(_sphere)
 _CABLE = motion.Programme(_cable, wander=(60.0, 60.0), angles=(-75.0, 75.0), dilation=0.25)
+"""Programmes that several scenes share; lengths in px of the raw frame, angles in degrees."""
 _SCENES: dict[str, _Recipe] = {
     "press": _Recipe("a ball is pressed in several places, at several depths", _PRESS),
     "cable": _Recipe("a straight cable is pressed at several angles", _CABLE),

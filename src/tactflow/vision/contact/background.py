@@ -46,6 +46,7 @@ EDGE_CHANGE: Final = 0.05
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
+"""What a comparison gives that found no change: nothing."""
 
 
 @dataclass(frozen=True, slots=True)

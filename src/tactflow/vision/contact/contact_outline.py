@@ -86,6 +86,7 @@ ENOUGH_PIXELS: Final = 8000
 """Pixels that are enough for the profile: of a window with n times as many, one row in n is taken."""
 
 _NOTHING: Final = np.zeros((0, 0), np.uint8)
+"""An empty mask."""
 
 
 @dataclass(frozen=True, slots=True)
