@@ -15,6 +15,7 @@ from tactflow.config.complaints import complain
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import add_sinks, apply, replaced
 from tactflow.config.registry import Section, code_place, did_you_mean, resolve
+from tactflow.config.shipped import is_packaged
 from tactflow.config.wiring import Draft
 from tactflow.config.yamlmap import Item, Problems, read_yaml, wrap
 from tactflow.engine.contract import Sink, StageParams
@@ -150,8 +151,10 @@ def _resolve(draft: Draft, directory: Path, problems: Problems) -> None:
     use = draft.id if entry is None else entry.item.content
     if not isinstance(use, str):
         return
+    # On the command line, and in a pipeline that nobody can put a file beside, it means the current folder.
+    own = is_packaged(directory) or (entry is not None and not entry.item.mark.line)
     try:
-        draft.component = resolve(use, draft.section, directory)
+        draft.component = resolve(use, draft.section, *([Path()] if own else []), directory)
     except ConfigError as error:
         mark, path = (draft.mark, draft.path) if entry is None else (entry.item.mark, f"{draft.path}.use")
         problems.add(mark, f"{path}: {error}")
