@@ -177,7 +177,8 @@ def _set_values(drafts: Sequence[Draft], values: Mapping[str, Mapping[str, Any]]
     by_id = {draft.id: draft for draft in drafts}
     for id_, given in values.items():
         for name, value in given.items():
-            mark = Mark(f"--{name.replace('_', '-')}", 0, 0)
+            shown = f" {value}" if isinstance(value, str) and value.isprintable() else ""
+            mark = Mark(f"--{name.replace('_', '-')}{shown}", 0, 0)
             if id_ not in by_id:
                 problems.add(mark, f"there is no stage {id_!r}{did_you_mean(id_, by_id)}")
                 continue
@@ -282,6 +283,9 @@ def _node(draft: Draft, entry: Entry) -> Node:
     on_error = OnError("disable" if issubclass(cls, Sink) and cls.observer else "stop")
     if entry.on_error:
         on_error = OnError(entry.on_error.action, entry.on_error.budget)
+    # What the command line makes it read may not be there: then the file is not to blame.
+    read = entries.get("source") if draft.component.kind == "source" else None
+    mark = read.item.mark if read and not read.item.mark.line else draft.mark
     gates = [
         Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
         for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
@@ -291,7 +295,7 @@ def _node(draft: Draft, entry: Entry) -> Node:
         component=draft.component,
         params=draft.params,
         inputs=draft.inputs,
-        mark=draft.mark,
+        mark=mark,
         gates=tuple(gates),
         segment=entry.segment,
         queue=Queue(entry.queue.capacity, entry.queue.when_full),
