@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import tactflow
-from tactflow.message import Results, build_message
+from tactflow.message import Results
+from tests.messages import build_message
 
 PIPELINE = """
 stages:

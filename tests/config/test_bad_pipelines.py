@@ -315,6 +315,10 @@ CASES: dict[str, tuple[str, list[str]]] = {
             "image (prepare) has this type: name the parameter image, or say in: {picture: prepare.image}",
         ],
     ),
+    "sensors without a name": (
+        COMPARE + SINK + "sensors: §{}\n",
+        ["sensors: expected a name -> changes for each sensor, as in {left: {stages: ...}, right: {}}, got"],
+    ),
     "dangling sink": (
         PREPARE + "sinks:\n  §out: {use: './parts.py:Require'}\n",
         ["needs contact, but no stage gives it"],

@@ -29,11 +29,12 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
-from tactflow.message import Results, build_message
+from tactflow.message import Results
 from tactflow.sinks.view import View
 from tactflow.view.address import address, bind, is_loopback
 from tactflow.vision.types import Contact, Markers
 from tests.clock import PATIENCE, until
+from tests.messages import build_message
 
 SECRET = "a-secret-of-some-length"
 

@@ -20,7 +20,7 @@ from tactflow.recording.schemas import PICTURE_DESCRIPTOR, PICTURE_TYPE, RESULT_
 NEVER = 1 << 62
 """Size at which a chunk would end by itself, bytes: they are ended by hand."""
 _OVERHEAD = 200
-"""About what an entry takes in memory beside its data, bytes."""
+"""About what an entry takes in memory beside its data, bytes: the object and its fields. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
