@@ -35,10 +35,10 @@ def test_a_stage_in_a_loose_file_replaces_a_built_in_one(by: str, tmp_path: Path
     options = ["--source", "sim:press?frames=60&light=bright", "--quiet", "--jsonl", "-"]
     if by == "file":
         pipeline["stages"].update(change)
+        pipeline["sinks"] = {}
+        (tmp_path / "pipeline.yaml").write_text(yaml.safe_dump(pipeline, sort_keys=False))
     else:
-        options += ["--set", 'stages.difference={use: "./bright.py:Bright"}']
-    pipeline["sinks"] = {}
-    (tmp_path / "pipeline.yaml").write_text(yaml.safe_dump(pipeline, sort_keys=False))
+        options += ["--set", "sinks={}", "--set", 'stages.difference={use: "./bright.py:Bright"}']
     done = run("-m", "tactflow", "run", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = [orjson.loads(line) for line in done.stdout.splitlines()]

@@ -392,9 +392,12 @@ def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
         "vandal": {"use": "Vandal", "in": {"grid": "bad"}},
         "gated": {"when": []},
     }
-    result = toy_runner({**stages, "heavy": {"in": {"level": "vandal"}}}, check=True).run()
+    runner = toy_runner({**stages, "heavy": {"in": {"level": "vandal"}}}, check=True)
+    result = runner.run()
     assert result.exit_code == 3
     assert "port half: required shape (H, W) with H = 4, W = 6, got (2, 6)" in str(result.error)
+    where = runner.nodes["bad"].node.component.cls.process.__code__  # type: ignore[attr-defined]
+    assert f"  in {where.co_filename}:{where.co_firstlineno}\n" in str(result.error)
 
 
 def test_a_stage_that_exits_while_it_is_built_is_named(toy_runner: MakeRunner) -> None:
