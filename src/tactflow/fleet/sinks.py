@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from tactflow.config.overrides import as_yaml
 from tactflow.config.sensors import PLACEHOLDER
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.graph import Node, Pipeline
@@ -80,15 +80,13 @@ def written_files(node: Node, params: StageParams) -> Sequence[Output]:
 def changes(node: Node, params: StageParams) -> list[str]:
     """`sinks.ID.KEY=VALUE` for every parameter in which `params` differ from those of the sink."""
     old, new = _plain(node.params), _plain(params)
-    return [
-        f"sinks.{node.id}.{key}={json.dumps(value)}" for key, value in new.items() if value != old.get(key)
-    ]
+    return [f"sinks.{node.id}.{key}={as_yaml(value)}" for key, value in new.items() if value != old.get(key)]
 
 
 def added(node: Node) -> str:
     """The override that adds a sink which an option of the command line has added."""
     given = node.params.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    return f"sinks.{node.id}={json.dumps({'use': node.component.name} | given)}"
+    return f"sinks.{node.id}={as_yaml({'use': node.component.name} | given)}"
 
 
 def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
