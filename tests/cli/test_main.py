@@ -185,6 +185,11 @@ def test_names_in_brackets_are_shown_as_they_are(name: str, tmp_path: Path) -> N
     assert ending.endswith("0 dropped (error)")
 
 
+def test_the_summary_of_one_frame(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--source", "sim:idle?frames=1", "--set", "sinks={}"]) == 0
+    assert "\n1 frame in " in "\n" + capsys.readouterr().err
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere every file name is text")
 def test_a_name_that_is_no_text_is_pointed_at(tmp_path: Path) -> None:
     done = program("run", "--source", "\udcff.png", "--quiet", cwd=tmp_path)

@@ -26,7 +26,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
 from tactflow.engine.trace import Trace
-from tactflow.fleet.names import with_name
+from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 
 Sinks = dict[str, dict[str, Any]]
@@ -97,22 +97,24 @@ def _run_all(
         file,
         args.overrides,
         added={option for added in sinks.values() for option in added},
-        options={sensor: _options(args, sensor) for sensor in sensors},
+        files={option: path for option, path in _statistics_files(args).items() if path is not None},
+        options=_options(args),
     )
     return run_fleet(request, {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors})
 
 
-def _options(args: argparse.Namespace, sensor: str) -> list[str]:
-    """The options of this run for the process of one sensor, but for those about sinks."""
+def _options(args: argparse.Namespace) -> list[str]:
+    """The options of this run for the process of every sensor, but for those about sinks and files."""
     words = []
-    for option, path in (("--stats", args.stats), ("--trace", args.trace)):
-        if path is not None:
-            words += [option, with_name(path, sensor)]
     for option, value in (("--max-frames", args.max_frames), ("--stats-every", args.stats_every)):
         if value is not None:
             words += [option, str(value)]
     flags = (("--realtime", args.realtime), ("--quiet", args.quiet), ("--check", args.check))
     return words + [flag for flag, given in flags if given]
+
+
+def _statistics_files(args: argparse.Namespace) -> dict[str, str | None]:
+    return {"--stats": args.stats, "--trace": args.trace}
 
 
 def _option_problems(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
@@ -123,14 +125,9 @@ def _option_problems(args: argparse.Namespace, sensors: Sequence[str]) -> list[s
             f"--source: the pipeline has {len(sensors)} sensors, each with its own source; choose one with "
             f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
         )
-    for option in ("jsonl", "stats", "trace", "out"):
-        path = getattr(args, option, None)
-        try:
-            for sensor in sensors if path is not None else ():
-                with_name(str(path), sensor)
-        except ConfigError as error:
-            problems.append(f"--{option} {path}: {error}")
-    return problems
+    files = {"--jsonl": args.jsonl, **_statistics_files(args), "--out": getattr(args, "out", None)}
+    given = {option: str(path) for option, path in files.items() if path is not None}
+    return problems + name_problems(given, sensors)
 
 
 def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:

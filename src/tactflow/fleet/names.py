@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tactflow.config.sensors import PLACEHOLDER
@@ -37,6 +38,21 @@ def with_name(path: str, sensor: str) -> str:
         example = os.path.join(named, f"{PLACEHOLDER}.json")
         raise ConfigError(f"required a file, not a folder; each sensor writes its own, as in {example}")
     return named
+
+
+def name_problems(files: Mapping[str, str], sensors: Sequence[str]) -> list[str]:
+    """One message for each option whose file not every sensor can have its own of.
+
+    files : option -> the file it names.
+    """
+    problems = []
+    for option, path in files.items():
+        try:
+            for sensor in sensors:
+                with_name(path, sensor)
+        except ConfigError as error:
+            problems.append(f"{option} {path}: {error}")
+    return problems
 
 
 def _is_folder(path: str) -> bool:

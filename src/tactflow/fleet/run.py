@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
+from tactflow.fleet.names import with_name
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import (
     Shared,
@@ -29,13 +30,15 @@ class Request:
     """What every sensor's process is asked to do.
 
     file : the pipeline file. overrides : for `--set`. added : options of the command line that added sinks,
-    as in the marks of these. options : sensor -> all other words of its command line.
+    as in the marks of these. files : option -> the file it names, of which each sensor writes its own.
+    options : all other words of the command line.
     """
 
     file: Path
     overrides: Sequence[str]
     added: Collection[str]
-    options: Mapping[str, Sequence[str]]
+    files: Mapping[str, str]
+    options: Sequence[str]
 
 
 def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
@@ -82,7 +85,9 @@ def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequenc
     command = [sys.executable, "-P", "-m", "tactflow", "run", str(request.file), "--sensor", sensor]
     for text in (*request.overrides, *sinks, *changed):
         command += ["--set", text]
-    return [*command, *request.options[sensor]]
+    for option, path in request.files.items():
+        command += [option, with_name(path, sensor)]
+    return [*command, *request.options]
 
 
 def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scratch: Path) -> list[str]:
