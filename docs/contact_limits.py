@@ -184,6 +184,20 @@ def _right(count: int, total: int) -> str:
     return f"{count} wrong, {100 - 100 * count / total:.1f} %"
 
 
+LEGEND = (
+    '<rect x="70" y="8" width="14" height="10" fill="#e4ecf7"/>'
+    '<text x="88" y="17">force &#8805; 0.75 N</text>'
+    '<path d="M180 13h22" stroke="#c0392b" stroke-width="2"/>'
+    '<text x="206" y="17">grip force, 0.03 to 60 N</text>'
+    '<path d="M350 13h22" stroke="#1f4e79" stroke-width="2"/>'
+    '<text x="376" y="17">change of the picture, 1 to 300 grey levels</text>'
+    '<rect x="622" y="9" width="14" height="7" fill="#4a7a3f"/><text x="640" y="17">called contact</text>'
+    '<rect x="736" y="11" width="14" height="4" fill="#d9a300"/>'
+    '<text x="754" y="17">disagrees</text>'
+)
+"""What the colours of the figure mean, SVG."""
+
+
 def picture(grasps: list[Grasp], said: tuple[Bools, ...]) -> str:
     """The figure as SVG."""
     width, height, left, gap, most = 900, 118, 70, 26, 80
@@ -226,21 +240,10 @@ def picture(grasps: list[Grasp], said: tuple[Bools, ...]) -> str:
         f'<text x="{x(tick):.0f}" y="{top + 6:.0f}" text-anchor="middle">{tick}</text>'
         for tick in range(0, most + 1, 10)
     ]
-    legend = (
-        '<rect x="70" y="8" width="14" height="10" fill="#e4ecf7"/>'
-        '<text x="88" y="17">force &#8805; 0.75 N</text>'
-        '<path d="M180 13h22" stroke="#c0392b" stroke-width="2"/>'
-        '<text x="206" y="17">grip force, 0.03 to 60 N</text>'
-        '<path d="M350 13h22" stroke="#1f4e79" stroke-width="2"/>'
-        '<text x="376" y="17">change of the picture, 1 to 300 grey levels</text>'
-        '<rect x="622" y="9" width="14" height="7" fill="#4a7a3f"/><text x="640" y="17">called contact</text>'
-        '<rect x="736" y="11" width="14" height="4" fill="#d9a300"/>'
-        '<text x="754" y="17">disagrees</text>'
-    )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {top + 28:.0f}" '
         'font-family="sans-serif" font-size="12"><rect width="100%" height="100%" fill="#fff"/>'
-        + legend
+        + LEGEND
         + "\n".join(rows)
         + f'<text x="{(left + width) / 2}" y="{top + 21:.0f}" text-anchor="middle">frame (30 a second)</text>'
         "</svg>\n"

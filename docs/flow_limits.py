@@ -49,7 +49,7 @@ class Curve:
     """One scene.
 
     expected : (S,) px, mean error for each of `SIGMA`. measured : px, of the default pipeline.
-    decided : px, the same over the frames in which no marker is at the rim (`Truth.at_rim`).
+    decided : px, the same over the frames in which no marker is at the edge (`Truth.at_edge`).
     sigma : px, standard deviation of its outline at the markers; None where there are too few.
     """
 

@@ -11,7 +11,7 @@ from pydantic import Field
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded
+from tactflow.files import expanded, make_folder
 from tactflow.ports import Picture
 
 
@@ -65,7 +65,7 @@ class Images(Sink):
             If it holds frames already and `overwrite` is not set, or cannot be created.
         """
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self._folder)
             present = next(self._folder.glob("frame-*.[pj][np]g"), None)
         except OSError as error:
             raise StageError(f"{self._folder}: cannot be created: {error.strerror or error}") from error

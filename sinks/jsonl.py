@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, lead_nowhere
+from tactflow.files import expanded, lead_nowhere, make_folder
 from tactflow.message import Results, encode_message
 
 log = logging.getLogger("tactflow")
@@ -89,7 +89,7 @@ class Jsonl(Sink):
             return
         path = expanded(self.params.path)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             self._file = self._open_file(path)
         except OSError as error:
             raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded
+from tactflow.files import expanded, make_folder
 from tactflow.ports import Picture
 
 log = logging.getLogger("tactflow")
@@ -99,7 +99,7 @@ class Video(Sink):
         if self._path.exists() and not self.params.overwrite:
             raise StageError(f"{self._path}: this file exists; set overwrite: true or give another path")
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._path.parent)
             with tempfile.TemporaryDirectory(dir=self._path.parent, prefix=".tactflow-") as folder:
                 self._codec = self._choose_codec(Path(folder) / f"probe{self._path.suffix.lower()}")
         except OSError as error:

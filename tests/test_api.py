@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import tactflow
-from tactflow.message import Results, build_message
+from tactflow.message import Results
+from tests.messages import build_message
 
 PIPELINE = """
 stages:
@@ -117,10 +118,54 @@ def test_of_a_live_source_a_slow_loop_gets_the_newest_results() -> None:
         seqs.append(result.seq)
         # As long as it takes for some more frames to come.
         threading.Event().wait(0.1)
-    stream.close()  # type: ignore[attr-defined]
+    stream.close()
     assert seqs == sorted(set(seqs))
     assert seqs[-1] > 5
     assert not background()
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_loop_may_take_its_time_at_the_end_of_a_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 0.0)
+    seqs = []
+    for result in tactflow.stream(max_frames=4):
+        # Longer than a run looks on before it calls something hanging.
+        threading.Event().wait(0.7)
+        seqs.append(result.seq)
+    assert seqs == [0, 1, 2, 3]
+
+
+@pytest.mark.usefixtures("folder")
+def test_an_unforeseen_error_reaches_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("not foreseen")
+
+    monkeypatch.setattr("tactflow.engine.run.make_schedule", fail)
+    with pytest.raises(RuntimeError, match="not foreseen"):
+        list(tactflow.stream())
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_stage_may_be_called_stream() -> None:
+    stage = {"use": "hull", "when": "touching"}
+    settings = {"stages.hull": None, "stages.stream": stage}
+    assert any(result.contact for result in tactflow.stream(settings=settings))
+
+
+@pytest.mark.usefixtures("folder")
+def test_arrays_of_a_result_cannot_be_written_to() -> None:
+    result = next(r for r in tactflow.stream(images=True) if r.contact is not None)
+    assert result.contact is not None
+    assert result.markers is not None
+    for array in (
+        result.image,
+        result.frame,
+        result.contact_mask,
+        result.contact.hull,
+        result.markers.position,
+    ):
+        assert array is not None
+        assert not array.flags.writeable
 
 
 @pytest.mark.usefixtures("folder")
@@ -148,10 +193,26 @@ def test_check_lists_every_mistake() -> None:
 def test_a_stage_can_be_called_without_the_engine() -> None:
     hull = tactflow.stage("hull")
     assert hull.process(np.zeros((40, 40), np.uint8)) == tactflow.Absent("no_contact")
-    with pytest.raises(tactflow.ConfigError, match=r"hull\.min_aera"):
+    with pytest.raises(tactflow.ConfigError, match=r"hull\.min_aera.* did you mean min_area"):
         tactflow.stage("hull", min_aera=3)
     with pytest.raises(tactflow.ConfigError, match="did you mean hull"):
         tactflow.stage("hul")
+
+
+def test_a_stage_that_asks_for_more_than_its_parameters_gets_it(folder: Path) -> None:
+    (folder / "named.py").write_text(
+        "from tactflow import Stage\nfrom tactflow.ports import Image\n"
+        "class Named(Stage):\n    memory = 'pure'\n"
+        "    def __init__(self, params, sensor):\n        self.sensor = sensor\n"
+        "    def process(self, image: Image) -> Image:\n        return image\n"
+    )
+    assert tactflow.stage("./named.py").sensor == "main"
+
+
+def test_settings_may_be_paths_and_any_text(folder: Path) -> None:
+    settings = {"stages.capture.source": folder / "\N{HERB}.npy", "sensor": "left"}
+    pipeline = tactflow.load(settings=settings)
+    assert pipeline.source.params.source.endswith("\N{HERB}.npy")  # type: ignore[attr-defined]
 
 
 def test_a_loaded_pipeline_can_be_streamed_twice(folder: Path) -> None:

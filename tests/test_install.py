@@ -48,8 +48,9 @@ def test_the_wheel_runs_its_packaged_pipeline_in_a_fresh_environment(tmp_path: P
     program = tmp_path / "venv" / "bin" / "tactflow"
     empty = tmp_path / "empty"
     empty.mkdir()
-    command(program, "run", "--max-frames", "30", "--set", "sinks.zmq.endpoint=tcp://127.0.0.1:*", cwd=empty)
-    assert len((empty / "out" / "results.jsonl").read_text().splitlines()) == 30
+    options = ("--max-frames", "30", "--set", "sinks.zmq.endpoint=tcp://127.0.0.1:*")
+    command(program, "run", "markerless", *options, cwd=empty)
+    assert len((empty / "out" / "markerless.jsonl").read_text().splitlines()) == 30
     where = command(python, "-c", "import tactflow.stages.hull as m; print(m.__file__)", cwd=empty)
     assert str(tmp_path / "venv") in where
     assert "hull" in command(program, "stages", cwd=empty)

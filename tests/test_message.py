@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import STATUS_NAMES, Results, build_message, encode_message, message_schema
+from tactflow.message import STATUS_NAMES, Results, encode_message, message_schema
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
+from tests.messages import build_message
 
 VALIDATOR = jsonschema.Draft202012Validator(message_schema())
 

@@ -11,6 +11,8 @@ import orjson
 import pytest
 import yaml
 
+from tactflow.cli.main import main
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 README = (REPOSITORY / "README.md").read_text()
 
@@ -35,10 +37,10 @@ def test_a_stage_in_a_loose_file_replaces_a_built_in_one(by: str, tmp_path: Path
     options = ["--source", "sim:press?frames=60&light=bright", "--quiet", "--jsonl", "-"]
     if by == "file":
         pipeline["stages"].update(change)
+        pipeline["sinks"] = {}
+        (tmp_path / "pipeline.yaml").write_text(yaml.safe_dump(pipeline, sort_keys=False))
     else:
-        options += ["--set", 'stages.difference={use: "./bright.py:Bright"}']
-    pipeline["sinks"] = {}
-    (tmp_path / "pipeline.yaml").write_text(yaml.safe_dump(pipeline, sort_keys=False))
+        options += ["--set", "sinks={}", "--set", 'stages.difference={use: "./bright.py:Bright"}']
     done = run("-m", "tactflow", "run", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = [orjson.loads(line) for line in done.stdout.splitlines()]
@@ -54,7 +56,7 @@ def test_the_notebook_example_finds_the_dots(tmp_path: Path) -> None:
 
 def test_every_command_and_file_that_the_readme_names_is_there() -> None:
     for command in set(re.findall(r"`tactflow (\w+)", README)):
-        assert run("-m", "tactflow", command, "--help", cwd=REPOSITORY).returncode == 0, command
+        assert main([command, "--help"]) == 0, command
     for link in re.findall(r"\]\(([^)#:]+)\)", README):
         assert (REPOSITORY / link).exists(), link
     stages = set(re.findall(r"^\| `(\w+)` \|.*\|.*\|$", README, re.M))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,15 @@ from typing import Any
 import cv2
 from pydantic import ValidationError
 
+from tactflow.config.complaints import complain
 from tactflow.config.load import load_pipeline
+from tactflow.config.overrides import as_yaml
 from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
+from tactflow.config.yamlmap import Problems, wrap
+from tactflow.engine.conformance import build
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Mark, Pipeline
 from tactflow.engine.run import Runner, RunResult
 
 Settings = Mapping[str, Any]
@@ -54,7 +57,7 @@ def load(
     values: dict[str, Any] = {} if source is None else {"source": str(source)}
     if realtime:
         values["realtime"] = True
-    overrides = [f"{key}={json.dumps(value)}" for key, value in (settings or {}).items()]
+    overrides = [f"{key}={as_yaml(value)}" for key, value in (settings or {}).items()]
     file = find_pipeline(None if pipeline is None else str(pipeline))
     return load_pipeline(file, overrides, source_values=values, sensor=sensor)
 
@@ -156,10 +159,14 @@ def stage(use: str, /, **params: Any) -> Any:
     ((29.5, 29.5), 0.0)
     """
     component = resolve(use, "stages", Path())
+    problems = Problems()
     try:
-        instance = component.cls(component.params.model_validate(params))
+        checked = component.params.model_validate(params)
     except ValidationError as error:
-        mistakes = [f"{use}.{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
-        raise ConfigError(*mistakes) from None
+        given = wrap(params, Mark(f'stage("{use}")', 0, 0))
+        complain(error, component.params, given, use, problems, noun="parameter")
+    problems.raise_if_any()
+    offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None}
+    instance = build(component.cls, checked, offered)
     instance.open()
     return instance

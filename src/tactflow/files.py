@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -25,6 +26,20 @@ def is_device(text: str) -> bool:
     """Whether it is there and neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
     there = status(text)
     return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and all above it, unless it is there.
+
+    Raises
+    ------
+    OSError : that cannot be; where a file stands in its place, `strerror` says which.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        file = next((path for path in (folder, *folder.parents) if path.is_file()), folder)
+        raise NotADirectoryError(errno.ENOTDIR, f"{file} is a file, not a folder") from None
 
 
 def lead_nowhere(stream: IO[str]) -> None:

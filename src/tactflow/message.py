@@ -106,12 +106,6 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
     )
 
 
-def build_message(tick: Tick, results: Results, *, detail: bool = False) -> dict[str, Any]:
-    """The same message as plain dicts, lists and numbers: what a subscriber gets after parsing it."""
-    message: dict[str, Any] = orjson.loads(encode_message(tick, results, detail=detail))
-    return message
-
-
 def _contact(contact: Contact, detail: bool) -> dict[str, Any]:
     ellipse = contact.ellipse
     result: dict[str, Any] = {

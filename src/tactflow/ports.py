@@ -1,7 +1,7 @@
 """The vocabulary of ports: what the built-in stages and sinks say to each other.
 
-Besides these arrays and signals, `Frame` and the dataclasses of `tactflow.vision` (`Contact`, `Markers`,
-`Flow`, ...) are port types; their port is named after them: `frame`, `contact`, `markers`, `flow`.
+Besides these arrays and signals, `Frame` and the dataclasses of `tactflow.vision.types` (`Contact`,
+`Markers`, `Flow`, ...) are port types; their port is named after them: `frame`, `contact`, `markers`, `flow`.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 from tactflow.api import Settings, load, make_runner
 from tactflow.engine.conformance import component
 from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
 from tactflow.engine.graph import Mark, Node, Pipeline, Ref
 from tactflow.engine.link import Link
-from tactflow.engine.run import Runner, RunResult
+from tactflow.engine.run import Runner
 from tactflow.ports import ContactMask, Image
 from tactflow.vision.types import Contact, Flow, Markers
 
-_WAITING = 2
-"""Results that may wait for the loop: one is computed while another is looked at."""
-
-_SINK = "stream"
+_SINK = "tactflow.stream"
+"""Id of the sink that hands results over; no id of a file has a point in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +37,8 @@ class Result:
     skipped : port -> why it was not computed in this frame: `unchanged` repeats the last value.
     image : (H, W, 3) uint8 BGR, the processed frame. frame : the raw one. Both None unless asked for, because
         a list of results would hold them all in memory.
+
+    Arrays are read-only, as the run may use them again; copy one to draw on it.
 
     >>> result = next(stream(source="sim:press", max_frames=1))
     >>> result.seq, result.contact, len(result.markers.position)
@@ -66,7 +67,7 @@ def stream(
     max_frames: int | None = None,
     images: bool = False,
     sinks: bool = False,
-) -> Iterator[Result]:
+) -> Generator[Result, None, None]:
     """Run a pipeline and iterate over its results.
 
     The run goes on in the background while the loop works on a result. A recording waits for the loop, so
@@ -93,17 +94,20 @@ def stream(
     """
     if not isinstance(pipeline, Pipeline):
         pipeline = load(pipeline, source=source, settings=settings, sensor=sensor, realtime=realtime)
-    link: Link[Result] = Link(_SINK, _WAITING, "block")
+    link: Link[Result] = Link(_SINK, 1, "block")
     runner = make_runner(_with_hand(pipeline, link, images=images, sinks=sinks), max_frames=max_frames)
     return _results(runner, link)
 
 
-def _results(runner: Runner, link: Link[Result]) -> Iterator[Result]:
-    ended: list[RunResult] = []
+def _results(runner: Runner, link: Link[Result]) -> Generator[Result, None, None]:
+    failures: list[BaseException] = []
 
     def work() -> None:
         try:
-            ended.append(runner.run())
+            failure = runner.run().failure
+            failures.extend([failure] if failure is not None else [])
+        except BaseException as error:
+            failures.append(error)
         finally:
             link.close()
 
@@ -116,8 +120,8 @@ def _results(runner: Runner, link: Link[Result]) -> Iterator[Result]:
         runner.stop()
         link.abort()
         thread.join()
-    if ended and ended[0].failure is not None:
-        raise ended[0].failure
+    if failures:
+        raise failures[0]
 
 
 class _Inputs(NamedTuple):
@@ -136,6 +140,15 @@ class _Hand(Sink):
     link: Link[Result]
     images: bool
 
+    def __init__(self, params: StageParams, control: Control) -> None:
+        super().__init__(params)
+        self._control = control
+
+    def open(self) -> None:
+        """Of a live source only the newest result waits for the loop."""
+        if self._control.source is not None and self._control.source.live:
+            self.link.when_full = "latest"
+
     def write(self, tick: Tick, inputs: _Inputs) -> None:
         frame = tick.frame
         self.link.put(
@@ -143,15 +156,28 @@ class _Hand(Sink):
                 sensor=frame.sensor,
                 seq=frame.seq,
                 t=frame.t,
-                contact=inputs.contact,
+                contact=_locked(inputs.contact),
                 flow=inputs.flow,
-                markers=inputs.markers,
-                contact_mask=inputs.contact_mask,
+                markers=_locked(inputs.markers),
+                contact_mask=_locked(inputs.contact_mask),
                 skipped=dict(tick.skipped),
-                image=inputs.image if self.images else None,
+                image=_locked(inputs.image) if self.images else None,
                 frame=frame.image if self.images else None,
             )
         )
+
+
+def _locked(value: Any) -> Any:
+    """The same with arrays that cannot be written to: an array, or a dataclass of arrays and numbers."""
+    if isinstance(value, np.ndarray):
+        view = value.view()
+        view.flags.writeable = False
+        return view
+    if value is None:
+        return None
+    parts = {field.name: getattr(value, field.name) for field in fields(value)}
+    arrays = {name: _locked(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
+    return replace(value, **arrays)
 
 
 def _with_hand(pipeline: Pipeline, link: Link[Result], *, images: bool, sinks: bool) -> Pipeline:

@@ -169,17 +169,17 @@ def test_flow_is_compared_where_both_know_it(truth: Truth) -> None:
     score.add(Flow((x + 0.3, y + 0.4), 5), truth)
     score.add(Flow(None, 0), truth)
     score.add(None, truth)
-    assert not truth.at_rim.any()
+    assert not truth.at_edge.any()
     assert score.errors() == {"flow_error": pytest.approx(0.5), "flow_decided": pytest.approx(0.5)}
 
 
-def test_flow_beside_a_marker_at_the_rim_is_a_matter_of_chance(truth: Truth) -> None:
+def test_flow_beside_a_marker_at_the_edge_is_a_matter_of_chance(truth: Truth) -> None:
     assert truth.mean_flow is not None
     x, y = truth.mean_flow
-    at_rim = np.zeros_like(truth.at_rim)
-    at_rim[0] = True
+    at_edge = np.zeros_like(truth.at_edge)
+    at_edge[0] = True
     score = FlowScore()
-    score.add(Flow((x + 3, y), 5), replace(truth, at_rim=at_rim))
+    score.add(Flow((x + 3, y), 5), replace(truth, at_edge=at_edge))
     assert score.errors() == {"flow_error": pytest.approx(3)}
 
 

@@ -132,6 +132,16 @@ class Refine(Stage):
         return contact if flow is None else Contact(float(flow.count), contact.center, None, None, ZERO, None)
 
 
+class Spot(Stage):
+    memory = "pure"
+
+    def __init__(self, params: StageParams) -> None:
+        self.params = params
+
+    def process(self, picture: Image) -> Flow:
+        return Flow(None, int(picture[0, 0, 0]))
+
+
 class Needy(Stage):
     memory = "pure"
 

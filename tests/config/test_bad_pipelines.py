@@ -308,6 +308,17 @@ CASES: dict[str, tuple[str, list[str]]] = {
         PREPARE + "  §outline: {use: './parts.py:Outline'}\n  compare: {use: './parts.py:Compare'}\n" + SINK,
         ["compare gives it but stands below", "in: {contact_mask: compare.contact_mask}"],
     ),
+    "dangling input of a type that one stage gives": (
+        PREPARE + "  §spot: {use: './parts.py:Spot'}\n" + SINK,
+        [
+            "needs picture, but no stage above gives it",
+            "image (prepare) has this type: name the parameter image, or say in: {picture: prepare.image}",
+        ],
+    ),
+    "sensors without a name": (
+        COMPARE + SINK + "sensors: §{}\n",
+        ["sensors: expected a name -> changes for each sensor, as in {left: {stages: ...}, right: {}}, got"],
+    ),
     "dangling sink": (
         PREPARE + "sinks:\n  §out: {use: './parts.py:Require'}\n",
         ["needs contact, but no stage gives it"],

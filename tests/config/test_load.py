@@ -45,6 +45,19 @@ def load(tmp_path: Path) -> Load:
     return from_text
 
 
+def test_a_loose_file_named_on_the_command_line_stands_in_the_current_folder(
+    load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    (here / "mine.py").write_text(PARTS.read_text())
+    monkeypatch.chdir(here)
+    pipeline = load(BODY, "stages.outline.use=./mine.py:Outline")
+    assert pipeline.nodes["outline"].component.cls.__module__.startswith("tactflow_file_mine")
+    with pytest.raises(ConfigError, match=r"cannot read ./mine\.py"):
+        load(BODY.replace("./parts.py:Outline", "./mine.py:Outline"))
+
+
 def test_a_file_becomes_nodes_with_parameters_and_marks(load: Load, tmp_path: Path) -> None:
     pipeline = load()
     assert list(pipeline.nodes) == ["capture", "prepare", "compare", "outline", "out"]

@@ -146,6 +146,20 @@ def test_a_loose_file_with_one_class_needs_no_class_name(tmp_path: Path) -> None
     assert resolve("./edges.py", "stages", tmp_path).cls.__name__ == "Edges"
 
 
+def test_a_loose_file_is_taken_from_the_first_folder_that_has_it(tmp_path: Path) -> None:
+    for folder, name in (("a", "First"), ("b", "Second")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / f"{name}.py").write_text(STAGE.format(name=name))
+    folders = tmp_path / "a", tmp_path / "b"
+    (tmp_path / "b" / "First.py").write_text(STAGE.format(name="Other"))
+    assert resolve("./First.py", "stages", *folders).cls.__name__ == "First"
+    assert resolve("./Second.py", "stages", *folders).cls.__name__ == "Second"
+    with pytest.raises(
+        ConfigError, match=rf"cannot read ./no\.py: .* \({folders[0]}/no.py or {folders[1]}/no.py\)"
+    ):
+        resolve("./no.py", "stages", *folders)
+
+
 def test_two_loose_files_of_one_name_do_not_share_a_module(tmp_path: Path) -> None:
     for folder, name in (("a", "First"), ("b", "Second")):
         (tmp_path / folder).mkdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -65,6 +66,8 @@ def test_a_class_is_of_the_kind_that_it_inherits_from(cls: type, kind: str) -> N
         (GoodSink, "queue_capacity", 0, "queue_capacity: required a whole number from 1, got 0"),
         (GoodSink, "queue_capacity", True, "queue_capacity: required a whole number from 1, got True"),
         (GoodSink, "observer", None, "observer: required True or False, got None"),
+        (GoodSink, "description", 3, "description: required a text or None, got 3"),
+        (GoodSource, "live", "no", "live: required True or False, got 'no'"),
         (Good, "reset", True, "reset: required a method, got True"),
         (Good, "Params", dict, "Params must be a subclass of tactflow.StageParams"),
     ],
@@ -74,19 +77,48 @@ def test_a_wrong_value_is_an_error(base: type, name: str, value: Any, words: str
 
 
 @pytest.mark.parametrize(
-    ("base", "misspelt", "meant"),
+    ("base", "misspelt", "value", "meant"),
     [
-        (GoodSink, "takes_reference", "takes_references"),
-        (GoodSink, "when_life", "when_live"),
-        (GoodSink, "queue_capasity", "queue_capacity"),
-        (Good, "resets", "reset"),
+        (GoodSink, "takes_reference", True, "takes_references"),
+        (GoodSink, "when_life", "latest", "when_live"),
+        (GoodSink, "queue_capasity", 3, "queue_capacity"),
+        (GoodSink, "want", lambda self: id(self), "wants"),
+        (Good, "resets", lambda self: id(self), "reset"),
     ],
 )
-def test_a_misspelt_name_is_an_error_that_says_what_was_meant(base: type, misspelt: str, meant: str) -> None:
-    assert (
-        f"{misspelt}: a {component(base, '', '', ()).kind} has no such attribute; did you mean {meant}?"
-        in wrong(base, **{misspelt: "latest"})
+def test_a_misspelt_name_is_an_error_that_says_what_was_meant(
+    base: type, misspelt: str, value: Any, meant: str
+) -> None:
+    said = wrong(base, **{misspelt: value})
+    assert re.search(rf"\.{misspelt}: a \w+ has no such attribute; did you mean {meant}\?", said)
+
+
+@pytest.mark.parametrize(
+    ("base", "own"),
+    [
+        (GoodSink, {"publish": lambda self: id(self), "output": "out.csv", "counter": 0}),
+        (GoodSink, {"closed": property(bool), "frames": 0}),
+        (GoodSource, {"total": property(id), "live": property(bool)}),
+    ],
+)
+def test_names_of_another_sort_are_its_own(base: type, own: dict[str, Any]) -> None:
+    cls = type("Own", (base,), own)
+    assert component(cls, "own", "a test", ()).cls is cls
+
+
+def test_a_property_of_the_contract_must_be_one() -> None:
+    assert "missed: required a property; write @property above it" in wrong(
+        GoodSource, missed=lambda self: id(self)
     )
+
+
+def test_what_belongs_to_another_kind_is_an_error() -> None:
+    assert "threaded: a stage has no such attribute" in wrong(Good, threaded=True)
+    assert "memory: a sink has no such attribute" in wrong(GoodSink, memory="pure")
+
+
+def test_parameters_under_another_name_are_an_error() -> None:
+    assert "Parameters: nobody reads it" in wrong(Good, Parameters=type("Parameters", (StageParams,), {}))
 
 
 def test_a_name_of_its_own_is_free() -> None:

@@ -97,7 +97,8 @@ def test_the_return_annotation_names_the_output_ports(
         (RawField, "RawField.picture: a bare array"),
         (NoFields, "NoFields has no annotated fields"),
         (HiddenField, "the fields of HiddenField use Ellipse"),
-        (float, "gives the output port no name"),
+        (float, "gives the output port no name; return a NamedTuple with a field for it, as in name: float"),
+        (bool, r'is Annotated\[bool, SignalPort\("name", closed="reason"\)\]'),
         (dict[str, int], "gives the output port no name"),
         (Any, "gives the output port no name"),
         (Contact | Flow, "names several types for one port"),
@@ -206,6 +207,18 @@ class SinkWithOtherTick:
     def write(self, now: Tick) -> None: ...
 
 
+class SinkWithBareTick:
+    def write(self, tick, contact: Contact) -> None: ...  # type: ignore[no-untyped-def]
+
+
+class SinkWithBareResults:
+    def write(self, tick: Tick, results) -> None: ...  # type: ignore[no-untyped-def]
+
+
+class SinkWithDictOfResults:
+    def write(self, tick: Tick, results: dict[str, Any]) -> None: ...
+
+
 @pytest.mark.parametrize(
     ("cls", "method", "words"),
     [
@@ -231,6 +244,9 @@ class SinkWithOtherTick:
         (StageThatIsAwaited, "process", "async functions are not awaited"),
         (SinkThatReturns, "write", "a sink returns nothing"),
         (SinkWithOtherTick, "write", "must be called tick, not now"),
+        (SinkWithBareTick, "write", "as in tick: Tick"),
+        (SinkWithBareResults, "write", "as in results: Results"),
+        (SinkWithDictOfResults, "write", "as in results: Results"),
     ],
 )
 def test_annotations_that_break_the_contract_are_reported_with_their_line(

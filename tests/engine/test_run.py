@@ -392,9 +392,12 @@ def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
         "vandal": {"use": "Vandal", "in": {"grid": "bad"}},
         "gated": {"when": []},
     }
-    result = toy_runner({**stages, "heavy": {"in": {"level": "vandal"}}}, check=True).run()
+    runner = toy_runner({**stages, "heavy": {"in": {"level": "vandal"}}}, check=True)
+    result = runner.run()
     assert result.exit_code == 3
     assert "port half: required shape (H, W) with H = 4, W = 6, got (2, 6)" in str(result.error)
+    where = runner.nodes["bad"].node.component.cls.process.__code__  # type: ignore[attr-defined]
+    assert f"  in {where.co_filename}:{where.co_firstlineno}\n" in str(result.error)
 
 
 def test_a_stage_that_exits_while_it_is_built_is_named(toy_runner: MakeRunner) -> None:
@@ -531,10 +534,33 @@ def test_a_paused_run_can_be_stopped(toy_runner: MakeRunner) -> None:
     assert not thread.is_alive()
 
 
+def test_a_run_that_was_not_stopped_may_take_as_long_as_it_needs(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 0.0)
+    runner = toy_runner({"join": {"seconds": 0.7}, "capture": {"frames": 3}})
+    ran(runner)
+    assert len(rows(runner)) == 3
+
+
+def test_a_run_that_is_stopped_before_its_sinks_are_open_opens_none(toy_runner: MakeRunner) -> None:
+    runner = toy_runner()
+    runner.stop()
+    result = ran(runner)
+    assert (result.stats["frames"], result.stats["end"]) == (0, "signal")
+    assert not runner.nodes
+
+
+@pytest.mark.parametrize("frames", [0, -1])
+def test_a_run_of_no_frames_is_a_mistake(toy_runner: MakeRunner, frames: int) -> None:
+    with pytest.raises(Exception, match="max_frames: required a whole number from 1"):
+        toy_runner(max_frames=frames)
+
+
 def test_a_stage_that_hangs_is_named(toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 0.2)
     runner = toy_runner({"join": {"seconds": 60}, "capture": {"frames": 3}})
-    result = runner.run()
+    result = runner.run(on_progress=lambda _: runner.stop())
     assert result.exit_code == 3
     assert "compute (in join) hangs" in str(result.error)
     runner.nodes["join"].instance.release.set()

@@ -82,3 +82,18 @@ def test_without_skipping_there_are_no_signals_to_wait_for(toy_runner: MakeRunne
 def test_a_gate_that_repeats_makes_its_stage_see_every_frame(toy_runner: MakeRunner, otherwise: str) -> None:
     found = needs(toy_runner({"gated": {"when": {"signal": "active", "otherwise": otherwise}}}))
     assert (("always", "") in found["gated"]) == (otherwise == "repeat")
+
+
+def test_a_maker_that_is_only_needed_behind_another_signal_comes_after_that_signal(
+    toy_runner: MakeRunner,
+) -> None:
+    stages: dict[str, Any] = {
+        "behind": {"use": "Gated", "when": "pulse.active"},
+        "even": {"use": "Even"},
+        "front": {"use": "Heavy", "in": {"level": "behind.gated"}, "when": "even.active"},
+        **dict.fromkeys(("gated", "total", "join")),
+    }
+    runner = toy_runner(stages, {"out": {"use": "OnlyLevel", "in": {"level": "front.heavy"}}})
+    assert order(runner).index("even") < order(runner).index("pulse")
+    assert needs(runner)["pulse"] == {("out", "even.active")}
+    assert needs(runner)["heavy"] == {("out", "even.active+pulse.active")}

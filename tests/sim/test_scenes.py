@@ -112,7 +112,7 @@ def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
             around = truth.contact_mask[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
             if around.all() or not around.any():
                 assert truth.inside[i] == around.any()
-                assert not (truth.at_rim[i] and 1 < x < width - 2 and 1 < y < height - 2)
+                assert not (truth.at_edge[i] and 1 < x < width - 2 and 1 < y < height - 2)
         assert not (truth.inside & ~truth.visible).any()
         if truth.mean_flow is None:
             assert not truth.inside.any()
@@ -137,7 +137,7 @@ def test_a_marker_at_the_outline_of_the_contact_is_told_apart_from_one_inside() 
     shown = np.ones(5, np.bool_)
     truth = measure(press, scene.camera, places, places, shown, scene.size, None, lambda: scene.clean(40))
     assert truth.inside.tolist() == [True, True, True, False, False]
-    assert truth.at_rim.tolist() == [False, False, True, True, False]
+    assert truth.at_edge.tolist() == [False, False, True, True, False]
 
 
 def test_index_i_is_the_same_marker_in_every_frame() -> None:
@@ -317,7 +317,7 @@ def test_truth_in_processed_coordinates_agrees_with_truth_in_raw_ones(rotate: in
     assert processed.mean_flow is not None
     assert raw.mean_flow is not None
     turned = {0: raw.mean_flow, 90: (-raw.mean_flow[1], raw.mean_flow[0])}[rotate]
-    # Twice the pixel: half the flow. Which markers count may differ by one at the rim.
+    # Twice the pixel: half the flow. Which markers count may differ by one at the edge.
     np.testing.assert_allclose(processed.mean_flow, np.array(turned) / 2, atol=0.3)
     exact = scene.truth(50, preprocess).unmarked
     np.testing.assert_array_equal(exact, preprocess(scene.clean(50)))

@@ -189,7 +189,7 @@ def test_a_disk_that_fills_up_leaves_complete_lines_only(append: bool, flush: fl
     ("make", "expected"),
     [
         (lambda folder: folder, "Is a directory"),
-        (lambda folder: folder / "file" / "r.jsonl", "Not a directory|File exists"),
+        (lambda folder: folder / "file" / "r.jsonl", "file is a file, not a folder"),
         (lambda _: Path("/proc/nowhere/r.jsonl"), "cannot be written"),
     ],
     ids=["a folder", "below a file", "where nothing can be created"],

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -26,16 +25,32 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from tactflow.config.load import load_pipeline
+from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
-from tactflow.message import Results, build_message
+from tactflow.message import Results
 from tactflow.sinks.view import View
 from tactflow.view.address import address, bind, is_loopback
 from tactflow.vision.types import Contact, Markers
 from tests.clock import PATIENCE, until
+from tests.messages import build_message
 
 SECRET = "a-secret-of-some-length"
+
+
+class FakeSource(Source):
+    """A source that is as the test wants it."""
+
+    total = 600
+    description = "a test"
+    words = "running"
+
+    @property
+    def state(self) -> str:
+        return self.words
+
+    def retake(self) -> None: ...
 
 
 class FakeRun:
@@ -44,7 +59,8 @@ class FakeRun:
     def __init__(self, *, live: bool = False, recorder: Any = None) -> None:
         self.calls: list[Any] = []
         self.paused = False
-        self.source = SimpleNamespace(live=live, total=600, description="a test", retake=lambda: None)
+        self.source = FakeSource(StageParams())
+        self.source.live = live
         self.sink = recorder
 
     def recorder(self) -> Any:
@@ -304,12 +320,12 @@ def test_a_page_that_comes_late_to_a_paused_run_sees_the_last_picture(
 # -- what pages may ask for ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("state", ["running", "waiting since 12:00:00 (no frames)", None])
+@pytest.mark.parametrize("state", ["running", "waiting since 12:00:00 (no frames)"])
 def test_a_source_that_is_held_is_not_said_to_run(
-    state: str | None, view: Callable[..., View], page: Callable[..., Page]
+    state: str, view: Callable[..., View], page: Callable[..., Page]
 ) -> None:
     run = FakeRun()
-    run.source.state = state
+    run.source.words = state
     browser = page(view(run))
     assert browser.next("state")["source"]["state"] == state
     browser.say(do="pause", value=True)

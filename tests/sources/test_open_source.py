@@ -333,6 +333,10 @@ BAD = {
     "empty array file": (_bytes("a.npy", b""), ["not a .npy"]),
     "text as array": (_bytes("a.npy", b"hello world, this is no array"), ["not a .npy"]),
     "pickled array": (_pickled_array, ["not a .npy"]),
+    "damaged header": (
+        _bytes("a.npy", b"\x93NUMPY\x01\x00" + bytes(200)),
+        ["not a .npy", "or a damaged one"],
+    ),
     "archive of arrays": (_archive, [".npz", "np.save"]),
     "text as image": (_bytes("a.png", b"hello"), ["not an image"]),
     "empty image": (_bytes("a.png", b""), ["empty"]),

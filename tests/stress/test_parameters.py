@@ -145,7 +145,7 @@ COMPONENTS = [(section, name) for section in ("stages", "sinks") for name in nam
 NUMBERS = [
     pytest.param(section, name, path, id=f"{name}.{'.'.join(path)}")
     for section, name in COMPONENTS
-    for path in numbers_of(resolve(section=section, use=name, directory=REPOSITORY).params)
+    for path in numbers_of(resolve(name, section, REPOSITORY).params)
 ]
 
 

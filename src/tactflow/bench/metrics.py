@@ -193,7 +193,7 @@ def lattice_area(hull: FloatArray) -> float:
     """Number of pixels whose centres lie in or on a polygon (N, 2) with corners on pixel centres, px^2.
 
     This is the area of the convex region that those pixels make up; the polygon through their centres misses
-    half a pixel along the rim.
+    half a pixel along its border.
 
     References
     ----------
@@ -203,8 +203,8 @@ def lattice_area(hull: FloatArray) -> float:
         return 0.0
     corners = np.rint(np.asarray(hull)).astype(np.int64)
     edge = np.roll(corners, -1, axis=0) - corners
-    on_rim = int(np.gcd(np.abs(edge[:, 0]), np.abs(edge[:, 1])).sum())
-    return polygon_area(corners.astype(np.float64)) + on_rim / 2 + 1
+    on_border = int(np.gcd(np.abs(edge[:, 0]), np.abs(edge[:, 1])).sum())
+    return polygon_area(corners.astype(np.float64)) + on_border / 2 + 1
 
 
 def _counter_clockwise(polygon: FloatArray) -> NDArray[np.float64]:

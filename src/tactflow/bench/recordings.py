@@ -26,7 +26,7 @@ from tactflow.engine.graph import Pipeline
 from tactflow.vision.types import MarkerStatus
 
 CONTACT_FORCE = 0.75
-"""Grip force from which on there is contact, N."""
+"""Grip force from which on there is contact, N; docs/contact-limits.md shows what hangs on it."""
 
 WEDGE_DOTS = 140
 """Dots printed on the Wedge's gel: 10 x 14."""

@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 
 from tactflow.bench import limit
 from tactflow.sim import Scene, Truth, open_scene
-from tactflow.sim.markers import EDGE
+from tactflow.sim.markers import DARK_MARKER, EDGE
 from tactflow.vision.geometry import PixelMapping
-
-DARK_MARKER = 0.88
-"""Share of the light that a fresh dark marker of the simulated sensor takes away."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ from tactflow.sim import Truth
 from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
 
 DIRECTED = 2.0
-"""Ratio of a contact's axes from which on its direction is judged."""
+"""Ratio of a contact's axes from which on its direction is judged. Chosen by hand."""
 
 _ROUND = 100
-"""Pixels from which on a contact is large enough to be called round."""
+"""Pixels from which on a contact is large enough to be called round. Chosen by hand."""
 
 
 def _drop_unknown(values: dict[str, float | None]) -> dict[str, float]:
@@ -237,7 +237,7 @@ class FlowScore:
             return
         error = float(np.hypot(flow.mean[0] - truth.mean_flow[0], flow.mean[1] - truth.mean_flow[1]))
         self.error.append(error)
-        if not truth.at_rim.any():
+        if not truth.at_edge.any():
             self.decided.append(error)
 
     def errors(self) -> dict[str, float]:

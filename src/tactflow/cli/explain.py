@@ -83,7 +83,8 @@ def _facts(
 
 def _demand(node: Node) -> str:
     rate = "" if node.max_rate is None else f", at most {node.max_rate:g} times a second"
-    asks = getattr(node.component.cls, "wants", None) is not Sink.wants
+    cls = node.component.cls
+    asks = issubclass(cls, Sink) and cls.wants is not Sink.wants
     own = "; it says for each frame whether it wants it" if asks else ""
     return rate + own
 

@@ -6,9 +6,11 @@ import argparse
 import difflib
 import importlib
 import os
+import re
 import signal
 import sys
 from collections.abc import Collection, Sequence
+from typing import NoReturn
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError, TactflowError
@@ -92,7 +94,7 @@ def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:
         if name in complete:
             module = importlib.import_module(f"tactflow.cli.{name}")
             module.add_arguments(command)
-            command.set_defaults(run=module.run)
+            command.set_defaults(run=module.run, parser=command)
     return parser
 
 
@@ -103,7 +105,19 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         guess = difflib.get_close_matches(wanted, COMMANDS, n=1)
         hint = f"did you mean {guess[0]}?" if guess else f"there are {', '.join(COMMANDS)}"
         parser.error(f"there is no command {wanted}; {hint}")
-    return parser.parse_args(argv)
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        _refuse(args.parser, unknown)
+    return args
+
+
+def _refuse(command: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:
+    """End with the usage of a command that was given words it does not know."""
+    options = re.findall(r"--[a-z][a-z-]*", command.format_usage())
+    option = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)
+    guess = difflib.get_close_matches(option, options, n=1) if option else []
+    hint = f"; did you mean {guess[0]}?" if guess else ""
+    command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from tactflow.engine.run import Runner, RunResult
 from tactflow.vision import compiled
 
 _COSTLIEST = 4
-"""Stages named in a line of statistics."""
+"""Stages named in a line of statistics. Chosen by hand: with them it fits on a wide terminal."""
 
 
 @contextmanager
@@ -100,13 +100,17 @@ def statistics_line(stats: Mapping[str, Any], before: Mapping[str, Any] | None =
 
 
 def summary(result: RunResult, runner: Runner) -> str:
+    """How a run ended: frames, drops, contacts, latency, and where each sink wrote."""
     stats = result.stats
-    lines = [
-        f"{stats['frames']} frames in {stats['wall_s']:.1f} s, {stats['dropped']} dropped ({stats['end']})"
-    ]
+    frames = "1 frame" if stats["frames"] == 1 else f"{stats['frames']} frames"
+    # What went wrong was said already.
+    end = "error" if result.error is not None else stats["end"]
+    lines = [f"{frames} in {stats['wall_s']:.1f} s, {stats['dropped']} dropped ({end})"]
     touching = next((s for name, s in stats["signals"].items() if name.endswith(".touching")), None)
     if touching is not None:
-        lines.append(f"contacts: {touching['rises']} ({touching['true']} frames with contact)")
+        number = touching["true"]
+        held = "1 frame" if number == 1 else f"{number} frames"
+        lines.append(f"contacts: {touching['rises']} ({held} with contact)")
     latency = stats["latency_ms"]
     if latency["p50"] is not None:
         lines.append(f"latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")

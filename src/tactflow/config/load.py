@@ -15,6 +15,7 @@ from tactflow.config.complaints import complain
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import add_sinks, apply, replaced
 from tactflow.config.registry import Section, code_place, did_you_mean, resolve
+from tactflow.config.shipped import is_packaged
 from tactflow.config.wiring import Draft
 from tactflow.config.yamlmap import Item, Problems, read_yaml, wrap
 from tactflow.engine.contract import Sink, StageParams
@@ -150,8 +151,10 @@ def _resolve(draft: Draft, directory: Path, problems: Problems) -> None:
     use = draft.id if entry is None else entry.item.content
     if not isinstance(use, str):
         return
+    # On the command line, and in a pipeline that nobody can put a file beside, it means the current folder.
+    own = is_packaged(directory) or (entry is not None and not entry.item.mark.line)
     try:
-        draft.component = resolve(use, draft.section, directory)
+        draft.component = resolve(use, draft.section, *([Path()] if own else []), directory)
     except ConfigError as error:
         mark, path = (draft.mark, draft.path) if entry is None else (entry.item.mark, f"{draft.path}.use")
         problems.add(mark, f"{path}: {error}")
@@ -174,7 +177,8 @@ def _set_values(drafts: Sequence[Draft], values: Mapping[str, Mapping[str, Any]]
     by_id = {draft.id: draft for draft in drafts}
     for id_, given in values.items():
         for name, value in given.items():
-            mark = Mark(f"--{name.replace('_', '-')}", 0, 0)
+            shown = f" {value}" if isinstance(value, str) and value.isprintable() else ""
+            mark = Mark(f"--{name.replace('_', '-')}{shown}", 0, 0)
             if id_ not in by_id:
                 problems.add(mark, f"there is no stage {id_!r}{did_you_mean(id_, by_id)}")
                 continue
@@ -279,6 +283,9 @@ def _node(draft: Draft, entry: Entry) -> Node:
     on_error = OnError("disable" if issubclass(cls, Sink) and cls.observer else "stop")
     if entry.on_error:
         on_error = OnError(entry.on_error.action, entry.on_error.budget)
+    # What the command line makes it read may not be there: then the file is not to blame.
+    read = entries.get("source") if draft.component.kind == "source" else None
+    mark = read.item.mark if read and not read.item.mark.line else draft.mark
     gates = [
         Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
         for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
@@ -288,7 +295,7 @@ def _node(draft: Draft, entry: Entry) -> Node:
         component=draft.component,
         params=draft.params,
         inputs=draft.inputs,
-        mark=draft.mark,
+        mark=mark,
         gates=tuple(gates),
         segment=entry.segment,
         queue=Queue(entry.queue.capacity, entry.queue.when_full),

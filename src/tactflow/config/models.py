@@ -76,6 +76,14 @@ def _free(name: str) -> str:
     return name
 
 
+def _at_least_one(sensors: dict[str, Any]) -> dict[str, Any]:
+    if not sensors:
+        raise PydanticCustomError(
+            "expected", "a name -> changes for each sensor, as in {left: {stages: ...}, right: {}}"
+        )
+    return sensors
+
+
 Word = Annotated[str, StringConstraints(pattern=WORD), _says("a word of letters, digits, _ and -")]
 Id = Annotated[
     str,
@@ -219,7 +227,8 @@ _Sensors = Annotated[
     dict[
         SensorKey, Annotated[Changes, _mapping("a mapping of changes, as in {stages: {capture: ...}}")] | None
     ],
-    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
+    AfterValidator(_at_least_one),
+    Field(json_schema_extra={"additionalProperties": False, "minProperties": 1}),
     _mapping("a mapping of name -> changes, as in {left: {stages: ...}}"),
 ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,16 @@ from tactflow.config.registry import did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems, read_value, wrap
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Mark
+
+
+def as_yaml(value: Any) -> str:
+    """A value as `--set` takes it: JSON, which is YAML too.
+
+    >>> from pathlib import Path
+    >>> as_yaml({"path": Path("out/a.jsonl")})
+    '{"path": "out/a.jsonl"}'
+    """
+    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def apply(root: Item, text: str, problems: Problems) -> Item:

@@ -25,13 +25,13 @@ from tactflow.engine.graph import Component
 Section = Literal["stages", "sinks"]
 
 
-def resolve(use: str, section: Section, directory: Path) -> Component:
+def resolve(use: str, section: Section, *folders: Path) -> Component:
     """Find the class that `use` names and read its contract.
 
     use : a built-in name, the name of an installed plug-in, `package.module:Class`, or `./file.py:Class`
         (`./file.py` alone where the file holds one class).
     section : "stages" or "sinks", the part of the pipeline file it stands in.
-    directory : folder of the pipeline file, against which file names are resolved.
+    folders : where a loose file is looked for, in this order.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def resolve(use: str, section: Section, directory: Path) -> Component:
     if not separator and _is_file(use):
         file, name = use, ""
     if _is_file(file):
-        found = component(_find_class(_load_file(directory, file), name, section), use, file, RESERVED)
+        found = component(_find_class(_load_file(folders, file), name, section), use, file, RESERVED)
     elif separator:
         found = component(_find_class(_load_module(file), name, section), use, f"module {file}", RESERVED)
     else:
@@ -162,11 +162,16 @@ def _load_module(name: str, owner: str = "") -> ModuleType:
         raise ConfigError(_failure(name, error)) from None
 
 
-def _load_file(directory: Path, file: str) -> ModuleType:
+def _load_file(folders: Sequence[Path], file: str) -> ModuleType:
     """Run a Python file as a module of its own, once for each version of the file."""
     try:
-        path = (directory / file).resolve()
+        # The same folder may be given twice.
+        paths = list(dict.fromkeys((folder / file).resolve() for folder in folders))
+        path = next((path for path in paths if path.exists()), paths[0])
         source = path.read_bytes()
+    except FileNotFoundError as error:
+        places = " or ".join(map(str, paths))
+        raise ConfigError(f"cannot read {file}: {error.strerror} ({places})") from None
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror} ({path})") from None
     except ValueError as error:

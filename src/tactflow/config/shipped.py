@@ -28,6 +28,11 @@ def find_pipeline(name: str | None) -> Path:
     return path
 
 
+def is_packaged(folder: Path) -> bool:
+    """Whether a folder is the one in which the pipelines of the package stand."""
+    return folder.resolve() == _packaged("default").parent.resolve()
+
+
 def _packaged(stem: str) -> Path:
     with as_file(files("tactflow.pipelines") / f"{stem}.yaml") as path:
         return path

@@ -230,7 +230,21 @@ class _Wiring:
             return text + f"{{{port.name}: {below.id}.{port.name}}}"
         text += f"; there are {', '.join(given)}" if given else "; there are none"
         makers = [c.name for c in catalogue()[0] if port.name in (output.name for output in c.ports.outputs)]
-        return text + (f"; it comes from the stage {' or '.join(makers)}" if makers else "")
+        if makers:
+            return text + f"; it comes from the stage {' or '.join(makers)}"
+        return text + self._one_of_the_type(port, user)
+
+    def _one_of_the_type(self, port: Port, user: Draft) -> str:
+        """Advice for an input whose name nobody gives, where exactly one output has its type."""
+        outputs = [(draft, output) for draft in self._above(user) for output in draft.outputs.values()]
+        fits = [Ref(draft.id, output.name) for draft, output in outputs if mismatch(output, port) is None]
+        if len(fits) != 1:
+            return ""
+        (ref,) = fits
+        return (
+            f"; {ref.port} ({ref.node}) has this type: name the parameter {ref.port}, "
+            f"or say in: {{{port.name}: {ref}}}"
+        )
 
     def _gate(self, item: Item, path: str, draft: Draft) -> None:
         ref = self._reference(item, path, draft, by_port=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import inspect
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, get_args
 
 from tactflow.engine.contract import Memory, Part, Sink, Source, Stage, StageParams, WhenLive
@@ -21,8 +22,20 @@ METHODS: dict[Kind, str] = {"source": "frames", "stage": "process", "sink": "wri
 OFFERED = ("sensor", "directory", "skipping", "control")
 """What a constructor may ask for beside `params`."""
 
-_CHOICES = {"memory": get_args(Memory), "when_live": get_args(WhenLive)}
-_FLAGS = ("threaded", "observer", "takes_references")
+_FLAG = ("True or False", lambda value: isinstance(value, bool))
+_TEXT = ("a text or None", lambda value: value is None or isinstance(value, str))
+_VALUES: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "memory": ("'pure' or 'stateful'", lambda value: value in get_args(Memory)),
+    "when_live": ("'block' or 'latest'", lambda value: value in get_args(WhenLive)),
+    "threaded": _FLAG,
+    "observer": _FLAG,
+    "takes_references": _FLAG,
+    "live": _FLAG,
+    "description": _TEXT,
+    "queue_capacity": ("a whole number from 1", lambda value: type(value) is int and value >= 1),
+    "total": ("a whole number or None", lambda value: value is None or type(value) is int),
+}
+"""Attribute of the contract -> what is required of its value, in words and in code."""
 _MISSPELT = 0.85
 """Similarity (`difflib`, 0 to 1) from which a name is taken for a misspelt one; one letter in eight: 0.87."""
 
@@ -44,12 +57,22 @@ def component(cls: type[Any], name: str, origin: str, reserved: Collection[str])
     kind = kind_of(cls)
     if kind is None:
         raise _broken(cls, f" must inherit from {_bases_in_words(cls)} of tactflow")
-    problems = [*_wrong_parameters(cls, reserved), *_wrong_constructor(cls), *_wrong_names(cls, kind)]
-    problems += [] if problems else [*_wrong_values(cls, kind), *_wrong_methods(cls, kind)]
+    problems = [*_wrong_parameters(cls, reserved), *_wrong_constructor(cls), *_wrong_methods(cls, kind)]
+    problems += [*_wrong_names(cls, kind), *_wrong_values(cls, kind)]
     if problems:
         raise _broken(cls, problems[0], *problems[1:])
     memory: Memory = getattr(cls, "memory", "pure")
     return Component(name, kind, cls, cls.Params, read_ports(cls, METHODS[kind]), memory, origin)
+
+
+def build(cls: type[Any], params: StageParams, offered: Mapping[str, Any]) -> Part:
+    """Construct a part of a pipeline with what its constructor asks for.
+
+    offered : value for each name of `OFFERED`.
+    """
+    wanted = inspect.signature(cls).parameters
+    part: Part = cls(params, **{name: value for name, value in offered.items() if name in wanted})
+    return part
 
 
 def _bases_in_words(cls: type) -> str:
@@ -81,15 +104,35 @@ def _wrong_constructor(cls: type) -> Iterator[str]:
 
 
 def _wrong_names(cls: type, kind: Kind) -> Iterator[str]:
-    """Public names of a class that are nearly ones of the contract which it leaves out."""
-    known = _contract(kind) | {METHODS[kind]}
-    own = _defined(cls)
+    """Public names of a class that are nearly ones of the contract which it leaves out.
+
+    Only a name of the same sort counts: a method `publish` is no misspelt class method `publishes`.
+    """
+    known = _contract(kind)
+    left_out = sorted(known - _defined(cls))
     for name in sorted(vars(cls)):
-        if name.startswith("_") or name in known:
+        if name.startswith("_") or name in known or name in METHODS.values():
             continue
-        near = difflib.get_close_matches(name, sorted(known - own), n=1, cutoff=_MISSPELT)
+        sort = _sort(inspect.getattr_static(cls, name))
+        alike = [other for other in left_out if _sort(_of_contract(kind, other)) == sort]
+        near = difflib.get_close_matches(name, alike, n=1, cutoff=_MISSPELT)
         if near:
             yield f".{name}: a {kind} has no such attribute; did you mean {near[0]}?"
+    for name in sorted(_VALUES.keys() - known):
+        if name in vars(cls) and _sort(vars(cls)[name]) == "value":
+            yield f".{name}: a {kind} has no such attribute"
+    inner = [n for n, v in vars(cls).items() if inspect.isclass(v) and issubclass(v, StageParams)]
+    if inner and "Params" not in _defined(cls):
+        yield f".{inner[0]}: nobody reads it; the parameters are an inner class called Params"
+
+
+def _sort(attribute: Any) -> str:
+    """What sort of attribute it is, as it stands in the class."""
+    if isinstance(attribute, property | functools.cached_property):
+        return "property"
+    if isinstance(attribute, classmethod):
+        return "class method"
+    return "method" if inspect.isroutine(attribute) else "value"
 
 
 def _names(base: type) -> set[str]:
@@ -101,6 +144,11 @@ def _names(base: type) -> set[str]:
 def _contract(kind: Kind) -> set[str]:
     """Every name of the contract of a kind, but for the method that holds its ports."""
     return {name for base in BASES[kind].__mro__[:-1] for name in _names(base)} - {METHODS[kind]}
+
+
+def _of_contract(kind: Kind, name: str) -> Any:
+    """An attribute of the contract as it stands there."""
+    return inspect.getattr_static(BASES[kind], name, None)
 
 
 def _defined(cls: type) -> set[str]:
@@ -115,35 +163,29 @@ def _wrong_values(cls: type, kind: Kind) -> Iterator[str]:
             ' must declare memory = "pure" (its outputs depend on its inputs alone) or memory = "stateful", '
             "got nothing"
         )
-    for name, choices in _CHOICES.items():
-        value = getattr(cls, name, choices[0])
-        if value not in choices:
-            yield f".{name}: required {' or '.join(map(repr, choices))}, got {value!r}"
-    for name in _FLAGS:
-        value = getattr(cls, name, False)
-        if not isinstance(value, bool):
-            yield f".{name}: required True or False, got {value!r}"
-    capacity = getattr(cls, "queue_capacity", 1)
-    if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
-        yield f".queue_capacity: required a whole number from 1, got {capacity!r}"
+    for name in sorted(_VALUES.keys() & _contract(kind) & _defined(cls)):
+        words, fits = _VALUES[name]
+        value = inspect.getattr_static(cls, name)
+        if _sort(value) != "property" and not fits(value):
+            yield f".{name}: required {words}, got {value!r}"
 
 
 def _wrong_methods(cls: type[Part], kind: Kind) -> Iterator[str]:
     """Methods that are missing, or cannot be called as the engine does."""
-    other = [method for other, method in METHODS.items() if other != kind and hasattr(cls, method)]
-    if other:
-        yield f": a {kind} has no {other[0]}(); a class is one of stage, sink and source"
-    if kind != "source" and not callable(getattr(cls, METHODS[kind], None)):
-        yield f": a {kind} has a method {METHODS[kind]}(), whose annotations are its ports"
-    if kind == "source" and "frames" not in _defined(cls):
-        yield ": a source has a method frames(), which yields its frames"
-    base = BASES[kind]
-    for name in sorted(_contract(kind) - {"Params"}):
-        ours, theirs = getattr(cls, name, None), getattr(base, name, None)
-        if inspect.ismethod(theirs) and callable(ours) and not inspect.ismethod(ours):
+    for other, method in METHODS.items():
+        if other != kind and callable(getattr(cls, method, None)):
+            yield f": a {kind} has no {method}(); a class is one of stage, sink and source"
+    if METHODS[kind] not in _defined(cls) or not callable(getattr(cls, METHODS[kind])):
+        makes = "which yields its frames" if kind == "source" else "whose annotations are its ports"
+        yield f": a {kind} has a method {METHODS[kind]}(), {makes}"
+    for name in sorted(_contract(kind) & _defined(cls) - {"Params"}):
+        ours, theirs = inspect.getattr_static(cls, name), _of_contract(kind, name)
+        if _sort(theirs) == "class method" and _sort(ours) == "method":
             yield f".{name}: required a class method; write @classmethod above it"
-        elif inspect.isroutine(theirs):
-            yield from _wrong_method(name, ours, theirs)
+        elif _sort(theirs) == "property" and _sort(ours) == "method":
+            yield f".{name}: required a property; write @property above it"
+        elif _sort(theirs) in ("method", "class method"):
+            yield from _wrong_method(name, getattr(cls, name), getattr(BASES[kind], name))
 
 
 def _wrong_method(name: str, ours: Any, theirs: Any) -> Iterator[str]:

@@ -2,7 +2,8 @@
 
 This file is the reference. Each class attribute below may be set and each method overridden; everything has
 the default that stands here. When a pipeline is loaded, every class is checked against it: a wrong value, a
-missing method or a misspelt name is an error with its place (see `tactflow.engine.conformance`).
+missing method, or a name that is nearly one of these, is an error with its place (see
+`tactflow.engine.conformance`).
 
 A stage that swaps dark and bright::
 
@@ -13,7 +14,7 @@ A stage that swaps dark and bright::
             strength: float = Field(1.0, ge=0, le=1, description="0 keeps the image, 1 inverts it")
 
         def process(self, image: Image) -> Image:
-            return np.uint8(self.params.strength * 255) - image
+            return np.rint(image + self.params.strength * (255.0 - 2.0 * image)).astype(np.uint8)
 
 All three kinds are built from their parameters, `Invert(Invert.Params(strength=1))`, and can be called
 without the engine. A constructor that takes more than `params` is given, by name, what it asks for:
@@ -84,7 +85,7 @@ class Part:
 
         Raises
         ------
-        TactflowError : what is wrong, and what to do. Nothing has been captured then.
+        StageError from a stage or a sink, SourceError from a source: what is wrong, and what to do.
         """
 
     def close(self) -> None:
@@ -103,8 +104,9 @@ class Stage(Part):
 
     - an input for each parameter, named like it; `X | None` marks an input that may be absent. A parameter
       annotated with a NamedTuple stands for one input per field.
-    - one output named after the type returned, or one for each field of a NamedTuple. `process` may return
-      `Absent("reason")` instead; `None` is `Absent("none")`.
+    - one output named after the type returned, or one for each field of a NamedTuple (a number is a field
+      such as `brightness: float`). `process` may return `Absent("reason")` instead; `None` is
+      `Absent("none")`.
 
     What a stage returns it must not change later; what it receives it must not change at all.
 
@@ -130,7 +132,8 @@ class Stage(Part):
 class Output:
     """A file or folder that a sink writes.
 
-    parameter : the one that names it. refuses_existing : whether the sink fails if there is something in it.
+    path : where it is. kind : what it is. parameter : the one that names it. refuses_existing : that `open`
+    fails if there is something in it; the sink itself must check.
     """
 
     path: Path

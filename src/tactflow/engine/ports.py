@@ -191,7 +191,16 @@ def _parameter(parameter: inspect.Parameter, annotation: Any, method: str) -> Pa
         return Parameter(name, ())
     if _is_group(annotation):
         return Parameter(name, _field_inputs(annotation), annotation)
+    if method == "write" and name == "tick":
+        raise _PortError("the parameter tick takes the Tick; annotate it as in tick: Tick")
+    if method == "write" and name == "results" and _says_nothing(annotation):
+        raise _PortError("the parameter results takes all results; annotate it as in results: Results")
     return Parameter(name, (_input_port(parameter, annotation),))
+
+
+def _says_nothing(annotation: Any) -> bool:
+    """Whether it is no more than a container, or nothing at all."""
+    return (get_origin(annotation) or annotation) in (None, Any, object, dict, tuple, list)
 
 
 def _check_tick(name: str, method: str) -> None:
@@ -262,11 +271,24 @@ def _output_ports(annotation: Any) -> tuple[Port, ...]:
         return (Port(spec.name, result, optional),)
     _check_array("the return annotation", result)
     if result is Any or not inspect.isclass(result) or result.__module__ == "builtins":
-        raise _PortError(
-            f"the return annotation {_describe(result)} gives the output port no name; return a dataclass "
-            "(Contact gives the port contact), a type of tactflow.ports, or a NamedTuple of ports"
-        )
+        nameless = f"the return annotation {_describe(result)} gives the output port no name"
+        raise _PortError(f"{nameless}; {_named_output(result)}")
     return (Port(_snake_case(result.__name__), result, optional),)
+
+
+def _named_output(result: Any) -> str:
+    """How an output is written so that its port has a name."""
+    if result is bool:
+        return (
+            'a signal that can gate stages is Annotated[bool, SignalPort("name", closed="reason")], '
+            "another bool a field of a NamedTuple, as in name: bool"
+        )
+    if result in (int, float, str):
+        return f"return a NamedTuple with a field for it, as in name: {result.__name__}"
+    return (
+        "return a dataclass (Contact gives the port contact), a type of tactflow.ports, "
+        "or a NamedTuple of ports"
+    )
 
 
 def _field_hints(group: type) -> dict[str, Any]:

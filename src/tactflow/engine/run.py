@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 import threading
 import time
@@ -11,9 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tactflow.engine.conformance import OFFERED
+from tactflow.engine.conformance import OFFERED, build
 from tactflow.engine.contract import Part, Recorder, Source
-from tactflow.engine.errors import SourceError, StageError, TactflowError
+from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.link import Link
@@ -31,7 +30,8 @@ INTERRUPTED = 130
 """Exit code of a run that was not allowed to finish the frames under way."""
 
 CLOSE_SECONDS = 10.0
-"""How long the threads may take to end after the stream has ended, before the one that hangs is named."""
+"""How long, s, the threads may take to end after the run was stopped or has failed, before the one that hangs
+is named. Chosen by hand: the slowest stage takes a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Runner:
     Raises
     ------
     ConfigError
-        If the pipeline cannot be planned. Nothing was started.
+        If the pipeline cannot be planned, or `max_frames` is less than 1. Nothing was started.
     """
 
     def __init__(
@@ -77,6 +77,8 @@ class Runner:
         check: bool = False,
         trace: Trace | None = None,
     ) -> None:
+        if max_frames is not None and max_frames < 1:
+            raise ConfigError(f"max_frames: required a whole number from 1, got {max_frames}")
         self.pipeline = pipeline
         self.max_frames = max_frames
         self.check = check
@@ -96,6 +98,7 @@ class Runner:
         self._began = 0.0
         self._source_stats = NodeStats()
         self._stopping = threading.Event()
+        self._hurried = False
         self._interrupted = False
         self._turn = threading.Condition()
         self._paused = False
@@ -116,18 +119,11 @@ class Runner:
         self._began = time.perf_counter()
         try:
             self._open()
-            self._connect()
             # Opening may take long: a camera that wakes up, kernels that are compiled.
             self._began = time.perf_counter()
-            for name, segment in self._segments.items():
-                target = self._capture_loop if name == self._source_segment else segment.loop
-                thread = threading.Thread(target=target, name=f"tactflow-{name}", daemon=True)
-                self._threads[name] = thread
-            for thread in self._threads.values():
-                thread.start()
-            if self._is_live and self.pipeline.realtime_priority:
-                self._go_first()
-            self._wait(on_progress, interval_s)
+            if not self._stopping.is_set():
+                self._start()
+                self._wait(on_progress, interval_s)
         except TactflowError as failure:
             self.fail(failure)
         except KeyboardInterrupt:
@@ -149,6 +145,7 @@ class Runner:
         """End the run soon: no more frames are captured, those under way are finished. From any thread."""
         with self._lock:
             self._end = self._end or reason
+            self._hurried = self._hurried or reason != "max_frames"
         self._stopping.set()
         with self._turn:
             self._turn.notify_all()
@@ -217,6 +214,9 @@ class Runner:
         ports = [(id_, port.name) for id_, n in pipeline.nodes.items() for port in n.component.ports.outputs]
         self._slots = {port: slot for slot, port in enumerate(ports, start=UNCONNECTED + 1)}
         for node in pipeline.nodes.values():
+            if self._stopping.is_set():
+                # Nothing that is not open yet is opened now: no file is emptied for a run without a frame.
+                return
             if node.component.kind == "source" or node.id in pruned:
                 continue
             instance = self._build(node, StageError)
@@ -230,9 +230,7 @@ class Runner:
         values = (pipeline.sensor, pipeline.directory, pipeline.skipping, self)
         offered = dict(zip(OFFERED, values, strict=True))
         try:
-            wanted = inspect.signature(node.component.cls).parameters
-            extra = {name: value for name, value in offered.items() if name in wanted}
-            instance: Part = node.component.cls(node.params, **extra)
+            instance = build(node.component.cls, node.params, offered)
             self._opened.append((node.id, instance))
             instance.open()
         except kind as error:
@@ -246,6 +244,17 @@ class Runner:
                 f"  in {place.filename}:{place.lineno}"
             ) from error
         return instance
+
+    def _start(self) -> None:
+        """Connect the segments and start their threads."""
+        self._connect()
+        for name, segment in self._segments.items():
+            target = self._capture_loop if name == self._source_segment else segment.loop
+            self._threads[name] = threading.Thread(target=target, name=f"tactflow-{name}", daemon=True)
+        for thread in self._threads.values():
+            thread.start()
+        if self._is_live and self.pipeline.realtime_priority:
+            self._go_first()
 
     def _connect(self) -> None:
         for name, steps in make_schedule(self.plan).items():
@@ -266,13 +275,13 @@ class Runner:
         return self.plan.segment_of(self.pipeline.source.id)
 
     def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
-        """Wait for the threads; after the source has ended, not for ever."""
+        """Wait for the threads: as long as it takes until the source has ended, not for ever after a stop."""
         deadline: float | None = None
         while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
             self._threads[alive[0]].join(interval_s)
             if on_progress is not None:
                 on_progress(self.progress())
-            if self._stopping.is_set() and deadline is None:
+            if self._hurried and deadline is None:
                 deadline = time.perf_counter() + CLOSE_SECONDS
             if deadline is not None and time.perf_counter() > deadline and self._no_headway():
                 hanging = ", ".join(

@@ -6,12 +6,13 @@ must see every frame because it remembers. Who asks may stand behind gates. So e
 
 The makers of gate signals come first in the list, each after what it needs itself. A gate therefore is known
 before what only its stage needs. Where that is not possible (the signal is made later, or in another thread),
-the gate is taken for open: too much may then be computed, never too little.
+the gate is taken for open: too much may then be computed, never too little. A stage that runs for such a
+reason may also fail.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from tactflow.engine.graph import Node, Pipeline, Ref
@@ -51,10 +52,12 @@ Schedule = Mapping[str, Sequence[Step]]
 def make_schedule(plan: Plan) -> Schedule:
     """Order the nodes of a plan and find out when each of them is needed."""
     pipeline = plan.pipeline
-    order = _order(plan)
+    nodes = _in_order(plan, {})
+    # First as if every signal were known in time: who is guarded by which signals, and so better comes later.
+    ideal = _needs(nodes, pipeline, lambda *_: True)
+    order = _in_order(plan, {id_: _guards(needs) for id_, needs in ideal.items()})
     place = {node.id: number for number, node in enumerate(order)}
     segments = {node.id: plan.segment_of(node.id) for node in order}
-    needs: dict[str, list[Need]] = {node.id: _own_needs(node, pipeline) for node in order}
 
     def known(signal: Ref, user: Node) -> bool:
         """Whether a signal is there when it is decided whether a node is needed."""
@@ -63,21 +66,38 @@ def make_schedule(plan: Plan) -> Schedule:
         mine, its = segments[user.id], segments[signal.node]
         return its in plan.ancestors[mine] or (its == mine and place[signal.node] < place[user.id])
 
+    needs = _needs(order, pipeline, known)
+    steps: dict[str, list[Step]] = {name: [] for name in plan.segments}
+    for node in order:
+        steps[segments[node.id]].append(Step(node, _merged(needs[node.id])))
+    return steps
+
+
+def _needs(
+    order: Sequence[Node], pipeline: Pipeline, known: Callable[[Ref, Node], bool]
+) -> dict[str, list[Need]]:
+    """Node -> its needs: its own, and those of all that take from it.
+
+    Say `gated` has `when: active`, which `pulse` makes, and the sink `out` takes from `gated`. Then what
+    `gated` reads is needed when `out` wants the frame and `active` is True; `pulse` whenever `out` wants it.
+    """
+    needs = {node.id: _own_needs(node, pipeline) for node in order}
     for consumer in reversed(order):
         gates = gate_signals(consumer, pipeline)
-        for maker in dependencies(consumer):
-            if maker not in place:
-                continue
+        for maker in dependencies(consumer) & needs.keys():
             # A gate is looked at whenever its stage is needed; the inputs only if the gates are open.
             passed = gates if maker not in {signal.node for signal in gates} else frozenset[Ref]()
             node = pipeline.nodes[maker]
             for need in needs[consumer.id]:
                 signals = frozenset(s for s in need.signals | passed if known(s, node))
                 needs[maker].append(Need(need.sinks, signals))
-    steps: dict[str, list[Step]] = {name: [] for name in plan.segments}
-    for node in order:
-        steps[segments[node.id]].append(Step(node, _merged(needs[node.id])))
-    return steps
+    return needs
+
+
+def _guards(needs: Sequence[Need]) -> frozenset[str]:
+    """The makers of the signals without which a node is never needed."""
+    common = frozenset.intersection(*(need.signals for need in needs)) if needs else frozenset[Ref]()
+    return frozenset(signal.node for signal in common)
 
 
 def remembers(node: Node, pipeline: Pipeline) -> bool:
@@ -97,31 +117,47 @@ def _own_needs(node: Node, pipeline: Pipeline) -> list[Need]:
     return [Need(None, frozenset())] if remembers(node, pipeline) else []
 
 
-def _order(plan: Plan) -> list[Node]:
-    """Every node after what it takes from; makers of gate signals first, then who remembers, then sinks."""
+def _in_order(plan: Plan, guards: Mapping[str, frozenset[str]]) -> list[Node]:
+    """Every node after what it takes from and, where possible, after the makers of what guards it.
+
+    Makers of gate signals come first, then who remembers, then the others.
+    """
     pipeline = plan.pipeline
     pruned = {node.id for node in plan.pruned}
     nodes = [n for n in pipeline.nodes.values() if n.id not in pruned and n.component.kind != "source"]
     makers = {signal.node for node in nodes for signal in gate_signals(node, pipeline)}
     first = [node for node in nodes if node.id in makers]
     then = [node for node in nodes if remembers(node, pipeline)]
-    done: dict[str, Node] = {}
+    wanted: dict[str, None] = {}
+    under_way: set[str] = set()
 
-    def visit(node: Node) -> None:
-        if node.id in done or node.component.kind == "source":
+    def visit(id_: str) -> None:
+        """What guards a node first, then its gates, its inputs, itself."""
+        node = pipeline.nodes[id_]
+        if id_ in under_way or node.component.kind == "source":
             return
-        for ref in [*gate_signals_in_order(node), *(ref for ref in node.inputs.values() if ref)]:
-            visit(pipeline.nodes[ref.node])
-        done[node.id] = node
+        under_way.add(id_)
+        inputs = [ref.node for ref in node.inputs.values() if ref]
+        for other in [*sorted(guards.get(id_, ())), *(gate.signal.node for gate in node.gates), *inputs]:
+            visit(other)
+        wanted[id_] = None
+
+    placed: dict[str, Node] = {}
+
+    def place(id_: str) -> None:
+        """A node after what it takes from, which guards that depend on each other may have turned around."""
+        node = pipeline.nodes[id_]
+        if id_ in placed or node.component.kind == "source":
+            return
+        for other in dependencies(node):
+            place(other)
+        placed[id_] = node
 
     for node in [*first, *then, *nodes]:
-        visit(node)
-    return list(done.values())
-
-
-def gate_signals_in_order(node: Node) -> list[Ref]:
-    """The signals of a node's gates, as they stand in the file."""
-    return [gate.signal for gate in node.gates]
+        visit(node.id)
+    for id_ in wanted:
+        place(id_)
+    return list(placed.values())
 
 
 def _merged(needs: Iterable[Need]) -> list[Need]:

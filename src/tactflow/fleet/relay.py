@@ -12,11 +12,12 @@ import zmq
 from tactflow.engine.errors import StageError
 
 SEND_BUFFER = 32_768
-"""Kernel send buffer per subscriber, bytes, as in the ZeroMQ sink. Large ones hold seconds of messages."""
+"""Kernel send buffer per subscriber, bytes, the ZeroMQ sink's default. Large ones hold seconds of messages.
+Chosen by hand."""
 LINGER_MS = 500
-"""Time to deliver the last messages at the end. Chosen by hand."""
+"""Time to deliver the last messages at the end, ms. Chosen by hand."""
 POLL_MS = 100
-"""How often the thread looks whether it shall end. Chosen by hand."""
+"""How often the thread looks whether it shall end, ms. Chosen by hand."""
 
 
 @contextmanager

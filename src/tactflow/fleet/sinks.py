@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
+import os
 import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from tactflow.config.overrides import as_yaml
 from tactflow.config.sensors import PLACEHOLDER
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.graph import Node, Pipeline
@@ -16,7 +17,10 @@ from tactflow.fleet.names import STREAMS
 
 
 class _State(NamedTuple):
-    """What tells whether somebody has written to a file."""
+    """What tells whether somebody has written to a file or folder.
+
+    size : of a file in bytes; of a folder, how much stands in it.
+    """
 
     device: int
     inode: int
@@ -25,14 +29,14 @@ class _State(NamedTuple):
 
 
 class WatchedSink:
-    """The files of one sink of one sensor, watched from before its sensor's first start.
+    """The files and folders of one sink of one sensor, watched from before its sensor's first start.
 
     node : the sink.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._before = {output.path: _state(output.path) for output in written_files(node, node.params)}
+        self._before = {output: _state(output) for output in written_files(node, node.params)}
 
     @property
     def overrides(self) -> list[str]:
@@ -45,16 +49,16 @@ class WatchedSink:
 
     @property
     def refused(self) -> Path | None:
-        """A file that the sink would refuse to write if it were started now, None if there is none."""
+        """What the sink would refuse to write to if it were started now, None if there is nothing."""
         for output in written_files(self._node, self._params):
-            now = _state(output.path)
+            now = _state(output)
             if output.refuses_existing and now is not None and now.size > 0:
                 return output.path
         return None
 
     @property
     def _params(self) -> StageParams:
-        begun = any(_state(path) not in (None, before) for path, before in self._before.items())
+        begun = any(_state(output) not in (None, before) for output, before in self._before.items())
         return sink_class(self._node).on_restart(self._node.params) if begun else self._node.params
 
 
@@ -76,15 +80,13 @@ def written_files(node: Node, params: StageParams) -> Sequence[Output]:
 def changes(node: Node, params: StageParams) -> list[str]:
     """`sinks.ID.KEY=VALUE` for every parameter in which `params` differ from those of the sink."""
     old, new = _plain(node.params), _plain(params)
-    return [
-        f"sinks.{node.id}.{key}={json.dumps(value)}" for key, value in new.items() if value != old.get(key)
-    ]
+    return [f"sinks.{node.id}.{key}={as_yaml(value)}" for key, value in new.items() if value != old.get(key)]
 
 
 def added(node: Node) -> str:
     """The override that adds a sink which an option of the command line has added."""
     given = node.params.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    return f"sinks.{node.id}={json.dumps({'use': node.component.name} | given)}"
+    return f"sinks.{node.id}={as_yaml({'use': node.component.name} | given)}"
 
 
 def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
@@ -137,9 +139,11 @@ def _plain(params: StageParams) -> dict[str, object]:
     return params.model_dump(mode="json", by_alias=True)
 
 
-def _state(path: Path) -> _State | None:
-    """The present state of a regular file; None if there is none."""
-    there = status(str(path))
-    if there is None or not stat.S_ISREG(there.st_mode):
+def _state(output: Output) -> _State | None:
+    """The present state of a regular file or a folder; None if there is none."""
+    there = status(str(output.path))
+    is_kind = stat.S_ISDIR if output.kind == "folder" else stat.S_ISREG
+    if there is None or not is_kind(there.st_mode):
         return None
-    return _State(there.st_dev, there.st_ino, there.st_size, there.st_mtime_ns)
+    size = len(os.listdir(output.path)) if output.kind == "folder" else there.st_size
+    return _State(there.st_dev, there.st_ino, size, there.st_mtime_ns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 import os
@@ -13,6 +12,7 @@ from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
+from tactflow.files import make_folder
 from tactflow.message import message_schema
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
 from tactflow.recording.schemas import PICTURE_DESCRIPTOR, PICTURE_TYPE, RESULT_TYPE, plain_schema
@@ -20,7 +20,7 @@ from tactflow.recording.schemas import PICTURE_DESCRIPTOR, PICTURE_TYPE, RESULT_
 NEVER = 1 << 62
 """Size at which a chunk would end by itself, bytes: they are ended by hand."""
 _OVERHEAD = 200
-"""About what an entry takes in memory beside its data, bytes."""
+"""About what an entry takes in memory beside its data, bytes: the object and its fields. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class RecordingWriter:
     def __init__(self, path: Path, about: About, *, overwrite: bool = False) -> None:
         self.path = path
         self.frames = 0
-        _make_folder(path.parent)
+        make_folder(path.parent)
         self._file = _WholeRecords(path, overwrite=overwrite)
         try:
             self._writer = Writer(
@@ -167,13 +167,6 @@ class RecordingWriter:
     def abandon(self) -> None:
         """Close the file as it is, without an index."""
         self._file.close()
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder)) from None
 
 
 class _WholeRecords(io.BufferedIOBase):

@@ -1,10 +1,10 @@
 """The gel: where an indenter touches it, what its surface looks like, and how its markers move.
 
 Contact. A soft surface gives way before it is touched. Around a ball of radius R pressed by d into a deep gel
-it has sunk by d / 2 at the rim of the contact, whose radius is sqrt(R d) (Hertz); a thin layer on a plate
+it has sunk by d / 2 at the edge of the contact, whose radius is sqrt(R d) (Hertz); a thin layer on a plate
 sinks only where it is touched, and the radius is the sqrt(2 R d) of the geometric overlap (Johnson, Contact
 Mechanics, 1985, ch. 4 and 5.8). The gel of a sensor is a layer of moderate depth: here it has sunk by
-`SINK_IN` d at the rim, and for every shape the contact is where the indenter reaches deeper than that. There
+`SINK_IN` d at the edge, and for every shape the contact is where the indenter reaches deeper than that. There
 the gel's surface is the indenter's surface. Around it the surface decays smoothly to rest, as the pyramid of
 Gaussians of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors",
 RA-L 2022) makes it, but in closed form: with s = SINK_IN d it is s exp(RIM (reached / s - 1)).
@@ -21,13 +21,16 @@ from numpy.typing import NDArray
 from tactflow.sim.shapes import Array, Shape
 
 SINK_IN = 0.3
-"""Share of the depth by which the gel has sunk at the rim of a contact."""
+"""Share of the depth by which the gel has sunk at the edge of a contact. Chosen by hand, between a thin layer
+(0) and a deep gel (0.5)."""
 RIM = 0.6
-"""Slope of the surface just outside a contact, relative to just inside: the crease at the rim."""
+"""Slope of the surface just outside a contact, relative to just inside: the crease at the edge.
+Chosen by hand."""
 TOUCH_DEPTH = 0.25
-"""Depth below which an indenter does not count as touching, px."""
+"""Depth below which an indenter does not count as touching, px. Chosen by hand."""
 SHEAR_SPREAD = 110.0
-"""How far around a contact the gel follows its shear and twist, px (standard deviation of a Gaussian)."""
+"""How far around a contact the gel follows its shear and twist, px (standard deviation of a Gaussian).
+Chosen by hand: four to five pitches of the markers."""
 
 
 @dataclass(frozen=True, slots=True)

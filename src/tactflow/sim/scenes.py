@@ -21,11 +21,12 @@ SIZE = (800, 600)
 FPS = 60.0
 """Frames a second of every scene."""
 _STEP = 2
-"""The gel's surface is computed at every second pixel of the raw frame; the light on it is smooth."""
+"""The gel's surface is computed at every second pixel of the raw frame; the light on it is smooth. Chosen
+by hand."""
 
 
 _LARGEST_STROKE = 110.0
-"""Contacts move the gel in proportion to the markers' pitch, up to this pitch, px."""
+"""Contacts move the gel in proportion to the markers' pitch, up to this pitch, px. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,9 @@ _SCENES: dict[str, _Recipe] = {
         {"noise": 6.0, "shot": 3.0, "hot": 40, "jpeg": 70, "blur": 1.0},
     ),
     "soft_rim": _Recipe(
-        "a deep gel, whose surface shows no crease at the rim of a contact", _PRESS, {"sink": 0.5, "rim": 1.0}
+        "a deep gel, whose surface shows no crease at the edge of a contact",
+        _PRESS,
+        {"sink": 0.5, "rim": 1.0},
     ),
     "stutter": _Recipe("a camera that drops and repeats frames", _PRESS, {"dropped": 0.1, "repeated": 0.1}),
     "strong_shear": _Recipe(
@@ -385,7 +388,7 @@ class Scene:
         return np.asarray(cv2.copyMakeBorder(fixed, half, half, half, half, cv2.BORDER_REPLICATE), np.int16)
 
     def _gel_window(self, raw_x: NDArray[np.float32], raw_y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W, 1): 1 on the gel, nearly dark around it, where a tilted camera sees past the gel's rim."""
+        """(H, W, 1): 1 on the gel, nearly dark around it, where a tilted camera sees past its border."""
         points = np.stack([raw_x, raw_y], axis=-1).reshape(-1, 2).astype(np.float64)
         mapped = self.camera.to_gel(points).reshape(*raw_x.shape, 2)
         width, height = SIZE
@@ -506,10 +509,10 @@ class Scene:
         if self._light.brightening:
             share = press.depth / press.shape.depth
             amount = self._light.brightening * (0.45 + 0.55 * share) * min(1.0, share / 0.1)
-            rim = (depth - np.float32(press.sink * press.depth)) * np.float32(
+            edge = (depth - np.float32(press.sink * press.depth)) * np.float32(
                 1.0 / (0.05 * press.shape.depth)
             )
-            extra = np.float32(0.5 * amount) * (np.float32(1.0) + np.tanh(rim * np.float32(0.5)))
+            extra = np.float32(0.5 * amount) * (np.float32(1.0) + np.tanh(edge * np.float32(0.5)))
         if self.settings.specular:
             spots = light.highlight(sunk, _STEP, self.settings.specular)
             extra = spots if extra is None else extra + spots
@@ -523,11 +526,11 @@ class Scene:
         """Rows and columns of the coarse grid that a contact reaches, or None."""
         reach = press.shape.reach
         turn = np.linspace(0, 2 * np.pi, 33)
-        rim = np.stack([press.x + reach * np.cos(turn), press.y + reach * np.sin(turn)], axis=1)
+        ring = np.stack([press.x + reach * np.cos(turn), press.y + reach * np.sin(turn)], axis=1)
         if not self.camera.identity:
-            rim = self.camera.to_raw(np.clip(rim, (-60.0, -60.0), (SIZE[0] + 60.0, SIZE[1] + 60.0)))
-        low = np.floor(rim.min(axis=0) / _STEP).astype(int) - 2
-        high = np.ceil(rim.max(axis=0) / _STEP).astype(int) + 3
+            ring = self.camera.to_raw(np.clip(ring, (-60.0, -60.0), (SIZE[0] + 60.0, SIZE[1] + 60.0)))
+        low = np.floor(ring.min(axis=0) / _STEP).astype(int) - 2
+        high = np.ceil(ring.max(axis=0) / _STEP).astype(int) + 3
         left, top = max(int(low[0]), 0), max(int(low[1]), 0)
         right, bottom = min(int(high[0]), SIZE[0] // _STEP), min(int(high[1]), SIZE[1] // _STEP)
         return None if right - left < 3 or bottom - top < 3 else (top, bottom, left, right)

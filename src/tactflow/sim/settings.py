@@ -104,7 +104,7 @@ KEYS: dict[str, Key] = {
     "twist": Key("largest turn of the gel by a contact", "degrees", -60, 60),
     "bend": Key("turn of a cable's direction from end to end", "degrees", -150, 150),
     "sink": Key(
-        "share of the depth by which the gel has sunk at a contact's rim: 0.5 is a deep gel", "", 0.1, 0.6
+        "share of the depth by which the gel has sunk at a contact's edge: 0.5 is a deep gel", "", 0.1, 0.6
     ),
     "rim": Key("slope just outside a contact relative to just inside: 1 is no crease", "", 0.4, 1),
 }

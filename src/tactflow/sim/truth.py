@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from tactflow.sim.camera import Camera
 from tactflow.sim.gel import Press, in_contact
 
-AT_RIM = 0.25
-"""Distance to the outline of the contact, px, at which no method can tell whether a marker is inside."""
+AT_EDGE = 0.25
+"""Distance to the outline of the contact, px, at which no method can tell whether a marker is inside.
+Chosen by hand; docs/flow-limits.md shows what hangs on it."""
 
 NO_DIRECTION = 0.02
-"""Anisotropy (difference over sum of the principal second moments) below which a region has no direction."""
+"""Anisotropy (difference over sum of the principal second moments) below which a region has no direction.
+Chosen by hand: an axis ratio of 1.02."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +39,7 @@ class Truth:
         never printed are not listed.
     visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, and not vanished.
     inside : (N,) bool, whether a marker is visible and its centre lies in the contact.
-    at_rim : (N,) bool, whether a marker is visible and the outline passes its centre at `AT_RIM` or less.
+    at_edge : (N,) bool, whether a marker is visible and the outline passes its centre at `AT_EDGE` or less.
     mean_flow : (dx, dy), mean displacement of the markers inside, px; None where there are none.
     """
 
@@ -51,7 +53,7 @@ class Truth:
     position: NDArray[np.float64]
     visible: NDArray[np.bool_]
     inside: NDArray[np.bool_]
-    at_rim: NDArray[np.bool_]
+    at_edge: NDArray[np.bool_]
     mean_flow: tuple[float, float] | None
     depth: float
     _render: Callable[[], NDArray[np.uint8]] = field(repr=False)
@@ -165,7 +167,7 @@ def measure(
         position=position,
         visible=visible,
         inside=inside,
-        at_rim=visible & (reached.any(axis=0) != reached.all(axis=0)),
+        at_edge=visible & (reached.any(axis=0) != reached.all(axis=0)),
         mean_flow=mean_flow,
         depth=max((press.depth for press in pressed), default=0.0) if touching else 0.0,
         _render=partial(_processed, clean, mapping),
@@ -197,9 +199,9 @@ def _processed(clean: Callable[[], NDArray[np.uint8]], mapping: Any) -> NDArray[
 
 
 def _around(position: NDArray[np.float64], to: Any) -> NDArray[np.float64]:
-    """(9, N, 2) raw px: points (N, 2), raw px, and eight places `AT_RIM` processed px from each."""
+    """(9, N, 2) raw px: points (N, 2), raw px, and eight places `AT_EDGE` processed px from each."""
     turn = np.arange(8) * (np.pi / 4)
-    steps = AT_RIM * np.concatenate([[[0.0, 0.0]], np.stack([np.cos(turn), np.sin(turn)], axis=1)])
+    steps = AT_EDGE * np.concatenate([[[0.0, 0.0]], np.stack([np.cos(turn), np.sin(turn)], axis=1)])
     if to is None:
         return position + steps[:, None]
     around = np.asarray(to.to_processed(position), dtype=np.float64) + steps[:, None]

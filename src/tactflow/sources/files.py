@@ -231,7 +231,7 @@ def _map_array(path: Path) -> NDArray[Any]:
             raise SourceError(
                 f"{path}: the file is cut off: it holds fewer bytes than its header promises; copy it again"
             ) from error
-        raise SourceError(f"{path}: not a .npy array that can be mapped ({error}); {wanted}") from error
+        raise SourceError(f"{path}: not a .npy file, or a damaged one; {wanted}") from error
     if not isinstance(mapped, np.ndarray):
         mapped.close()
         raise SourceError(f"{path}: a .npz archive; save its array with np.save; {wanted}")

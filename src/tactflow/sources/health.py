@@ -21,7 +21,7 @@ log = logging.getLogger("tactflow")
 BLACK_LEVEL = 4.0
 """Mean grey level at and below which a picture counts as black; a lit gel has 30 and more."""
 BLACK_STEP = 8
-"""The mean is taken over every so-manieth row and column: a mean needs no more pixels. Chosen by hand, px."""
+"""The mean is taken over one row and column in so many: a mean needs no more pixels. Chosen by hand, px."""
 STEADY_SECONDS = 5.0
 """A connection that delivered for so long has proven itself: the next back-off starts small again.
 Chosen by hand, s."""
@@ -40,7 +40,7 @@ INTERVAL_GAIN = 0.1
 MOST_DOUBLINGS = 30
 """The time between attempts is not doubled more often, which would only overflow."""
 COMPARED_STEP = 64
-"""Pictures are compared in every so-manieth row first: noise shows there already. Chosen by hand, px."""
+"""Pictures are compared in one row of so many first: noise shows there already. Chosen by hand, px."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,8 @@ from tactflow.sources.base import BgrImage, FrameReader, log
 from tactflow.sources.health import HANG_INTERVALS, Health, Verdict, Watch
 
 OPENING_SECONDS = 15.0
-"""Opening that takes longer hangs, s; more than what drivers and streams themselves allow."""
+"""Opening that takes longer hangs, s; more than what drivers and streams themselves allow. Chosen by
+hand."""
 MAX_ABANDONED = 4
 """No new attempt while so many threads hang in a driver. Chosen by hand."""
 POLL_SECONDS = 0.1

@@ -25,16 +25,17 @@ from tactflow.engine.stats import Durations
 log = logging.getLogger("tactflow")
 
 STATS_SECONDS = 0.5
-"""How often pages are told the statistics of the run."""
+"""How often pages are told the statistics of the run, s. Chosen by hand."""
 
 STALE_SECONDS = 1.0
-"""A picture older than this is not shown to a page that has just opened, unless the run is paused."""
+"""A picture older than this is not shown to a page that has just opened, unless the run is paused, s.
+Chosen by hand."""
 
 REST_MS = 250
-"""A page whose machine is full may ask for at most this long until its next frame."""
+"""A page whose machine is full may ask for at most this long until its next frame. Chosen by hand."""
 
 MAX_PAGES = 16
-"""More pages than this at a time are turned away."""
+"""More pages than this at a time are turned away. Chosen by hand."""
 
 
 class Wire(Protocol):

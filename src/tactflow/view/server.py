@@ -35,11 +35,12 @@ HOST_HEADER = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?"
 
 START_SECONDS = 10.0
 CLOSE_SECONDS = 3.0
-"""How long the server may take to start, and to end."""
+"""How long the server may take to start, and to end, s. Chosen by hand."""
 
 WRONG_TOKEN = 4401
 TOO_MANY = 4429
-"""WebSocket close codes of our own: the page must be told why, and a refused handshake tells it nothing."""
+"""WebSocket close codes of our own: the page must be told why, and a refused handshake tells it nothing.
+The range from 4000 is for private use (RFC 6455, 7.4.2); the rest follows HTTP 401 and 429."""
 
 TYPES = {
     "html": "text/html; charset=utf-8",

@@ -28,12 +28,13 @@ DARK: Final[Colour] = (25, 25, 25)
 """Colours, blue, green, red."""
 
 _SHIFT: Final = 4
-"""Binary digits after the point in drawing coordinates: they are exact to 1/16 px."""
+"""Binary digits after the point in drawing coordinates: they are exact to 1/16 px. Chosen by hand."""
 _FAR: Final = 1e5
-"""Largest drawing coordinate, px: far outside any picture, and within 32 bits with `_SHIFT` digits."""
+"""Largest drawing coordinate, px: far outside any picture, and within 32 bits with `_SHIFT` digits. Chosen
+by hand."""
 _UNIT_SIDE: Final = 300
 """Shorter side of a picture, px, up to which everything is drawn at the sizes below; in larger pictures they
-grow with it. All of these sizes are chosen by eye."""
+grow with it. It and all sizes below are chosen by hand, by how the pictures look."""
 _LINE: Final = 1.2
 """Width of lines, px."""
 _DARK_LINE: Final = 2.6

@@ -19,7 +19,7 @@ it. Chosen by hand."""
 MAX_COMPONENTS: Final = 12
 """At most so many contacts are outlined. Chosen by hand."""
 MIN_CELLS: Final = 8
-"""Cells that must change together; 128 px^2 is the halo of a ball's first touch."""
+"""Cells that must change together. Chosen by hand: 128 px^2 is the halo of a ball's first touch."""
 WIDE_DEVIATION: Final = 12.0
 """Squared deviation of the colour from which a cell counts as part of a wide change: 1 of 400 by chance
 (chi-square with two degrees of freedom)."""

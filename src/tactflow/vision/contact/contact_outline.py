@@ -51,14 +51,15 @@ EVEN: Final = 6.0
 part in so many of its length's: of three equal channels it is one in three. Chosen by hand, half of that."""
 
 SKIRT: Final = 0.6
-"""Fraction of its peak to which the mean profile has fallen in the surroundings of the contact."""
+"""Fraction of its peak to which the mean profile has fallen in the surroundings of the contact.
+Chosen by hand."""
 
 SHARP_SKIRT: Final = 0.11
 """Distance from there to the top where the slope breaks at the border, as on a half-space (Hertz), in half
 widths of the contact."""
 
 SKIRT_BLUR: Final = 0.6
-"""What smoothing adds to that distance, pixels at half resolution."""
+"""What smoothing adds to that distance, pixels at half resolution. Chosen by hand."""
 
 SOFTNESS: Final = 1.75
 """Where the distance is larger, the gel is coated or soft and the slope has no break: the peak of the profile
@@ -71,19 +72,21 @@ has steeper slopes than its border, the profile peaks anywhere. Chosen by hand."
 
 HALF: Final = 0.45
 """Fraction of the peak at which a brightened contact ends: half of the plateau, of which noise and shading
-make the peak a little more."""
+make the peak a little more. Chosen by hand."""
 
 BRIGHTENED_SCALE: Final = 8.0
-"""Scale of a brightened contact's level set. Only its sign counts, and that of its interpolation."""
+"""Scale of a brightened contact's level set. Chosen by hand: only its sign counts, and that of its
+interpolation."""
 
 BIN: Final = 0.5
-"""Width of the profile's bins, pixels at half resolution."""
+"""Width of the profile's bins, pixels at half resolution. Chosen by hand."""
 
 MIN_BIN_PIXELS: Final = 8
 """Pixels from which on a bin of the profile counts. Chosen by hand."""
 
 ENOUGH_PIXELS: Final = 8000
-"""Pixels that are enough for the profile: of a window with n times as many, one row in n is taken."""
+"""Pixels that are enough for the profile: of a window with n times as many, one row in n is taken.
+Chosen by hand."""
 
 _NOTHING: Final = np.zeros((0, 0), np.uint8)
 """An empty mask."""

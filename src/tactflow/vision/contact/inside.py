@@ -21,17 +21,18 @@ FloatArray = NDArray[np.float64]
 Outline = NDArray[np.int32]
 
 MANY: Final = 400
-"""Of an outline with more points, every second is enough: some 400 points still follow it. By hand."""
+"""Of an outline with more points, every second is enough: some 400 points still follow it. Chosen by hand."""
 SIDE: Final = 1.5
 """How much of the outline to each side of a gap takes part in its bridge, in half widths of the gap. Less,
 and the pixels' stairs tilt it; more, and it cuts corners. Chosen by hand."""
 ALONG: Final = np.linspace(0, 1, 12)
-"""Where the points of a side lie that are taken, from the gap outwards, in parts of the side."""
+"""Where the points of a side lie that are taken, from the gap outwards, in parts of the side.
+Their number is chosen by hand."""
 RIDGE: Final = (1e-9, 1e-6, 1e-6)
-"""Added to the squares of the fit: a trace that keeps a side of a few points solvable."""
+"""Added to the squares of the fit: a trace that keeps a side of a few points solvable. Chosen by hand."""
 TIE: Final = 1e-6
 """Of two bridges at the same distance but for so much, px, that one counts which has the point outside: both
-sides of a line that is one pixel wide."""
+sides of a line that is one pixel wide. Chosen by hand."""
 NEIGHBOUR: Final = math.sqrt(2) + 1e-9
 """Distance of neighbouring pixels of an outline at most, px, rounded up."""
 

@@ -19,9 +19,11 @@ _GRID_NOISE: Final = 0.122
 """Variance of the anisotropy of a disc of radius R px on a pixel grid at random phase, along its stronger
 component, times R^3. Derived in `anisotropy_limit`."""
 _HARMONICS: Final = range(3, 10)
-"""Harmonics that measure how rough the outline is; 0 to 2 are size, place and elongation themselves."""
+"""Harmonics that measure how rough the outline is; 0 to 2 are size, place and elongation themselves.
+Where they end is chosen by hand."""
 _LINEAR_LIMIT: Final = 0.6
-"""Anisotropy (axis ratio 2) up to which it is proportional to the outline's second harmonic."""
+"""Anisotropy (axis ratio 2) up to which it is proportional to the outline's second harmonic. Chosen by
+hand."""
 _LEAST_VARIANCE: Final = 1e-12
 """Variance, px^2, that stands for that across a line of pixels where it is divided by. Chosen by hand."""
 _LEAST_RADIUS: Final = 1e-9

@@ -92,11 +92,12 @@ CENTROID_ROUNDS: Final = 4
 """Steps of a centroid's window, at most. Chosen by hand."""
 
 CENTROID_CONVERGED: Final = 1e-3
-"""Step of all windows, px, below which they have converged."""
+"""Step of all windows, px, below which they have converged. Chosen by hand: a tenth of a
+marker's error."""
 
 BLOCKING: Final = 1.1
 """Sum of squares, over the squared distance of two marks, below which a third one between them blocks their
-link. A right angle has 1; a tenth more keeps a skewed square free of diagonals."""
+link. A right angle has 1; a tenth more keeps a skewed square free of diagonals. Chosen by hand."""
 
 GRAPH_CANDIDATES: Final = 12
 """Nearest marks among which neighbours are looked for. Chosen by hand."""

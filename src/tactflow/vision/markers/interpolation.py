@@ -12,14 +12,14 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 NEIGHBOURS: Final = 24
-"""Marks around a mark that a fit uses, at most: two rings of a square grid."""
+"""Marks around a mark that a fit uses, at most: the two rings of a square grid, 8 + 16."""
 
 WEIGHT_SIGMA: Final = 1.1
 """Width of the Gaussian by which a mark's weight falls with its distance, pitches: 0.66 at one pitch. Chosen
 by hand."""
 
 LEAST_WEIGHT: Final = 0.02
-"""Weight below which a mark does not count, which is 3.1 pitches away."""
+"""Weight below which a mark does not count, which is 3.1 pitches away. Chosen by hand."""
 
 LEAST_SUPPORT: Final = 0.6
 """Sum of the weights of the seen marks around a mark that is placed: one neighbour is enough. Below, the mark

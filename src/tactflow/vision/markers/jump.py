@@ -17,7 +17,7 @@ AGREEMENT: Final = 2
 """Votes within so many bins of the peak agree with it: a fifth of a pitch for the scatter of the field."""
 
 RIVAL: Final = 5
-"""Another peak is looked for from so many bins on, half a pitch."""
+"""Another peak is looked for from so many bins on, half a pitch: nearer ones belong to the same peak."""
 
 LEAST_VOTES: Final = 0.75
 """Fraction of the marks that have to agree. Chosen by hand."""

@@ -28,7 +28,8 @@ SHARPEST_CIRCLE: Final = 4.0
 for the gel. Chosen by hand."""
 
 CONTRAST_FRACTION: Final = 0.25
-"""Fraction of the dots' median contrast from which on a spot is a dot. Worn dots keep that much."""
+"""Fraction of the dots' median contrast from which on a spot is a dot. Worn dots keep that much.
+Chosen by hand."""
 
 LEAST_CONTRAST: Final = 6.0
 """Least contrast of a dot, grey levels: 120 / 20, the threshold of the original script over its gain."""
@@ -130,14 +131,6 @@ def marker_mask(image: Bytes, dot: Dot) -> Bytes:
     threshold = min(255, math.floor(dot.contrast))
     cover_spots(own.contrast, threshold, own.reach, _corner(dot.radius), own.spots, own.doubled, mask)
     return np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
-
-
-def halved_mask(mask: Bytes) -> Bytes:
-    """255 where any of 2 x 2 pixels is not 0, else 0: (h, w) uint8, h and w even -> half as high and wide."""
-    # A pixel of 255 in four leaves 64, and one of 1 none: so the mask is spread to 0 and 255 first.
-    full = cv2.threshold(mask, 0, 255, cv2.THRESH_BINARY)[1]
-    small = cv2.resize(full, (mask.shape[1] // 2, mask.shape[0] // 2), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.threshold(small, 0, 255, cv2.THRESH_BINARY)[1], np.uint8)
 
 
 def _even(image: Bytes) -> Bytes:

@@ -31,8 +31,8 @@ MARGIN: Final = 3.0
 CELL: Final = 0.12
 """Side of the cells in which nearness is judged, pitches. Chosen by hand."""
 
-ROOM: Final = 1024
-"""Peaks for which there is room at first; where it does not do, the search is made again."""
+FIRST_CAPACITY: Final = 1024
+"""Peaks for which memory is made at first; where there are more, the search is made again. Chosen by hand."""
 
 
 class SpotFinder:
@@ -102,13 +102,13 @@ def find_peaks(response: Float32Array, least: float, reach: int) -> tuple[FloatA
     Returns (M, 2) float64, each the vertex of a parabola along each axis, at most half a pixel away, and the
     response (M,) float32.
     """
-    room = ROOM
+    capacity = FIRST_CAPACITY
     while True:
-        points, value = np.empty((room, 2)), np.empty(room, np.float32)
+        points, value = np.empty((capacity, 2)), np.empty(capacity, np.float32)
         count = local_maxima(response, least, reach, points, value)
-        if count <= room:
+        if count <= capacity:
             return points[:count], value[:count]
-        room = count
+        capacity = count
 
 
 class NearPoints:

@@ -16,7 +16,8 @@ IntArray = NDArray[np.int64]
 
 PHASES: Final = 4
 """Sub-pixel phases per axis at which templates are kept. An estimate then lies at most an eighth of a pixel
-from one of them, where the linear model errs by far less than the noise."""
+from one of them, where the linear model errs by far less than the noise. Chosen by
+hand."""
 
 CONVERGED: Final = 0.25
 """Length of a step, px, after which another one is made: below it the linear model leaves less than
@@ -38,7 +39,7 @@ PATCH_MARGIN: Final = 1.2
 
 RIDGE: Final = 1e-6
 """Ridge of the normal equations, relative to their trace: keeps marks without contrast solvable. Such marks
-are never trusted."""
+are never trusted. Chosen by hand."""
 
 LANES: Final = 32
 """Rows of weights are padded to multiples of so many values: whole vector registers."""
