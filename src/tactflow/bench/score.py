@@ -46,6 +46,12 @@ class ContactScore:
     the method both see a contact. A missed contact of at least half depth enters with an overlap of 0; what
     was missed in all is counted beside. Directions are judged where the truth is at least `DIRECTED` times as
     long as wide.
+
+    iou, hull : overlaps in [0, 1], of masks and of convex hulls. area : %. center : px. angle : degrees.
+    directed, undirected : frames whose truth has a direction, and whose truth is round; without_direction,
+    invented_direction : those of them in which the method disagrees. idle, touched, deep : frames without
+    contact, with one, and with one of at least half depth; false, missed, missed_deep : those of them in
+    which the method disagrees.
     """
 
     iou: list[float] = field(default_factory=list[float])
@@ -140,6 +146,10 @@ class MarkerScore:
     The first frame tells which of the method's markers is which true one. Displacement errors are lengths of
     error vectors: their RMS over the markers that kept their identity, their 99th percentile over all whose
     position the method claims to know. A visible marker that the method never found is lost.
+
+    index : (N,), true marker -> the method's, -1 for none. pitch : of the true ones, px. right, claimed :
+    errors, px, of markers that kept their identity, and of all that are claimed to be known. visible, wrong,
+    lost : markers, summed over the frames.
     """
 
     index: NDArray[np.int64] | None = None
@@ -197,7 +207,7 @@ class MarkerScore:
 
 @dataclass(slots=True)
 class DetectionScore:
-    """Are the dots found, and nothing else?"""
+    """Are the dots found, and nothing else? One number a frame; distance : px, one for each dot found."""
 
     recall: list[float] = field(default_factory=list[float])
     precision: list[float] = field(default_factory=list[float])
@@ -226,7 +236,10 @@ class DetectionScore:
 
 @dataclass(slots=True)
 class FlowScore:
-    """Is the mean flow inside the contact right?"""
+    """Is the mean flow inside the contact right?
+
+    error : length of the error vector, px, one a frame; decided : only frames without a marker at the edge.
+    """
 
     error: list[float] = field(default_factory=list[float])
     decided: list[float] = field(default_factory=list[float])
@@ -249,7 +262,10 @@ class FlowScore:
 
 @dataclass(slots=True)
 class RemovalScore:
-    """Does the picture without markers look as the gel would without them?"""
+    """Does the picture without markers look as the gel would without them?
+
+    mae : mean absolute error inside the marker mask, grey levels, one a frame. psnr : dB.
+    """
 
     mae: list[float] = field(default_factory=list[float])
     psnr: list[float] = field(default_factory=list[float])

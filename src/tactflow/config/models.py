@@ -206,7 +206,10 @@ class SinkEntry(Entry):
 
 
 class Changes(Part):
-    """What one of several sensors changes. The values are checked where they are laid over the file's."""
+    """What one of several sensors changes: the keys of `PipelineFile` that may differ between sensors.
+
+    The values are checked where they are laid over the file's.
+    """
 
     skipping: Any = None
     opencv_threads: Any = None

@@ -16,6 +16,7 @@ from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, por
 class Draft:
     """A stage or sink of the file before its inputs are connected.
 
+    section : "stages" or "sinks". mark, item : its place in the file, and its settings.
     component : None when `use` could not be resolved; what depends on it is then not judged.
     params : None when they are wrong.
     inputs, gates : filled by `connect`; for each gate the port, and the signal that says what closed means.

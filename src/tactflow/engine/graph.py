@@ -31,8 +31,9 @@ class Mark:
 class Component:
     """A stage or sink class that `use:` can name.
 
-    name : what `use:` says. origin : where it comes from, for people ("built-in", "plug-in NAME VERSION",
-    a file, a module). memory : always "pure" for sources and sinks.
+    name : what `use:` says. cls, params : the class, and the model of its parameters. ports : read from its
+    annotations. memory : always "pure" for sources and sinks. origin : where it comes from, for people
+    ("built-in", "plug-in NAME VERSION", a file, a module).
     """
 
     name: str
@@ -71,7 +72,10 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Queue:
-    """The bounded queue in front of a node's segment; None leaves the choice to the planner."""
+    """The bounded queue in front of a node's segment; None leaves the choice to the planner.
+
+    capacity : ticks that it holds. when_full : what happens to one more, see docs/pipeline-file.md.
+    """
 
     capacity: int | None = None
     when_full: FullPolicy | None = None
@@ -90,8 +94,9 @@ class Node:
     """One stage or sink of a pipeline.
 
     inputs : every input port of the component -> the output it is connected to, or None for an optional
-    input that nothing provides. segment : name given in the file, or None. marks : key of the node -> the
-    place of its value, for those that the plan may refuse. max_rate : a sink's limit in Hz.
+    input that nothing provides. mark : the place that set it up. gates : all must be open for it to run.
+    segment : name given in the file, or None. queue : in front of its segment. max_rate : a sink's limit in
+    Hz. marks : key of the node -> the place of its value, for those that the plan may refuse.
     """
 
     id: str
@@ -111,7 +116,9 @@ class Node:
 class Pipeline:
     """A pipeline that is known to be right. `nodes` is ordered so that every input comes before its user.
 
-    runs : sensors of the same file, each with a run of its own.
+    file, directory : where it was read from. nodes : id -> node. skipping : whether work may be skipped.
+    opencv_threads : None leaves them to OpenCV. runs : sensors of the same file, each with a run of its own.
+    warnings : what the user should know before the run.
     settings : what the file and all overrides come to, as plain values that can be written as YAML again.
     """
 

@@ -44,7 +44,11 @@ class TickState:
 
 
 class RunningGate:
-    """A gate with its signal looked up."""
+    """A gate with its signal looked up.
+
+    slot : of the signal. absent : what the outputs are while it is closed, unless it `repeats`: then they are
+    the last ones again.
+    """
 
     __slots__ = ("absent", "repeats", "slot")
 
@@ -59,6 +63,13 @@ class RunningNode:
 
     skipping : whether gates may close and results be reused. check : whether values are checked against the
     port types.
+
+    Attributes
+    ----------
+    instance : of the class; `sink` is the same, or None for a stage. ports, input_slots : its inputs, and
+    where their values are. slots : where its outputs go. signals : output port -> (slot, how often it was
+    true), for those that are signals. disabled : it failed and is not called again. check : None without
+    checks. last : the outputs of its last run, for gates that repeat them and for inputs that come again.
     """
 
     def __init__(self, node: Node, instance: Part, slots: Slots, *, skipping: bool, check: bool) -> None:
@@ -87,7 +98,6 @@ class RunningNode:
         repeats = any(gate.repeats for gate in self.gates)
         self._is_pure = skipping and node.component.memory == "pure" and self.sink is None and not repeats
         self.last: Sequence[Any] | None = None
-        """The outputs of its last run, for gates that repeat them and for inputs that come again."""
         self._last_inputs: Sequence[Any] | None = None
 
     def reset(self) -> None:

@@ -25,7 +25,10 @@ BLOCK_CAPACITY = 4
 
 @dataclass(frozen=True, slots=True)
 class LinkPlan:
-    """A link to be made: from one segment to another."""
+    """A link to be made: from one segment, the producer, to another, the consumer.
+
+    capacity : ticks that it holds. when_full : what happens to one more.
+    """
 
     producer: str
     consumer: str

@@ -68,8 +68,9 @@ class Segment:
     Attributes
     ----------
     inputs, outputs : links; an output with the ids of the sinks that it leads to, or None where it leads to
-    stages too. current : id of the node that runs just now. urgent : whether somebody waits for what it does,
-    rather than only looking on or reading it later.
+    stages too. nodes : in the order of the steps. data_sinks : those that do not only look on. current : id
+    of the node that runs just now. urgent : whether somebody waits for what it does, rather than only looking
+    on or reading it later. epoch : of the last tick; a new one makes all nodes forget.
     """
 
     def __init__(

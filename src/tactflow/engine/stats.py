@@ -79,7 +79,11 @@ class Durations:
 
 @dataclass(slots=True)
 class NodeStats:
-    """What a stage or sink did. Written by the one thread that runs it."""
+    """What a stage or sink did. Written by the one thread that runs it.
+
+    skips : reason -> frames in which it did not run. errors : frames in which it failed. durations : of its
+    runs.
+    """
 
     skips: Counter[str] = field(default_factory=Counter)
     errors: int = 0
@@ -93,7 +97,7 @@ class NodeStats:
 
 @dataclass(slots=True)
 class SignalStats:
-    """How often a boolean port was True, and how often it rose."""
+    """How often a boolean port was True, and how often it rose. last : its value in the last tick."""
 
     true: int = 0
     rises: int = 0

@@ -21,7 +21,11 @@ Hop = tuple[str, int]
 
 
 class Track:
-    """Events of one thread. Only that thread adds to it."""
+    """Events of one thread. Only that thread adds to it.
+
+    slices : (name, began and ended in s, what is shown with it). hops : (start or finish of an arrow, which
+    one, when in s).
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name

@@ -43,7 +43,9 @@ class Member:
     """One sensor's process and its history.
 
     command : runs the sensor. sinks : what it has written decides how it is started again.
-    told : signals passed on to the process. code : how the sensor ended for good.
+    process : the present one; None between two. started, start_at : when it was started, and when it may be
+    started next, s. told : signals passed on to the process. failures : in a row. code : how the sensor ended
+    for good. readers : threads that pass its output on.
     """
 
     sensor: str

@@ -55,7 +55,9 @@ class Wire(Protocol):
 
 
 class Packet(NamedTuple):
-    """A frame as it is sent. number : counts from 1. captured : `time.perf_counter` at its capture, s."""
+    """A frame as it is sent. number : counts from 1. captured, published : `time.perf_counter`, s,
+    at its capture and when the sink had its results.
+    """
 
     number: int
     data: bytes
@@ -68,7 +70,12 @@ class BadCommandError(Exception):
 
 
 class Page:
-    """One open page."""
+    """One open page.
+
+    credit : it has asked for the next frame. sent, answered : numbers of the last frame it was sent, and of
+    the last it has shown. captured, sent_at : `time.perf_counter` of the one sent, s. screen_s : times from
+    capture to screen of the last frames, s. wake : there is something to send. ended : it is gone.
+    """
 
     def __init__(self, wire: Wire) -> None:
         self.wire = wire

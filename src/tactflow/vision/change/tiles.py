@@ -28,6 +28,18 @@ class Tiling:
     Samples are laid out (lines, channels, pixels), with zeros added so that all tiles are equally large; sums
     (rows of tiles, kinds, tiles in a row), the kinds being light of each channel and of all, marks, and
     motion in x and y.
+
+    frame : (H, W) or (H, W, C) uint8, of the untouched gel. tile : side of a tile, px, about.
+
+    Attributes
+    ----------
+    slice, coarse : the rows of a frame that are read, and those that are read first. coarse_shape : of the
+    latter. grid : (rows, columns) of tiles. width : of a tile, px. size : of samples with their zeros. used :
+    (lines, pixels) without them; count : all of these. lights : sums of light a tile, of the channels and of
+    all. collect : (rows of tiles, lines), adds lines up; together : adds channels up. places, weights : flat
+    indices of the samples on edges, and what they count in the sums of marks and motion. resting : those
+    samples of `frame`. ones : as many ones. unit : variance of each sum for noise of variance 1 that is
+    independent from pixel to pixel.
     """
 
     def __init__(self, frame: NDArray[np.uint8], tile: int) -> None:
@@ -57,7 +69,6 @@ class Tiling:
         unit[:, self.lights :] = at_edges.reshape(-1, rows, columns).swapaxes(0, 1)
         # A tile without any gradient shows no motion, and no noise of it either.
         self.unit = np.maximum(unit, np.float32(_LEAST_VARIANCE))
-        """Variance of each sum for noise of variance 1 that is independent from pixel to pixel."""
 
     def _choose_edges(self, frame: NDArray[np.uint8]) -> None:
         """Flat indices (samples, tiles) of the steepest edges, and their weights in the sums there."""
