@@ -286,7 +286,7 @@ def _make_ready(kernels: Sequence[Kernel[..., Any]]) -> None:
 def _without_collector() -> Iterator[None]:
     """Keep Python from looking for garbage in the block: what numba makes of code is long in use.
 
-    Compiling all takes 0.87 times as long (CPU time of one process, in turns).
+    Compiling all takes 0.9 times as long (CPU time of one process, in turns).
     """
     was_enabled = gc.isenabled()
     gc.disable()
