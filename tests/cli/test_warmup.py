@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -35,9 +38,36 @@ def test_a_run_after_it_compiles_nothing(tmp_path: Path) -> None:
     warm = python("-m", "tactflow", "warmup", cwd=tmp_path)
     assert warm.returncode == 0, warm.stderr
     assert warm.stdout == ""
-    assert "loops are ready" in warm.stderr
+    said = re.search(r"(\d+) loops are ready; (\d+) of them were compiled", warm.stderr)
+    assert said is not None
+    assert said[1] == said[2]
     done = python("-c", RUN, cwd=tmp_path)
     assert done.stdout.strip() == "0 True []", done.stderr
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
+def test_one_ctrl_c_ends_compiling_and_the_processes_that_help(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    sinks = "sinks={jsonl: {path: out.jsonl}}"
+    command = [sys.executable, "-m", "tactflow", "run", "--source", "sim:press?frames=60", "--set", sinks]
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as run:
+        assert run.stderr is not None
+        line = run.stderr.readline()
+        while line and "compiling" not in line:
+            line = run.stderr.readline()
+        run.send_signal(signal.SIGINT)
+        begin = time.monotonic()
+        assert run.wait(timeout=30) == 130
+        # As long as it takes to compile the longest loop on a machine with other work.
+        assert time.monotonic() - begin < 10
+    assert not [path for path in Path("/proc").glob("[0-9]*") if mentions(path, tmp_path)]
+
+
+def mentions(process: Path, folder: Path) -> bool:
+    try:
+        return str(folder).encode() in (process / "environ").read_bytes()
+    except OSError:
+        return False
 
 
 def test_a_wrong_pipeline_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

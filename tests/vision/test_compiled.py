@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +114,25 @@ def program(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
     return start
 
 
+@contextmanager
+def hold(folder: Path, name: str) -> Iterator[subprocess.Popen[str]]:
+    """A process that has claimed a kernel until it is killed."""
+    holder = textwrap.dedent(f"""
+        import time
+        from tactflow.vision.kernel_cache import claimed
+        with claimed({str(folder)!r}, {name!r}, wait=True) as mine:
+            print(mine, flush=True)
+            time.sleep(1000)
+    """)
+    with subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "True\n"
+            yield process
+        finally:
+            process.kill()
+
+
 RESULTS = ["6", "15", "8", "6", "1.0"]
 
 
@@ -129,6 +150,13 @@ def test_a_kernel_reads_what_must_not_be_written() -> None:
     values.setflags(write=False)
     _running_sum(values, sums)
     assert sums.tolist() == [0, 1, 3, 6]
+
+
+def test_a_kernel_refuses_to_lose_what_it_would_write_to_a_read_only_array() -> None:
+    values, sums = np.arange(4.0), np.empty(4)
+    sums.setflags(write=False)
+    with pytest.raises(ValueError, match="argument 1"):
+        _running_sum(values, sums)
 
 
 def test_a_kernel_refuses_what_its_signature_does_not_name() -> None:
@@ -161,21 +189,12 @@ def test_two_processes_that_start_together_compute_the_same(
 
 
 def test_what_a_killed_process_had_claimed_is_compiled_by_the_next(tmp_path: Path) -> None:
-    holder = textwrap.dedent(f"""
-        import time
-        from tactflow.vision.kernel_cache import claimed
-        with claimed({str(tmp_path)!r}, "loops.twice", wait=True) as mine:
-            print(mine, flush=True)
-            time.sleep(1000)
-    """)
-    with subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "True\n"
+    with hold(tmp_path, "loops.twice") as holder:
         with kernel_cache.claimed(str(tmp_path), "loops.twice", wait=False) as mine:
             assert not mine
         with kernel_cache.claimed(str(tmp_path), "loops.thrice", wait=False) as mine:
             assert mine
-        process.send_signal(signal.SIGKILL)
+        holder.send_signal(signal.SIGKILL)
     with kernel_cache.claimed(str(tmp_path), "loops.twice", wait=False) as mine:
         assert mine
 
@@ -234,6 +253,76 @@ def test_a_damaged_cache_is_said_and_compiled_around(
     out, said = program().communicate()
     assert out.split()[1:] == RESULTS, said
     assert "cannot be kept or read" in said
+
+
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_a_damaged_file_of_the_cache_is_replaced(
+    program: Callable[..., subprocess.Popen[str]], tmp_path: Path, kind: str
+) -> None:
+    program().communicate()
+    (damaged,) = (tmp_path / "kept").rglob(f"loops.twice*.{kind}")
+    damaged.write_bytes(bytes(300))
+    out, said = program().communicate()
+    assert out.split() == ["1", *RESULTS], said
+    assert "compiled again" in said
+    assert program().communicate() == (" ".join(["0", *RESULTS]) + "\n", "")
+
+
+def test_processes_that_compile_run_no_code_of_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / "getpass.py").write_text("open('executed', 'w')\n")
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "loops.py").write_text(MODULE)
+    starter = f"""
+import sys
+sys.path[:] = [{str(tmp_path / "modules")!r}, *(path for path in sys.path if path)]
+from tactflow.vision import compiled
+import loops
+compiled.os.sched_getaffinity = lambda _: {{0, 1}}
+(worker,) = compiled._start_workers(compiled.known())
+print(len(worker.stdout.read().splitlines()))
+"""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    environment.pop("PYTHONSAFEPATH", None)
+    done = subprocess.run(
+        [sys.executable, "-c", starter],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "5\n", done.stderr
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no claims on Windows")
+def test_a_process_that_waits_for_another_says_so(
+    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    program().communicate()
+    (index,) = (tmp_path / "kept").rglob("loops.twice*.nbi")
+    with hold(index.parent, "loops.twice") as holder:
+        waiting = program()
+        assert waiting.stderr is not None
+        assert "waiting for another process" in waiting.stderr.readline()
+        holder.kill()
+    out, said = waiting.communicate()
+    assert out.split() == ["0", *RESULTS]
+    assert said == ""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no claims on Windows")
+def test_nobody_waits_for_ever_for_a_process_that_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_cache, "PATIENCE_S", 0.2)
+    with hold(tmp_path, "loops.twice") as holder:
+        holder.send_signal(signal.SIGSTOP)
+        begin = time.monotonic()
+        with kernel_cache.claimed(str(tmp_path), "loops.twice", wait=True) as mine:
+            assert mine
+        assert time.monotonic() - begin >= 0.2
+        holder.kill()
 
 
 def test_without_the_compiler_kernels_run_as_plain_python_and_say_so(

@@ -28,6 +28,7 @@ from tactflow.engine.run import Runner
 from tactflow.engine.trace import Trace
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
+from tactflow.vision import compiled
 
 Sinks = dict[str, dict[str, Any]]
 """Option of the command line -> settings of the sink that it adds."""
@@ -224,13 +225,16 @@ def _logging_to(console: Console) -> Iterator[None]:
 
 @contextmanager
 def _signals(runner: Runner) -> Iterator[None]:
-    """One Ctrl-C or SIGTERM drains the pipeline; a second one ends it at once; a third is not caught."""
+    """One Ctrl-C or SIGTERM drains the pipeline; a second one ends it at once; a third is not caught.
+
+    While kernels are compiled there is nothing to drain, and the first one ends it.
+    """
     caught = 0
 
     def handle(number: int, _: FrameType | None) -> None:
         nonlocal caught
         caught += 1
-        if caught == 1:
+        if caught == 1 and not compiled.is_loading():
             runner.stop("signal")
             return
         signal.signal(number, signal.SIG_DFL)

@@ -26,6 +26,7 @@ segments of a pipeline work at the same time.
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import os
@@ -36,6 +37,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
+from pickle import PickleError
 from types import FunctionType, ModuleType
 from typing import Any, Generic, ParamSpec, TypeVar
 
@@ -56,12 +58,24 @@ _REASSOCIATED = {"reassoc", "contract", "arcp", "nsz"}
 
 _MOST_PROCESSES = 4
 """Processes that compile. Chosen by hand: the longest kernel takes a tenth of the whole."""
+_WORKER = "from tactflow.vision import compiled; compiled._work()"
+"""What a process that is started to compile runs."""
 _LEAST_SHARED = 4
 """Kernels for which others are started; to start one takes as long as to compile two. Chosen by hand."""
+
+_UNKEPT = (
+    *(OSError, EOFError, PickleError, AttributeError, ImportError),
+    *(LookupError, RuntimeError, TypeError, ValueError),
+)
+"""What numba raises where a file cannot be written, or a damaged one is read."""
 
 _lock = threading.RLock()
 _known: dict[str, Kernel[..., Any]] = {}
 _reports: list[Report] = []
+_listeners: list[Callable[[str], None]] = []
+"""Told the name of each kernel that this process has compiled, while it holds the claim."""
+_loading = threading.Event()
+"""Set while kernels are compiled or read."""
 
 
 class Kernel(Generic[P, R]):
@@ -71,7 +85,8 @@ class Kernel(Generic[P, R]):
     signature : numba's, so that no call has to find out its types. C-contiguous arrays are `[:, ::1]`.
     reorder : whether sums of floats may be taken in any order, which lets them run in parallel lanes; if not,
         operations are those of the Python code, in its order.
-    compiled_here : whether this process has compiled it, rather than found it on disk.
+    compiled_here : whether this process, or one that it has started, has compiled it, rather than found it
+        on disk.
     kept : whether it has a place on disk.
 
     >>> @kernel("float64(float64[::1])")
@@ -119,7 +134,16 @@ class Kernel(Generic[P, R]):
         except TypeError:
             # To numba, an array that must not be written is of another type.
             given: Any = [_writable(value) for value in args]
-            return self._compiled(*given, **kwargs)
+            if all(one is other for one, other in zip(given, args, strict=True)):
+                raise
+            result = self._compiled(*given, **kwargs)
+            for place, (copy, value) in enumerate(zip(given, args, strict=True)):
+                if copy is not value and copy.tobytes() != np.asarray(value).tobytes():
+                    text = (
+                        f"{self.name}: required an array to write to as argument {place}, got a read-only one"
+                    )
+                    raise ValueError(text) from None
+            return result
 
     def load(self, *, wait: bool = True) -> bool:
         """Compile, or take what is on disk; returns whether it is ready.
@@ -141,17 +165,35 @@ class Kernel(Generic[P, R]):
         with claimed(found.stats.cache_path, self.name, wait) as mine:
             if not mine:
                 return None
-            try:
-                found.compile(self._signature)
-            except (OSError, EOFError, ValueError) as error:
-                _warn_once(f"compiled loops cannot be kept or read ({error}); they are compiled in each run")
-                found = numba.njit(**self._options)(function)
-                found.compile(self._signature)
+            found, self.kept = self._compile_or_read(found, function)
+            self.compiled_here = bool(found.stats.cache_misses) or not self.kept
+            if self.compiled_here:
+                for tell in _listeners:
+                    tell(self.name)
         found.disable_compile()
-        self.kept = found.stats.cache_path is not None
-        self.compiled_here = bool(found.stats.cache_misses) or not self.kept
         compiled: Callable[P, R] = found
         return compiled
+
+    def _compile_or_read(self, found: Any, function: Callable[P, R]) -> tuple[Any, bool]:
+        """The dispatcher, ready, and whether it is kept on disk; a damaged file is replaced."""
+        numba = import_module("numba")
+        try:
+            found.compile(self._signature)
+            return found, found.stats.cache_path is not None
+        except _UNKEPT as error:
+            if found.signatures:
+                # Compiled, but not written.
+                _warn_once(f"compiled loops cannot be kept ({error}); they are compiled in each run")
+                return found, False
+            _warn_once(f"compiled loops cannot be kept or read ({error}); they are compiled again")
+        # An empty index takes the place of what cannot be read.
+        with suppress(*_UNKEPT):
+            found.recompile()
+            found.compile(self._signature)
+            return found, True
+        found = numba.njit(**self._options)(function)
+        found.compile(self._signature)
+        return found, False
 
 
 def kernel(signature: str, *, reorder: bool = False) -> Callable[[Callable[P, R]], Kernel[P, R]]:
@@ -219,25 +261,57 @@ def numba_version() -> str:
     return str(import_module("numba").__version__)
 
 
+def is_loading() -> bool:
+    """Whether kernels are being compiled or read, which a KeyboardInterrupt in that thread ends."""
+    return _loading.is_set()
+
+
 def _make_ready(kernels: Sequence[Kernel[..., Any]]) -> None:
     """Load kernels; after the first that was not on disk, compile all that are imported."""
-    with _lock:
-        # The shortest first: the others wait until it is clear that they must be compiled.
-        for kernel in sorted(kernels, key=_length):
-            if not kernel.ready:
-                kernel.load()
-                if kernel.compiled_here:
-                    _compile([other for other in (known() if kernel.kept else kernels) if not other.ready])
+    with _lock, _without_collector():
+        _loading.set()
+        try:
+            # The shortest first: the others wait until it is clear that they must be compiled.
+            for kernel in sorted(kernels, key=_length):
+                if not kernel.ready:
+                    _load_first(kernel)
+                    if kernel.compiled_here:
+                        others = known() if kernel.kept else kernels
+                        _compile([other for other in others if not other.ready], shared=kernel.kept)
+        finally:
+            _loading.clear()
 
 
-def _compile(pending: list[Kernel[..., Any]]) -> None:
-    """Make kernels ready, if they have a place on disk together with other processes."""
+@contextmanager
+def _without_collector() -> Iterator[None]:
+    """Keep Python from looking for garbage in the block: what numba makes of code is long in use.
+
+    Compiling all takes 0.9 times as long (CPU time of one process, in turns).
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def _load_first(kernel: Kernel[..., Any]) -> None:
+    """Load a kernel, and say so if another process must be waited for."""
+    if not kernel.load(wait=False):
+        _say_once("waiting for another process, which prepares the same loops")
+        kernel.load()
+
+
+def _compile(pending: list[Kernel[..., Any]], *, shared: bool) -> None:
+    """Make kernels ready; shared : with other processes, which needs a place on disk."""
     if not pending:
         return
     total = len(pending) + 1
     logger.info("compiling %d loops for this processor, once", total)
     pending.sort(key=_length, reverse=True)
-    workers = _start_workers(pending)
+    kernels, workers = list(pending), _start_workers(pending) if shared else []
     try:
         while pending:
             done = next((kernel for kernel in pending if kernel.load(wait=False)), None)
@@ -249,45 +323,64 @@ def _compile(pending: list[Kernel[..., Any]]) -> None:
             for report in _reports:
                 report(total - len(pending), total)
     finally:
-        for worker in workers:
-            worker.terminate()
-            worker.wait()
+        names = _end_workers(workers)
+        for kernel in kernels:
+            kernel.compiled_here |= kernel.name in names
 
 
 def _length(kernel: Kernel[..., Any]) -> int:
-    """Bytes of its code, helpers left out: roughly in proportion to the time that compiling takes."""
-    return len(kernel.plain.__code__.co_code)
+    """Bytes of its code: roughly in proportion to the time that compiling takes."""
+    return _code_length(kernel.plain)
 
 
-def _start_workers(kernels: Sequence[Kernel[..., Any]]) -> list[subprocess.Popen[bytes]]:
+@cache
+def _code_length(function: Callable[..., Any]) -> int:
+    """Bytes of the code of a function and of its helpers."""
+    helpers = [function.__globals__.get(name) for name in function.__code__.co_names]
+    return len(function.__code__.co_code) + sum(
+        _code_length(value.plain) for value in helpers if isinstance(value, Helper)
+    )
+
+
+def _start_workers(kernels: Sequence[Kernel[..., Any]]) -> list[subprocess.Popen[str]]:
     """Processes that compile these kernels, too; each takes those that no other has claimed."""
-    if sys.platform == "win32" or not sys.executable or len(kernels) < _LEAST_SHARED:
-        # There are no claims on Windows.
+    # There are no claims on Windows. The executable of a frozen program is the program, not Python.
+    alone = sys.platform == "win32" or not sys.executable or getattr(sys, "frozen", False)
+    if alone or len(kernels) < _LEAST_SHARED:
         return []
     processors = os.cpu_count() or 1
     if sys.platform == "linux":
         processors = len(os.sched_getaffinity(0))
     order = {"path": sys.path, "kernels": [(kernel.plain.__module__, kernel.name) for kernel in kernels]}
-    # In sessions of their own, so that Ctrl-C does not reach them: this process ends them.
     return [
         subprocess.Popen(
-            [
-                sys.executable,
-                "-c",
-                "from tactflow.vision import compiled; compiled._work()",
-                json.dumps(order),
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+            # Without -P, modules of the current folder would be imported.
+            [sys.executable, "-P", "-c", _WORKER, json.dumps(order)],
+            # It ends with this process, whatever ends that.
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
+            text=True,
+            # Ctrl-C does not reach it: this process ends it.
             start_new_session=True,
         )
         for _ in range(min(processors, _MOST_PROCESSES) - 1)
     ]
 
 
+def _end_workers(workers: Sequence[subprocess.Popen[str]]) -> set[str]:
+    """End processes; returns the names of the kernels that they have compiled."""
+    for worker in workers:
+        # SIGTERM would not reach one that is stopped.
+        worker.kill()
+    return {name for worker in workers for name in worker.communicate()[0].splitlines()}
+
+
 def _work() -> None:
-    """What a worker does: compile what nobody else is at."""
+    """What a worker does: compile what nobody else is at, and tell the names."""
+    threading.Thread(target=_end_with_starter, daemon=True).start()
+    gc.disable()
+    _listeners.append(lambda name: print(name, flush=True))
     order = json.loads(sys.argv[1])
     sys.path[:] = order["path"]
     for module, name in order["kernels"]:
@@ -295,6 +388,12 @@ def _work() -> None:
             import_module(module)
         if name in _known:
             _known[name].load(wait=False)
+
+
+def _end_with_starter() -> None:
+    """End this process when the one that has started it ends: then its side of the pipe is closed."""
+    sys.stdin.read()
+    os._exit(1)
 
 
 def _with_helpers(function: Callable[P, R], options: dict[str, Any]) -> Callable[P, R]:
@@ -315,6 +414,11 @@ def _with_helpers(function: Callable[P, R], options: dict[str, Any]) -> Callable
 @cache
 def _warn_once(text: str) -> None:
     logger.warning("%s", text)
+
+
+@cache
+def _say_once(text: str) -> None:
+    logger.info("%s", text)
 
 
 def _writable(value: object) -> object:

@@ -13,15 +13,23 @@ import os
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Final
 from zlib import crc32
 
 logger = logging.getLogger("tactflow")
+
+PATIENCE_S: Final = 60.0
+"""Longest wait for another process that compiles a kernel; it may be stopped. The longest takes 4 s (see
+docs/kernels.md)."""
+
+_POLL_S: Final = 0.02
+"""Pause between two attempts to claim a kernel. Chosen by hand."""
 
 LOCK = "tactflow-kernels.lock"
 """File in each cache folder; who compiles a kernel holds one byte of it. It is never deleted."""
@@ -52,7 +60,8 @@ def claimed(folder: str | None, name: str, wait: bool) -> Iterator[bool]:
     The claim is a lock of the operating system, which ends with the process that holds it, however that ends.
 
     folder : of the cache; None: there is none, and nothing to agree upon.
-    wait : until the process that has claimed it is done, rather than give up.
+    wait : until the process that has claimed it is done, rather than give up; after `PATIENCE_S` it is
+        compiled without a claim.
     """
     try:
         lock = None if folder is None else open(Path(folder) / LOCK, "ab")  # noqa: SIM115 (closed below)
@@ -75,15 +84,19 @@ else:
     import fcntl
 
     def _lock(file: IO[bytes], byte: int, wait: bool) -> bool:
-        """Lock one byte of a file until it is closed; False where another process has it."""
-        try:
-            fcntl.lockf(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, byte)
-        except BlockingIOError:
-            return False
-        except OSError:
-            # A file system without locks.
-            pass
-        return True
+        """Lock one byte of a file until it is closed; whether this process may go on."""
+        until = time.monotonic() + (PATIENCE_S if wait else 0.0)
+        while True:
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, byte)
+                return True
+            except BlockingIOError:
+                if time.monotonic() >= until:
+                    return wait
+            except OSError:
+                # A file system without locks.
+                return True
+            time.sleep(_POLL_S)
 
 
 @cache
