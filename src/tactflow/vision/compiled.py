@@ -33,6 +33,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -60,6 +61,10 @@ _MOST_PROCESSES = 4
 """Processes that compile. Chosen by hand: the longest kernel takes a tenth of the whole."""
 _WORKER = "from tactflow.vision import compiled; compiled._work()"
 """What a process that is started to compile runs."""
+_SAID_AFTER_S = 2.0
+"""Time after which it is said that another process is waited for. To read all loops takes half a second."""
+_POLL_S = 0.05
+"""Pause between two looks whether that process is done. Chosen by hand."""
 _LEAST_SHARED = 4
 """Kernels for which others are started; to start one takes as long as to compile two. Chosen by hand."""
 
@@ -298,10 +303,14 @@ def _without_collector() -> Iterator[None]:
 
 
 def _load_first(kernel: Kernel[..., Any]) -> None:
-    """Load a kernel, and say so if another process must be waited for."""
-    if not kernel.load(wait=False):
-        _say_once("waiting for another process, which prepares the same loops")
-        kernel.load()
+    """Load a kernel, and say so if one that compiles must be waited for; one that reads is soon done."""
+    until = time.monotonic() + _SAID_AFTER_S
+    while not kernel.load(wait=False):
+        if time.monotonic() >= until:
+            _say_once("waiting for another process, which prepares the same loops")
+            kernel.load()
+            return
+        time.sleep(_POLL_S)
 
 
 def _compile(pending: list[Kernel[..., Any]], *, shared: bool) -> None:
