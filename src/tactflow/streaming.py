@@ -16,7 +16,7 @@ from tactflow.engine.conformance import component
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Mark, Node, Pipeline, Ref
+from tactflow.engine.graph import Mark, Node, Pipeline
 from tactflow.engine.link import Link
 from tactflow.engine.run import Runner
 from tactflow.ports import ContactMask, Image
@@ -185,15 +185,6 @@ def _with_hand(pipeline: Pipeline, link: Link[Result], *, images: bool, sinks: b
     values: dict[str, Any] = {"link": link, "images": images, "__annotations__": {}}
     hand = component(type("Hand", (_Hand,), values), _SINK, "tactflow.stream", ())
     kept = {id_: node for id_, node in pipeline.nodes.items() if sinks or node.component.kind != "sink"}
-    inputs = {port.name: _last_output(kept, port.name) for port in hand.ports.inputs}
+    inputs = {port.name: pipeline.last_output(port.name) for port in hand.ports.inputs}
     kept[_SINK] = Node(_SINK, hand, StageParams(), inputs, Mark("tactflow.stream", 0, 0))
     return replace(pipeline, nodes=kept)
-
-
-def _last_output(nodes: Mapping[str, Node], port: str) -> Ref | None:
-    """The port of that name which comes last, as a sink at the end of the file would see it."""
-    last = None
-    for node in nodes.values():
-        if any(output.name == port for output in node.component.ports.outputs):
-            last = Ref(node.id, port)
-    return last

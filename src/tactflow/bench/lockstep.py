@@ -24,7 +24,7 @@ from tactflow.config.registry import resolve
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
-from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue, Ref
+from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.ports import Parameter, Port, Ports
 from tactflow.engine.run import RunResult
 from tactflow.vision.geometry import PixelMapping
@@ -236,16 +236,6 @@ def _lockstep_source(cls: type, turns: _Turns) -> type:
     return Lockstep
 
 
-def _last_output(pipeline: Pipeline, name: str) -> Ref | None:
-    """The port of that name which comes last in the file, as a sink at its end would see it."""
-    found = None
-    for node in pipeline.nodes.values():
-        for port in node.component.ports.outputs:
-            if port.name == name:
-                found = Ref(node.id, name)
-    return found
-
-
 def _rewired(pipeline: Pipeline, jsonl: Path | None, turns: _Turns) -> Pipeline:
     """The same graph in one segment, with the bench's source in front and its sinks behind."""
     source = pipeline.source
@@ -264,7 +254,7 @@ def _rewired(pipeline: Pipeline, jsonl: Path | None, turns: _Turns) -> Pipeline:
     if jsonl is not None:
         component = resolve("jsonl", "sinks", pipeline.directory)
         params = component.params.model_validate({"path": str(jsonl), "overwrite": True})
-        inputs = {port.name: _last_output(pipeline, port.name) for port in component.ports.inputs}
+        inputs = {port.name: pipeline.last_output(port.name) for port in component.ports.inputs}
         nodes["jsonl"] = Node("jsonl", component, params, inputs, mark, segment=segment)
     wanted: Mapping[str, Any] = {
         "contact": Contact,
@@ -285,7 +275,7 @@ def _rewired(pipeline: Pipeline, jsonl: Path | None, turns: _Turns) -> Pipeline:
         memory="pure",
         origin="bench",
     )
-    inputs = {name: _last_output(pipeline, name) for name in wanted}
+    inputs = {name: pipeline.last_output(name) for name in wanted}
     nodes[_COLLECT] = Node(
         _COLLECT, collect, StageParams(), inputs, mark, segment=segment, on_error=OnError()
     )

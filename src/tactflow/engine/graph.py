@@ -142,3 +142,11 @@ class Pipeline:
     def sinks(self) -> Sequence[Node]:
         """The nodes that publish or write."""
         return [node for node in self.nodes.values() if node.component.kind == "sink"]
+
+    def last_output(self, port: str) -> Ref | None:
+        """The output of that name which comes last, as a sink at the end of the file would see it."""
+        last = None
+        for node in self.nodes.values():
+            if any(output.name == port for output in node.component.ports.outputs):
+                last = Ref(node.id, port)
+        return last
