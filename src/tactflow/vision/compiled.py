@@ -44,7 +44,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
 
-from tactflow.vision.kernel_cache import claimed, dispatcher_of
+from tactflow.vision.kernel_cache import POLL_S, claimed, dispatcher_of
 
 logger = logging.getLogger("tactflow")
 
@@ -63,8 +63,6 @@ _WORKER = "from tactflow.vision import compiled; compiled._work()"
 """What a process that is started to compile runs."""
 _SAID_AFTER_S = 2.0
 """Time after which it is said that another process is waited for. To read all loops takes half a second."""
-_POLL_S = 0.05
-"""Pause between two looks whether that process is done. Chosen by hand."""
 _LEAST_SHARED = 4
 """Kernels for which others are started; to start one takes as long as to compile two. Chosen by hand."""
 
@@ -310,7 +308,7 @@ def _load_first(kernel: Kernel[..., Any]) -> None:
             _say_once("waiting for another process, which prepares the same loops")
             kernel.load()
             return
-        time.sleep(_POLL_S)
+        time.sleep(POLL_S)
 
 
 def _compile(pending: list[Kernel[..., Any]], *, shared: bool) -> None:

@@ -28,7 +28,7 @@ PATIENCE_S: Final = 60.0
 """Longest wait for another process that compiles a kernel; it may be stopped. The longest takes 4 s (see
 docs/kernels.md)."""
 
-_POLL_S: Final = 0.02
+POLL_S: Final = 0.02
 """Pause between two attempts to claim a kernel. Chosen by hand."""
 
 LOCK = "tactflow-kernels.lock"
@@ -96,7 +96,7 @@ else:
             except OSError:
                 # A file system without locks.
                 return True
-            time.sleep(_POLL_S)
+            time.sleep(POLL_S)
 
 
 @cache
