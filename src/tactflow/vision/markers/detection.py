@@ -193,14 +193,7 @@ def detect_markers(
     ('dark', 2)
     """
     gray, shortest = to_gray(image).astype(np.float32), min(image.shape[:2])
-    if dot_radius is not None and not 1.0 <= dot_radius <= max(1.0, shortest / 4):
-        raise ValueError(f"required dot_radius 1 to {max(1.0, shortest / 4):g} px, got {dot_radius:g}")
-    if polarity not in ("auto", "dark", "bright"):
-        raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
-    if valid is not None and (valid.shape != gray.shape or valid.dtype != np.uint8):
-        raise ValueError(
-            f"required valid to be {gray.shape} uint8, got shape {valid.shape}, dtype {valid.dtype}"
-        )
+    _require_options(dot_radius, polarity, valid, gray.shape)
     if shortest < 8:
         raise NoMarkersError(_NO_MARKERS)
     polarities: Sequence[Literal["dark", "bright"]] = (
@@ -219,6 +212,19 @@ def detect_markers(
     distances = _nearest(centers, 1)[0]
     pitch = float(np.median(distances[:, 0])) if len(centers) > 1 else LONE_PITCH * radius
     return Detection(centers, radius, best.polarity, pitch, neighbour_graph(centers, LONGEST_LINK * pitch))
+
+
+def _require_options(
+    dot_radius: float | None, polarity: str, valid: NDArray[np.uint8] | None, shape: tuple[int, ...]
+) -> None:
+    """Raises ValueError for options of `detect_markers` that are not of their kind."""
+    largest = max(1.0, min(shape) / 4)
+    if dot_radius is not None and not 1.0 <= dot_radius <= largest:
+        raise ValueError(f"required dot_radius 1 to {largest:g} px, got {dot_radius:g}")
+    if polarity not in ("auto", "dark", "bright"):
+        raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
+    if valid is not None and (valid.shape != shape or valid.dtype != np.uint8):
+        raise ValueError(f"required valid to be {shape} uint8, got shape {valid.shape}, dtype {valid.dtype}")
 
 
 class _Family(NamedTuple):
