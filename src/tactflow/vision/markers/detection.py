@@ -196,14 +196,7 @@ def detect_markers(
     _require_options(dot_radius, polarity, valid, gray.shape)
     if shortest < 8:
         raise NoMarkersError(_NO_MARKERS)
-    polarities: Sequence[Literal["dark", "bright"]] = (
-        ("dark", "bright") if polarity == "auto" else (polarity,)
-    )
-    best: _Family | None = None
-    for sigma in _sigmas(dot_radius, shortest):
-        for family in _families(gray, valid, sigma, polarities):
-            if best is None or family.score > best.score:
-                best = family
+    best = _best_family(gray, valid, _sigmas(dot_radius, shortest), polarity)
     if best is None or (dot_radius is None and best.score < LEAST_SCORE):
         raise NoMarkersError(_NO_MARKERS + ("" if best is None else _FEW_MARKERS))
     radius = best.sigma * RADIUS_PER_SIGMA
@@ -234,6 +227,21 @@ class _Family(NamedTuple):
     sigma: float
     polarity: Literal["dark", "bright"]
     peaks: FloatArray
+
+
+def _best_family(
+    gray: NDArray[np.float32], valid: NDArray[np.uint8] | None, sigmas: Sequence[float], polarity: Polarity
+) -> _Family | None:
+    """The family of the highest score of all scales."""
+    polarities: Sequence[Literal["dark", "bright"]] = (
+        ("dark", "bright") if polarity == "auto" else (polarity,)
+    )
+    best: _Family | None = None
+    for sigma in sigmas:
+        for family in _families(gray, valid, sigma, polarities):
+            if best is None or family.score > best.score:
+                best = family
+    return best
 
 
 def _families(
