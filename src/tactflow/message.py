@@ -24,8 +24,9 @@ SCHEMA = "tactflow.frame/1"
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
 """The word for each value of `MarkerStatus`."""
 
-_RESULTS = frozenset({"contact", "flow", "markers"})
-"""Ports whose absence or repetition the message explains: those that it publishes."""
+_EXPLAINED = frozenset({"contact", "flow", "markers", "reference"})
+"""What `skipped` may name: the ports that are published, and the frame itself where a stage had it made a new
+reference."""
 
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 
@@ -100,7 +101,7 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
             "contact": None if contact is None else _contact(contact, detail),
             "flow": None if flow is None else _flow(flow, detail),
             "markers": None if markers is None else _markers(markers, detail),
-            "skipped": {port: reason for port, reason in tick.skipped.items() if port in _RESULTS},
+            "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
         },
         option=_OPTIONS,
     )
@@ -267,7 +268,9 @@ class _Message(_Strict):
     contact: _ContactModel | None = Field(description="null when nothing touches the gel")
     flow: _FlowModel | None = Field(description="null when there is no contact")
     markers: _MarkersModel | None = Field(description="null when markers were not computed")
-    skipped: dict[str, str] = Field(description="port -> why this frame did not need it")
+    skipped: dict[str, str] = Field(
+        description="port -> why this frame did not need it; reference -> why this frame became a new one"
+    )
 
 
 class _NoDefaults(GenerateJsonSchema):

@@ -276,6 +276,50 @@ def test_a_reference_image_is_seen_by_stateful_stages_and_by_no_sink(toy_runner:
     assert result.stats["frames"] == 20
 
 
+ASKING: dict[str, Any] = {"doubtful": {"use": "Doubtful"}}
+FRAMES: dict[str, Any] = {"out": {"use": "Frames"}}
+
+
+@pytest.mark.parametrize("segment", [None, "capture"])
+def test_a_stage_gets_the_very_next_frame_as_a_new_reference(
+    toy_runner: MakeRunner, segment: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = ("level", "pulse", "heavy", "gated", "total", "join", "doubtful")
+    cut = {name: {} if segment is None else {"segment": segment} for name in names}
+    cut["doubtful"] = cut["doubtful"] | ASKING["doubtful"]
+    runner = toy_runner(cut, FRAMES)
+    with caplog.at_level(logging.INFO, "tactflow"):
+        ran(runner)
+    assert [row[:3] for row in rows(runner)] == [(i, i in (0, 8), int(i >= 8)) for i in range(20)]
+    assert [row[3] for row in rows(runner) if row[3]] == [{"reference": "light_changed"}]
+    assert runner.nodes["level"].stage is not None
+    assert "frame 7: doubtful takes a new reference: light changed" in caplog.messages
+
+
+def test_a_new_reference_resets_the_stages_that_saw_the_old_one(toy_runner: MakeRunner) -> None:
+    sinks = {**FRAMES, "rows": {"use": "Collect"}}
+    runner = toy_runner(ASKING, sinks)
+    ran(runner)
+    assert rows(runner, "rows")[19][2] == sum(range(8, 20))
+    assert runner.nodes["total"].instance.resets == 1
+
+
+def test_a_sink_that_takes_references_gets_the_new_one_unasked(toy_runner: MakeRunner) -> None:
+    runner = toy_runner(ASKING, {**FRAMES, "kept": {"use": "References"}})
+    ran(runner)
+    assert rows(runner, "kept") == [0, 8]
+
+
+def test_where_other_stages_run_ahead_the_source_is_asked_for_a_new_reference(
+    toy_runner: MakeRunner,
+) -> None:
+    runner = toy_runner({"doubtful": {"use": "Doubtful", "segment": "other"}}, FRAMES)
+    ran(runner)
+    assert not any(row[2] for row in rows(runner))
+    assert runner.source is not None
+    assert vars(runner.source)["retakes"] == 1
+
+
 # -- errors -----------------------------------------------------------------------------------------------
 
 

@@ -47,7 +47,7 @@ class Ramp(contract.Source):
         self.params, self.sensor = params, sensor
         self.live = params.realtime
         self.stopped = threading.Event()
-        self.closed = 0
+        self.closed = self.retakes = 0
 
     @property
     def missed(self) -> int:
@@ -80,6 +80,9 @@ class Ramp(contract.Source):
 
     def stop(self) -> None:
         self.stopped.set()
+
+    def retake(self) -> None:
+        self.retakes += 1
 
     def close(self) -> None:
         self.closed += 1
@@ -184,8 +187,22 @@ class Total(Counted, Stage):
         self.resets += 1
 
 
+class DoubtfulPorts(NamedTuple):
+    doubtful: Number
+
+
 class JoinPorts(NamedTuple):
     joined: Number
+
+
+class Doubtful(Counted, Stage):
+    """Asks for a new reference in frame 7."""
+
+    def process(self, level: Number) -> DoubtfulPorts:
+        self.saw(int(level.value))
+        if level.value == 7:
+            self.wants_reference = "light_changed"
+        return DoubtfulPorts(level)
 
 
 class Join(Counted, Stage):
@@ -274,6 +291,34 @@ class Collect(Counted, Sink):
 
     def wants(self) -> bool:
         return self.wanted
+
+
+class Frames(Counted, Sink):
+    """Keeps number, reference and epoch of each frame, and what was skipped."""
+
+    def __init__(self, params: Counted.Params) -> None:
+        super().__init__(params)
+        self.rows: list[tuple[int, bool, int, dict[str, str]]] = []
+
+    def write(self, tick: Tick, doubtful: Number) -> None:  # noqa: ARG002 (the port must be asked for)
+        frame = tick.frame
+        self.rows.append((frame.seq, frame.reference, frame.epoch, dict(tick.skipped)))
+
+
+class References(Counted, Sink):
+    """Wants nothing but references."""
+
+    takes_references = True
+
+    def __init__(self, params: Counted.Params) -> None:
+        super().__init__(params)
+        self.rows: list[int] = []
+
+    def wants(self) -> bool:
+        return False
+
+    def write(self, tick: Tick, level: Number) -> None:  # noqa: ARG002 (the port must be asked for)
+        self.rows.append(tick.frame.seq)
 
 
 class ThreadedCollect(Collect):

@@ -32,6 +32,7 @@ _VALUES: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "takes_references": _FLAG,
     "live": _FLAG,
     "description": _TEXT,
+    "wants_reference": _TEXT,
     "queue_capacity": ("a whole number from 1", lambda value: type(value) is int and value >= 1),
     "total": ("a whole number or None", lambda value: value is None or type(value) is int),
 }

@@ -124,6 +124,13 @@ class Stage(Part):
     """Required. "pure": the outputs depend on the inputs alone, so the stage may be left out of a frame that
     nobody asks for, and results may be reused. "stateful": it sees every accepted frame, in order."""
 
+    wants_reference: str | None = None
+    """Why the gel must be looked at anew, a short snake_case word; None: it need not. `process` sets it on
+    `self`; the engine takes it back and makes the next frame a reference, in a new epoch, as
+    `Source.retake` does, so that all stages are reset. With the stages in one segment, as they are unless
+    the pipeline says otherwise, it is the very next one, so that a recording gives the same again; else the
+    source is asked, whose next frame may be a few later."""
+
     def reset(self) -> None:
         """Forget everything: a new reference follows (`Frame.epoch` has grown)."""
 

@@ -54,7 +54,8 @@ class Tick:
     """What a sink may know about a tick besides the values of its input ports.
 
     frame : the captured frame (its image is the raw one).
-    skipped : input port of this sink -> reason, for values that were not computed in this tick.
+    skipped : input port of this sink -> reason, for values that were not computed in this tick; "reference"
+        -> reason, where a stage asked for this frame to become a new reference.
 
     >>> frame = Frame("main", 0, 0.0, np.zeros((4, 6, 3), np.uint8))
     >>> Tick(frame, {"contact": "no_contact"}).skipped["contact"]

@@ -29,10 +29,10 @@ class TickState:
 
     index : number of the tick in this run. demand : ids of the sinks that want it. values : one per slot;
     `Absent` where there is none. reasons : slot -> why its value was not computed in this tick, for values
-    that are absent or repeated.
+    that are absent or repeated. renewed : why a stage had this frame made a reference, None if none had.
     """
 
-    __slots__ = ("demand", "frame", "index", "reasons", "values")
+    __slots__ = ("demand", "frame", "index", "reasons", "renewed", "values")
 
     def __init__(self, index: int, frame: Frame, demand: frozenset[str], slots: int) -> None:
         self.index = index
@@ -41,6 +41,7 @@ class TickState:
         self.values: list[Any] = [_NONE] * slots
         self.values[UNCONNECTED] = None
         self.reasons: dict[int, str] = {}
+        self.renewed: str | None = None
 
 
 class RunningGate:
@@ -66,10 +67,11 @@ class RunningNode:
 
     Attributes
     ----------
-    instance : of the class; `sink` is the same, or None for a stage. ports, input_slots : its inputs, and
-    where their values are. slots : where its outputs go. signals : output port -> (slot, how often it was
-    true), for those that are signals. disabled : it failed and is not called again. check : None without
-    checks. last : the outputs of its last run, for gates that repeat them and for inputs that come again.
+    instance : of the class; `sink` or `stage` is the same, the other is None. ports, input_slots : its
+    inputs, and where their values are. slots : where its outputs go. signals : output port -> (slot, how
+    often it was true), for those that are signals. disabled : it failed and is not called again. check :
+    None without checks. last : the outputs of its last run, for gates that repeat them and for inputs that
+    come again.
     """
 
     def __init__(self, node: Node, instance: Part, slots: Slots, *, skipping: bool, check: bool) -> None:
@@ -77,6 +79,7 @@ class RunningNode:
         self.id = node.id
         self.instance = instance
         self.sink = instance if isinstance(instance, Sink) else None
+        self.stage = instance if isinstance(instance, Stage) else None
         ports = node.component.ports
         self.ports = ports.inputs
         refs = [node.inputs.get(port.name) for port in self.ports]
@@ -103,8 +106,9 @@ class RunningNode:
     def reset(self) -> None:
         """A new reference follows: forget what was learned from the last one."""
         self.forget()
-        if isinstance(self.instance, Stage):
-            self.instance.reset()
+        if self.stage is not None:
+            self.stage.wants_reference = None
+            self.stage.reset()
 
     def forget(self) -> None:
         """Repeat nothing from before."""
@@ -165,12 +169,13 @@ class RunningNode:
         return arguments
 
     def skipped(self, tick: TickState) -> dict[str, str]:
-        """Input port -> why it was not computed, for those that were not."""
+        """Input port -> why it was not computed, for those that were not; `reference` -> why it is new."""
         reasons = tick.reasons
+        renewed = {} if tick.renewed is None else {"reference": tick.renewed}
         if not reasons:
-            return {}
+            return renewed
         ports = zip(self.ports, self.input_slots, strict=True)
-        return {port.name: reasons[slot] for port, slot in ports if slot in reasons}
+        return {port.name: reasons[slot] for port, slot in ports if slot in reasons} | renewed
 
     def inherited_reason(self, tick: TickState) -> str | None:
         """Why its outputs are repeated ones: the reason of its inputs, where all that are connected have one.

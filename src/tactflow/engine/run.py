@@ -20,7 +20,7 @@ from tactflow.engine.node import UNCONNECTED, RunningNode, TickState
 from tactflow.engine.plan import Plan, make_plan
 from tactflow.engine.priority import ask_for_realtime
 from tactflow.engine.schedule import make_schedule
-from tactflow.engine.segment import NodeFailedError, Segment
+from tactflow.engine.segment import NewReferences, NodeFailedError, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.engine.trace import Trace
 
@@ -269,6 +269,21 @@ class Runner:
             if all(node.sink for node in consumer.nodes):
                 only_sinks = frozenset(node.id for node in consumer.nodes)
             self._segments[link_plan.producer].outputs.append((link, only_sinks))
+        self._lead_new_references()
+
+    def _lead_new_references(self) -> None:
+        """Let the segment that sees each frame before all other stages do make frames references."""
+        first = self._segments[self._source_segment]
+        if all(node.sink for node in first.nodes):
+            consumers = [link.consumer for link in self.plan.links if link.producer == first.name]
+            stages = [s for s in map(self._segments.get, consumers) if s and not all(n.sink for n in s.nodes)]
+            if len(stages) != 1:
+                return
+            first = stages[0]
+        source = self.pipeline.source
+        slot = self._slots[source.id, source.component.ports.outputs[0].name]
+        takers = [id_ for id_, node in self.nodes.items() if node.sink and node.sink.takes_references]
+        first.references = NewReferences(slot, takers)
 
     @property
     def _source_segment(self) -> str:

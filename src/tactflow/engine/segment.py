@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, Protocol
 
-from tactflow.engine.contract import Sink
+from tactflow.engine.contract import Sink, Stage
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.engine.failure import describe_failure
-from tactflow.engine.frame import Absent
+from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.link import Link
 from tactflow.engine.node import RunningNode, Slots, TickState
 from tactflow.engine.schedule import Step
@@ -30,6 +31,8 @@ class Run(Protocol):
     latency: Durations
 
     def fail(self, error: TactflowError, cause: BaseException | None = None) -> None: ...
+
+    def retake_reference(self) -> None: ...
 
 
 class NodeFailedError(Exception):
@@ -59,6 +62,37 @@ class _RunningStep:
         return False
 
 
+class NewReferences:
+    """Makes frames references, on their way into the first segment of stages.
+
+    slot : of the source's frames. sinks : ids of those that take every reference.
+    """
+
+    def __init__(self, slot: int, sinks: Collection[str]) -> None:
+        self._slot = slot
+        self._sinks = frozenset(sinks)
+        self._reason: str | None = None
+        self._taken = 0
+        self._epoch = 0
+
+    def ask(self, reason: str) -> None:
+        """Make the next frame a reference."""
+        self._reason = reason
+
+    def enter(self, tick: TickState) -> None:
+        """Give a tick's frame its epoch, and make it a reference if one was asked for."""
+        frame, reason = tick.frame, self._reason
+        if reason is not None and frame.epoch == self._epoch:
+            self._taken += 1
+            tick.renewed = reason
+            tick.demand |= self._sinks
+        self._reason, self._epoch = None, frame.epoch
+        if self._taken:
+            reference = frame.reference or tick.renewed is not None
+            tick.frame = replace(frame, reference=reference, epoch=frame.epoch + self._taken)
+            tick.values[self._slot] = tick.frame
+
+
 class Segment:
     """Evaluates the nodes of one segment for a tick.
 
@@ -70,7 +104,8 @@ class Segment:
     inputs, outputs : links; an output with the ids of the sinks that it leads to, or None where it leads to
     stages too. nodes : in the order of the steps. data_sinks : those that do not only look on. current : id
     of the node that runs just now. urgent : whether somebody waits for what it does, rather than only looking
-    on or reading it later. epoch : of the last tick; a new one makes all nodes forget.
+    on or reading it later. epoch : of the last tick; a new one makes all nodes forget. references : makes
+    frames references that its stages ask for; None where other stages may have seen those frames already.
     """
 
     def __init__(
@@ -86,6 +121,7 @@ class Segment:
         self.inputs: list[Link[TickState]] = []
         self.outputs: list[tuple[Link[TickState], frozenset[str] | None]] = []
         self.epoch = 0
+        self.references: NewReferences | None = None
         self.current: str | None = None
 
     def handle(self, tick: TickState) -> None:
@@ -105,6 +141,8 @@ class Segment:
 
     def execute(self, tick: TickState) -> None:
         """Compute what this tick needs from this segment."""
+        if self.references is not None:
+            self.references.enter(tick)
         if tick.frame.epoch != self.epoch:
             self.epoch = tick.frame.epoch
             for node in self.nodes:
@@ -151,6 +189,18 @@ class Segment:
         if self.track is not None:
             self.track.add(node.id, began, ended, {"seq": tick.frame.seq})
         node.publish(tick, outputs)
+        if node.stage is not None and node.stage.wants_reference is not None:
+            self._renew(node.stage, node.id, tick.frame)
+
+    def _renew(self, stage: Stage, name: str, frame: Frame) -> None:
+        """Have the next frame made a reference, which a stage asked for."""
+        reason, stage.wants_reference = stage.wants_reference, None
+        assert reason is not None
+        logger.info("frame %d: %s takes a new reference: %s", frame.seq, name, reason.replace("_", " "))
+        if self.references is not None:
+            self.references.ask(reason)
+        else:
+            self.run.retake_reference()
 
     def _failed(self, node: RunningNode, tick: TickState, inputs: Sequence[Any], error: Exception) -> None:
         node.stats.errors += 1

@@ -93,6 +93,14 @@ def test_a_gel_without_marks_is_an_error_with_advice(kind: str) -> None:
         detect_markers(image)
 
 
+def test_marks_are_only_looked_for_where_there_is_gel() -> None:
+    truth = grid(8, 8, 30.0, corner=(25.0, 25.0))
+    image = render((260, 260), truth, 4.0)
+    valid = np.full((260, 260), 255, np.uint8)
+    valid[:, :100] = 0
+    assert len(detect_markers(image, valid=valid).centers) == np.count_nonzero(truth[:, 0] > 100)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_a_few_marks_are_found_when_their_radius_is_given(count: int) -> None:
     truth = np.array([[50.3, 60.7], [120.2, 61.1], [90.0, 130.4]])[:count]
@@ -156,6 +164,7 @@ def test_gray_pictures_are_accepted() -> None:
         (np.zeros((80, 80, 3), np.uint8), {"dot_radius": 0.5}, "dot_radius 1 to 20 px, got 0.5"),
         (np.zeros((80, 80, 3), np.uint8), {"dot_radius": 40.0}, "dot_radius 1 to 20 px, got 40"),
         (np.zeros((80, 80, 3), np.uint8), {"polarity": "red"}, "polarity"),
+        (np.zeros((80, 80, 3), np.uint8), {"valid": np.ones((80, 79), np.uint8)}, r"valid to be \(80, 80\)"),
     ],
 )
 def test_wrong_input_is_refused_in_words(

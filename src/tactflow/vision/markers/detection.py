@@ -154,6 +154,7 @@ def detect_markers(
     *,
     dot_radius: float | None = None,
     polarity: Polarity = "auto",
+    valid: NDArray[np.uint8] | None = None,
 ) -> Detection:
     """Find the marks of a gel, whatever their size, shape and arrangement.
 
@@ -166,6 +167,8 @@ def detect_markers(
     dot_radius : of a (whole) mark, px, 1 to a quarter of the shorter side; None finds it, but then wants at
         least four marks in an even arrangement, lest dust passes for them.
     polarity : "dark" or "bright" against the gel; "auto" takes the stronger family.
+    valid : (H, W) uint8, not 0 where there is gel; no mark is looked for where most of what lies around is
+        none. None: everywhere.
 
     Returns
     -------
@@ -190,17 +193,10 @@ def detect_markers(
     ('dark', 2)
     """
     gray, shortest = to_gray(image).astype(np.float32), min(image.shape[:2])
-    if dot_radius is not None and not 1.0 <= dot_radius <= max(1.0, shortest / 4):
-        raise ValueError(f"required dot_radius 1 to {max(1.0, shortest / 4):g} px, got {dot_radius:g}")
-    if polarity not in ("auto", "dark", "bright"):
-        raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
+    _require_options(dot_radius, polarity, valid, gray.shape)
     if shortest < 8:
         raise NoMarkersError(_NO_MARKERS)
-    best: _Family | None = None
-    for sigma in _sigmas(dot_radius, shortest):
-        for family in _families(gray, sigma, ("dark", "bright") if polarity == "auto" else (polarity,)):
-            if best is None or family.score > best.score:
-                best = family
+    best = _best_family(gray, valid, _sigmas(dot_radius, shortest), polarity)
     if best is None or (dot_radius is None and best.score < LEAST_SCORE):
         raise NoMarkersError(_NO_MARKERS + ("" if best is None else _FEW_MARKERS))
     radius = best.sigma * RADIUS_PER_SIGMA
@@ -209,6 +205,19 @@ def detect_markers(
     distances = _nearest(centers, 1)[0]
     pitch = float(np.median(distances[:, 0])) if len(centers) > 1 else LONE_PITCH * radius
     return Detection(centers, radius, best.polarity, pitch, neighbour_graph(centers, LONGEST_LINK * pitch))
+
+
+def _require_options(
+    dot_radius: float | None, polarity: str, valid: NDArray[np.uint8] | None, shape: tuple[int, ...]
+) -> None:
+    """Raises ValueError for options of `detect_markers` that are not of their kind."""
+    largest = max(1.0, min(shape) / 4)
+    if dot_radius is not None and not 1.0 <= dot_radius <= largest:
+        raise ValueError(f"required dot_radius 1 to {largest:g} px, got {dot_radius:g}")
+    if polarity not in ("auto", "dark", "bright"):
+        raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
+    if valid is not None and (valid.shape != shape or valid.dtype != np.uint8):
+        raise ValueError(f"required valid to be {shape} uint8, got shape {valid.shape}, dtype {valid.dtype}")
 
 
 class _Family(NamedTuple):
@@ -220,8 +229,26 @@ class _Family(NamedTuple):
     peaks: FloatArray
 
 
+def _best_family(
+    gray: NDArray[np.float32], valid: NDArray[np.uint8] | None, sigmas: Sequence[float], polarity: Polarity
+) -> _Family | None:
+    """The family of the highest score of all scales."""
+    polarities: Sequence[Literal["dark", "bright"]] = (
+        ("dark", "bright") if polarity == "auto" else (polarity,)
+    )
+    best: _Family | None = None
+    for sigma in sigmas:
+        for family in _families(gray, valid, sigma, polarities):
+            if best is None or family.score > best.score:
+                best = family
+    return best
+
+
 def _families(
-    gray: NDArray[np.float32], sigma: float, polarities: Sequence[Literal["dark", "bright"]]
+    gray: NDArray[np.float32],
+    valid: NDArray[np.uint8] | None,
+    sigma: float,
+    polarities: Sequence[Literal["dark", "bright"]],
 ) -> Iterator[_Family]:
     """The family of each polarity at one scale, if there is one."""
     factor = 1
@@ -233,6 +260,9 @@ def _families(
         peaks, strength = _peaks(wide - narrow if sign == "dark" else narrow - wide, fine)
         spots = _surrounded(narrow if sign == "dark" else -narrow, peaks, fine * RADIUS_PER_SIGMA)
         peaks, strength = peaks[spots] * factor + (factor - 1) / 2, strength[spots]
+        if valid is not None:
+            on_gel = _on_gel(valid, peaks, sigma * RADIUS_PER_SIGMA)
+            peaks, strength = peaks[on_gel], strength[on_gel]
         kept = _members(peaks, strength, gray.shape, sigma * RADIUS_PER_SIGMA)
         if len(kept):
             yield _Family(_score(peaks[kept], strength[kept]), sigma, sign, peaks[kept])
@@ -376,6 +406,15 @@ def _surrounded(smooth: NDArray[np.float32], peaks: FloatArray, radius: float) -
     own_column, own_row = np.clip(np.rint(peaks).astype(np.int64), 0, limits).T
     above = np.sort(smooth[row, column] - smooth[own_row, own_column][:, None], axis=1)
     return np.flatnonzero(above[:, 1] > RING_CONTRAST * above[:, RING_POINTS // 2])
+
+
+def _on_gel(valid: NDArray[np.uint8], peaks: FloatArray, radius: float) -> NDArray[np.bool_]:
+    """Which peaks have gel in at least half of the square around them."""
+    side = 2 * round(RING * radius) + 1
+    share = cv2.boxFilter((valid > 0).astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE)
+    limits = np.array([valid.shape[1] - 1, valid.shape[0] - 1])
+    column, row = np.clip(np.rint(peaks).astype(np.int64), 0, limits).T
+    return np.asarray(share[row, column] >= 0.5)
 
 
 def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, FloatArray]:

@@ -61,6 +61,7 @@ def find_dot(
     *,
     radius: float | None = None,
     polarity: Literal["dark", "bright", "auto"] = "auto",
+    valid: Bytes | None = None,
 ) -> Dot | None:
     """Size, polarity and contrast of the markers of a gel, from a picture of the untouched gel.
 
@@ -69,6 +70,7 @@ def find_dot(
     image : (H, W, 3) uint8, BGR grey levels.
     radius : of a marker, px, if it is known.
     polarity : of the markers; "auto" takes the stronger family of spots.
+    valid : (H, W) uint8, not 0 where there is gel; None: everywhere.
 
     Returns
     -------
@@ -82,7 +84,7 @@ def find_dot(
     'dark'
     """
     try:
-        found = detect_markers(image, dot_radius=radius, polarity=polarity)
+        found = detect_markers(image, dot_radius=radius, polarity=polarity, valid=valid)
     except NoMarkersError:
         return None
     contrast = _median_contrast(_even(image), found.dot_radius, found.polarity)
