@@ -16,7 +16,7 @@ run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
 
 test: lint types
-	$(PY) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+	$(PY) -m pytest --numprocesses auto --dist loadfile
 
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .

@@ -74,7 +74,7 @@ class Preprocess(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        if params.method == "area":
+        if params.method == "area" and params.downsample > 1:
             compiled.load(downsample)
         self._params = params
         self._preprocessor: Preprocessor | None = None

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+MOST_WORKERS = 4
+"""Processes that run tests at most: many tests watch a run in real time and need a processor then."""
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One process more than there are processors: tests that start programs mostly wait."""
+    return min((os.cpu_count() or 1) + 1, MOST_WORKERS)
 
 
 @pytest.fixture(scope="session")

@@ -27,7 +27,7 @@ sensors:
       preprocess: {rotate: 0}
 stages:
   capture: {source: "sim:idle"}
-  preprocess: {rotate: 90, downsample: 2}
+  preprocess: {rotate: 90}
 sinks:
   jsonl: {path: "out-{sensor}.jsonl"}
 """
@@ -60,8 +60,8 @@ def test_each_sensor_runs_the_graph_with_its_own_changes(folder: Path) -> None:
     left, right = rows(folder / "out-left.jsonl"), rows(folder / "out-right.jsonl")
     assert [len(left), len(right)] == [40, 30]
     assert {row["sensor"] for row in left} == {"left"}
-    assert left[0]["size"] == [300, 400]
-    assert right[0]["size"] == [400, 300]
+    assert left[0]["size"] == [600, 800]
+    assert right[0]["size"] == [800, 600]
     assert json.loads((folder / "stats-left.json").read_text())["frames"] == 40
     assert "[left] 40 frames" in done.stderr
 
@@ -439,7 +439,7 @@ def test_check_tells_a_mistake_of_all_sensors_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
-    text = GRAPH.replace("downsample: 2", "downsample: 0")
+    text = GRAPH.replace("rotate: 90", "rotate: 90, downsample: 0")
     (folder / "pipeline.yaml").write_text(text)
     assert main(["check"]) == 2
     alone = capsys.readouterr().err

@@ -70,7 +70,8 @@ class RunningNode:
     instance : of the class; `sink` or `stage` is the same, the other is None. ports, input_slots : its
     inputs, and where their values are. slots : where its outputs go. signals : output port -> (slot, how
     often it was true), for those that are signals. disabled : it failed and is not called again. check :
-    None without checks. last : the outputs of its last run, for gates that repeat them and for inputs that come again.
+    None without checks. last : the outputs of its last run, for gates that repeat them and for inputs that
+    come again.
     """
 
     def __init__(self, node: Node, instance: Part, slots: Slots, *, skipping: bool, check: bool) -> None:

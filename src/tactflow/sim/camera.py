@@ -17,6 +17,8 @@ Points = NDArray[np.float64]
 
 NOISE_UNIT = 4096.0
 """Integer steps of the noise bank per standard deviation."""
+_APERTURE_EDGE = 3.0
+"""Width of the unsharp rim of the aperture, px. Chosen by hand."""
 _BANK_SPAN = 1 << 22
 _BANK_STEP = 2592173
 """Offsets into the noise bank, elements, and the step from one frame's to the next. An odd step near span /
@@ -25,7 +27,7 @@ span / (2.7 n) apart."""
 
 
 class Camera:
-    """Perspective followed by radial lens distortion.
+    """Perspective followed by radial lens distortion, seen through a round aperture.
 
     Parameters
     ----------
@@ -34,12 +36,20 @@ class Camera:
         and the whole gel shrinks a little, so that it appears as the trapezoid of a tilted camera. 0: none.
     distortion : in [-0.2, 0.4]; k of undistorted = distorted * (1 + k rho^2), rho = distance from the centre
         in half diagonals. Positive is a barrel (wide lens), negative a pincushion. 0: none.
+    aperture : radius of the round picture in a black frame, in half heights of the frame. 0: none.
     """
 
-    def __init__(self, size: tuple[int, int], perspective: float = 0.0, distortion: float = 0.0) -> None:
+    def __init__(
+        self,
+        size: tuple[int, int],
+        perspective: float = 0.0,
+        distortion: float = 0.0,
+        aperture: float = 0.0,
+    ) -> None:
         self.size = size
-        self._key = (size, perspective, distortion)
+        self._key = (size, perspective, distortion, aperture)
         width, height = size
+        self._radius = aperture * height / 2.0 if aperture else np.inf
         self.identity = perspective == 0.0 and distortion == 0.0
         self._k = distortion
         self._center = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
@@ -88,6 +98,11 @@ class Camera:
             shrink = np.divide(solved, radius, out=np.ones_like(radius), where=radius > 0)
             offset *= shrink[..., None]
         return self._absolute(offset)
+
+    def aperture(self, raw: Points) -> NDArray[np.float64]:
+        """Share of the light, (N,) in [0, 1], that reaches raw pixel positions (N, 2): 0 in a black frame."""
+        inside = self._radius - np.hypot(raw[..., 0] - self._center[0], raw[..., 1] - self._center[1])
+        return np.asarray(0.5 + 0.5 * np.tanh(inside / _APERTURE_EDGE), dtype=np.float64)
 
     def _relative(self, pixels: Points) -> Points:
         return np.asarray((pixels - self._center) / self._half_diagonal, dtype=np.float64)

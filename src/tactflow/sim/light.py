@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.sim.gel import Press
 from tactflow.sim.shapes import Array
 
 
@@ -29,7 +30,9 @@ class Light:
     falloff : how much brighter the gel is near a light than far from it, 0 for even light.
     slope_gain : cotangent of the lights' elevation; more makes a tilted surface more colourful.
     ambient : share of the light that comes from everywhere, in [0, 1].
-    brightening : grey levels by which all channels rise in a contact of full depth.
+    brightening : grey levels by which all channels rise in a contact of full depth; negative: fall.
+    onset : depth beyond the contact's edge over which they do, as a share of the full depth.
+    halo : grey levels by which the gel is brighter just outside a contact of full depth.
     """
 
     description: str
@@ -39,6 +42,8 @@ class Light:
     slope_gain: float
     ambient: float
     brightening: float
+    onset: float = 0.05
+    halo: float = 0.0
 
     def tilt(self) -> NDArray[np.float32]:
         """(3, 2) float32: change of a channel's relative light per unit slope in x and y."""
@@ -59,6 +64,14 @@ LIGHTS = {
     "mixed": Light(
         "coloured lights, and a contact brightens too",
         (325.0, 80.0, 205.0), (106.0, 114.0, 104.0), 0.35, 0.7, 0.35, 46.0,
+    ),
+    "dark_channel": Light(
+        "three coloured lights, of which the red one hardly lights the untouched gel",
+        (325.0, 80.0, 205.0), (92.0, 132.0, 9.0), 0.4, 1.9, 0.25, 0.0,
+    ),
+    "darkening": Light(
+        "white light through a black coating; a contact darkens, with a bright halo around it",
+        (325.0, 80.0, 205.0), (150.0, 152.0, 154.0), 0.12, 0.10, 0.5, -75.0, 0.2, 26.0,
     ),
 }  # fmt: skip
 
@@ -112,6 +125,61 @@ def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
         lit += np.float32(light.ambient)
         channels.append(lit)
     return np.asarray(cv2.merge(channels), dtype=np.float32)
+
+
+def brightness(light: Light, press: Press, depth: Array) -> Array:
+    """Grey levels (h, w) that a contact adds to all channels; `depth` (h, w) px, as `reached` gives it."""
+    share = press.depth / press.shape.depth
+    grown, set_in = 0.45 + 0.55 * share, min(1.0, share / 0.1)
+    beyond = (depth - np.float32(press.sink * press.depth)) * np.float32(
+        1.0 / (light.onset * press.shape.depth)
+    )
+    inside = np.tanh(beyond * np.float32(0.5))
+    added = np.float32(0.5 * (light.brightening * grown * set_in)) * (np.float32(1.0) + inside)
+    if light.halo:
+        fading = np.exp(np.minimum(beyond, 0) * np.float32(0.15))
+        added += np.float32(0.5 * light.halo * grown * set_in) * (np.float32(1.0) - inside) * fading
+    return np.asarray(added, np.float32)
+
+
+def settling(moment: int, frames: int) -> NDArray[np.float64]:
+    """(3,) gains, BGR, of a camera that begins too bright and too blue and is right after so many frames.
+
+    The way is that of a control loop: fast at first, without a step at its end. A third too bright is what
+    the first frames of many recorded grasps show.
+    """
+    left = max(1.0 - moment / frames, 0.0) ** 2 if frames else 0.0
+    return np.asarray(1.0 + left * np.array([0.45, 0.3, 0.2]))
+
+
+def lamp(size: tuple[int, int], strength: float) -> NDArray[np.float32]:
+    """(H, W, 3) float32: the gel's light after a lamp was switched on at its right, relative to before.
+
+    size : (width, height) px. strength : of the lamp in the middle, relative.
+    """
+    side = np.linspace(0.65, 1.35, size[0], dtype=np.float32) * np.float32(strength)
+    row = 1.0 + side[:, None] * np.array([0.8, 1.0, 1.2], np.float32)
+    return np.ascontiguousarray(np.broadcast_to(row, (size[1], size[0], 3)), dtype=np.float32)
+
+
+def spot(size: tuple[int, int], place: tuple[float, float], spread: tuple[float, float]) -> Array:
+    """(H, W) float32: a Gaussian, 1 at `place` (x, y), of standard deviations `spread` (x, y), px."""
+    across, down = (
+        np.exp(-0.5 * ((np.arange(length) - middle) / deviation) ** 2).astype(np.float32)
+        for length, middle, deviation in zip(size, place, spread, strict=True)
+    )
+    return np.outer(down, across)
+
+
+@lru_cache(maxsize=2)
+def blotches(size: tuple[int, int], contrast: float, seed: int) -> Array:
+    """(H, W) float32: the light that a random pattern of blotches some 15 px wide lets through."""
+    draw = np.random.default_rng([seed, 0x626C]).standard_normal((size[1], size[0]), dtype=np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(draw, (0, 0), 5.0), dtype=np.float32)
+    pattern = 0.5 + 0.5 * np.tanh(2.0 * smooth / float(smooth.std()))
+    shade = np.asarray(1.0 - contrast * pattern, dtype=np.float32)
+    shade.setflags(write=False)
+    return shade
 
 
 def highlight(depth: Array, step: float, strength: float) -> Array:

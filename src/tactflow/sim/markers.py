@@ -27,12 +27,13 @@ class Layout:
     """What is printed on the gel.
 
     rest : (N, 2) float64 positions on the untouched gel, px. contrast : (N,) in [0, 1], 1 for a fresh marker.
-    group : (N,) int; markers of the same group never overlap.
+    group : (N,) int; markers of the same group never overlap. size : (N,) > 0, radii in units of `radius`.
     """
 
     rest: NDArray[np.float64]
     contrast: NDArray[np.float64]
     group: NDArray[np.int64]
+    size: NDArray[np.float64]
     pitch: float
     radius: float
 
@@ -47,6 +48,7 @@ def layout(
     jitter: float = 0.0,
     missing: float = 0.0,
     worn: float = 0.0,
+    sizes: float = 0.0,
     seed: int = 0,
 ) -> Layout:
     """A grid of markers, centred.
@@ -55,6 +57,7 @@ def layout(
     pitch, radius : px; 0 fits the grid to the gel, and the radius to the pitch.
     jitter : standard deviation of each coordinate, in pitches. missing : fraction that was never printed.
     worn : fraction that has faded to between 35 and 80 % of its contrast.
+    sizes : radii are spread evenly between 1 - sizes and 1 + sizes of `radius`.
     """
     width, height = size
     pitch = pitch or min(width / ((columns or 10) + 0.7), height / ((rows or 8) + 0.7))
@@ -70,7 +73,8 @@ def layout(
     contrast = np.where(rng.random(len(rest)) < worn, rng.uniform(0.35, 0.8, len(rest)), 1.0)
     kept = rng.random(len(rest)) >= missing
     group = parity[:, 0] + 2 * parity[:, 1]
-    return Layout(rest[kept], contrast[kept], group[kept].astype(np.int64), pitch, radius)
+    size_of = 1.0 + sizes * rng.uniform(-1.0, 1.0, len(rest))
+    return Layout(rest[kept], contrast[kept], group[kept].astype(np.int64), size_of[kept], pitch, radius)
 
 
 def _ramp(inside: NDArray[np.float32], edge: float) -> NDArray[np.float32]:
@@ -80,17 +84,20 @@ def _ramp(inside: NDArray[np.float32], edge: float) -> NDArray[np.float32]:
 
 
 def coverage(
-    x: NDArray[np.float32], y: NDArray[np.float32], radius: float, shape: str, edge: float = EDGE
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    radius: float | NDArray[np.float32],
+    shape: str,
+    edge: float = EDGE,
 ) -> NDArray[np.float32]:
     """How much of a pixel at offset (x, y) from a marker's centre the marker covers, in [0, 1]."""
-    r = np.float32(radius)
+    r = np.asarray(radius, np.float32)
     if shape == "square":
         return _ramp(r - np.abs(x), edge) * _ramp(r - np.abs(y), edge)
     if shape == "doubled":
-        half = np.float32(0.72 * radius)
-        small = np.float32(0.72 * radius)
-        left = _ramp(small - np.hypot(x + half, y), edge)
-        right = _ramp(small - np.hypot(x - half, y), edge)
+        small = np.asarray(0.72 * radius, np.float32)
+        left = _ramp(small - np.hypot(x + small, y), edge)
+        right = _ramp(small - np.hypot(x - small, y), edge)
         return np.asarray(1 - (1 - left) * (1 - right), np.float32)
     return _ramp(r - np.hypot(x, y), edge)
 
@@ -107,7 +114,7 @@ def draw(
     strength: NDArray[np.float64],
     group: NDArray[np.int64],
     *,
-    radius: float,
+    radius: NDArray[np.float64],
     shape: str,
     half: int,
     bright: float | None,
@@ -117,6 +124,7 @@ def draw(
 
     canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT`.
     centers : (N, 2) positions without the padding, px. strength : (N,) in [0, 1], how opaque each is.
+    radius : (N,) px.
     bright : grey level of a bright marker, or None for a dark one, which lets 12 % of the light through.
     deform : (N, 2, 2), from offsets in the image to offsets on the gel; None where they are equal.
     """
@@ -138,7 +146,8 @@ def draw(
         if deform is not None:
             m = deform[chosen].astype(np.float32)[:, :, :, None, None]
             dx, dy = m[:, 0, 0] * dx + m[:, 0, 1] * dy, m[:, 1, 0] * dx + m[:, 1, 1] * dy
-        opaque = coverage(dx, dy, radius, shape) * strength[chosen].astype(np.float32)[:, None, None]
+        radii = radius[chosen, None, None].astype(np.float32)
+        opaque = coverage(dx, dy, radii, shape) * strength[chosen].astype(np.float32)[:, None, None]
         rows = anchor[chosen, 1, None] + half + span
         columns = anchor[chosen, 0, None] + half + span
         np.clip(rows, 0, padded_height - 1, out=rows)

@@ -42,7 +42,7 @@ class Programme:
     wander : how far from it they may be, px. angles : range of the indenter's angle, degrees.
     travel : px by which the indenter slides during a hold. jumps : if true, the gel is dragged to a new place
     every third frame. creep : px per frame by which the gel is dragged. dilation : pitches by which a press
-    pushes the gel apart. single : one contact that lasts as long as the recording.
+    pushes the gel apart. contacts : so many that share the length of the recording; 0: as many as fit.
     """
 
     build: Callable[[float], tuple[Shape, ...]]
@@ -58,7 +58,7 @@ class Programme:
     jumps: bool = False
     creep: float = 0.0
     dilation: float = 0.3
-    single: bool = False
+    contacts: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +120,10 @@ def _timing(programme: Programme, moment: int, frames: int) -> _Timing | None:
     usable = frames - start - max(1, frames // _LAST_REST)
     if moment < start or usable < 1:
         return None
-    cycles = 1 if programme.single else max(1, usable // programme.period)
+    cycles = programme.contacts or max(1, usable // programme.period)
     # A recording shorter than one contact shows a faster one.
-    stretch = usable / programme.period if programme.single or usable < programme.period else 1.0
+    fitted = programme.contacts > 0 or usable < programme.period
+    stretch = usable / (programme.period * cycles) if fitted else 1.0
     period = programme.period * stretch
     rise, hold = programme.rise * stretch, max(programme.hold * stretch, 1.0)
     elapsed = moment - start

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
@@ -12,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim import camera as optics
-from tactflow.sim import gel, light, markers, motion, shapes
+from tactflow.sim import gel, light, markers, motion
+from tactflow.sim.recipes import SCENES
 from tactflow.sim.settings import Settings, parse_query, suggestion
 from tactflow.sim.truth import Truth, measure
 
@@ -23,167 +22,26 @@ FPS = 60.0
 _STEP = 2
 """The gel's surface is computed at every second pixel of the raw frame; the light on it is smooth. Chosen
 by hand."""
-
-
+_SPECKLE_STEP = 20
+"""How far blotches are carried along is computed at every so many pixels; the gel stretches smoothly. Chosen
+by hand."""
+_INVERSIONS = 4
+"""Steps of the fixed-point iteration that finds where a point of the gel came from. Chosen by hand: the
+pattern need not be exact, only carried along."""
+_LAMP_AT = 0.475
+"""Part of a recording after which the lamp is on: between two contacts that share its length."""
 _LARGEST_STROKE = 110.0
 """Contacts move the gel in proportion to the markers' pitch, up to this pitch, px. Chosen by hand."""
 
 
-@dataclass(frozen=True)
-class _Recipe:
-    description: str
-    programme: motion.Programme | None
-    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
-
-
-def _sphere(_bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.sphere(),)
-
-
-def _cable(bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.cable(bend=bend),)
-
-
-def _one(make: Any, **sizes: Any) -> Any:
-    return partial(_made, make, tuple(sizes.items()))
-
-
-def _made(make: Any, sizes: tuple[tuple[str, Any], ...], _bend: float) -> tuple[shapes.Shape, ...]:
-    return (make(**dict(sizes)),)
-
-
-def _pair(_bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.sphere(radius=70.0, depth=22.0), shapes.box(half_width=48.0, half_height=36.0, depth=11.0))
-
-
-_PRESS = motion.Programme(_sphere)
-_CABLE = motion.Programme(_cable, wander=(60.0, 60.0), angles=(-75.0, 75.0), dilation=0.25)
-"""Programmes that several scenes share; lengths in px of the raw frame, angles in degrees."""
-_SCENES: dict[str, _Recipe] = {
-    "press": _Recipe("a ball is pressed in several places, at several depths", _PRESS),
-    "cable": _Recipe("a straight cable is pressed at several angles", _CABLE),
-    "bent_cable": _Recipe("a cable that bends by 70 degrees", _CABLE, {"bend": 70.0}),
-    "slide": _Recipe(
-        "a ball drags the gel along until it slips, and slides over it",
-        motion.Programme(
-            _sphere, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)
-        ),
-        {"shear": 0.9},
-    ),
-    "roll": _Recipe(
-        "a ball rolls over the gel without dragging it",
-        motion.Programme(
-            _sphere, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7)
-        ),
-        {"shear": 0.0},
-    ),
-    "idle": _Recipe("nothing touches the gel", None),
-    "twist": _Recipe(
-        "a flat punch is pressed and turned by 20 degrees to either side",
-        motion.Programme(
-            _one(shapes.box), wander=(120.0, 80.0), angles=(-40.0, 40.0), hold=50, period=90,
-            depths=(1.0, 0.6, 0.8), dilation=0.12,
-        ),
-        {"twist": 20.0, "shear": 0.0},
-    ),
-    "edge": _Recipe(
-        "a knife edge at several angles",
-        motion.Programme(_one(shapes.edge), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.2),
-    ),
-    "box": _Recipe(
-        "a flat rectangular punch at several angles",
-        motion.Programme(_one(shapes.box), wander=(170.0, 110.0), angles=(-90.0, 90.0), dilation=0.15),
-    ),
-    "ring": _Recipe(
-        "a ring: a contact with a hole, and without a direction",
-        motion.Programme(_one(shapes.ring), wander=(150.0, 90.0), dilation=0.15),
-    ),
-    "text": _Recipe(
-        "raised letters",
-        motion.Programme(_one(shapes.text), wander=(60.0, 110.0), angles=(-20.0, 20.0), dilation=0.1),
-    ),
-    "screw": _Recipe(
-        "a threaded rod: a contact in many pieces",
-        motion.Programme(_one(shapes.screw), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.25),
-    ),
-    "two": _Recipe(
-        "a ball and a small flat punch at once",
-        motion.Programme(_pair, offsets=((-150.0, -40.0), (150.0, 50.0)), wander=(90.0, 90.0), dilation=0.2),
-    ),
-    "border": _Recipe(
-        "a contact that the border of the frame cuts",
-        motion.Programme(_sphere, place=(0.965, 0.5), wander=(25.0, 180.0)),
-    ),
-    "tap": _Recipe(
-        "contacts of a single frame",
-        motion.Programme(_sphere, period=30, rise=0, hold=1, depths=(1.0, 0.6)),
-    ),
-    "spike": _Recipe(
-        "contacts that come and go within five frames", motion.Programme(_sphere, period=24, rise=1, hold=3)
-    ),
-    "creep": _Recipe(
-        "one long contact that drags the gel by 0.02 px a frame",
-        motion.Programme(_sphere, single=True, period=300, rise=15, hold=225, depths=(0.9,), creep=0.02),
-    ),
-    "hold": _Recipe(
-        "one long contact that does not move",
-        motion.Programme(_sphere, single=True, period=300, rise=15, hold=225, depths=(0.9,)),
-        {"shear": 0.0},
-    ),
-    "drift": _Recipe("presses while the lights warm up", _PRESS, {"drift": 0.18}),
-    "flicker": _Recipe("presses under flickering light", _PRESS, {"flicker": 0.06, "gain": 0.03}),
-    "jumps": _Recipe(
-        "a contact that drags the markers by up to 0.9 pitch between two frames",
-        motion.Programme(
-            _one(shapes.box), wander=(120.0, 80.0), jumps=True, hold=36, period=72, dilation=0.1
-        ),
-    ),
-    "worn": _Recipe(
-        "faded, missing and vanishing markers, and dirt",
-        _PRESS,
-        {"worn": 0.3, "missing": 0.08, "dirty": 0.3, "vanish": 0.15, "shear": 0.4},
-    ),
-    "dense": _Recipe("520 small markers", _PRESS, {"markers": (26, 20), "shear": 0.6}),
-    "sparse": _Recipe("25 markers", _PRESS, {"markers": (5, 5), "dot": 12.0}),
-    "bright_dots": _Recipe("bright markers on a darker gel", _PRESS, {"polarity": "bright"}),
-    "square_dots": _Recipe("square markers", _PRESS, {"shape": "square"}),
-    "doubled_dots": _Recipe("each marker is a pair of dots", _PRESS, {"shape": "doubled"}),
-    "irregular": _Recipe("markers in no regular grid", _PRESS, {"jitter": 0.14}),
-    "unmarked": _Recipe("a gel without markers", _PRESS, {"markers": (0, 0)}),
-    "bright": _Recipe("a gel whose pressed area brightens in all channels", _PRESS, {"light": "bright"}),
-    "bright_cable": _Recipe("a cable on a gel that brightens", _CABLE, {"light": "bright"}),
-    "mixed": _Recipe("a gel that answers with colour and brightness", _PRESS, {"light": "mixed"}),
-    "glossy": _Recipe("a gel with mirror-like highlights", _PRESS, {"specular": 0.8}),
-    "tilted": _Recipe("a tilted camera with a wide lens", _PRESS, {"perspective": 0.22, "distortion": 0.12}),
-    "noisy": _Recipe(
-        "a poor camera: noise, shot noise, hot pixels, JPEG, blur",
-        _PRESS,
-        {"noise": 6.0, "shot": 3.0, "hot": 40, "jpeg": 70, "blur": 1.0},
-    ),
-    "soft_rim": _Recipe(
-        "a deep gel, whose surface shows no crease at the edge of a contact",
-        _PRESS,
-        {"sink": 0.5, "rim": 1.0},
-    ),
-    "stutter": _Recipe("a camera that drops and repeats frames", _PRESS, {"dropped": 0.1, "repeated": 0.1}),
-    "strong_shear": _Recipe(
-        "a ball that moves markers by up to 1.5 pitches",
-        motion.Programme(
-            _sphere, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2
-        ),
-        {"shear": 1.3},
-    ),
-}  # fmt: skip
-
-
 def scene_descriptions() -> dict[str, str]:
     """Scene -> what it shows, in one line."""
-    return {name: recipe.description for name, recipe in _SCENES.items()}
+    return {name: recipe.description for name, recipe in SCENES.items()}
 
 
 def scene_names() -> tuple[str, ...]:
     """The names that `open_scene` knows."""
-    return tuple(_SCENES)
+    return tuple(SCENES)
 
 
 def open_scene(spec: str) -> Scene:
@@ -204,9 +62,9 @@ def open_scene(spec: str) -> Scene:
     (60, (600, 800, 3))
     """
     name, _, query = spec.partition("?")
-    if name not in _SCENES:
-        raise ValueError(f"simulated sensor: unknown scene {name!r}{suggestion(name, _SCENES)}")
-    recipe = _SCENES[name]
+    if name not in SCENES:
+        raise ValueError(f"simulated sensor: unknown scene {name!r}{suggestion(name, SCENES)}")
+    recipe = SCENES[name]
     return Scene(name, recipe.programme, parse_query(query, recipe.settings))
 
 
@@ -226,7 +84,7 @@ class Scene:
     def __init__(self, name: str, programme: motion.Programme | None, settings: Settings) -> None:
         self.name = name
         self.settings = settings
-        self.camera = optics.Camera(SIZE, settings.perspective, settings.distortion)
+        self.camera = optics.Camera(SIZE, settings.perspective, settings.distortion, settings.aperture)
         self.layout = markers.layout(
             *settings.markers,
             SIZE,
@@ -235,6 +93,7 @@ class Scene:
             jitter=settings.jitter,
             missing=settings.missing,
             worn=settings.worn,
+            sizes=settings.sizes,
             seed=settings.seed,
         )
         self._programme = programme
@@ -243,11 +102,9 @@ class Scene:
         self._delivered = optics.delivered_frames(
             settings.frames, settings.dropped, settings.repeated, settings.seed
         )
-        self._half = markers.half_patch(
-            self.layout.radius, settings.shape, 1.6 if settings.perspective else 1.2
-        )
-        if self.camera.identity:
-            self._half = markers.half_patch(self.layout.radius, settings.shape)
+        largest = self.layout.radius * (1.0 + settings.sizes)
+        widened = 1.0 if self.camera.identity else 1.6 if settings.perspective else 1.2
+        self._half = markers.half_patch(largest, settings.shape, widened)
         self._vanishing = np.random.default_rng([settings.seed, 0x7661]).random(len(self.layout.rest))
 
     def __len__(self) -> int:
@@ -352,12 +209,16 @@ class Scene:
     @cached_property
     def _coarse(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Gel coordinates of the centres of blocks of `_STEP` x `_STEP` raw pixels."""
-        width, height = SIZE
-        across = np.arange(width // _STEP) * _STEP + (_STEP - 1) / 2.0
-        down = np.arange(height // _STEP) * _STEP + (_STEP - 1) / 2.0
-        points = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-        mapped = self.camera.to_gel(points).astype(np.float32).reshape(height // _STEP, width // _STEP, 2)
+        mapped = self._gel_blocks(_STEP).astype(np.float32)
         return np.ascontiguousarray(mapped[..., 0]), np.ascontiguousarray(mapped[..., 1])
+
+    def _gel_blocks(self, step: int) -> NDArray[np.float64]:
+        """Gel coordinates (600 // step, 800 // step, 2) of the centres of blocks of so many raw pixels."""
+        width, height = SIZE
+        across = np.arange(width // step) * step + (step - 1) / 2.0
+        down = np.arange(height // step) * step + (step - 1) / 2.0
+        points = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        return self.camera.to_gel(points).reshape(height // step, width // step, 2)
 
     @cached_property
     def _resting(self) -> NDArray[np.int16]:
@@ -381,16 +242,36 @@ class Scene:
             radius = ((raw_x - center[0]) ** 2 + (raw_y - center[1]) ** 2) / np.float32(half_diagonal**2)
             image *= (np.float32(1.0) - np.float32(settings.vignette) * radius)[..., None]
         if settings.perspective:
-            image *= self._gel_window(raw_x, raw_y)
+            image *= self._gel_window()
+        if settings.leds:
+            image += np.float32(255.0) * self._leds()[..., None]
+        if settings.aperture:
+            image *= self._framed[..., None]
         np.clip(image, 0, 500, out=image)
         fixed = np.rint(image * np.float32(markers.FIXED_POINT)).astype(np.int16)
         half = self._half
         return np.asarray(cv2.copyMakeBorder(fixed, half, half, half, half, cv2.BORDER_REPLICATE), np.int16)
 
-    def _gel_window(self, raw_x: NDArray[np.float32], raw_y: NDArray[np.float32]) -> NDArray[np.float32]:
+    @cached_property
+    def _framed(self) -> NDArray[np.float32]:
+        """(H, W): the share of the light that the aperture lets through."""
+        width, height = SIZE
+        raw = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+        return self.camera.aperture(raw).astype(np.float32)
+
+    def _leds(self) -> NDArray[np.float32]:
+        """(H, W), 1 in the middle of an LED; every other one at the lower border."""
+        width, height = SIZE
+        count = self.settings.leds
+        total = np.zeros((height, width), np.float32)
+        for number in range(count):
+            y = height - 16.0 if number % 2 else 16.0
+            total += light.spot(SIZE, ((number + 0.5) * width / count, y), (11.0, 8.0))
+        return total
+
+    def _gel_window(self) -> NDArray[np.float32]:
         """(H, W, 1): 1 on the gel, nearly dark around it, where a tilted camera sees past its border."""
-        points = np.stack([raw_x, raw_y], axis=-1).reshape(-1, 2).astype(np.float64)
-        mapped = self.camera.to_gel(points).reshape(*raw_x.shape, 2)
+        mapped = self._gel_blocks(1)
         width, height = SIZE
         inside = np.minimum.reduce(
             [
@@ -445,6 +326,11 @@ class Scene:
                 self._paint(padded, rest + gel.displacement(pressed, rest), shown, pressed)
         half = self._half
         canvas = padded[half:-half, half:-half]
+        if settings.speckle:
+            shade = self._speckle(pressed) if pressed else self._resting_speckle
+            canvas = np.asarray(cv2.multiply(canvas, cv2.merge([shade] * 3), dtype=cv2.CV_16S), np.int16)
+        if settings.stray:
+            canvas = self._with_reflections(canvas, pressed)
         if settings.blur:
             canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), settings.blur), dtype=np.int16)
         if settings.gain:
@@ -452,6 +338,47 @@ class Scene:
             wave = np.sin(2 * np.pi * (2.0 * rows - 0.37 * moment)).astype(np.float32)
             banded = canvas * (np.float32(1.0) + np.float32(settings.gain) * wave)[:, None, None]
             canvas = np.rint(banded, out=banded).astype(np.int16)
+        if moment < settings.settle:
+            gains = np.append(light.settling(moment, settings.settle), 1.0)
+            canvas = np.asarray(cv2.multiply(canvas, gains, dtype=cv2.CV_16S), np.int16)
+        if settings.lamp and moment >= _LAMP_AT * (int(self._delivered[-1]) + 1):
+            canvas = np.asarray(cv2.multiply(canvas, self._lamp, dtype=cv2.CV_16S), np.int16)
+        return canvas
+
+    @cached_property
+    def _lamp(self) -> NDArray[np.float32]:
+        return light.lamp(SIZE, self.settings.lamp)
+
+    @cached_property
+    def _resting_speckle(self) -> NDArray[np.float32]:
+        return self._speckle(())
+
+    def _speckle(self, pressed: tuple[gel.Press, ...]) -> NDArray[np.float32]:
+        """(H, W): the share of the light that the blotches let through."""
+        blocks = self._gel_blocks(_SPECKLE_STEP).reshape(-1, 2)
+        origin = blocks
+        for _ in range(_INVERSIONS if pressed else 0):
+            origin = blocks - gel.displacement(pressed, origin)
+        width, height = SIZE
+        moved = (blocks - origin).reshape(height // _SPECKLE_STEP, width // _SPECKLE_STEP, 2)
+        place = self._gel_blocks(1) - cv2.resize(moved, SIZE, interpolation=cv2.INTER_LINEAR)
+        pattern = light.blotches(SIZE, self.settings.speckle, self.settings.seed)
+        x, y = place[..., 0].astype(np.float32), place[..., 1].astype(np.float32)
+        shade = cv2.remap(pattern, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(shade, dtype=np.float32)
+
+    def _with_reflections(
+        self, canvas: NDArray[np.int16], pressed: tuple[gel.Press, ...]
+    ) -> NDArray[np.int16]:
+        """Add what each contact throws on the gel: a bright streak opposite to it."""
+        center = np.array(SIZE) / 2.0
+        for press in pressed:
+            away = center - self.camera.to_raw(np.array([press.x, press.y]))
+            away /= max(float(np.hypot(*away)), 1.0)
+            x, y = center + away * (320.0, 220.0)
+            level = 90.0 * self.settings.stray * press.depth / press.shape.depth * markers.FIXED_POINT
+            streak = np.float32(level) * light.spot(SIZE, (x, y), (16.0, 48.0))
+            canvas = np.asarray(cv2.add(canvas, cv2.merge([streak] * 3), dtype=cv2.CV_16S), np.int16)
         return canvas
 
     def _paint(
@@ -462,28 +389,35 @@ class Scene:
         pressed: tuple[gel.Press, ...] = (),
     ) -> None:
         settings = self.settings
-        common: dict[str, Any] = {
-            "radius": self.layout.radius,
-            "half": self._half,
-        }
         if settings.dirty and len(self.layout.rest):
             rest, strength, deform = self._dirt
             at = rest + gel.displacement(pressed, rest)
             # One at a time: nothing keeps two specks apart.
             alone = np.arange(len(rest))
             draw_at = self.camera.to_raw(at)
+            radius = np.full(len(rest), self.layout.radius)
             markers.draw(
-                canvas, draw_at, strength, alone, shape="round", bright=None, deform=deform, **common
+                canvas,
+                draw_at,
+                strength,
+                alone,
+                radius=radius,
+                shape="round",
+                half=self._half,
+                bright=None,
+                deform=deform,
             )
+        raw = self.camera.to_raw(gel_points)
         markers.draw(
             canvas,
-            self.camera.to_raw(gel_points),
-            self.layout.contrast * shown,
+            raw,
+            self.layout.contrast * shown * self.camera.aperture(raw),
             self.layout.group,
+            radius=self.layout.radius * self.layout.size,
             shape=settings.shape,
             bright=225.0 if settings.polarity == "bright" else None,
+            half=self._half,
             deform=None if self.camera.identity else self.camera.local_inverse(gel_points),
-            **common,
         )
 
     def _shade(self, padded: NDArray[np.int16], press: gel.Press) -> None:
@@ -507,17 +441,14 @@ class Scene:
         lit = cv2.multiply(region, fine, dtype=cv2.CV_32F)
         extra = None
         if self._light.brightening:
-            share = press.depth / press.shape.depth
-            amount = self._light.brightening * (0.45 + 0.55 * share) * min(1.0, share / 0.1)
-            edge = (depth - np.float32(press.sink * press.depth)) * np.float32(
-                1.0 / (0.05 * press.shape.depth)
-            )
-            extra = np.float32(0.5 * amount) * (np.float32(1.0) + np.tanh(edge * np.float32(0.5)))
+            extra = light.brightness(self._light, press, depth)
         if self.settings.specular:
             spots = light.highlight(sunk, _STEP, self.settings.specular)
             extra = spots if extra is None else extra + spots
         if extra is not None:
             wide = cv2.resize(extra, full, interpolation=cv2.INTER_LINEAR) * np.float32(markers.FIXED_POINT)
+            if self.settings.aperture:
+                wide *= self._framed[_STEP * top : _STEP * bottom, _STEP * left : _STEP * right]
             lit = cv2.add(lit, cv2.merge([wide, wide, wide]))
         np.clip(lit, 0, 32000, out=lit)
         region[...] = np.rint(lit, out=lit)

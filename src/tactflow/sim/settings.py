@@ -24,6 +24,7 @@ class Settings:
     markers: tuple[int, int] = (10, 8)
     dot: float = 0.0
     pitch: float = 0.0
+    sizes: float = 0.0
     shape: str = "round"
     polarity: str = "dark"
     jitter: float = 0.0
@@ -31,11 +32,16 @@ class Settings:
     missing: float = 0.0
     dirty: float = 0.0
     vanish: float = 0.0
+    speckle: float = 0.0
     light: str = "photometric"
     drift: float = 0.0
     flicker: float = 0.0
+    settle: int = 0
+    lamp: float = 0.0
     vignette: float = 0.2
     specular: float = 0.0
+    stray: float = 0.0
+    leds: int = 0
     texture: float = 1.0
     blur: float = 0.0
     jpeg: int = 0
@@ -45,6 +51,7 @@ class Settings:
     repeated: float = 0.0
     perspective: float = 0.0
     distortion: float = 0.0
+    aperture: float = 0.0
     depth: float = 1.0
     shear: float = 0.12
     twist: float = 0.0
@@ -74,6 +81,7 @@ KEYS: dict[str, Key] = {
     "markers": Key("columns x rows, as in 10x8, or none", "", 0, 60),
     "dot": Key("radius of a marker; 0 fits it to the pitch", "px", 0, 60),
     "pitch": Key("distance between markers; 0 fits the grid to the frame", "px", 0, 400),
+    "sizes": Key("spread of the markers' radii to either side of the mean, relative", "", 0, 0.8),
     "shape": Key("shape of a marker", choices=SHAPES),
     "polarity": Key("whether markers are darker or brighter than the gel", choices=("dark", "bright")),
     "jitter": Key("irregularity of the grid, standard deviation of each coordinate", "pitches", 0, 0.3),
@@ -81,13 +89,18 @@ KEYS: dict[str, Key] = {
     "missing": Key("fraction of markers that were never printed", "", 0, 0.9),
     "dirty": Key("specks of dirt per marker", "", 0, 2),
     "vanish": Key("fraction of markers that cannot be seen while the gel is touched", "", 0, 0.9),
+    "speckle": Key("contrast of random blotches all over the gel, which move with it", "", 0, 1),
     "light": Key("the kind of sensor", choices=tuple(LIGHTS)),
     "drift": Key(
         "rise of the brightness while the lights warm up (time constant 5 s), relative", "", -0.5, 0.5
     ),
     "flicker": Key("amplitude of the flicker of mains light (100 Hz seen at 60 Hz), relative", "", 0, 0.5),
+    "settle": Key("time until the camera has set exposure and white balance", "frames", 0, 10_000),
+    "lamp": Key("light of a lamp that is switched on before the second half, relative", "", -0.5, 0.5),
     "vignette": Key("loss of light in the corners, relative", "", 0, 1),
     "specular": Key("strength of mirror-like highlights", "", 0, 1),
+    "stray": Key("strength of a reflection that a contact throws on the far side of the gel", "", 0, 1),
+    "leds": Key("number of glaring LEDs at the upper and lower border of the frame", "", 0, 40),
     "texture": Key("grain of the gel's coating", "% of the light", 0, 10),
     "blur": Key("standard deviation of a Gaussian blur on top of the lens's own", "px", 0, 20),
     "jpeg": Key("quality of a JPEG round trip; 0 is none", "", 0, 100),
@@ -99,6 +112,9 @@ KEYS: dict[str, Key] = {
         "tilt of the camera: by how much of half the width the lower corners move in", "", 0, 0.4
     ),
     "distortion": Key("radial distortion, positive for a wide lens", "", -0.2, 0.4),
+    "aperture": Key(
+        "radius of the round picture in a black frame, in half heights of the frame; 0 is none", "", 0, 2
+    ),
     "depth": Key("scales the depth of every contact", "", 0, 1.5),
     "shear": Key("largest drag of the gel by a contact", "pitches", 0, 1.5),
     "twist": Key("largest turn of the gel by a contact", "degrees", -60, 60),

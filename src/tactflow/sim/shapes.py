@@ -98,13 +98,22 @@ def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0,
     return Shape("cable", gap, half_length + 4 * contact, depth, sources, 1.3 * contact)
 
 
-def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0) -> Shape:
-    """A rounded knife edge along x whose flanks rise with `slope`."""
+def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, lean: float = 0.0) -> Shape:
+    """A rounded knife edge along x whose flanks rise with `slope`.
+
+    lean : in [0, 1); one flank rises by this share more, the other by this share less: the edge of a box.
+    """
+    # Where a leaning edge is lowest: there its gap is 0.
+    lowest, rise = -3.0 * lean / np.sqrt(1.0 - lean**2), 3.0 * np.sqrt(1.0 - lean**2)
 
     def gap(x: Array, y: Array) -> Array:
         beyond = np.maximum(np.abs(x) - np.float32(half_length), 0)
-        away = np.sqrt(beyond * beyond + y * y + np.float32(9.0)) - np.float32(3.0)
-        return np.asarray(away * np.float32(slope), dtype=np.float32)
+        if not lean:
+            away = np.sqrt(beyond * beyond + y * y + np.float32(9.0)) - np.float32(3.0)
+            return np.asarray(away * np.float32(slope), dtype=np.float32)
+        across = y + np.float32(lowest)
+        away = np.sqrt(beyond * beyond + across * across + np.float32(9.0)) - np.float32(rise)
+        return np.asarray((away + across * np.float32(lean)) * np.float32(slope), dtype=np.float32)
 
     return Shape("edge", gap, half_length + 150, depth, _segment(half_length, 12), 45.0)
 
@@ -139,44 +148,106 @@ def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape
     return Shape("ring", gap, radius + 3.8 * float(np.sqrt(tube * depth)), depth, np.zeros((1, 2)), radius)
 
 
-def text(words: str = "TACT", depth: float = 11.0) -> Shape:
-    """Raised letters, 3.4 times the size of OpenCV's plain font."""
-    scale, thickness, margin = 3.4, 11, 60
+def _lookup(picture: Array, outside: float) -> Callable[[Array, Array], Array]:
+    """The value of a picture (H, W) whose centre is the origin, at (x, y) px; `outside` beyond its border."""
+    center_x, center_y = np.float32((picture.shape[1] - 1) / 2), np.float32((picture.shape[0] - 1) / 2)
+
+    def value(x: Array, y: Array) -> Array:
+        map_x = np.ascontiguousarray(x + center_x).reshape(len(x), -1)
+        map_y = np.ascontiguousarray(y + center_y).reshape(len(y), -1)
+        found = cv2.remap(
+            picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(outside,)
+        )
+        return np.asarray(found, dtype=np.float32).reshape(x.shape)
+
+    return value
+
+
+def _letters(words: str, scale: float, thickness: int, margin: int) -> tuple[NDArray[np.uint8], int, int]:
+    """Words in OpenCV's plain font, 0 on 255, with their width and height without the margin, px."""
     (width, height), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
     canvas = np.full((height + 2 * margin, width + 2 * margin), 255, np.uint8)
     place = (margin, margin + height)
     cv2.putText(canvas, words, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0.0,), thickness, cv2.LINE_8)
+    return canvas, width, height
+
+
+def text(words: str = "TACT", depth: float = 11.0) -> Shape:
+    """Raised letters, 3.4 times the size of OpenCV's plain font."""
+    margin = 60
+    canvas, width, height = _letters(words, 3.4, 11, margin)
     distance = cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     # Distances to pixels step by whole pixels along the letters' edges; the surface shall not.
-    field = np.asarray(cv2.GaussianBlur(distance, (0, 0), 1.2), dtype=np.float32)
-    center_x, center_y = np.float32((field.shape[1] - 1) / 2), np.float32((field.shape[0] - 1) / 2)
+    outside = _lookup(np.asarray(cv2.GaussianBlur(distance, (0, 0), 1.2), dtype=np.float32), float(margin))
 
     def gap(x: Array, y: Array) -> Array:
-        shape = x.shape
-        map_x = np.ascontiguousarray(x + center_x).reshape(len(x), -1)
-        map_y = np.ascontiguousarray(y + center_y).reshape(len(y), -1)
-        outside = cv2.remap(
-            field,
-            map_x,
-            map_y,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=(float(margin),),
-        )
-        return _flank(np.asarray(outside, dtype=np.float32).reshape(shape))
+        return _flank(outside(x, y))
 
     reach = float(np.hypot(width, height)) / 2 + margin
     return Shape("text", gap, reach, depth, _segment(width / 2 - height / 2, 5), 60.0)
 
 
+def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Shape:
+    """A disc with a raised rim and raised words, `relief` px high, on a plane that touches as well."""
+    words = 255 - _letters("10c", 3.4, 14, 60)[0]
+    smooth = np.asarray(cv2.GaussianBlur(words, (0, 0), 2.5), dtype=np.float32)
+    raised = _lookup(smooth / np.float32(255.0), 0.0)
+
+    def gap(x: Array, y: Array) -> Array:
+        from_center = np.hypot(x, y)
+        rim = np.exp(-((from_center - np.float32(radius - 10.0)) ** 2) / np.float32(2 * 6.0**2))
+        lower = np.float32(relief) * (1 - np.maximum(rim, raised(x, y)))
+        beyond = _flank(np.maximum(from_center - np.float32(radius - 10.0), 0))
+        return np.asarray(np.where(from_center > radius - 10.0, 0, lower) + beyond, dtype=np.float32)
+
+    return Shape("coin", gap, radius + 90, depth, np.zeros((1, 2)), 0.8 * radius)
+
+
+def block(half_width: float = 215.0, half_height: float = 135.0, depth: float = 12.0) -> Shape:
+    """A large flat punch with grooves across it, 5 px deep, which touch as well."""
+    plain = box(half_width, half_height, 14.0, depth)
+
+    def gap(x: Array, y: Array) -> Array:
+        groove = np.float32(0.5) - np.float32(0.5) * np.cos(x * np.float32(2 * np.pi / 43.0))
+        return np.asarray(plain.gap(x, y) + np.float32(5.0) * groove**4, dtype=np.float32)
+
+    return Shape("block", gap, plain.reach, depth, plain.sources, plain.spread)
+
+
+def key(depth: float = 11.0) -> Shape:
+    """A flat key along x: a bow with a hole, a shaft, and teeth of several lengths."""
+    canvas = np.full((330, 560), 255, np.uint8)
+    cv2.circle(canvas, (145, 165), 85, (0.0,), -1)
+    cv2.circle(canvas, (115, 165), 26, (255.0,), -1)
+    cv2.rectangle(canvas, (215, 142), (485, 182), (0.0,), -1)
+    for number, length in enumerate((26, 14, 34, 20)):
+        cv2.rectangle(canvas, (330 + 40 * number, 182), (350 + 40 * number, 182 + length), (0.0,), -1)
+    distance = cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outside = _lookup(np.asarray(cv2.GaussianBlur(distance, (0, 0), 1.2), dtype=np.float32), 60.0)
+
+    def gap(x: Array, y: Array) -> Array:
+        return _flank(outside(x, y))
+
+    return Shape("key", gap, 290.0, depth, _segment(150.0, 7), 75.0)
+
+
 def screw(
-    radius: float = 62.0, half_length: float = 190.0, thread: float = 34.0, depth: float = 16.0
+    radius: float = 62.0,
+    half_length: float = 190.0,
+    thread: float = 34.0,
+    depth: float = 16.0,
+    ridges: float = 2.4,
 ) -> Shape:
-    """A threaded rod along x: ridges every `thread` px, slightly inclined."""
+    """A threaded rod along x: ridges every `thread` px, `ridges` px to either side of the mean, inclined."""
     smooth = cable(radius, half_length, depth)
 
     def gap(x: Array, y: Array) -> Array:
         ridge = np.cos((x + np.float32(0.16) * y) * np.float32(2 * np.pi / thread))
-        return np.asarray(smooth.gap(x, y) + np.float32(2.4) * (1 - ridge), dtype=np.float32)
+        return np.asarray(smooth.gap(x, y) + np.float32(ridges) * (1 - ridge), dtype=np.float32)
 
     return Shape("screw", gap, smooth.reach, depth, _segment(half_length, 12), smooth.spread)
+
+
+def finger(depth: float = 26.0) -> Shape:
+    """A fingertip along x: wide, soft and round, with the fine ridges of its skin."""
+    return screw(radius=165.0, half_length=120.0, thread=15.0, depth=depth, ridges=0.35)

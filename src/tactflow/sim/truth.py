@@ -37,7 +37,7 @@ class Truth:
     depth : of the deepest indenter, raw px, 0 without a contact: how faint the contact is.
     origin : (N, 2) float64, markers on the untouched gel. position : (N, 2) float64, now. Markers that were
         never printed are not listed.
-    visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, and not vanished.
+    visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, lit, not vanished.
     inside : (N,) bool, whether a marker is visible and its centre lies in the contact.
     at_edge : (N,) bool, whether a marker is visible and the outline passes its centre at `AT_EDGE` or less.
     mean_flow : (dx, dy), mean displacement of the markers inside, px; None where there are none.
@@ -98,9 +98,18 @@ def _pixel_centres(
     width, height = size if mapping is None else mapping.size
     grid = _pixels(width, height)
     raw = grid if mapping is None else np.asarray(mapping.to_raw(grid), dtype=np.float64)
-    seen = np.all((raw >= -0.5) & (raw <= np.array(size) - 0.5), axis=1).reshape(height, width)
+    seen = np.all((raw >= -0.5) & (raw <= np.array(size) - 0.5), axis=1) & _lit(camera, raw)
     mapped = camera.to_gel(raw).astype(np.float32).reshape(height, width, 2)
-    return np.ascontiguousarray(mapped[..., 0]), np.ascontiguousarray(mapped[..., 1]), seen
+    return (
+        np.ascontiguousarray(mapped[..., 0]),
+        np.ascontiguousarray(mapped[..., 1]),
+        seen.reshape(height, width),
+    )
+
+
+def _lit(camera: Camera, raw: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,): which raw pixel positions (N, 2) are not in the black frame around the picture."""
+    return camera.aperture(raw) >= 0.5
 
 
 def _window(
@@ -148,7 +157,7 @@ def measure(
         position = np.asarray(to.to_processed(position), dtype=np.float64)
     nearest = np.rint(position).astype(np.int64)
     height, width = mask.shape
-    visible = shown & np.all((nearest >= 0) & (nearest < (width, height)), axis=1)
+    visible = shown & _lit(camera, places[0]) & np.all((nearest >= 0) & (nearest < (width, height)), axis=1)
     gel = camera.to_gel(places.reshape(-1, 2)).astype(np.float32)
     reached = in_contact(pressed, gel[:, 0], gel[:, 1]).reshape(places.shape[:2])
     inside = visible & reached[0]
