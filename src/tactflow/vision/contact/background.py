@@ -103,7 +103,7 @@ class BackgroundModel:
     ----------
     image : (H, W, 3) uint8, BGR grey levels, without markers.
     repeatability, tint, shift : as `ContactDetector` takes them.
-    valid : (H, W) uint8, 0 where no gel is. Cells there never differ, nor do those where the gel is black, for
+    valid : (H, W) uint8, 0 where no gel is. Cells there never differ, nor do those where the gel is black, as
         the light says nothing there. None: all cells show gel.
 
     Examples
