@@ -20,8 +20,9 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
 from tactflow.message import STATUS_NAMES, Results, encode_message
-from tactflow.ports import Image
+from tactflow.ports import Image, Valid
 from tactflow.view.address import Neighbours, address, bind, is_loopback
+from tactflow.vision.draw import dimmed
 from tactflow.vision.types import Markers
 
 if TYPE_CHECKING:
@@ -146,8 +147,10 @@ class View(Sink):
         """encoded : pictures made; and those of `Hub.counters`."""
         return {"encoded": self._encoded} | ({} if self._hub is None else self._hub.counters())
 
-    def write(self, tick: Tick, results: Results) -> None:
+    def write(self, tick: Tick, results: Results, valid: Valid | None = None) -> None:
         """Send the plain picture and the result message; the page draws one over the other.
+
+        Where no gel is, the picture is darker.
 
         Browsers take in a message a kilobyte at a time, and each costs a switch between processes. So what is
         only drawn comes in tenths of a pixel: the hull, and the markers, which stand beside the message.
@@ -163,7 +166,8 @@ class View(Sink):
         if contact is not None:
             contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1))
         message = encode_message(tick, results._replace(contact=contact, markers=None), detail=True)
-        jpeg = self._encode(frame.image if results.image is None else results.image)
+        image = frame.image if results.image is None else results.image
+        jpeg = self._encode(image if valid is None else dimmed(image, valid))
         latency = (now - frame.captured) * 1000 if frame.captured else -1.0
         header = b'{"latency_ms":%.3f,"epoch":%d,"message":%b,"markers":%b' % (
             *(latency, frame.epoch, message),

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.ports import ContactMask, MarkerMask, Touching, Unmarked
+from tactflow.ports import ContactMask, MarkerMask, Touching, Unmarked, Valid
 from tactflow.vision.contact import ContactDetector
 
 
@@ -82,10 +82,17 @@ class Difference(Stage):
         self._detector.reset()
 
     def process(
-        self, unmarked: Unmarked, frame: Frame, marker_mask: MarkerMask | None = None
+        self,
+        unmarked: Unmarked,
+        frame: Frame,
+        marker_mask: MarkerMask | None = None,
+        valid: Valid | None = None,
     ) -> ContactPorts:
-        """The contact mask of this frame; below markers its outline is continued from what is seen."""
+        """The contact mask of this frame; below markers its outline is continued from what is seen.
+
+        Nothing outside of `valid` counts.
+        """
         if frame.reference or not self._detector.has_reference:
-            self._detector.add_reference(unmarked)
+            self._detector.add_reference(unmarked, valid)
         result = self._detector.detect(unmarked, marker_mask)
         return ContactPorts(result.mask, result.touching)

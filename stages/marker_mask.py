@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
-from tactflow.ports import Image, MarkerMask
+from tactflow.ports import Image, MarkerMask, Valid
 from tactflow.vision import compiled
 from tactflow.vision.geometry import downsample
 from tactflow.vision.markers import mask
@@ -42,18 +42,21 @@ class MarkerMaskStage(Stage):
         """Forget the dots; a new reference follows."""
         self._dot, self._known = None, False
 
-    def process(self, image: Image) -> MarkerMask:
-        """255 where a marker covers the gel; all 0 where the first frame showed no markers."""
+    def process(self, image: Image, valid: Valid | None = None) -> MarkerMask:
+        """255 where a marker covers the gel; all 0 where the first frame showed no markers.
+
+        How they look is learned inside of `valid`.
+        """
         if not self._known:
-            self._dot, self._known = self._find(image), True
+            self._dot, self._known = self._find(image, valid), True
         if self._dot is None:
             return np.zeros(image.shape[:2], np.uint8)
         return marker_mask(image, self._dot)
 
-    def _find(self, image: Image) -> Dot | None:
+    def _find(self, image: Image, valid: Valid | None) -> Dot | None:
         params = self._params
         radius = None if params.dot == "auto" else params.dot
-        found = find_dot(image, radius=radius, polarity=params.polarity)
+        found = find_dot(image, radius=radius, polarity=params.polarity, valid=valid)
         if found is None or params.contrast == "auto":
             return found
         return Dot(found.radius, found.polarity, params.contrast)

@@ -10,6 +10,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Changed
 from tactflow.vision.change import ChangeHold, ChangeProbe
+from tactflow.vision.geometry.valid_area import bounding_box, valid_area
 
 
 class ProbePorts(NamedTuple):
@@ -51,6 +52,7 @@ class Probe(Stage):
         self.params = params
         self._skipping = skipping
         self._probe: ChangeProbe | None = None
+        self._gel = slice(None), slice(None)
         self._hold = ChangeHold(params.hold, params.at_least_every)
 
     def reset(self) -> None:
@@ -58,11 +60,16 @@ class Probe(Stage):
         self._probe = None
 
     def process(self, frame: Frame) -> ProbePorts:
-        """Compare with the last frame that was worked on. A reference frame always is."""
+        """Compare with the last frame that was worked on. A reference frame always is.
+
+        Only the smallest rectangle that holds all of the gel is looked at.
+        """
         if not self._skipping:
             return ProbePorts(True)
         if self._probe is None:
+            self._gel = bounding_box(valid_area(frame.image))
             self._probe = ChangeProbe(
-                frame.image, false_alarms=self.params.false_alarms, tile=self.params.tile
+                frame.image[self._gel], false_alarms=self.params.false_alarms, tile=self.params.tile
             )
-        return ProbePorts(self._hold.works_on(frame.image, self._probe, reference=frame.reference))
+        gel = frame.image[self._gel]
+        return ProbePorts(self._hold.works_on(gel, self._probe, reference=frame.reference))

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.ports import Image
+from tactflow.ports import Image, Valid
 from tactflow.vision import compiled
 from tactflow.vision.markers import field, matching, spots, template, tracking
 from tactflow.vision.markers.detection import Detection, detect_markers
@@ -50,11 +50,14 @@ class Tracker(Stage):
         self._detection: Detection | None = None
         self._tracker: MarkerTracker | None = None
 
-    def process(self, image: Image, frame: Frame) -> Markers:
-        """Position, status and standard error of every marker; the first frame serves as reference."""
+    def process(self, image: Image, frame: Frame, valid: Valid | None = None) -> Markers:
+        """Position, status and standard error of every marker; the first frame serves as reference.
+
+        Marks are looked for inside of `valid`.
+        """
         if self._tracker is None:
             self._references.append(image)
-            self._tracker = self._first_tracker(image)
+            self._tracker = self._first_tracker(image, valid)
         elif frame.reference:
             self._references.append(image)
         elif len(self._references) > 1 and self._detection is not None:
@@ -63,8 +66,10 @@ class Tracker(Stage):
             self._references = self._references[:1]
         return self._tracker.track(image)
 
-    def _first_tracker(self, image: NDArray[np.uint8]) -> MarkerTracker:
-        self._detection = detect_markers(image, dot_radius=self._params.dot, polarity=self._params.polarity)
+    def _first_tracker(self, image: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> MarkerTracker:
+        self._detection = detect_markers(
+            image, dot_radius=self._params.dot, polarity=self._params.polarity, valid=valid
+        )
         return self._tracker_of([image], self._detection)
 
     def _tracker_of(self, references: list[NDArray[np.uint8]], detection: Detection) -> MarkerTracker:

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
-from tactflow.ports import ContactMask, Image, Picture
+from tactflow.ports import ContactMask, Image, Picture, Valid
 from tactflow.vision.draw import Annotator
 from tactflow.vision.types import Contact, Flow, Markers
 
@@ -48,6 +48,9 @@ class Visualize(Stage):
         flow: Flow | None,
         markers: Markers | None,
         contact_mask: ContactMask | None,
+        valid: Valid | None = None,
     ) -> Picture:
         """A new picture; what is absent is not drawn."""
-        return self._annotator(image, contact=contact, flow=flow, markers=markers, contact_mask=contact_mask)
+        return self._annotator(
+            image, contact=contact, flow=flow, markers=markers, contact_mask=contact_mask, valid=valid
+        )

@@ -16,6 +16,9 @@ from tactflow.engine.ports import ArrayPort, SignalPort
 Image = Annotated[NDArray[np.uint8], ArrayPort("image", ("H", "W", 3), "uint8", "grey levels, BGR")]
 """The processed frame."""
 
+Valid = Annotated[NDArray[np.uint8], ArrayPort("valid", ("H", "W"), "uint8", "0 or 255")]
+"""255 where the picture shows gel, 0 on a black or saturated surround; the same array for a whole epoch."""
+
 MarkerMask = Annotated[NDArray[np.uint8], ArrayPort("marker_mask", ("H", "W"), "uint8", "0 or 255")]
 """255 where a marker covers the gel."""
 

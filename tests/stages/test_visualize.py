@@ -35,6 +35,7 @@ def test_everything_but_the_image_may_be_absent() -> None:
         "flow": True,
         "markers": True,
         "contact_mask": True,
+        "valid": True,
     }
     assert [port.name for port in ports.outputs] == ["annotated"]
     picture = Visualize(Visualize.Params(text=False)).process(IMAGE, None, None, None, None)

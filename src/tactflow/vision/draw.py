@@ -35,6 +35,8 @@ by hand."""
 _UNIT_SIDE: Final = 300
 """Shorter side of a picture, px, up to which everything is drawn at the sizes below; in larger pictures they
 grow with it. It and all sizes below are chosen by hand, by how the pictures look."""
+_DIM: Final = 3
+"""How many times darker a place without gel is shown."""
 _LINE: Final = 1.2
 """Width of lines, px."""
 _DARK_LINE: Final = 2.6
@@ -61,6 +63,21 @@ _STATUS_COLOURS: Final = (
     (MarkerStatus.TRACKED, YELLOW),
 )
 """Colours of the arrows, in the order in which they are drawn: what is known best comes last, on top."""
+
+
+def dimmed(image: NDArray[np.uint8], valid: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The picture, (H, W, 3) uint8, dark where no gel is: where `valid`, (H, W) uint8, is 0.
+
+    The same array where gel is everywhere. Raises ValueError if `valid` is not of the picture's size.
+
+    >>> dimmed(np.full((1, 2, 3), 90, np.uint8), np.array([[255, 0]], np.uint8))[0, :, 0].tolist()
+    [90, 30]
+    """
+    if valid.shape != image.shape[:2]:
+        raise ValueError(f"required valid of shape {image.shape[:2]}, got {valid.shape}")
+    if valid.all():
+        return image
+    return np.where(valid[:, :, None] == 0, image // _DIM, image)
 
 
 class Annotator:
@@ -115,10 +132,12 @@ class Annotator:
         flow: Flow | None = None,
         markers: Markers | None = None,
         contact_mask: NDArray[np.uint8] | None = None,
+        valid: NDArray[np.uint8] | None = None,
     ) -> NDArray[np.uint8]:
         """A new picture of the size of `image`, with whatever is given drawn on it.
 
         image : (H, W, 3) uint8 BGR. contact_mask : (H, W) uint8, needed by the "contact" view alone.
+        valid : (H, W) uint8, 0 where no gel is, which is shown darker.
         Returns (H, W, 3) uint8; the inputs stay as they are. Raises ValueError on another shape.
         """
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
@@ -128,7 +147,7 @@ class Annotator:
             if markers is not None:
                 markers = self._inside(markers, contact_mask)
         else:
-            picture = image.copy()
+            picture = (image if valid is None else dimmed(image, valid)).copy()
         unit = max(1.0, min(image.shape[:2]) / _UNIT_SIDE)
         if contact is not None and len(contact.hull):
             draw_polygon(picture, contact.hull, GREEN, unit)

@@ -23,6 +23,7 @@ from tactflow.vision.contact.background_kernels import (
 from tactflow.vision.contact.contact_outline import RelativeChange
 from tactflow.vision.contact.illumination import IlluminationModel, illumination_change, positions
 from tactflow.vision.geometry.downsample import halved
+from tactflow.vision.geometry.valid_area import lit_area
 
 Float = NDArray[np.float32]
 
@@ -43,6 +44,9 @@ DARK_OFFSET: Final = 0.1
 """Part of the mean brightness that is added before changes are taken relative to the brightness. By hand."""
 EDGE_CHANGE: Final = 0.05
 """Relative change by which an edge, moved by `shift`, begins to count less for the outline. By hand."""
+
+CELL_VALID: Final = 128
+"""Mean of a valid area, 0 to 255, over a cell that counts, at least: half of it."""
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
@@ -99,6 +103,8 @@ class BackgroundModel:
     ----------
     image : (H, W, 3) uint8, BGR grey levels, without markers.
     repeatability, tint, shift : as `ContactDetector` takes them.
+    valid : (H, W) uint8, 0 where no gel is. Cells there never differ, nor do those where the gel is black, as
+        the light says nothing there. None: all cells show gel.
 
     Examples
     --------
@@ -112,12 +118,20 @@ class BackgroundModel:
     ((16, 12), True)
     """
 
-    def __init__(self, image: NDArray[np.uint8], repeatability: float, tint: float, shift: float) -> None:
+    def __init__(
+        self,
+        image: NDArray[np.uint8],
+        repeatability: float,
+        tint: float,
+        shift: float,
+        valid: NDArray[np.uint8] | None = None,
+    ) -> None:
         half, cells = _cells(image)
         self._half = _planes(half)
         self._mean: Float = _smoothed(cells)
         self._squares = np.zeros_like(self._mean)
         self._noise = _spatial_noise(cells)
+        self._counts = _counting(half, valid)
         self._count = 1
         self._repeatability, self._tint, self._shift = repeatability, tint, shift
         self._known: _Derived | None = None
@@ -208,7 +222,7 @@ class BackgroundModel:
         variance = (PRIOR_FRAMES * self._noise**2 + self._squares) / (PRIOR_FRAMES + count - 1)
         steady = variance * (1 + 1 / count) + (self._shift / CELL * _steepness(mean)) ** 2
         variance = steady + (self._repeatability * mean) ** 2
-        illumination = IlluminationModel(mean, np.asarray(variance, np.float32))
+        illumination = IlluminationModel(mean, np.asarray(variance, np.float32), self._counts)
         weight = 1 / np.sqrt(variance)
         # One factor for all channels, so that a change in proportion to the brightness is none of colour.
         factor = (variance / (steady + (self._tint * mean) ** 2)).min(axis=0)
@@ -216,6 +230,10 @@ class BackgroundModel:
         direction /= np.linalg.norm(direction, axis=0) + np.float32(1e-6)
         dark = DARK_OFFSET * half.mean(axis=(1, 2), keepdims=True) + 1
         edge = self._shift / 2 * _steepness(half) / (EDGE_CHANGE * (half + dark))
+        half_scale = 1 / ((half + dark) * np.sqrt(1 + edge**2))
+        if self._counts is not None:
+            weight = weight * self._counts
+            half_scale = half_scale * self._counts.repeat(2, axis=0).repeat(2, axis=1)
         self._known = _Derived(
             illumination=illumination,
             mean=np.ascontiguousarray(mean, np.float32),
@@ -225,7 +243,7 @@ class BackgroundModel:
             colour_factor=np.asarray(factor, np.float32),
             half_mean=half,
             half_gain_basis=illumination.gain_basis(half),
-            half_scale=np.asarray(1 / ((half + dark) * np.sqrt(1 + edge**2)), np.float32),
+            half_scale=np.asarray(half_scale, np.float32),
         )
         return self._known
 
@@ -251,6 +269,16 @@ def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint
         whole = np.asarray(cv2.copyMakeBorder(whole, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
     half = halved(whole)
     return half, halved(half)
+
+
+def _counting(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
+    """Cells (h, w) that show gel and have light; None where all do. half : the gel at half resolution."""
+    if valid is None:
+        return None
+    counts = lit_area(half)[::2, ::2]
+    if not valid.all():
+        counts = counts & (_cells(np.repeat(valid[:, :, None], 3, axis=2))[1][:, :, 0] >= CELL_VALID)
+    return None if counts.all() else np.asarray(counts)
 
 
 def _steepness(planes: Float) -> Float:

@@ -210,18 +210,21 @@ class ContactDetector:
         """Whether a frame of the untouched gel is known."""
         return self._last is not None
 
-    def add_reference(self, image: NDArray[np.uint8]) -> None:
+    def add_reference(self, image: NDArray[np.uint8], valid: NDArray[np.uint8] | None = None) -> None:
         """Learn from a frame of the untouched gel; the more, the better the noise is known.
 
-        image : (H, W, 3) uint8, BGR grey levels, without markers. Raises ValueError if it is not of that
-        kind, or not of the size of the frames before.
+        image : (H, W, 3) uint8, BGR grey levels, without markers.
+        valid : (H, W) uint8, 0 where the picture shows no gel, and so no contact either (`noise` only; that
+            of the first frame holds). None: gel is everywhere.
+        Raises ValueError if they are not of that kind, or not of the size of the frames before.
         """
         self._check(image)
+        _check_mask(valid, image)
         if self._method != "noise":
             self._last = image.copy()
             return
         if self._background is None:
-            self._background = BackgroundModel(image, self._repeatability, self._tint, self._shift)
+            self._background = BackgroundModel(image, self._repeatability, self._tint, self._shift, valid)
         else:
             self._background.add(image)
         self._last = image
@@ -235,11 +238,7 @@ class ContactDetector:
         Raises ValueError if they are not of that kind, or without a reference.
         """
         self._check(image)
-        if hidden is not None and (hidden.shape != image.shape[:2] or hidden.dtype != np.uint8):
-            raise ValueError(
-                f"required a uint8 mask of shape {image.shape[:2]}, got shape {hidden.shape}, "
-                f"dtype {hidden.dtype}"
-            )
+        _check_mask(hidden, image)
         if self._last is None:
             raise ValueError("required a reference frame first: call add_reference")
         if self._method == "colour":
@@ -340,6 +339,13 @@ class ContactDetector:
         if cells not in self._limits:
             self._limits[cells] = chi_square_threshold(self._false_alarms / cells)
         return self._limits[cells]
+
+
+def _check_mask(mask: NDArray[np.uint8] | None, image: NDArray[np.uint8]) -> None:
+    if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != np.uint8):
+        raise ValueError(
+            f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
+        )
 
 
 def _colour_distance(

@@ -37,6 +37,7 @@ class IlluminationModel:
     Parameters
     ----------
     reference, variance : (3, h, w) float32, mean (grey levels) and variance of the untouched gel's cells.
+    counts : (h, w) bool, cells that show gel and are fitted; None: all.
 
     References
     ----------
@@ -51,7 +52,7 @@ class IlluminationModel:
     [5.0, 5.0, 5.0]
     """
 
-    def __init__(self, reference: Float, variance: Float) -> None:
+    def __init__(self, reference: Float, variance: Float, counts: NDArray[np.bool_] | None = None) -> None:
         height, width = reference.shape[1:]
         self._row_weights = _block_weights(max(1, height // BLOCK), height)
         self._column_weights = np.ascontiguousarray(_block_weights(max(1, width // BLOCK), width).T)
@@ -60,10 +61,13 @@ class IlluminationModel:
         planes = np.stack([one, one * positions(width), one * positions(height)[:, None]])
         common, gain = self._block_means(planes), self._block_means(self.gain_basis(reference))
         basis = np.stack([np.vstack([common, gain[channel]]) for channel in range(3)])
-        penalty = RIDGE * basis.shape[2] * np.diag([0.0, 1.0, 1.0, 1.0])
-        inverse = np.linalg.inv(basis @ basis.transpose(0, 2, 1) + penalty + 1e-6 * np.eye(4))
+        self._fitted = self._fitted_blocks(counts)
+        fitted = basis if self._fitted is None else basis * self._fitted
+        blocks = basis.shape[2] if self._fitted is None else np.count_nonzero(self._fitted)
+        penalty = RIDGE * blocks * np.diag([0.0, 1.0, 1.0, 1.0])
+        inverse = np.linalg.inv(fitted @ basis.transpose(0, 2, 1) + penalty + 1e-6 * np.eye(4))
         self._basis: Float = np.ascontiguousarray(basis, np.float32)
-        self._step: Float = np.ascontiguousarray(inverse @ basis, np.float32)
+        self._step: Float = np.ascontiguousarray(inverse @ fitted, np.float32)
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
         self._limit: Float = np.float32(CLIP) * np.sqrt(self._block_means(variance))
@@ -82,10 +86,18 @@ class IlluminationModel:
         Returns (3, 4) float32: offset, slope along x and along y (over the whole frame), gain; grey levels.
         """
         excess = self._block_means(cells) - self._reference
+        shown = excess if self._fitted is None else excess[:, self._fitted]
         coefficients = np.zeros((3, 4), np.float32)
-        coefficients[:, 0] = np.sort(excess, axis=1)[:, excess.shape[1] // 2]
+        coefficients[:, 0] = np.sort(shown, axis=1)[:, shown.shape[1] // 2]
         fit_robustly(excess, self._basis, self._step, self._shrink, self._limit, coefficients)
         return coefficients
+
+    def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        """Blocks (n,) of which at least half counts; None for all, also where there is none of them."""
+        if counts is None:
+            return None
+        fitted = self._block_means(counts[None].astype(np.float32))[0] >= np.float32(0.5)
+        return fitted if fitted.any() else None
 
     def _block_means(self, planes: Float) -> Float:
         """(n, blocks) float32: means over blocks of (n, h, w) planes; a cell may belong to two in parts."""

@@ -1,0 +1,138 @@
+"""Valid area: where a picture of the untouched gel shows gel at all.
+
+Around the gel there may be a black housing, a vignette, a dark corner that the lens does not reach, or a lamp
+that saturates the camera. What changes there says nothing about the gel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.uint8]
+
+BLACK: Final = 24
+"""Grey levels below which a pixel is black: video has its black at 16 (ITU-R BT.601), and compression and
+noise add to it; the gel below the white pins of tactip_video is 17. Chosen by hand."""
+DARK: Final = 0.15
+"""Brightness of a dark place, relative to that of the brightest tenth of the picture, at most. Chosen on the
+development recordings: corners of a gel are above 0.2, housings that are seen below 0.12."""
+BRIGHTEST: Final = 90.0
+"""Percentile of the brightness that stands for the brightest part of the picture. Chosen by hand."""
+SATURATED: Final = 250
+"""Grey levels of all channels from which a place is saturated: it cannot become brighter. Chosen by hand."""
+COARSE: Final = 200
+"""Shorter side of the picture that is looked at, px, at least; larger ones are shrunk by a whole factor. By
+hand: 10 ms instead of 100 for each reference."""
+SMOOTHING: Final = 5
+"""Side of the square over which brightness is averaged, px of that picture: single pixels are noise. Chosen
+by hand."""
+LEAST_RADIUS: Final = 0.05
+"""Radius of the largest disc that fits into a place without gel, at least, over the shorter side of the
+picture. Smaller places are marks, or the gaps between bright ones. Chosen by hand: the largest marks of the
+development recordings have 0.04."""
+
+MOST: Final = 0.5
+"""Part of a place that is not black, at least, for the light to say something there: the larger one."""
+
+
+def valid_area(image: NDArray[np.uint8]) -> Mask:
+    """Where the picture of an untouched gel shows gel: neither black nor saturated over some width.
+
+    What lies beyond the picture's border counts as no gel, so that a dark strip along the border is found
+    however thin it is, while a mark that the border cuts stays gel. A picture that shows gel nowhere is valid
+    everywhere: then brightness does not tell.
+
+    image : (H, W, 3) or (H, W) uint8, grey levels. Returns (H, W) uint8, 255 where there is gel, else 0.
+    Raises ValueError if it is not of that kind.
+
+    >>> picture = np.full((60, 80, 3), 120, np.uint8)
+    >>> bool(valid_area(picture).all())
+    True
+    >>> picture[:, :20] = 8
+    >>> valid_area(picture)[30, [10, 40]].tolist()
+    [0, 255]
+    """
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.size == 0:
+        raise ValueError(f"required an image of uint8, got shape {image.shape} {image.dtype}")
+    height, width = image.shape[:2]
+    factor = max(1, min(height, width) // COARSE)
+    size = (math.ceil(width / factor), math.ceil(height / factor))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    smooth = np.atleast_3d(cv2.blur(small, (SMOOTHING, SMOOTHING)))
+    brightness = smooth.max(axis=2)
+    dark = brightness < max(BLACK, DARK * float(np.percentile(brightness, BRIGHTEST)))
+    without = _opened(dark | (smooth.min(axis=2) >= SATURATED), LEAST_RADIUS * min(size))
+    if without.all() or not without.any():
+        return np.full((height, width), 255, np.uint8)
+    valid = np.where(without, 0, 255).astype(np.uint8)
+    return np.asarray(cv2.resize(valid, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def lit_area(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Where a gel without its marks has light that can change: most of the surroundings are not black.
+
+    On a black gel with white pins the light says nothing, although a pin that was not removed is bright. What
+    most of a place shows is the gel, for marks cover less than half of it.
+
+    image : (H, W, 3) uint8, grey levels, without markers. Returns (H, W) bool.
+
+    >>> gel = np.full((60, 80, 3), 120, np.uint8)
+    >>> bool(lit_area(gel).all()), bool(lit_area(gel // 10).any())
+    (True, False)
+    """
+    lit = (image.max(axis=2) >= BLACK).astype(np.float32)
+    side = 2 * math.ceil(LEAST_RADIUS * min(lit.shape)) + 1
+    return np.asarray(cv2.blur(lit, (side, side)) >= MOST)
+
+
+def polygon_area(polygon: Sequence[Sequence[float]], width: int, height: int) -> Mask:
+    """The area inside a polygon.
+
+    polygon : corners (x, y) in order, px, three at least. width, height : of the picture, px.
+    Returns (height, width) uint8, 255 inside and on the border. Raises ValueError for fewer corners, or if no
+    pixel is inside.
+
+    >>> polygon_area([(1, 1), (3, 1), (3, 2), (1, 2)], width=5, height=4)[:, 2].tolist()
+    [0, 255, 255, 0]
+    """
+    corners = np.array(polygon, np.float64).reshape(-1, 2)
+    if len(corners) < 3:
+        raise ValueError(f"required a polygon of at least 3 corners, got {len(corners)}")
+    area = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(area, [np.rint(corners).astype(np.int32)], 255)
+    if not area.any():
+        raise ValueError(f"the polygon covers no pixel of the {width} x {height} picture")
+    return area
+
+
+def bounding_box(valid: Mask) -> tuple[slice, slice]:
+    """Rows and columns of the smallest rectangle that holds all of an area, (H, W) uint8, which is not empty.
+
+    >>> bounding_box(polygon_area([(1, 1), (3, 1), (3, 2), (1, 2)], width=5, height=4))
+    (slice(1, 3, None), slice(1, 4, None))
+    """
+    left, top, width, height = cv2.boundingRect(valid)
+    return slice(top, top + height), slice(left, left + width)
+
+
+def _opened(region: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """Morphological opening of a region by a disc, the region going on for ever beyond the border.
+
+    By two distance transforms, whose time does not depend on the radius.
+    """
+    if not region.any():
+        return region
+    # Beyond the border a disc fits everywhere; two radii of it are all that reaches into the picture.
+    margin = int(np.ceil(2 * radius)) + 2
+    wide = np.pad(region, margin, constant_values=True).astype(np.uint8)
+    inside = cv2.distanceTransform(wide, cv2.DIST_L2, cv2.DIST_MASK_5)
+    outside_centers = (inside <= radius).astype(np.uint8)
+    covered = cv2.distanceTransform(outside_centers, cv2.DIST_L2, cv2.DIST_MASK_5) <= radius
+    cut = slice(margin, -margin)
+    return np.asarray(region & covered[cut, cut])

@@ -1,0 +1,72 @@
+"""Stage `valid_area`: where the picture shows gel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.errors import StageError
+from tactflow.ports import Image, Valid
+from tactflow.sources.files import load_image
+from tactflow.vision.geometry.valid_area import polygon_area, valid_area
+
+Point = Annotated[list[float], Field(min_length=2, max_length=2)]
+Polygon = Annotated[list[Point], Field(min_length=3)]
+
+
+class ValidArea(Stage):
+    """Find the gel in the reference frame; what is black or saturated around it is none."""
+
+    memory = "stateful"
+
+    class Params(StageParams):
+        """Where the gel is, if it need not be found."""
+
+        area: Polygon | str = Field(
+            "auto",
+            min_length=1,
+            description="auto finds it in the reference frame; all is the whole picture; or its corners "
+            "[[x, y], ...], processed px; or an image file of the processed frame's size, black where no "
+            "gel is",
+        )
+
+    def __init__(self, params: Params, directory: Path | None = None) -> None:
+        """Prepare. directory : where a relative path is looked for if not in the current directory."""
+        self._area = params.area
+        self._directory = directory
+        self._valid: Valid | None = None
+
+    def reset(self) -> None:
+        """A new reference follows."""
+        self._valid = None
+
+    def process(self, image: Image) -> Valid:
+        """255 where there is gel; the same array until a new reference comes."""
+        if self._valid is None:
+            self._valid = self._find(image)
+        return self._valid
+
+    def _find(self, image: Image) -> Valid:
+        height, width = image.shape[:2]
+        if self._area == "auto":
+            return valid_area(image)
+        if self._area == "all":
+            return np.full((height, width), 255, np.uint8)
+        if not isinstance(self._area, str):
+            try:
+                return polygon_area(self._area, width, height)
+            except ValueError as problem:
+                raise StageError(f"area: {problem}") from None
+        mask = np.where(load_image(self._area, self._directory).any(axis=2), 255, 0).astype(np.uint8)
+        if mask.shape != (height, width):
+            raise StageError(
+                f"area: {self._area} is {mask.shape[1]} x {mask.shape[0]} pixels, required "
+                f"{width} x {height}, those of the processed frame"
+            )
+        if not mask.any():
+            raise StageError(f"area: {self._area} is black everywhere, so there would be no gel")
+        return mask
