@@ -5,8 +5,12 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import sys
 from pathlib import Path
 from typing import IO
+
+if sys.platform != "win32":
+    import fcntl
 
 
 def expanded(text: str) -> Path:
@@ -40,6 +44,29 @@ def make_folder(folder: Path) -> None:
     except (FileExistsError, NotADirectoryError):
         file = next((path for path in (folder, *folder.parents) if path.is_file()), folder)
         raise NotADirectoryError(errno.ENOTDIR, f"{file} is a file, not a folder") from None
+
+
+if sys.platform == "win32":
+
+    def claim(_file: IO[bytes]) -> bool:
+        """True: Windows itself refuses to replace a file that is open."""
+        return True
+
+else:
+
+    def claim(file: IO[bytes]) -> bool:
+        """Claim a file for as long as it is open; whether nobody else has claimed it.
+
+        The claim binds only those who ask. It ends with the process, however that ends; where the file system
+        knows no claims, everybody gets one.
+        """
+        try:
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        return True
 
 
 def lead_nowhere(stream: IO[str]) -> None:

@@ -20,6 +20,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from tactflow.cli.main import main
+from tactflow.recording.writer import About, RecordingWriter
 from tactflow.sim import open_scene
 from tactflow.sources import open_source
 from tests.cli.kill_me import image
@@ -204,9 +205,10 @@ def test_a_kill_at_any_moment_loses_no_frame_that_was_written(tmp_path: Path) ->
             # The one frame more: killed between the last byte of the frame and the counter.
             assert written <= found <= written + 1
             assert main(["repair", str(path), "--quiet"]) == 0
-            with path.open("rb") as file:
+            repaired = path.with_stem(f"{number}-repaired")
+            with repaired.open("rb") as file:
                 again = list(make_reader(file, validate_crcs=True).iter_messages("/main/results"))
-            assert len(again) == found == pixels_are_right(path)
+            assert len(again) == found == pixels_are_right(repaired)
         helper.stdin.close()
     assert helper.returncode == 0
 
@@ -249,11 +251,27 @@ def test_repair_can_write_elsewhere_and_replaces_nothing_unasked(
     assert main(["repair", str(out), "--out", str(folder), "--overwrite"]) == 2
     assert f"is a folder; name a file in it, as in {folder / 'a.mcap'}" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "kept"]
+    assert main(["repair", str(out), "--out", str(out), "--overwrite"]) == 2
+    assert "is the file to repair" in capsys.readouterr().err
     assert main(["repair", str(out), "--out", str(copy), "--overwrite"]) == 0
     assert out.read_bytes() == data
     with copy.open("rb") as file:
         assert make_reader(file).get_summary() is not None
     assert len(stamps(copy)) == 3
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows refuses to open it twice")
+def test_a_file_that_is_being_recorded_is_left_to_its_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mcap"
+    writer = RecordingWriter(path, About("main"))
+    assert main(["repair", str(path)]) == 2
+    assert "is still being recorded" in capsys.readouterr().err
+    with pytest.raises(BlockingIOError, match="another run is recording into it"):
+        RecordingWriter(path, About("main"), overwrite=True)
+    writer.finish()
+    assert main(["repair", str(path)]) == 0
 
 
 @pytest.mark.parametrize(("content", "words"), [(b"no", "is not an MCAP file"), (None, "no such file")])

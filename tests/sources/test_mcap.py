@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import tracemalloc
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from numpy.typing import NDArray
@@ -16,6 +19,8 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
+from tactflow.recording.frames import StoredFrame
+from tactflow.recording.records import Damage, intact_records
 from tactflow.recording.repair import repair
 from tactflow.sinks.record import Record
 from tactflow.sources import StampedReader, open_source
@@ -266,5 +271,70 @@ def test_damage_in_the_middle_of_a_whole_file_is_reported(tmp_path: Path) -> Non
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
-    with pytest.raises(SourceError, match=r"is damaged .*tactflow repair keeps what lies before"):
+    with pytest.raises(SourceError, match=r"is damaged .*tactflow repair keeps all that is intact"):
         captured(path)
+
+
+def test_one_wrong_bit_costs_one_frame_wherever_it_lies(tmp_path: Path) -> None:
+    made = frames(range(6))
+    data = record(tmp_path / "a.mcap", made).read_bytes()
+    flipped, fixed = tmp_path / "flipped.mcap", tmp_path / "fixed.mcap"
+    for place in range(8, len(data), 211):
+        changed = bytearray(data)
+        changed[place] ^= 1 << (place % 8)
+        flipped.write_bytes(changed)
+        repair(flipped, fixed)
+        assert flipped.read_bytes() == changed
+        again = captured(fixed)
+        kept = [frame for frame in made if any(frame.seq == other.seq for other in again)]
+        assert len(kept) >= len(made) - 1, place
+        same(again, kept)
+
+
+def chunk(data: bytes, compression: str, size: int) -> bytes:
+    """One chunk of an MCAP file."""
+    name = compression.encode()
+    beginning = struct.pack("<QQQII", 0, 0, size, 0, len(name)) + name
+    body = beginning + struct.pack("<Q", len(data)) + data
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+@pytest.mark.parametrize(
+    ("data", "compression", "size"),
+    [
+        (zstandard.compress(bytes(64 << 20)), "zstd", 100),
+        (zstandard.compress(bytes(100)), "zstd", 1 << 60),
+        (b"no such thing", "zstd", 100),
+        (b"no such thing", "lz4", 100),
+        (bytes(100), "brotli", 100),
+        (bytes(100), "", 1 << 60),
+    ],
+    ids=["bomb", "absurd size", "garbage", "lz4 garbage", "unknown", "plain of another size"],
+)
+def test_a_chunk_that_cannot_be_unpacked_is_passed_over(
+    tmp_path: Path, data: bytes, compression: str, size: int
+) -> None:
+    path = record(tmp_path / "a.mcap", frames(range(3)))
+    whole = path.read_bytes()
+    with path.open("rb") as file:
+        before = len(list(intact_records(file)))
+    hostile = chunk(data, compression, size)
+    path.write_bytes(whole[:8] + hostile + whole[8:])
+    tracemalloc.start()
+    with path.open("rb") as file:
+        records = list(intact_records(file))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert [record for record in records if isinstance(record, Damage)] == [Damage(8, 8 + len(hostile))]
+    assert len(records) == before + 1
+    # What the file itself holds, several times over; none of the sizes that it claims.
+    assert peak < 10 * len(whole) + len(data)
+
+
+def test_a_frame_that_claims_more_pixels_than_any_camera_has_is_refused() -> None:
+    huge = StoredFrame(0, 0.0, False, 0, (1 << 16, 1 << 16), memoryview(zstandard.compress(bytes(100))))
+    with pytest.raises(ValueError, match="65536 x 65536"):
+        huge.image()
+    bomb = StoredFrame(0, 0.0, False, 0, (8, 4), memoryview(zstandard.compress(bytes(64 << 20))))
+    with pytest.raises(ValueError, match="required 96 bytes"):
+        bomb.image()

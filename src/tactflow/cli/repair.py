@@ -1,4 +1,4 @@
-"""`tactflow repair`: give a recording that was cut off its index."""
+"""`tactflow repair`: a copy of all that is intact in a damaged or unfinished recording."""
 
 from __future__ import annotations
 
@@ -12,23 +12,29 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tactflow.engine.errors import ConfigError, SourceError, StageError
+from tactflow.files import claim
 from tactflow.recording import missing_packages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `repair`."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="an .mcap file that was not finished")
     parser.add_argument(
-        "--out", type=Path, metavar="FILE", help="write here and leave FILE as it is; default: replace FILE"
+        "file",
+        type=Path,
+        metavar="FILE",
+        help="an .mcap file that is damaged, or was not finished; it stays as it is",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace the file --out if it is there")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="where the copy goes; default: FILE-repaired.mcap, beside it"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace the copy if it is there")
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
 
 
 def run(args: argparse.Namespace) -> int:
     """Repair the file; returns the exit code.
 
-    The repaired copy takes the file's place only when it is complete, so an interrupted repair harms nothing.
+    The copy gets its name only when it is complete, so an interrupted repair leaves nothing behind.
 
     Raises
     ------
@@ -40,13 +46,16 @@ def run(args: argparse.Namespace) -> int:
     if problem is not None:
         raise ConfigError(problem)
     path: Path = args.file
-    out: Path = args.out or path
+    out: Path = args.out or path.with_name(f"{path.stem}-repaired{path.suffix}")
     if not path.is_file():
         raise SourceError(f"{path}: no such file")
     if out.is_dir():
         raise ConfigError(f"--out: {out} is a folder; name a file in it, as in {out / path.name}")
-    if args.out is not None and out.exists() and not args.overwrite:
-        raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
+    if out.exists() and out.samefile(path):
+        raise ConfigError(f"--out: {out} is the file to repair; name another one")
+    if out.exists() and not args.overwrite:
+        raise ConfigError(f"{out} is already there; give --overwrite to replace it, or --out FILE")
+    _refuse_if_in_use(path)
     try:
         handle, name = tempfile.mkstemp(dir=out.absolute().parent, prefix=f".{out.stem}-", suffix=".mcap")
         os.close(handle)
@@ -57,6 +66,16 @@ def run(args: argparse.Namespace) -> int:
         return _repair(path, copy, out, quiet=args.quiet)
     finally:
         copy.unlink(missing_ok=True)
+
+
+def _refuse_if_in_use(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            free = claim(file)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not free:
+        raise ConfigError(f"{path}: is still being recorded; repair it when that run has ended")
 
 
 def _repair(path: Path, copy: Path, out: Path, *, quiet: bool) -> int:
@@ -76,13 +95,13 @@ def _repair(path: Path, copy: Path, out: Path, *, quiet: bool) -> int:
                 f"{copy.parent}: the repaired copy cannot be written: {error.strerror or error}; "
                 "--out puts it on another disk"
             ) from error
-    if result.finished and out == path:
+    if result.finished:
         _say(f"{path}: is whole already, nothing to repair ({result.messages} messages)", quiet=quiet)
         return 0
     os.chmod(copy, path.stat().st_mode & 0o777)
     os.replace(copy, out)
-    lost = f", {result.lost} bytes at the end belonged to no whole message" if result.lost else ""
-    _say(f"{out}: repaired, {result.messages} messages{lost}", quiet=quiet)
+    lost = f", {result.lost} bytes belonged to nothing intact" if result.lost else ""
+    _say(f"{out}: {result.messages} messages{lost}; {path} stays as it is", quiet=quiet)
     return 0
 
 

@@ -14,6 +14,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from tactflow.engine.frame import Frame
+from tactflow.recording.packing import unpacked
 from tactflow.recording.protobuf import FieldType, decode, describe, encode, timestamp, unzigzag, zigzag
 
 TYPE_NAME = "tactflow.RawFrame"
@@ -22,6 +23,8 @@ ENCODING = "bgr8"
 """Names of how pixels are packed and ordered, which a reader compares."""
 LEVEL = 1
 """Level of zstd: the fastest that still does entropy coding."""
+MOST_PIXELS = 1 << 27
+"""Pixels of a frame at most: more than any camera gives; unpacked they take 0.4 GB."""
 
 _FIELDS: tuple[tuple[str, int, FieldType], ...] = (
     ("timestamp", 1, "Timestamp"),
@@ -139,12 +142,12 @@ class StoredFrame:
             If they are damaged.
         """
         width, height = self.size
+        if not 0 < width * height <= MOST_PIXELS:
+            raise ValueError(f"required 1 to {MOST_PIXELS} pixels, got {width} x {height}")
         try:
-            raw = zstandard.ZstdDecompressor().decompress(self.data, max_output_size=height * width * 3)
-        except zstandard.ZstdError as error:
-            raise ValueError(f"the pixels are damaged ({error})") from error
-        if len(raw) != height * width * 3:
-            raise ValueError(f"required {height * width * 3} bytes of pixels, got {len(raw)}")
+            raw = unpacked(self.data, "zstd", height * width * 3)
+        except ValueError as error:
+            raise ValueError(f"the pixels: {error}") from error
         differences = np.frombuffer(raw, np.uint8).reshape(height, width * 3)
         rows = np.empty_like(differences)
         rows[0] = previous = differences[0]

@@ -1,35 +1,42 @@
-"""Gives a recording that was cut off its index."""
+"""Copies all that is intact in a recording to a new one, with an index."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from tactflow.recording.reader import DAMAGE, MAGIC, NotARecordingError
+from tactflow.recording.reader import read_summary
+from tactflow.recording.records import Damage, intact_records
 from tactflow.recording.writer import NEVER
+
+CHUNK_BYTES = 1 << 22
+"""Bytes after which a chunk of the copy ends, as other writers do it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
     """What `repair` found.
 
-    finished : the file was whole; nothing was written. messages : how many were kept. lost : bytes at the end
-    that belonged to no whole chunk.
+    finished : the file was whole. messages : how many were kept. damage : what belonged to no intact record.
     """
 
     finished: bool
     messages: int
-    lost: int
+    damage: tuple[Damage, ...] = ()
+
+    @property
+    def lost(self) -> int:
+        """Bytes that belonged to no intact record."""
+        return sum(gap.end - gap.start for gap in self.damage)
 
 
 def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -> Repaired:
-    """Copy all whole chunks of an MCAP file to another, with an index; works for any MCAP file.
+    """Copy all that is intact in an MCAP file to another, with an index; works for any MCAP file.
 
     path : stays as it is. out : is replaced. report : called now and then with the bytes read so far.
 
@@ -38,26 +45,26 @@ def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -
     NotARecordingError
         If it is no MCAP file. OSError if one cannot be read or the other not written.
     """
-    messages = 0
+    messages, whole, damage = 0, False, []
     with path.open("rb") as source, out.open("wb") as target:
-        if source.read(len(MAGIC)) != MAGIC:
-            raise NotARecordingError("is not an MCAP file")
-        source.seek(0)
         copy = _Copy(Writer(target, chunk_size=NEVER, compression=CompressionType.NONE))
-        whole = len(MAGIC)
-        try:
-            for record in StreamReader(source, emit_chunks=True, validate_crcs=True).records:
+        summary = read_summary(source)
+        if summary is not None:
+            # What the first chunk says about the others is there once more.
+            copy.know([*summary.schemas.values(), *summary.channels.values()])
+        for record in intact_records(source):
+            if isinstance(record, Damage):
+                damage.append(record)
+            else:
                 messages += copy.add(record)
-                whole = source.tell()
-                if report is not None:
-                    report(whole)
-            finished = True
-        except DAMAGE:
-            finished = False
+                whole = whole or isinstance(record, DataEnd)
+            if report is not None:
+                report(source.tell())
         copy.finish()
         target.flush()
         os.fsync(target.fileno())
-    return Repaired(finished, messages, 0 if finished else path.stat().st_size - whole)
+    finished = whole and summary is not None and not damage
+    return Repaired(finished, messages, tuple(damage))
 
 
 class _Copy:
@@ -68,31 +75,36 @@ class _Copy:
         self._started = False
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
+        self._known: list[Schema | Channel] = []
+        self._pending = 0
+
+    def know(self, records: Sequence[Schema | Channel]) -> None:
+        """Schemas and channels that the copy has even where the chunk that brings them is damaged."""
+        self._known.extend(records)
 
     def add(self, record: object) -> int:
         """Copy one record; returns the number of messages in it."""
         writer = self._writer
-        if isinstance(record, Chunk):
-            count = sum([self.add(inner) for inner in breakup_chunk(record, validate_crc=True)])
-            writer.flush()  # type: ignore[no-untyped-call]
-            return count
-        if isinstance(record, Header):
-            writer.start(record.profile, record.library)
-            self._started = True
-        elif isinstance(record, Schema) and record.id not in self._schemas:
+        if isinstance(record, Header) and not self._started:
+            self._start(record.profile, record.library)
+            return 0
+        if not self._started:
+            self._start()
+        if isinstance(record, Schema) and record.id not in self._schemas:
             self._schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
         elif isinstance(record, Channel) and record.id not in self._channels:
-            schema = self._schemas[record.schema_id]
-            self._channels[record.id] = writer.register_channel(
-                record.topic, record.message_encoding, schema, record.metadata
-            )
+            schema = self._schemas.get(record.schema_id)
+            if schema is not None:
+                self._channels[record.id] = writer.register_channel(
+                    record.topic, record.message_encoding, schema, record.metadata
+                )
         elif isinstance(record, Attachment):
             writer.add_attachment(
                 record.create_time, record.log_time, record.name, record.media_type, record.data
             )
         elif isinstance(record, Metadata):
             writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, Message):
+        elif isinstance(record, Message) and record.channel_id in self._channels:
             writer.add_message(
                 self._channels[record.channel_id],
                 log_time=record.log_time,
@@ -100,10 +112,21 @@ class _Copy:
                 sequence=record.sequence,
                 data=record.data,
             )
+            self._pending += len(record.data)
+            if self._pending > CHUNK_BYTES:
+                writer.flush()  # type: ignore[no-untyped-call]
+                self._pending = 0
             return 1
         return 0
 
+    def _start(self, profile: str = "", library: str = "") -> None:
+        self._writer.start(profile, library)
+        self._started = True
+        for record in self._known:
+            self.add(record)
+
     def finish(self) -> None:
+        """Write what is pending, and the index."""
         if not self._started:
-            self._writer.start()
+            self._start()
         self._writer.finish()  # type: ignore[no-untyped-call]

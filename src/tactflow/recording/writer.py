@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -12,7 +13,7 @@ from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
-from tactflow.files import make_folder
+from tactflow.files import claim, make_folder
 from tactflow.message import message_schema
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
 from tactflow.recording.schemas import PICTURE_DESCRIPTOR, PICTURE_TYPE, RESULT_TYPE, plain_schema
@@ -177,7 +178,11 @@ class _WholeRecords(io.BufferedIOBase):
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         super().__init__()
-        self._file = path.open("wb" if overwrite else "xb", buffering=0)
+        self._file = path.open("r+b" if overwrite and path.exists() else "xb", buffering=0)
+        if not claim(self._file):
+            self._file.close()
+            raise BlockingIOError(errno.EWOULDBLOCK, "another run is recording into it")
+        self._file.truncate()
         self._kept = 0
         self._at = 0
 

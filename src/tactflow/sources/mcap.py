@@ -103,14 +103,14 @@ class Recording:
         self._first = None
 
     def _next(self) -> tuple[StoredFrame, float, Stamp] | None:
-        from tactflow.recording.reader import DAMAGE
+        from tactflow.recording.records import DAMAGE
 
         try:
             return next(self._frames, None)
         except DAMAGE as error:
             raise SourceError(
                 f"{self._path}: is damaged ({error or type(error).__name__}); "
-                "tactflow repair keeps what lies before the damage"
+                "tactflow repair keeps all that is intact"
             ) from error
         except OSError as error:
             raise SourceError(f"{self._path}: cannot be read: {error.strerror or error}") from error
