@@ -69,7 +69,7 @@ class FirstFrames:
         self._bytes += image.nbytes
         settling = self._settling
         settling.add(image)
-        if settling.unrelated or (settling.steady and len(settling) >= self._count):
+        if settling.touched or settling.unrelated or (settling.steady and len(settling) >= self._count):
             return True
         return t - self._began >= self._seconds or self._bytes > MEMORY
 

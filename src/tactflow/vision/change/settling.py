@@ -171,6 +171,15 @@ class Settling:
         return self._is_steady(self._states[-1]) if self._states else False
 
     @property
+    def touched(self) -> bool:
+        """Whether the light was steady from the first frame on, until something touched the gel."""
+        first, *later = self._states
+        if not later or len(first) < SHORT:
+            return False
+        spread = np.ptp([self._gains[i] for i in first], axis=0).max()
+        return bool(spread < STEADY) and unevenness(self._looks[-1]) > AS_EVEN * self._unevenness(first)
+
+    @property
     def unrelated(self) -> bool:
         """Whether these are separate pictures rather than a video."""
         return len(self) >= 2 * CALM and 2 * len(self._states) > len(self)
