@@ -7,7 +7,16 @@ import pytest
 from pydantic import Field
 
 from tactflow.bench.methods import alternatives, measure_methods, methods_of
-from tactflow.bench.scenes import FULL, FULL_STAGES, NOMINAL, QUICK, QUICK_STAGES, Case, Rendered
+from tactflow.bench.scenes import (
+    FULL,
+    FULL_STAGES,
+    NOMINAL,
+    QUICK,
+    QUICK_STAGES,
+    TROUBLES,
+    Case,
+    Rendered,
+)
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
@@ -45,12 +54,12 @@ def test_every_method_of_a_stage_is_an_alternative_and_the_scripts_is_the_yardst
 
 
 def test_a_scenes_name_tells_its_settings_apart() -> None:
-    labels = [case.label for case in FULL]
+    labels = [case.label for case in (*FULL, *TROUBLES)]
     assert len(labels) == len(set(labels))
 
 
 def test_all_scenes_exist_and_nominal_ones_are_measured() -> None:
-    for cases in (QUICK, FULL, QUICK_STAGES, FULL_STAGES):
+    for cases in (QUICK, FULL, TROUBLES, QUICK_STAGES, FULL_STAGES):
         assert {case.name for case in cases} <= set(scene_names())
     assert {case.label for case in FULL} >= NOMINAL
 

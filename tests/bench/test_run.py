@@ -10,7 +10,7 @@ import pytest
 from tactflow.bench.pipelines import ORIGINAL
 from tactflow.bench.results import Measurement, Result
 from tactflow.bench.run import Plan, run_bench
-from tactflow.bench.scenes import FULL, Case
+from tactflow.bench.scenes import FULL, TROUBLES, Case
 from tactflow.bench.targets import judge
 from tactflow.cli.main import main
 from tactflow.config.shipped import find_pipeline
@@ -25,7 +25,7 @@ def result() -> Result:
         FILES,
         quick=True,
         memory=False,
-        cases=(Case("bright_cable", 14), Case("unmarked", 6)),
+        cases=(Case("bright_cable", 14), Case("unmarked", 6), Case("speckle", 2, "speckle=0.01")),
         stage_cases=(Case("press", 4),),
     )
     steps: list[tuple[int, int]] = []
@@ -59,6 +59,14 @@ def test_a_gel_without_markers_is_measured_without_a_tracker(result: Result) -> 
         assert m.failure is None
         assert "displacement_rms" not in m.errors
         assert "tracker" not in m.stages_ms
+
+
+def test_a_gel_with_blotches_is_offered_to_the_pipeline_for_markers_as_well(result: Result) -> None:
+    (found,) = [
+        m for m in result.of("pipeline", "default") if "markers_false" in m.errors and m.scene == "speckle"
+    ]
+    assert found.failure is None
+    assert found.errors == {"markers_false": 0}  # so faint that it refuses to run
 
 
 def test_promises_name_what_was_not_measured(result: Result) -> None:
@@ -98,7 +106,7 @@ def test_scenes_can_be_chosen() -> None:
     whole, alone = Plan(FILES, scenes=frozenset({"press"})).chosen()
     assert [c.label for c in whole] == ["press"]
     assert [c.label for c in alone] == ["press"]
-    assert Plan(FILES).chosen()[0] == FULL
+    assert Plan(FILES).chosen()[0] == (*FULL, *TROUBLES)
 
 
 @pytest.mark.parametrize(

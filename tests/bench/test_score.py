@@ -104,6 +104,8 @@ def test_markers_at_their_true_places_score_perfectly(truth: Truth) -> None:
         "displacement_p99": 0,
         "wrong_percent": 0,
         "lost_percent": 0,
+        "markers_missed": 0,
+        "markers_false": 0,
     }
 
 
@@ -128,6 +130,17 @@ def test_markers_that_were_never_found_are_lost(truth: Truth) -> None:
     some = Markers(truth.origin[4:], truth.position[4:], np.zeros(count - 4, np.uint8), np.zeros(count - 4))
     score.add(some, truth)
     assert score.errors()["lost_percent"] == pytest.approx(100 * 4 / count)
+    assert score.errors()["markers_missed"] == 4
+
+
+def test_what_was_taken_for_a_marker_is_counted_and_an_inferred_place_is_not(truth: Truth) -> None:
+    places = np.concatenate([truth.origin, [(-30.0, -30.0), (-60.0, -60.0)]])
+    status = np.full(len(places), MarkerStatus.TRACKED, np.uint8)
+    status[-1] = MarkerStatus.INFERRED
+    score = MarkerScore()
+    score.add(Markers(places, places, status, np.zeros(len(places))), truth)
+    assert score.errors()["markers_false"] == 1
+    assert score.errors()["markers_missed"] == 0
 
 
 def test_a_swap_counts_as_wrong_and_does_not_enter_the_rms(truth: Truth) -> None:

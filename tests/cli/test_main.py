@@ -195,3 +195,16 @@ def test_a_name_that_is_no_text_is_pointed_at(tmp_path: Path) -> None:
     done = program("run", "--source", "\udcff.png", "--quiet", cwd=tmp_path)
     assert done.returncode == 2
     assert "--source: stages.capture: '\\udcff.png' is not UTF-8; rename the file" in done.stderr
+
+
+@pytest.mark.parametrize("option", ["--stats", "--trace"])
+def test_statistics_replace_only_older_statistics(
+    tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "numbers.json"
+    command = ["run", "--quiet", "--set", "sinks={}", "--source", "sim:press?frames=2", option, str(file)]
+    assert main(command) == main(command) == 0
+    file.write_text("a year of work")
+    assert main(command) == 2
+    assert "holds something else" in capsys.readouterr().err
+    assert file.read_text() == "a year of work"

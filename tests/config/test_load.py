@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -397,3 +399,22 @@ def test_an_option_adds_no_second_sink_for_a_file_that_is_written_already(load: 
     assert [sink.id for sink in kept.sinks] == ["lines"]
     with pytest.raises(ConfigError, match=r"--jsonl: .* writes .* already"):
         load(with_sinks(first=lines[:-1] + ", max_rate: 5}", second=""), extra_sinks=option)
+
+
+@pytest.mark.parametrize("link", ["", "symbolic", "hard"])
+def test_a_sink_never_writes_over_what_a_stage_reads(tmp_path: Path, link: str) -> None:
+    source = tmp_path / "press.npy"
+    np.save(source, np.zeros((2, 60, 80, 3), np.uint8))
+    target = source
+    if link:
+        target = tmp_path / "results.jsonl"
+        (os.symlink if link == "symbolic" else os.link)(source, target)
+    text = f"""
+stages:
+  capture: {{source: "press.npy?loop=2"}}
+sinks:
+  jsonl: {{path: {target}, overwrite: true}}
+"""
+    (tmp_path / "pipeline.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=r"pipeline\.yaml:5:3  sinks\.jsonl: .*is what stages\.capture reads"):
+        load_pipeline(tmp_path / "pipeline.yaml")

@@ -25,6 +25,7 @@ from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
 from tactflow.vision.geometry import PixelMapping
+from tactflow.vision.markers.detection import NoMarkersError
 
 
 def on_recording(pipeline: Pipeline, path: Path, **params: Any) -> Pipeline:
@@ -70,6 +71,8 @@ class _Score:
     def add(self, outcome: Outcome, rendered: Rendered) -> str:
         """Judge one frame; returns whether it shows a contact, as a kind of time."""
         index = outcome.frame.seq
+        if index < 0:  # the reference, handed over in front of the recording
+            return "reference"
         mapping = outcome.mapping
         if mapping is None:
             height, width = outcome.frame.image.shape[:2]
@@ -258,6 +261,26 @@ def measure_pipelines(
         made.append(measurement)
         if name == CLASSIC and repeats.samples and measurement.failure is None:
             made.append(_original(measurement, repeats, unit))
+    return made
+
+
+def measure_refusal(name: str, pipeline: Pipeline, rendered: Rendered, folder: Path) -> Measurement:
+    """What a pipeline for markers takes for markers on a gel that has none: at best, it refuses to run.
+
+    name : of the pipeline. rendered : a scene without markers. folder : for scratch files.
+    """
+    made = Measurement("pipeline", name, rendered.case.label, frames=1, errors={"markers_false": 0.0})
+    with quiet():
+        running = LockstepPipeline(on_recording(pipeline, rendered.path), folder / f"{name}.jsonl")
+        try:
+            outcome = running.step()
+            if outcome is not None and outcome.markers is not None:
+                made.errors["markers_false"] = float(len(outcome.markers.position))
+        except TactflowError as error:
+            if NoMarkersError.__name__ not in str(error):
+                made.errors, made.failure = {}, str(error)
+        finally:
+            running.close()
     return made
 
 

@@ -48,6 +48,8 @@ _ALL = [
     Quantity("displacement_p99", "marker displacement error, 99th percentile", "px", slack=0.02),
     Quantity("wrong_percent", "markers with a wrong identity", "%", slack=0.05),
     Quantity("lost_percent", "visible markers declared lost", "%", slack=0.1),
+    Quantity("markers_missed", "markers never found", "", slack=0.5),
+    Quantity("markers_false", "what was taken for a marker and is none", "", slack=0.5),
     Quantity("marker_recall", "markers found (recall)", "", better="higher", best=1.0, slack=0.005),
     Quantity("marker_precision", "detections that are markers (precision)", "", "higher", 1.0, slack=0.005),
     Quantity("localisation_rms", "detected centre against true centre, RMS", "px", slack=0.01),

@@ -17,13 +17,20 @@ import numpy as np
 from tactflow.bench import recordings
 from tactflow.bench.methods import CLASSIC, measure_methods
 from tactflow.bench.pictures import draw
-from tactflow.bench.pipelines import Worst, growth, measure_pipelines, peak_memory_mb
+from tactflow.bench.pipelines import (
+    Worst,
+    growth,
+    measure_pipelines,
+    measure_refusal,
+    peak_memory_mb,
+)
 from tactflow.bench.results import Result
 from tactflow.bench.scenes import (
     FULL,
     FULL_STAGES,
     QUICK,
     QUICK_STAGES,
+    TROUBLES,
     Case,
     Rendered,
     render_all,
@@ -75,7 +82,7 @@ class Plan:
         ConfigError
             If no scene is left.
         """
-        whole = self.cases or (QUICK if self.quick else FULL)
+        whole = self.cases or (QUICK if self.quick else (*FULL, *TROUBLES))
         alone = self.stage_cases or (QUICK_STAGES if self.quick else FULL_STAGES)
         if self.scenes is None:
             return whole, alone
@@ -191,6 +198,8 @@ class _Run:
         for rendered in render_all(self.whole, scratch):
             self.doing = f"pipelines on {rendered.case.label}"
             suited = self.general if len(rendered.scene.layout.rest) else self.bare
+            if rendered.scene.settings.speckle:
+                found.append(measure_refusal(DEFAULT, self.loaded[DEFAULT], rendered, scratch))
             worst = _keeper(self.plan.pictures, rendered.case.label)
             found += measure_pipelines(suited, rendered, scratch, self.unit, self.step, worst)
         for rendered in render_all(self.alone, scratch):

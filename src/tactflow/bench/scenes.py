@@ -80,6 +80,25 @@ FULL = (
 )
 """Every kind of contact, light, marker and camera trouble."""
 
+TROUBLES = (
+    Case("warm_up", 140),
+    Case("stale", 100),
+    Case("lamp", 100),
+    Case("round_gel", 56),
+    Case("block", 56),
+    Case("coin", 56),
+    Case("key", 56),
+    Case("long_edge", 56),
+    Case("finger", 56),
+    Case("dark_channel", 56),
+    Case("halo", 56),
+    Case("painted", 56),
+    Case("speckle", 56),
+    Case("leds", 56),
+    Case("stray", 56),
+)
+"""What went wrong on recordings of real gels, one trouble in each scene."""
+
 QUICK_STAGES = (Case("press", 20), Case("bright_cable", 20), Case("jumps", 16))
 """For methods alone; short, because OpenCV's inpainting is slow."""
 
@@ -146,6 +165,7 @@ class Rendered:
         """
         settings = self.scene.settings
         plain = settings.shape == "round" and settings.polarity == "dark" and self.scene.camera.identity
+        plain = plain and not settings.sizes and not settings.aperture
         if not plain or settings.noise <= 0 or settings.blur or settings.jpeg or settings.shot:
             return None
         layout = self.scene.layout

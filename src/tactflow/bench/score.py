@@ -147,6 +147,8 @@ class MarkerScore:
     error vectors: their RMS over the markers that kept their identity, their 99th percentile over all whose
     position the method claims to know. A visible marker that the method never found is lost.
 
+    missed, false : markers that the method did not find in the first frame, and what it took for markers
+    besides; the places of missing ones that it only inferred are not counted.
     index : (N,), true marker -> the method's, -1 for none. pitch : of the true ones, px. right, claimed :
     errors, px, of markers that kept their identity, and of all that are claimed to be known. visible, wrong,
     lost : markers, summed over the frames.
@@ -159,6 +161,8 @@ class MarkerScore:
     visible: int = 0
     wrong: int = 0
     lost: int = 0
+    missed: int = 0
+    false: int = 0
 
     def add(self, markers: Markers, truth: Truth) -> None:
         """Compare one frame."""
@@ -167,6 +171,9 @@ class MarkerScore:
         if self.index is None:
             self.pitch = metrics.grid_pitch(truth.origin) if len(truth.origin) > 1 else 1e9
             self.index = metrics.match(markers.origin, truth.origin, self.pitch / 2)
+            self.missed = int(np.count_nonzero(truth.visible & (self.index < 0)))
+            seen = np.flatnonzero(markers.status == MarkerStatus.TRACKED)
+            self.false = len(np.setdiff1d(seen, self.index))
         found = self.index >= 0
         visible = np.asarray(truth.visible, dtype=np.bool_)
         self.visible += int(np.count_nonzero(visible))
@@ -201,6 +208,8 @@ class MarkerScore:
                 "displacement_p99": metrics.percentile(claimed, 99),
                 "wrong_percent": 100 * self.wrong / self.visible,
                 "lost_percent": 100 * self.lost / self.visible,
+                "markers_missed": self.missed,
+                "markers_false": self.false,
             }
         )
 

@@ -293,9 +293,9 @@ def compare_all(
         with tempfile.TemporaryDirectory() as folder:
             scratch = Path(folder)
             path = scratch / "scene.npy"
-            write_frames(open_scene(spec + ("&" if "?" in spec else "?") + f"frames={frames}"), path)
-            bare = spec.startswith("unmarked") or "markers=none" in spec
-            pipeline = pipelines.markerless if bare else pipelines.default
+            scene = open_scene(spec + ("&" if "?" in spec else "?") + f"frames={frames}")
+            write_frames(scene, path)
+            pipeline = pipelines.default if len(scene.layout.rest) else pipelines.markerless
             yield compare(pipeline, path, spec, scratch)
     for index, (name, pipeline, path) in enumerate(real, len(scenes)):
         progress(name, index, count)

@@ -25,10 +25,14 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
-from tactflow.engine.trace import Trace
+from tactflow.engine.trace import TRACE_BEGINS, Trace
+from tactflow.files import is_device
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 from tactflow.vision import compiled
+
+STATISTICS_BEGIN = '{\n "frames":'
+"""How a file of statistics begins."""
 
 Sinks = dict[str, dict[str, Any]]
 """Option of the command line -> settings of the sink that it adds."""
@@ -156,8 +160,8 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     trace = None if args.trace is None else Trace(f"tactflow {pipeline.sensor}")
     runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
-    _refuse_unwritable("--stats", args.stats)
-    _refuse_unwritable("--trace", args.trace)
+    _refuse_unwritable("--stats", args.stats, begins=STATISTICS_BEGIN)
+    _refuse_unwritable("--trace", args.trace, begins=TRACE_BEGINS)
     with _logging_to(console), _signals(runner):
         logger = logging.getLogger("tactflow")
         for warning in runner.pipeline.warnings:
@@ -194,15 +198,24 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _refuse_unwritable(option: str, path: str | None) -> None:
-    """Find out before the run, not after it, that a file cannot be written."""
+def _refuse_unwritable(option: str, path: str | None, begins: str) -> None:
+    """Find out before the run, not after it, that a file cannot be written, or holds something else.
+
+    begins : the first characters of what an earlier run has written, which may be replaced.
+    """
     if path is None:
         return
     try:
-        with open(path, "a", encoding="utf-8"):
+        with open(path, "ab"):
             pass
+        if is_device(path):
+            return
+        with open(path, "rb") as file:
+            there = file.read(len(begins))
     except OSError as error:
         raise ConfigError(f"{option} {path}: cannot be written: {error.strerror}") from None
+    if there not in (b"", begins.encode()):
+        raise ConfigError(f"{option} {path}: holds something else; choose another file, or delete it")
 
 
 @contextmanager

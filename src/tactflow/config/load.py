@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from tactflow.config import sensors, wiring
 from tactflow.config.complaints import complain
+from tactflow.config.files_read import FileId, file_id, files_read
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import add_sinks, apply, replaced
 from tactflow.config.registry import Section, code_place, did_you_mean, resolve
@@ -68,6 +69,7 @@ def load_pipeline(
     for draft in drafts:
         draft.params = _params(draft, problems)
     drafts = _one_writer_each(drafts, extra_sinks or {}, problems)
+    _writes_nothing_that_is_read(drafts, path.parent, problems)
     wiring.connect(drafts, problems)
     drafts = wiring.ordered(drafts, problems)
     _check_needs(drafts, problems)
@@ -239,6 +241,20 @@ def _one_writer_each(drafts: Sequence[Draft], options: Collection[str], problems
             problems.add(draft.mark, f"{draft.path}: {there}")
         writers |= {place: draft for place in places if place not in writers}
     return kept
+
+
+def _writes_nothing_that_is_read(drafts: Sequence[Draft], directory: Path, problems: Problems) -> None:
+    """Report sinks that would write over what a stage reads: its source, a reference, a calibration."""
+    readers: dict[FileId, Draft] = {}
+    for draft in drafts:
+        if draft.section == "stages" and draft.params is not None:
+            readers |= dict.fromkeys(files_read(draft.params, directory), draft)
+    for draft in drafts:
+        for place in _written(draft):
+            reader = readers.get(identity) if (identity := file_id(place)) else None
+            if reader is not None:
+                there = f"{place} is what {reader.path} reads; choose another path"
+                problems.add(draft.mark, f"{draft.path}: {there}")
 
 
 def _does_as_much(there: Draft, added: Draft) -> bool:

@@ -20,6 +20,10 @@ Hop = tuple[str, int]
 """One frame's way through one link: (link, index of the tick)."""
 
 
+TRACE_BEGINS = '{"displayTimeUnit": "ms", "traceEvents":'
+"""How a file of events begins."""
+
+
 class Track:
     """Events of one thread. Only that thread adds to it.
 
@@ -64,7 +68,7 @@ class Trace:
     def write(self, path: Path) -> None:
         """Write the events as JSON. Call it when the run has ended."""
         with path.open("w", encoding="utf-8") as file:
-            file.write('{"displayTimeUnit": "ms", "traceEvents": [\n')
+            file.write(f"{TRACE_BEGINS} [\n")
             for index, event in enumerate(self.events()):
                 file.write((",\n" if index else "") + json.dumps(event))
             file.write("\n]}\n")

@@ -28,7 +28,8 @@ class Light:
     azimuth : of the blue, green and red light, degrees, counter-clockwise as seen on the screen.
     level : grey level of the untouched gel at the centre, blue, green, red.
     falloff : how much brighter the gel is near a light than far from it, 0 for even light.
-    slope_gain : cotangent of the lights' elevation; more makes a tilted surface more colourful.
+    slope_gain : cotangent of the lights' elevation, one for all or one each; more makes a tilted surface more
+        colourful.
     ambient : share of the light that comes from everywhere, in [0, 1].
     brightening : grey levels by which all channels rise in a contact of full depth; negative: fall.
     onset : depth beyond the contact's edge over which they do, as a share of the full depth.
@@ -39,7 +40,7 @@ class Light:
     azimuth: tuple[float, float, float]
     level: tuple[float, float, float]
     falloff: float
-    slope_gain: float
+    slope_gain: float | tuple[float, float, float]
     ambient: float
     brightening: float
     onset: float = 0.05
@@ -49,7 +50,7 @@ class Light:
         """(3, 2) float32: change of a channel's relative light per unit slope in x and y."""
         angle = np.radians(np.asarray(self.azimuth))
         toward = np.stack([np.cos(angle), -np.sin(angle)], axis=1)
-        return np.asarray(-toward * self.slope_gain, dtype=np.float32)
+        return np.asarray(-toward * np.reshape(self.slope_gain, (-1, 1)), dtype=np.float32)
 
 
 LIGHTS = {
@@ -66,8 +67,8 @@ LIGHTS = {
         (325.0, 80.0, 205.0), (106.0, 114.0, 104.0), 0.35, 0.7, 0.35, 46.0,
     ),
     "dark_channel": Light(
-        "three coloured lights, of which the red one hardly lights the untouched gel",
-        (325.0, 80.0, 205.0), (92.0, 132.0, 9.0), 0.4, 1.9, 0.25, 0.0,
+        "three coloured lights; the red one grazes the gel, which is nearly dark in it until it is touched",
+        (325.0, 80.0, 205.0), (115.0, 132.0, 12.0), 0.4, (0.5, 1.9, 9.0), 0.25, 0.0,
     ),
     "darkening": Light(
         "white light through a black coating; a contact darkens, with a bright halo around it",
@@ -145,11 +146,11 @@ def brightness(light: Light, press: Press, depth: Array) -> Array:
 def settling(moment: int, frames: int) -> NDArray[np.float64]:
     """(3,) gains, BGR, of a camera that begins too bright and too blue and is right after so many frames.
 
-    The way is that of a control loop: fast at first, without a step at its end. A third too bright is what
-    the first frames of many recorded grasps show.
+    The way is that of a control loop: fast at first, without a step at its end. In the first frame the
+    brighter parts of the gel are clipped.
     """
     left = max(1.0 - moment / frames, 0.0) ** 2 if frames else 0.0
-    return np.asarray(1.0 + left * np.array([0.45, 0.3, 0.2]))
+    return np.asarray(1.0 + left * np.array([0.9, 0.7, 0.5]))
 
 
 def lamp(size: tuple[int, int], strength: float) -> NDArray[np.float32]:

@@ -159,13 +159,18 @@ SCENES: dict[str, Recipe] = {
     "warm_up": Recipe(
         "presses that begin soon after the camera has set exposure and white balance", _PRESS, {"settle": 12}
     ),
+    "stale": Recipe(
+        "six first frames that the camera had kept from an earlier contact", _PRESS, {"stale": 6, "settle": 3}
+    ),
     "lamp": Recipe(
         "a lamp is switched on between two presses",
         motion.Programme(_sphere, contacts=2, rise=5, depths=(1.0, 0.7)),
         {"lamp": 0.25},
     ),
     "round_gel": Recipe(
-        "a round gel in a black frame, darker towards its border", _PRESS, {"aperture": 0.95, "vignette": 0.7}
+        "a round gel in a black frame, darker towards its border, under lights that warm up",
+        _PRESS,
+        {"aperture": 0.95, "vignette": 0.7, "drift": 0.18},
     ),
     "block": Recipe(
         "a grooved block that covers a quarter of the gel",
@@ -187,8 +192,9 @@ SCENES: dict[str, Recipe] = {
         ),
     ),
     "finger": Recipe(
-        "a fingertip at the border of the frame",
+        "a fingertip at the border of the frame, in a gel without a crease at the edge of a contact",
         motion.Programme(_one(shapes.finger), place=(0.93, 0.5), wander=(40.0, 150.0), angles=(-40.0, 40.0)),
+        {"sink": 0.5, "rim": 1.0},
     ),
     "dark_channel": Recipe("a gel that the red light hardly lights", _PRESS, {"light": "dark_channel"}),
     "halo": Recipe(
@@ -199,13 +205,13 @@ SCENES: dict[str, Recipe] = {
     "painted": Recipe(
         "markers of many sizes in no regular grid, seen by a tilted camera",
         _PRESS,
-        {"markers": (13, 10), "sizes": 0.5, "jitter": 0.06, "perspective": 0.12},
+        {"markers": (13, 10), "sizes": 0.7, "jitter": 0.06, "perspective": 0.12},
     ),
     "speckle": Recipe("random blotches instead of markers", _PRESS, {"markers": (0, 0), "speckle": 0.6}),
     "leds": Recipe(
-        "bright markers, and six glaring LEDs beside them",
+        "faint bright markers, and six glaring LEDs beside them",
         _PRESS,
-        {"polarity": "bright", "leds": 6, "markers": (13, 10)},
+        {"polarity": "bright", "worn": 1.0, "leds": 6, "markers": (13, 10)},
     ),
     "stray": Recipe("presses that throw a reflection on the far side of the gel", _PRESS, {"stray": 0.8}),
 }  # fmt: skip

@@ -102,6 +102,9 @@ class Scene:
         self._delivered = optics.delivered_frames(
             settings.frames, settings.dropped, settings.repeated, settings.seed
         )
+        if settings.stale:
+            kept = max(range(min(len(self), 300)), key=self._depth)
+            self._delivered = [kept] * settings.stale + list(self._delivered[settings.stale :])
         largest = self.layout.radius * (1.0 + settings.sizes)
         widened = 1.0 if self.camera.identity else 1.6 if settings.perspective else 1.2
         self._half = markers.half_patch(largest, settings.shape, widened)
@@ -117,6 +120,9 @@ class Scene:
         """Which moment of the scene frame `index` shows; another where frames are dropped or repeated."""
         return int(self._delivered[self._checked(index)])
 
+    def _depth(self, index: int) -> float:
+        return max((press.depth for press in self.presses(index)), default=0.0)
+
     def presses(self, index: int) -> tuple[gel.Press, ...]:
         """The indenters at frame `index`."""
         return self._contact(self.moment(index))[0]
@@ -125,7 +131,7 @@ class Scene:
         """The raw frame `index`: (600, 800, 3) uint8 BGR, fresh."""
         moment = self.moment(index)
         settings = self.settings
-        canvas = self._canvas(moment, marked=True)
+        canvas = self._canvas(index, marked=True)
         gain = self._gain(moment)
         scale = gain / markers.FIXED_POINT
         noise = optics.sensor_noise(settings.seed, moment, canvas.shape)
@@ -148,7 +154,7 @@ class Scene:
     def clean(self, index: int) -> NDArray[np.uint8]:
         """The raw frame without markers, dirt, and noise: (600, 800, 3) uint8 BGR, fresh."""
         moment = self.moment(index)
-        canvas = self._canvas(moment, marked=False)
+        canvas = self._canvas(index, marked=False)
         scale = self._gain(moment) / markers.FIXED_POINT
         return np.asarray(cv2.addWeighted(canvas, scale, canvas, 0.0, 0.0, dtype=cv2.CV_8U), dtype=np.uint8)
 
@@ -266,7 +272,7 @@ class Scene:
         total = np.zeros((height, width), np.float32)
         for number in range(count):
             y = height - 16.0 if number % 2 else 16.0
-            total += light.spot(SIZE, ((number + 0.5) * width / count, y), (11.0, 8.0))
+            total += light.spot(SIZE, ((number + 0.5) * width / count, y), (18.0, 13.0))
         return total
 
     def _gel_window(self) -> NDArray[np.float32]:
@@ -310,9 +316,10 @@ class Scene:
         )
         return rest, rng.uniform(0.2, 0.75, count), axes * squeeze[:, :, None]
 
-    def _canvas(self, moment: int, *, marked: bool) -> NDArray[np.int16]:
-        """(600, 800, 3) int16 fixed-point image of a moment, before gain and noise; a view or fresh."""
+    def _canvas(self, index: int, *, marked: bool) -> NDArray[np.int16]:
+        """(600, 800, 3) int16 fixed-point image of a frame, before gain and noise; a view or fresh."""
         settings = self.settings
+        moment = self.moment(index)
         pressed, cycle = self._contact(moment)
         if not pressed:
             padded = self._resting_marked if marked else self._resting
@@ -338,8 +345,8 @@ class Scene:
             wave = np.sin(2 * np.pi * (2.0 * rows - 0.37 * moment)).astype(np.float32)
             banded = canvas * (np.float32(1.0) + np.float32(settings.gain) * wave)[:, None, None]
             canvas = np.rint(banded, out=banded).astype(np.int16)
-        if moment < settings.settle:
-            gains = np.append(light.settling(moment, settings.settle), 1.0)
+        if index < settings.settle:
+            gains = np.append(light.settling(index, settings.settle), 1.0)
             canvas = np.asarray(cv2.multiply(canvas, gains, dtype=cv2.CV_16S), np.int16)
         if settings.lamp and moment >= _LAMP_AT * (int(self._delivered[-1]) + 1):
             canvas = np.asarray(cv2.multiply(canvas, self._lamp, dtype=cv2.CV_16S), np.int16)

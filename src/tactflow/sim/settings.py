@@ -37,6 +37,7 @@ class Settings:
     drift: float = 0.0
     flicker: float = 0.0
     settle: int = 0
+    stale: int = 0
     lamp: float = 0.0
     vignette: float = 0.2
     specular: float = 0.0
@@ -96,6 +97,7 @@ KEYS: dict[str, Key] = {
     ),
     "flicker": Key("amplitude of the flicker of mains light (100 Hz seen at 60 Hz), relative", "", 0, 0.5),
     "settle": Key("time until the camera has set exposure and white balance", "frames", 0, 10_000),
+    "stale": Key("frames at the start that a camera had kept from an earlier contact", "frames", 0, 10_000),
     "lamp": Key("light of a lamp that is switched on before the second half, relative", "", -0.5, 0.5),
     "vignette": Key("loss of light in the corners, relative", "", 0, 1),
     "specular": Key("strength of mirror-like highlights", "", 0, 1),

@@ -1,0 +1,67 @@
+"""Which files a pipeline reads, so that nothing in it writes over them."""
+
+from __future__ import annotations
+
+import glob
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from tactflow.files import expanded
+
+FileId = tuple[int, int]
+"""Device and inode: the same for all names of a file, links too."""
+
+
+def file_id(path: str | Path) -> FileId | None:
+    """What tells a file or folder from all others; None if nothing is there, or a device."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+        return None
+    return found.st_dev, found.st_ino
+
+
+def files_read(params: BaseModel, directory: Path) -> set[FileId]:
+    """The files and folders that parameters name: every text in them that is the path of something.
+
+    directory : where a relative path is looked for besides the current directory. Options behind a `?` are
+    left out; a pattern such as `pictures/*.png` stands for its folder.
+
+    >>> from tempfile import NamedTemporaryFile
+    >>> class Params(BaseModel):
+    ...     source: str
+    >>> with NamedTemporaryFile() as file:
+    ...     found = files_read(Params(source=f"{file.name}?loop=2"), Path())
+    ...     found == {file_id(file.name)}
+    True
+    """
+    found = set()
+    for text in _texts(params.model_dump()):
+        for name in {text, text.partition("?")[0]} - {""}:
+            path = expanded(_folder_of_pattern(name))
+            found |= {file_id(path), file_id(directory / path)}
+    return {identity for identity in found if identity is not None}
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str | Path):
+        yield str(value)
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from _texts(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _texts(item)
+
+
+def _folder_of_pattern(name: str) -> str:
+    while glob.has_magic(name):
+        name = os.path.dirname(name)
+    return name
