@@ -15,8 +15,17 @@ from pydantic import Field, field_validator
 from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
-from tactflow.sources import CameraRequest, FrameReader, LiveReader, StampedReader, Watch, open_source
+from tactflow.sources import (
+    Arrival,
+    CameraRequest,
+    FrameReader,
+    LiveReader,
+    StampedReader,
+    Watch,
+    open_source,
+)
 from tactflow.sources.files import load_image
+from tactflow.sources.first import Ahead, FirstFrames
 from tactflow.sources.pace import Pace
 
 
@@ -40,12 +49,17 @@ class Capture(Source):
         )
         reference: int | str = Field(
             1,
-            description="which frames show the untouched gel: the first N, N >= 1 (more average out noise), "
-            "or an image file that is shown to the stages before the first frame",
+            description="which frames show the untouched gel: the first N in steady light, N >= 1 (more "
+            "average out noise), or an image file that is shown to the stages before the first frame",
         )
-        skip: int = Field(
-            0, ge=0, description="frames thrown away at the start, while a camera's exposure settles"
+        settle: float = Field(
+            3.0,
+            ge=0,
+            le=60,
+            description="the reference is taken once exposure and white balance of the camera are steady, "
+            "after so many seconds at most; 0: at once",
         )
+        skip: int = Field(0, ge=0, description="frames thrown away at the start")
         width: int | None = Field(None, ge=1, description="ask the camera for this width, px")
         height: int | None = Field(None, ge=1, description="ask the camera for this height, px")
         fps: float | None = Field(
@@ -127,6 +141,7 @@ class Capture(Source):
         self._opener = opener
         self._source: FrameReader | None = None
         self._reference_image: NDArray[np.uint8] | None = None
+        self._looked_at = 0
         self._stop = threading.Event()
         self._retake = threading.Event()
 
@@ -169,8 +184,8 @@ class Capture(Source):
 
     @property
     def missed(self) -> int:
-        """Frames of a live source that a newer one overtook before they were taken: gaps in `seq`."""
-        return self._source.missed if isinstance(self._source, LiveReader) else 0
+        """Frames of a live source that a newer one overtook, or that were only looked at: gaps in `seq`."""
+        return self._source.missed + self._looked_at if isinstance(self._source, LiveReader) else 0
 
     @property
     def live_threads(self) -> Sequence[int]:
@@ -185,7 +200,10 @@ class Capture(Source):
     def frames(self) -> Iterator[Frame]:
         """Every frame of the source, in order, until its end or `stop()`.
 
-        A recording of tactflow's own knows its references; `reference` and `skip` do not apply to it.
+        The first frames of a recording are looked at ahead: if one of them is a better reference than the
+        very first, it comes before all others, with number -1. Those of a live source are left out until it
+        is steady. A recording of tactflow's own knows its references; `reference`, `settle` and `skip` do
+        not apply to it.
 
         Raises
         ------
@@ -203,25 +221,46 @@ class Capture(Source):
         if isinstance(source, LiveReader):
             yield from self._watch(source, count)
             return
-        references = _References(self._retake, count, count if self._reference_image is None else 0)
-        seq = -1
+        yield from self._play(Ahead(source), pace, count)
+
+    def _play(self, source: Ahead, pace: Pace | None, count: int) -> Iterator[Frame]:
+        """Frames of a recording, behind those that show the untouched gel if these are not the first ones."""
+        for _ in range(self.params.skip):
+            if self._stop.is_set() or source.read() is None:
+                return
+        shown, marked = self._choose(source, count)
+        references = _References(self._retake, count, marked)
+        seq = self.params.skip
         while not self._stop.is_set():
             if pace is not None and not pace.wait_to_read():
                 return
             item = source.read()
-            if item is None:
+            if item is None or (pace is not None and not pace.wait_for(item[1])):
                 return
-            image, t = item
-            seq += 1
-            if seq < self.params.skip:
-                continue
-            image = _read_only(image)
-            if pace is not None and not pace.wait_for(t):
-                return
-            if seq == self.params.skip and self._reference_image is not None:
-                yield self._reference_frame(image, t)
+            image, t = _read_only(item[0]), item[1]
+            for picture in shown:
+                yield self._shown_before(picture, image, t)
+            shown = []
             reference, epoch = references.next()
             yield Frame(self._sensor, seq, t, image, time.perf_counter(), reference, epoch)
+            seq += 1
+
+    def _choose(self, source: Ahead, count: int) -> tuple[list[NDArray[np.uint8]], int]:
+        """Pictures to show before the first frame, and how many of the first frames are references."""
+        if self._reference_image is not None:
+            return [self._reference_image], 0
+        if self.params.settle == 0 or source.live:
+            return [], count
+        first = FirstFrames(self.params.source, self.params.settle, count)
+        pictures: list[NDArray[np.uint8]] = []
+        while not self._stop.is_set() and (item := source.peek()) is not None:
+            pictures.append(item[0])
+            if first.look(*item):
+                break
+        chosen = first.references() if pictures else []
+        if chosen == list(range(len(chosen))):
+            return [], len(chosen)
+        return [pictures[index] for index in chosen], 0
 
     def _replay(self, source: StampedReader, pace: Pace | None, count: int) -> Iterator[Frame]:
         """Frames as they were captured the first time; references that are retaken now come on top."""
@@ -242,8 +281,10 @@ class Capture(Source):
     def _watch(self, source: LiveReader, count: int) -> Iterator[Frame]:
         """Frames of a source that numbers them where they arrive, and that may go and come back."""
         p = self.params
-        shown = self._reference_image is None
-        references = _References(self._retake, count, count if shown else 0)
+        image = self._reference_image
+        references = _References(self._retake, count, count if image is None else 0)
+        first = self._first_frames(count) if image is None else None
+        kept: list[Arrival] = []
         connection, begins = 0, p.skip
         while not self._stop.is_set():
             arrival = source.read_arrival()
@@ -253,18 +294,34 @@ class Capture(Source):
                 connection, begins = arrival.connection, arrival.seq + p.skip
                 if p.on_reconnect == "retake":
                     self._retake.set()
+                    first, kept = self._first_frames(count), []
             if arrival.seq < begins:
                 continue
-            image = _read_only(arrival.image)
-            if not shown:
-                shown = True
-                yield self._reference_frame(image, arrival.t)
-            reference, epoch = references.next()
-            yield Frame(self._sensor, arrival.seq, arrival.t, image, arrival.captured, reference, epoch)
+            if image is not None:
+                yield self._shown_before(image, arrival.image, arrival.t)
+                image = None
+            kept.append(arrival)
+            if first is not None:
+                if not first.look(arrival.image, arrival.t):
+                    continue
+                chosen = first.references()
+                self._looked_at += len(kept) - len(chosen)
+                kept = [kept[index] for index in chosen]
+                references.begin(len(chosen))
+                first = None
+            for arrival in kept:
+                reference, epoch = references.next()
+                picture = _read_only(arrival.image)
+                yield Frame(self._sensor, arrival.seq, arrival.t, picture, arrival.captured, reference, epoch)
+            kept = []
 
-    def _reference_frame(self, first: NDArray[np.uint8], t: float) -> Frame:
-        image = self._reference_image
-        assert image is not None
+    def _first_frames(self, count: int) -> FirstFrames | None:
+        """What looks at the first frames of a live source; None if they are handed out at once."""
+        settle = self.params.settle
+        return FirstFrames(self.params.source, settle, count) if settle > 0 else None
+
+    def _shown_before(self, image: NDArray[np.uint8], first: NDArray[np.uint8], t: float) -> Frame:
+        """A reference that comes before the first frame, which was taken at t."""
         if image.shape != first.shape:
             raise SourceError(
                 f"{self.params.reference}: the reference is {image.shape[1]} x {image.shape[0]} pixels, the "
@@ -285,6 +342,11 @@ class _References:
         self._count = count
         self._left = left
         self._epoch = 0
+
+    def begin(self, left: int) -> None:
+        """Make the next `left` frames references, whatever was asked for before."""
+        self.next()
+        self._left = left
 
     def next(self, *, retake: bool = True) -> tuple[bool, int]:
         """Whether the next frame is a reference, and its epoch. With `retake` False none begins with it."""

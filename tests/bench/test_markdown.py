@@ -23,6 +23,10 @@ def result() -> Result:
     made.measurements.append(
         Measurement("pipeline", "classic", "data:wedge_roll", failure="no markers\nmore")
     )
+    trouble = {"hull_iou": 0.91, "false_contacts": 0.0}
+    made.measurements.append(Measurement("pipeline", "markerless", "halo", errors=trouble))
+    gel = {"dots_found": 97.6, "dots_beyond": 0.0}
+    made.measurements.append(Measurement("pipeline", "default", "data:sts_640", frames=296, errors=gel))
     made.targets.append(Target("markers", "<= 0.03 px", "0.01", True, "press"))
     return made
 
@@ -44,6 +48,14 @@ def test_methods_promises_and_failures_are_listed(result: Result) -> None:
     assert "| markers | ≤ 0.03 px | 0.01 | met | press |" in text
     assert "| `ns` | - | 9 | 1.5 (1.5) |" in text
     assert "| wedge_roll | `classic` | - | no markers |" in text
+
+
+def test_troubles_and_real_gels_have_tables_of_their_own(result: Result) -> None:
+    lines = markdown(result, "default").splitlines()
+    (halo,) = [line for line in lines if line.startswith("| halo |")]
+    assert "| `markerless` | - | - | - | 0 | - | - | 0.91 | - |" in halo
+    (gel,) = [line for line in lines if line.startswith("| sts_640 |")]
+    assert "| chosen on | `default` | 296 | 165 | 97.6 | 0 | - |" in gel
 
 
 def test_an_existing_page_keeps_its_own_text(result: Result, tmp_path: Path) -> None:

@@ -416,5 +416,7 @@ sinks:
   jsonl: {{path: {target}, overwrite: true}}
 """
     (tmp_path / "pipeline.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"pipeline\.yaml:5:3  sinks\.jsonl: .*is what stages\.capture reads"):
+    with pytest.raises(
+        ConfigError, match=r"pipeline\.yaml:5:3  sinks\.jsonl: .*is what stages\.capture reads"
+    ):
         load_pipeline(tmp_path / "pipeline.yaml")

@@ -179,6 +179,24 @@ def test_capture_tells_how_many_frames_nobody_took(device: Flaky) -> None:
     capture.close()
 
 
+@pytest.mark.parametrize(("settle", "looked_at"), [(0, 0), (3, 9)])
+def test_the_first_frames_of_a_camera_are_only_looked_at_and_counted(
+    device: Flaky, settle: float, looked_at: int
+) -> None:
+    capture = Capture(
+        Capture.Params(source="0", settle=settle),
+        opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky", device.clock),
+    )
+    capture.open()
+    frames = capture.frames()
+    first, second = next(frames), next(frames)
+    assert (first.reference, second.reference) == (True, False)
+    assert second.seq >= first.seq + looked_at + 1
+    assert capture.missed >= looked_at
+    capture.stop()
+    capture.close()
+
+
 @pytest.mark.parametrize("does", ["gone", "hangs", "frozen", "black", "other_size"])
 def test_without_a_good_frame_for_too_long_the_error_says_what_to_try(
     does: str, device: Flaky, watched: Callable[..., Watched]

@@ -119,6 +119,64 @@ def test_retaking_after_a_reference_image_takes_one_frame(recording: str, tmp_pa
     assert [(frame.epoch, frame.reference) for frame in frames[:3]] == [(0, True), (1, True), (1, False)]
 
 
+def warming_up(path: Path, gains: list[float]) -> list[Any]:
+    """Frames of a gel while the camera sets its exposure, as a recording at 10 frames per second."""
+    gel = np.linspace(60, 120, 48 * 64 * 3).reshape(48, 64, 3)
+    frames = [np.uint8(np.rint(gel * gain)) for gain in gains]
+    np.save(path, np.stack(frames))
+    return frames
+
+
+def test_a_recording_is_compared_with_the_first_frame_in_steady_light_and_keeps_all_frames(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    images = warming_up(tmp_path / "r.npy", [0.6, 0.7, 0.8, 0.9] + [1.0] * 16)
+    with caplog.at_level("INFO", "tactflow"):
+        before, *frames = capture("r.npy", tmp_path, fps=10.0).frames()
+    assert (before.seq, before.reference, before.t) == (-1, True, 0.0)
+    np.testing.assert_array_equal(before.image, images[4])
+    assert [(frame.seq, frame.reference) for frame in frames] == [(i, False) for i in range(20)]
+    assert all(np.array_equal(frame.image, image) for frame, image in zip(frames, images, strict=True))
+    assert caplog.messages == [
+        "r.npy: the reference is frame 4; the camera was setting exposure and white balance until then"
+    ]
+
+
+@pytest.mark.parametrize(("settle", "reference"), [(0, 0), (3, -1)])
+def test_settling_can_be_switched_off(tmp_path: Path, settle: float, reference: int) -> None:
+    warming_up(tmp_path / "r.npy", [0.6, 0.8] + [1.0] * 18)
+    first = next(capture("r.npy", tmp_path, settle=settle).frames())
+    assert (first.seq, first.reference) == (reference, True)
+
+
+def test_light_that_never_becomes_steady_is_a_warning_after_the_time_stated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    warming_up(tmp_path / "r.npy", [1.02**i for i in range(40)])
+    frames = list(capture("r.npy", tmp_path, fps=10.0, settle=2.0).frames())
+    assert [frame.seq for frame in frames] == list(range(-1, 40))
+    assert "the light is not steady" in caplog.messages[0]
+
+
+def test_of_several_references_none_shows_an_early_contact(tmp_path: Path) -> None:
+    images = warming_up(tmp_path / "r.npy", [1.0] * 30)
+    for image in images[6:]:
+        image[16:32, 16:40] //= 2
+    np.save(tmp_path / "r.npy", np.stack(images))
+    frames = list(capture("r.npy", tmp_path, reference=12).frames())
+    assert [frame.seq for frame in frames if frame.reference] == list(range(6))
+
+
+def test_a_frame_that_cannot_be_read_is_an_error_when_its_turn_comes(tmp_path: Path) -> None:
+    for index in range(5):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((48, 64, 3), 100, np.uint8))
+    (tmp_path / "3.png").write_bytes(b"no picture")
+    frames = capture(str(tmp_path)).frames()
+    assert [frame.seq for frame in islice(frames, 3)] == [0, 1, 2]
+    with pytest.raises(SourceError, match=r"3\.png"):
+        next(frames)
+
+
 def test_skipped_frames_leave_their_numbers_unused(recording: str) -> None:
     stage = capture(recording, skip=4)
     assert stage.total == 2

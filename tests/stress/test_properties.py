@@ -20,8 +20,9 @@ from tactflow.vision.contact import chi_square_threshold
 from tactflow.vision.flow import inside_mask
 from tactflow.vision.geometry import Preprocessor, find_homography
 from tactflow.vision.geometry.hull import contact_geometry
-from tactflow.vision.markers.detection import detect_markers, neighbour_graph
+from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.markers.matching import choose_spots
 from tactflow.vision.smooth import AlphaBeta, OneEuro
 from tactflow.vision.types import Markers, MarkerStatus

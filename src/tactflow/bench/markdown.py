@@ -6,12 +6,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
 
+from tactflow.bench.gels import GELS
 from tactflow.bench.methods import CLASSIC
 from tactflow.bench.pareto import limit_of
 from tactflow.bench.pipelines import ORIGINAL
 from tactflow.bench.quantities import QUANTITIES, format_number
 from tactflow.bench.report import PRIMARY, TITLES
 from tactflow.bench.results import RECORDING, Measurement, Result
+from tactflow.bench.scenes import TROUBLES
+from tactflow.sim import scene_descriptions
 
 BEGIN = "<!-- tables of tactflow bench: written by --markdown -->"
 END = "<!-- end of tables -->"
@@ -25,6 +28,33 @@ _PER_SCENE = (
     ("direction, deg", ("angle_mean",)),
     ("mean flow, px", ("flow_error",)),
 )
+
+_TROUBLE = (
+    ("markers not found", "markers_missed"),
+    ("false markers", "markers_false"),
+    ("wrong identity, %", "wrong_percent"),
+    ("false contacts, %", "false_contacts"),
+    ("contact missed, %", "missed_contacts"),
+    ("missed at half depth, %", "missed_half_depth"),
+    ("hull IoU", "hull_iou"),
+    ("centre, px", "center_error"),
+)
+"""Title and quantity of the columns for the scenes of `TROUBLES`."""
+
+_GEL = (
+    ("dots found, %", "dots_found"),
+    ("beyond, %", "dots_beyond"),
+    ("contact at rest, %", "false_contacts"),
+    ("missed, %", "missed_contacts"),
+    ("early ones in time, %", "early_found"),
+    ("outline IoU, median", "outline_iou_p50"),
+    ("worst", "outline_iou_min"),
+    ("centre, px", "label_distance_p50"),
+    ("direction, deg", "line_angle_p50"),
+    ("worst, deg", "line_angle_max"),
+    ("false dots", "markers_false"),
+)
+"""The same for the recordings of gels."""
 
 
 def write_markdown(result: Result, path: Path, default: str) -> None:
@@ -59,12 +89,13 @@ def markdown(result: Result, default: str) -> str:
         f"Each cell: `{CLASSIC}`, then `{default}`. Times are CPU times of a frame with contact, ms; the "
         f"script is `{CLASSIC}` plus what the script computes twice. A dash: nothing to measure.",
         _scenes(result, default),
+        *_troubles(result),
         "### Methods alone, on the same inputs",
         "Median over the scenes, in brackets the worst scene. Times are copies of a raw frame.",
         *_methods(result),
     ]
     if any(m.scene.startswith(RECORDING) for m in result.measurements):
-        parts += ["### Real recordings", _recordings(result)]
+        parts += ["### Real recordings", _recordings(result), *_gels(result)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -94,7 +125,10 @@ def _value(measurement: Measurement | None, keys: Sequence[str]) -> str:
 
 def _scenes(result: Result, default: str) -> str:
     by_key = {m.key: m for m in result.of("pipeline")}
-    scenes = dict.fromkeys(m.scene for m in result.of("pipeline") if not m.scene.startswith(RECORDING))
+    apart = {case.label for case in TROUBLES}
+    scenes = dict.fromkeys(
+        m.scene for m in result.of("pipeline") if not m.scene.startswith(RECORDING) and m.scene not in apart
+    )
     rows = []
     for scene in scenes:
         others = (CLASSIC, ORIGINAL)
@@ -116,6 +150,59 @@ def _scenes(result: Result, default: str) -> str:
         *(title for title, _ in _PER_SCENE),
     ]
     return _table(header, rows)
+
+
+def _troubles(result: Result) -> list[str]:
+    """One row for each scene of `TROUBLES`, with the pipeline that its gel is for."""
+    others = (CLASSIC, ORIGINAL)
+    names = {case.label: scene_descriptions()[case.name] for case in TROUBLES}
+    rows = [
+        [m.scene, names[m.scene], f"`{m.method}`", *(_value(m, [key]) for _, key in _TROUBLE)]
+        for m in result.of("pipeline")
+        if m.scene in names and m.method not in others
+    ]
+    if not rows:
+        return []
+    header = ["scene", "", "pipeline", *(title for title, _ in _TROUBLE)]
+    return [
+        "### Troubles of real gels, simulated",
+        "What went wrong on recordings of many labs, one trouble in each scene, with its truth. The pipeline "
+        "is the one for the gel: with markers or without.",
+        _table(header, rows),
+    ]
+
+
+def _gels(result: Result) -> list[str]:
+    """One row for each recording of a gel: what was promised of all, and on which half it was chosen."""
+    by_name = {RECORDING + gel.folder: gel for gel in GELS}
+    rows = []
+    for m in result.of("pipeline"):
+        gel = by_name.get(m.scene)
+        if gel is None:
+            continue
+        half = "chosen on" if gel.chosen else "reported"
+        dots = "-" if gel.dots is None else str(gel.dots)
+        cells = [_value(m, [key]) for _, key in _GEL]
+        failure = f" {(m.failure or '').splitlines()[0]}" if m.failure else ""
+        rows.append([gel.folder, gel.sensor + failure, half, f"`{m.method}`", str(m.frames), dots, *cells])
+    if not rows:
+        return []
+    header = [
+        "recording",
+        "sensor",
+        "half",
+        "pipeline",
+        "frames",
+        "dots by eye",
+        *(title for title, _ in _GEL),
+    ]
+    return [
+        "### Real gels of many labs",
+        "With the settings as they are shipped, but for `rotate: 0` and a `downsample` of 1 or 2: which "
+        "stands in `tactflow.bench.gels`. Constants were chosen on one half of the sensors; the other half "
+        "is the test.",
+        _table(header, rows),
+    ]
 
 
 def _methods(result: Result) -> list[str]:
@@ -146,9 +233,10 @@ def _methods(result: Result) -> list[str]:
 
 
 def _recordings(result: Result) -> str:
+    gels = {RECORDING + gel.folder for gel in GELS}
     rows = []
     for m in result.measurements:
-        if not m.scene.startswith(RECORDING):
+        if not m.scene.startswith(RECORDING) or m.scene in gels:
             continue
         said = "; ".join(f"{QUANTITIES[key].title}: {format_number(v)}" for key, v in m.errors.items())
         time = m.time.get("contact", m.time.get("idle", {}))

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench.lockstep import Outcome
-from tactflow.sim import Truth
 from tactflow.vision.types import MarkerStatus
 
 _SCALE = 2
@@ -22,7 +21,9 @@ _CAPTION = 24
 """Height of the line of text at the top, px."""
 
 
-def draw(outcome: Outcome, truth: Truth, caption: str) -> NDArray[np.uint8] | None:
+def draw(
+    outcome: Outcome, region: NDArray[np.uint8], center: tuple[float, float] | None, caption: str
+) -> NDArray[np.uint8] | None:
     """Truth and answer on one processed frame; None where the pipeline has no image.
 
     Green: outline and centre of the true contact. Red: outline and centre of the one that was found. White
@@ -30,7 +31,8 @@ def draw(outcome: Outcome, truth: Truth, caption: str) -> NDArray[np.uint8] | No
 
     Parameters
     ----------
-    outcome : what the pipeline said. truth : in the same coordinates. caption : written above.
+    outcome : what the pipeline said. region : (H, W), not 0 in the true contact. center : of it, px, or None.
+    caption : written above.
 
     Returns
     -------
@@ -41,11 +43,11 @@ def draw(outcome: Outcome, truth: Truth, caption: str) -> NDArray[np.uint8] | No
     height, width = outcome.image.shape[:2]
     size = (width * _SCALE, height * _SCALE)
     picture: NDArray[Any] = cv2.resize(outcome.image, size, interpolation=cv2.INTER_CUBIC)
-    _outline(picture, np.asarray(truth.contact_mask, dtype=np.uint8), _TRUE)
+    _outline(picture, region, _TRUE)
     if outcome.contact_mask is not None:
         _outline(picture, outcome.contact_mask, _FOUND)
-    if truth.center is not None:
-        cv2.circle(picture, _place(truth.center), 5, _TRUE, 2, cv2.LINE_AA)
+    if center is not None:
+        cv2.circle(picture, _place(center), 5, _TRUE, 2, cv2.LINE_AA)
     if outcome.contact is not None:
         cv2.drawMarker(picture, _place(outcome.contact.center), _FOUND, cv2.MARKER_CROSS, 14, 2)
     if outcome.markers is not None:

@@ -264,14 +264,15 @@ def measure_pipelines(
     return made
 
 
-def measure_refusal(name: str, pipeline: Pipeline, rendered: Rendered, folder: Path) -> Measurement:
+def measure_refusal(name: str, pipeline: Pipeline, scene: str, folder: Path) -> Measurement:
     """What a pipeline for markers takes for markers on a gel that has none: at best, it refuses to run.
 
-    name : of the pipeline. rendered : a scene without markers. folder : for scratch files.
+    name : of the pipeline. pipeline : with a recording of such a gel. scene : what results call it.
+    folder : for scratch files.
     """
-    made = Measurement("pipeline", name, rendered.case.label, frames=1, errors={"markers_false": 0.0})
+    made = Measurement("pipeline", name, scene, frames=1, errors={"markers_false": 0.0})
     with quiet():
-        running = LockstepPipeline(on_recording(pipeline, rendered.path), folder / f"{name}.jsonl")
+        running = LockstepPipeline(pipeline, folder / f"{name}.jsonl")
         try:
             outcome = running.step()
             if outcome is not None and outcome.markers is not None:

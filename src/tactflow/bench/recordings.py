@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench import metrics
+from tactflow.bench import gels, metrics
 from tactflow.bench.lockstep import Outcome
 from tactflow.bench.methods import CLASSIC, fill_times
 from tactflow.bench.pipelines import on_recording, take_turns
@@ -83,10 +83,9 @@ def check(data: Path) -> None:
     ConfigError
         If the folder holds none of the known recordings.
     """
-    if not any((data / name).is_dir() for name in ("wedge_ball", "wedge_roll", "wedge_grasp")):
-        raise ConfigError(
-            f"--data {data}: required a folder with wedge_ball, wedge_roll or wedge_grasp in it"
-        )
+    known = ("wedge_ball", "wedge_roll", "wedge_grasp", gels.FOLDER)
+    if not any((data / name).is_dir() for name in known):
+        raise ConfigError(f"--data {data}: required a folder with one of {', '.join(known)} in it")
 
 
 def frame_count(data: Path) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tactflow.bench import recordings
+from tactflow.bench import gels, recordings
 from tactflow.bench.methods import CLASSIC, measure_methods
 from tactflow.bench.pictures import draw
 from tactflow.bench.pipelines import (
@@ -22,6 +22,7 @@ from tactflow.bench.pipelines import (
     growth,
     measure_pipelines,
     measure_refusal,
+    on_recording,
     peak_memory_mb,
 )
 from tactflow.bench.results import Result
@@ -184,7 +185,7 @@ class _Run:
         if self.plan.memory:
             steps += MEMORY_FRAMES * len(self.general)
         if self.plan.data is not None:
-            steps += recordings.frame_count(self.plan.data)
+            steps += recordings.frame_count(self.plan.data) + gels.step_count(self.plan.data)
         return steps
 
     def step(self, count: int = 1) -> None:
@@ -199,7 +200,8 @@ class _Run:
             self.doing = f"pipelines on {rendered.case.label}"
             suited = self.general if len(rendered.scene.layout.rest) else self.bare
             if rendered.scene.settings.speckle:
-                found.append(measure_refusal(DEFAULT, self.loaded[DEFAULT], rendered, scratch))
+                marked = on_recording(self.loaded[DEFAULT], rendered.path)
+                found.append(measure_refusal(DEFAULT, marked, rendered.case.label, scratch))
             worst = _keeper(self.plan.pictures, rendered.case.label)
             found += measure_pipelines(suited, rendered, scratch, self.unit, self.step, worst)
         for rendered in render_all(self.alone, scratch):
@@ -242,6 +244,16 @@ class _Run:
         )
         for measurements in measured:
             self.result.measurements += measurements
+        bare = MARKERLESS if MARKERLESS in self.bare else DEFAULT
+        self.result.measurements += gels.measure_gels(
+            (DEFAULT, self.loaded[DEFAULT]),
+            (bare, self.bare[bare]),
+            self.plan.data,
+            scratch,
+            self.unit,
+            self.step,
+            self.plan.pictures,
+        )
 
     def finished(self, growth: float | None) -> Result:
         """The result, its promises judged."""
@@ -260,7 +272,8 @@ def _keeper(folder: Path | None, scene: str) -> Callable[[str, Worst], None]:
         if folder is None or worst.outcome is None or worst.truth is None:
             return
         caption = f"{scene}, frame {worst.outcome.frame.seq}, {pipeline}: hull IoU {worst.overlap:.2f}"
-        picture = draw(worst.outcome, worst.truth, caption)
+        region = np.asarray(worst.truth.contact_mask, dtype=np.uint8)
+        picture = draw(worst.outcome, region, worst.truth.center, caption)
         if picture is not None:
             folder.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(folder / f"{scene}-{pipeline.replace('/', '_')}.png"), picture)

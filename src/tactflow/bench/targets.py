@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from statistics import median
 
+from tactflow.bench.gels import OUTLINES
 from tactflow.bench.pipelines import ORIGINAL
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import RECORDING, Measurement, Result, Target
-from tactflow.bench.scenes import NOMINAL
+from tactflow.bench.scenes import NOMINAL, TROUBLES
 
 DIRECTED = frozenset({"cable", "bright_cable", "edge"})
 """Scenes whose contacts are at least twice as long as wide."""
@@ -18,6 +19,9 @@ HARD_MARKERS = frozenset({"jumps", "jumps_worn"})
 
 ALWAYS = frozenset({"idle", "drift", "flicker", "noisy"})
 """Scenes that tempt a method to see contacts."""
+
+_COUNTED = {f"{RECORDING}{name}" for name in ("sts_640", "sts_torque160", "handmade_dots", "wrs_cam1")}
+"""Recordings with dots that are hard to find."""
 
 MOST_GROWTH = 4.4
 """Promise: times as long as before that a frame of 4 times the pixels and markers takes at most."""
@@ -39,7 +43,9 @@ def judge(result: Result, default: str, growth: float | None, *, wedge: str, mar
         *_marker_errors(simulated, nominal),
         *_contact_errors(simulated, nominal),
         _growth(growth),
+        *_troubles(result, default, markerless),
         *_recordings(result, wedge, markerless),
+        *_gels(result, default, markerless),
     ]
 
 
@@ -92,6 +98,44 @@ def _recordings(result: Result, wedge: str, markerless: str) -> list[Target]:
         _recording(result, wedge, "wedge_roll", roll),
         _tracker_time(result, wedge),
         _recording(result, markerless, "wedge_grasp", [("force_right", 98.0)]),
+    ]
+
+
+def _troubles(result: Result, default: str, markerless: str) -> list[Target]:
+    """The scenes of `TROUBLES`, each with the pipeline for its gel."""
+    names = {case.label for case in TROUBLES}
+    found = [m for m in result.measurements if m.method in (default, markerless) and m.scene in names]
+    return [
+        _worst("real gels' troubles, simulated: outline", found, [("hull_iou", 0.9)]),
+        _worst(
+            "real gels' troubles, simulated: decisions",
+            found,
+            [("false_contacts", 0.0), ("missed_half_depth", 0.0)],
+        ),
+        _worst(
+            "real gels' troubles, simulated: markers",
+            found,
+            [("markers_missed", 0.0), ("markers_false", 0.0)],
+        ),
+    ]
+
+
+def _gels(result: Result, default: str, markerless: str) -> list[Target]:
+    """Real gels of many labs, with the settings as they are shipped."""
+    decisions = [("false_contacts", 0.5), ("missed_contacts", 2.0), ("early_found", 95.0)]
+    dots = [("dots_found", 95.0), ("dots_beyond", 2.0)]
+    counted = [m for m in result.of("pipeline", default) if m.scene in _COUNTED]
+    return [
+        _recording(result, default, "franka_mini", decisions),
+        _recording(result, default, "seu_a", [("false_contacts", 0.0)]),
+        _recording(result, default, "sts_torque160", [("false_contacts", 0.0), ("missed_contacts", 5.0)]),
+        _recording(result, default, "tactip_video", [("false_contacts", 0.0), ("missed_contacts", 0.0)]),
+        _recording(result, default, OUTLINES, [("outline_iou_p50", 0.75), ("outline_iou_min", 0.5)]),
+        _recording(result, default, "mini_ball", [("outline_iou_p50", 0.85), ("label_distance_p50", 1.5)]),
+        _recording(result, markerless, "mini_box", [("line_angle_p50", 1.0), ("line_angle_max", 3.0)]),
+        _recording(result, markerless, "9dtact_1", [("outline_iou_p50", 0.75)]),
+        _recording(result, default, "simple_marks", [("outline_iou_p50", 0.75)]),
+        _worst("dots found of those seen by eye", counted, dots),
     ]
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.classic.functions import MARKER_AREAS, marker_center
-from tactflow.vision.markers.detection import NoMarkersError, neighbour_graph
+from tactflow.vision.markers.detection import NoMarkersError
+from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]

@@ -14,17 +14,18 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from tactflow.bench.compare import Regression, against, load_comparable
+from tactflow.bench.gels import left_out
 from tactflow.bench.markdown import write_markdown
 from tactflow.bench.methods import CLASSIC
 from tactflow.bench.report import html
 from tactflow.bench.results import Result
-from tactflow.bench.run import DEFAULT, Plan, run_bench
+from tactflow.bench.run import DEFAULT, MARKERLESS, WEDGE, Plan, run_bench
 from tactflow.bench.skipping import Pipelines, compare_all, print_comparisons
 from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
-from tactflow.config.shipped import find_pipeline, packaged_pipelines
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 
 WORSE = 3
@@ -50,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data",
         type=Path,
         metavar="DIR",
-        help="also measure on the real recordings in DIR (wedge_ball, wedge_roll, wedge_grasp)",
+        help="also measure on the real recordings in DIR (wedge_ball, wedge_roll, wedge_grasp, gels)",
     )
     _add_outputs(parser)
     _add_other_measurements(parser)
@@ -76,7 +77,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         "--pictures",
         type=Path,
         metavar="DIR",
-        help="write a picture of every pipeline's worst frame in every scene, the truth beside the answer",
+        help="write a picture of every pipeline's worst frame in every scene, and of the worst frame with an "
+        "outline in each recording of a gel in --data, the truth beside the answer",
     )
     parser.add_argument(
         "--against",
@@ -140,6 +142,8 @@ def run(args: argparse.Namespace) -> int:
         result = run_bench(plan, progress)
     print_result(result, Console(file=sys.stdout, highlight=False))
     _write(args, result)
+    for word in left_out(args.data) if args.data is not None else ():
+        print(f"tactflow: --data: {word}", file=sys.stderr)
     worse = against(result, args.against, plan.scenes) if args.against is not None else []
     _report(worse, args.against)
     return WORSE if worse else 0
@@ -180,9 +184,8 @@ def _stress(given: list[str], frames: int) -> int:
 
 
 def packaged_files() -> dict[str, Path]:
-    """Name -> file of the packaged pipelines, the default one first."""
-    others = [name for name in packaged_pipelines() if name not in (DEFAULT, CLASSIC)]
-    return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, CLASSIC, *others)}
+    """Name -> file of the packaged pipelines that differ in more than settings, the default one first."""
+    return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, CLASSIC, MARKERLESS, WEDGE)}
 
 
 def _files(given: list[str]) -> dict[str, Path]:

@@ -16,10 +16,11 @@ from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream, public_address
 from tactflow.sources.files import open_recording
 from tactflow.sources.health import Watch
-from tactflow.sources.watch import LiveReader, Watched
+from tactflow.sources.watch import Arrival, LiveReader, Watched
 
 __all__ = [
     "KINDS",
+    "Arrival",
     "CameraRequest",
     "FrameReader",
     "LiveReader",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactflow.vision.markers.detection import neighbour_graph
 from tactflow.vision.markers.field import DisplacementField
+from tactflow.vision.markers.lattice import neighbour_graph
 from tests.oracles import field
 from tests.oracles.plain import plain
 from tests.vision.dots import grid

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactflow.vision.markers.detection import neighbour_graph
+from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.markers.matching import choose_spots
 from tests.oracles import matching
 from tests.oracles.plain import plain

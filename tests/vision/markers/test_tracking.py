@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.markers.detection import Detection, detect_markers, neighbour_graph
+from tactflow.vision.markers.detection import Detection, detect_markers
+from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.markers.matching import choose_spots
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers, MarkerStatus

@@ -1,11 +1,13 @@
 """The printed markers of a gel: detection, mask, removal and tracking."""
 
-from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers, neighbour_graph
+from tactflow.vision.markers.detection import Candidate, Detection, NoMarkersError, detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
+from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 from tactflow.vision.markers.tracking import MarkerTracker
 
 __all__ = [
+    "Candidate",
     "Detection",
     "Dot",
     "MarkerTracker",

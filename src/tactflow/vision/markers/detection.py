@@ -1,8 +1,7 @@
-"""Find the printed marks of a gel: sub-pixel centres, their size, their polarity and their neighbours."""
+"""Find the printed marks of a gel: sub-pixel centres, their sizes, their polarity and their neighbours."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
@@ -10,73 +9,42 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.markers import family
+from tactflow.vision.markers.family import LONGEST_LINK, Family, Sign
+from tactflow.vision.markers.lattice import nearest, neighbour_graph
+from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
+
 Polarity = Literal["auto", "dark", "bright"]
 FloatArray = NDArray[np.float64]
 
-SCALE_RATIO: Final = 1.6
-"""Width of the wider Gaussian of a difference of Gaussians over that of the narrower: closest to the
-Laplacian of a Gaussian (Marr and Hildreth 1980)."""
+LEAST_SHARE: Final = 0.4
+"""Share of parallelograms of neighbours that close, at least, to be a lattice: random textures have up to
+0.31, painted dots 0.45 and more (measured)."""
 
-RADIUS_PER_SIGMA: Final = 1.83
-"""Radius of the disc that such a difference answers most strongly, over the narrower width. Measured on
-rendered discs of radius 2 to 12 px."""
+LEAST_SCORE: Final = 1.5
+"""Score of the weakest family that is believed to be marks (see `family.families`). Real gels with marks
+score 4 and more; dust, reflections and noise on gels without at most 0.4 (measured)."""
 
-LEAST_SIGMA: Final = 0.9
-"""Smallest scale that is looked at, px: marks of radius 1.6. Chosen by hand."""
+MANY_SPOTS: Final = 30
+"""Spots from which on a picture without a lattice is called a texture; fewer are dust. Chosen by hand."""
 
-SIGMA_STEP: Final = 1.2
-"""Ratio of neighbouring scales. Chosen by hand."""
+TEXTURE_STRENGTH: Final = 5.0
+"""Median response of spots that are called a texture, grey levels, at least; fainter ones are noise. Chosen
+by hand."""
 
-LARGEST_MARK: Final = 1 / 16
-"""Largest scale that is looked at, over the shorter side of the image. Chosen by hand."""
+CLOSE: Final = 0.75
+"""Score of the next best family over that of the best, from which on the choice was close. Chosen by hand."""
 
-FULL_SIZE_SIGMA: Final = 4.0
-"""Scales from here on are looked at in a smaller picture, px: it gives the same peaks at a cost that does not
-grow."""
+SAME_MARKS: Final = 0.5
+"""Share of the spots of another family that lie on the marks, from which on it is no rival but they again, at
+another scale or their highlights. Chosen by hand."""
 
-LEAST_RESPONSE: Final = 1.0
-"""Response of a peak, grey levels, at least: below it is rounding."""
+ONE_SIZE: Final = 1.1 * SIGMA_STEP
+"""Ratio of radii up to which they are one: what choosing among scales leaves uncertain, a step."""
 
-MOST_PEAKS: Final = 3000
-"""Peaks of one scale, the strongest ones: bounds the time on a textured picture."""
-
-RING: Final = 1.9
-"""Radius of the ring around a mark that is compared with it, in radii of the mark. Chosen by hand."""
-
-RING_POINTS: Final = 8
-"""Points of that ring. Chosen by hand."""
-
-RING_CONTRAST: Final = 0.3
-"""Contrast of a spot with all but one point of the ring, at least, over the median contrast. Chosen by
-hand."""
-
-OVERLAP: Final = 1.3
-"""Distance of neighbouring marks at least, in radii: spots closer than that are ridges of a pattern."""
-
-BORDER_MARGIN: Final = 0.8
-"""Distance of a mark from the border of the image at least, in radii: others are cut by it."""
-
-FAMILY_STRENGTH: Final = 0.35
-"""Response of a mark over that of the typical one, at least. Chosen by hand: dirt and grain are a tail."""
-
-LEAST_STRENGTH: Final = 2.0
-"""Response of a mark, grey levels, at least. Chosen by hand."""
-
-BETWEEN: Final = 0.55
-"""Distance, pitches, below which the weaker of two spots lies between marks. Chosen by hand."""
-
-LONELY: Final = 2.3
-"""Distance of the second nearest mark, pitches, beyond which a spot is lonely. Chosen by hand."""
-
-ENOUGH_MARKS: Final = 100
-"""Marks from which on more make a family no better. Chosen by hand."""
-
-LEAST_SCORE: Final = 25.0
-"""Score of the weakest family that is believed to be marks (see `_score`). Real and simulated gels score 100
-and more; dust, reflections and noise on gels without marks at most 14 (measured)."""
-
-LONGEST_LINK: Final = 2.6
-"""Distance of neighbours at most, pitches. Chosen by hand."""
+CROWDED: Final = 0.37
+"""Radius of a mark over the distance of the nearest other, at most: so its surroundings hold no other. Chosen
+on sts_torque160."""
 
 LONE_PITCH: Final = 8.0
 """Pitch of a single mark, in radii. Chosen by hand."""
@@ -95,29 +63,45 @@ CENTROID_CONVERGED: Final = 1e-3
 """Step of all windows, px, below which they have converged. Chosen by hand: a tenth of a
 marker's error."""
 
-BLOCKING: Final = 1.1
-"""Sum of squares, over the squared distance of two marks, below which a third one between them blocks their
-link. A right angle has 1; a tenth more keeps a skewed square free of diagonals. Chosen by hand."""
-
-GRAPH_CANDIDATES: Final = 12
-"""Nearest marks among which neighbours are looked for. Chosen by hand."""
-
 _NO_MARKERS: Final = "0 markers found: is the sensor marker-less? then use pipelines/markerless.yaml"
 _FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels)"
 
 
+class Candidate(NamedTuple):
+    """Spots that may be marks: what was chosen, or could have been.
+
+    centers : (N, 2) float64, px. radius : px. score : how much they look like marks, comparable within one
+    picture. lattice : share of parallelograms of neighbours that close, 0 to 1.
+    """
+
+    centers: FloatArray
+    radius: float
+    polarity: Literal["dark", "bright"]
+    score: float
+    lattice: float
+
+    def __str__(self) -> str:
+        return f"{len(self.centers)} {self.polarity} ones of radius {self.radius:.1f} px"
+
+
 class NoMarkersError(ValueError):
-    """The image shows no marks that could be tracked."""
+    """The image shows no marks that could be tracked. best : the spots that came closest, or None."""
+
+    def __init__(self, message: str, best: Candidate | None = None) -> None:
+        super().__init__(message)
+        self.best = best
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
     """The marks of an image.
 
-    centers : (N, 2) float64, px. dot_radius : of a disc that answers like the marks, px.
+    centers : (N, 2) float64, px. dot_radius : of a disc that answers like most marks, px.
     polarity : whether the marks are darker or brighter than the gel.
     pitch : median distance of a mark to its nearest neighbour, px; with one mark, eight radii.
     edges : (E, 2) int64, pairs of neighbouring marks, each pair once, smaller index first.
+    radii : (N,) float64, of each mark, px; None where all are of one size.
+    chosen : the spots that the marks grew from. rival : the next best spots elsewhere, if there are any.
     """
 
     centers: FloatArray
@@ -125,6 +109,19 @@ class Detection:
     polarity: Literal["dark", "bright"]
     pitch: float
     edges: NDArray[np.int64]
+    radii: FloatArray | None = None
+    chosen: Candidate | None = None
+    rival: Candidate | None = None
+
+    @property
+    def doubt(self) -> str | None:
+        """What else might be the marks, in words, if the choice was close."""
+        if self.chosen is None or self.rival is None or self.rival.score < CLOSE * self.chosen.score:
+            return None
+        return (
+            f"the marks might be others: {self.chosen} were chosen (score {self.chosen.score:.0f}) "
+            f"over {self.rival} (score {self.rival.score:.0f}); polarity and dot decide"
+        )
 
 
 def require_image(image: NDArray[np.uint8]) -> None:
@@ -156,10 +153,11 @@ def detect_markers(
     polarity: Polarity = "auto",
     valid: NDArray[np.uint8] | None = None,
 ) -> Detection:
-    """Find the marks of a gel, whatever their size, shape and arrangement.
+    """Find the marks of a gel: of one size or many, of any shape, in one lattice or several.
 
-    Differences of Gaussians over a range of scales give families of spots. The strongest one (many, alike,
-    evenly spaced) wins, without weak and lonely spots, ones between the others and ones cut by the border.
+    Differences of Gaussians over a range of scales give families of spots. The one with the most contrast in
+    the best lattice wins; a random texture forms none. Spots of other scales that its lattice wants join it.
+    Weak and lonely spots, ones between the others and ones cut by the border are left out.
 
     Parameters
     ----------
@@ -194,17 +192,67 @@ def detect_markers(
     """
     gray, shortest = to_gray(image).astype(np.float32), min(image.shape[:2])
     _require_options(dot_radius, polarity, valid, gray.shape)
-    if shortest < 8:
+    signs: tuple[Sign, ...] = ("dark", "bright") if polarity == "auto" else (polarity,)
+    scales = {
+        sign: {s: find_spots(gray, s, sign, valid) for s in sigmas(dot_radius, shortest)} for sign in signs
+    }
+    found = family.families(scales) if shortest >= 8 else []
+    if not found:
         raise NoMarkersError(_NO_MARKERS)
-    best = _best_family(gray, valid, _sigmas(dot_radius, shortest), polarity)
-    if best is None or (dot_radius is None and best.score < LEAST_SCORE):
-        raise NoMarkersError(_NO_MARKERS + ("" if best is None else _FEW_MARKERS))
+    best = found[0]
+    if dot_radius is None:
+        _require_lattice(found)
+        return _detection(gray, best, family.united(best, scales[best.polarity]), found[1:])
+    return _detection(gray, best, best.spots, found[1:])
+
+
+def _require_lattice(found: list[Family]) -> None:
+    """Raises NoMarkersError for spots, best first, that are too few, too faint, or in no lattice."""
+    if found[0].share >= LEAST_SHARE and found[0].score >= LEAST_SCORE:
+        return
+    best = max(found, key=lambda other: float(other.spots.strength.sum()))
+    count = len(best.spots.points)
+    if count >= MANY_SPOTS and float(np.median(best.spots.strength)) >= TEXTURE_STRENGTH:
+        raise NoMarkersError(
+            f"{_NO_MARKERS} ({count} {best.polarity} spots of radius {best.sigma * RADIUS_PER_SIGMA:.1f} px "
+            f"form no lattice: {100 * best.share:.0f} % of their parallelograms close, of a grid's 80 %; if "
+            "they are marks and no random texture, give their radius in pixels)",
+            _candidate(best),
+        )
+    raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(found[0]))
+
+
+def _candidate(found: Family) -> Candidate:
+    radius = found.sigma * RADIUS_PER_SIGMA
+    return Candidate(found.spots.points, radius, found.polarity, found.score, found.share)
+
+
+def _detection(gray: NDArray[np.float32], best: Family, marks: Spots, others: list[Family]) -> Detection:
+    """The marks with exact centres, in reading order, and what else they might be."""
+    dark = gray if best.polarity == "dark" else 255 - gray
     radius = best.sigma * RADIUS_PER_SIGMA
-    centers = refine_centers(gray if best.polarity == "dark" else 255 - gray, best.peaks, radius)
-    centers = centers[_reading_order(centers, radius)]
-    distances = _nearest(centers, 1)[0]
-    pitch = float(np.median(distances[:, 0])) if len(centers) > 1 else LONE_PITCH * radius
-    return Detection(centers, radius, best.polarity, pitch, neighbour_graph(centers, LONGEST_LINK * pitch))
+    ratio = np.maximum(marks.radius / radius, radius / marks.radius)
+    radii = np.where(ratio < ONE_SIZE, radius, marks.radius)
+    if len(radii) > 1:
+        room = CROWDED * nearest(marks.points, 1)[0][:, 0]
+        steps = np.ceil(np.log(radii / room) / np.log(SIGMA_STEP))
+        radii = radii / SIGMA_STEP ** np.maximum(steps, 0)
+    centers = np.array(marks.points)
+    for size in np.unique(radii):
+        centers[radii == size] = refine_centers(dark, centers[radii == size], size)
+    order = _reading_order(centers, radius)
+    centers, radii = centers[order], radii[order]
+    pitch = family.pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
+    edges = neighbour_graph(centers, LONGEST_LINK * pitch)
+    rival = next((_candidate(other) for other in others if not _same(other, centers, radii)), None)
+    sizes = radii if (radii != radius).any() else None
+    return Detection(centers, radius, best.polarity, pitch, edges, sizes, _candidate(best), rival)
+
+
+def _same(other: Family, centers: FloatArray, radii: FloatArray) -> bool:
+    """Whether another family lies where the marks are."""
+    away = np.hypot(*(other.spots.points[:, None] - centers).transpose(2, 0, 1))
+    return bool((away < radii).any(axis=1).mean() > SAME_MARKS)
 
 
 def _require_options(
@@ -218,54 +266,6 @@ def _require_options(
         raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
     if valid is not None and (valid.shape != shape or valid.dtype != np.uint8):
         raise ValueError(f"required valid to be {shape} uint8, got shape {valid.shape}, dtype {valid.dtype}")
-
-
-class _Family(NamedTuple):
-    """Spots that look like marks of one gel: how much so, at which scale and polarity, and where."""
-
-    score: float
-    sigma: float
-    polarity: Literal["dark", "bright"]
-    peaks: FloatArray
-
-
-def _best_family(
-    gray: NDArray[np.float32], valid: NDArray[np.uint8] | None, sigmas: Sequence[float], polarity: Polarity
-) -> _Family | None:
-    """The family of the highest score of all scales."""
-    polarities: Sequence[Literal["dark", "bright"]] = (
-        ("dark", "bright") if polarity == "auto" else (polarity,)
-    )
-    best: _Family | None = None
-    for sigma in sigmas:
-        for family in _families(gray, valid, sigma, polarities):
-            if best is None or family.score > best.score:
-                best = family
-    return best
-
-
-def _families(
-    gray: NDArray[np.float32],
-    valid: NDArray[np.uint8] | None,
-    sigma: float,
-    polarities: Sequence[Literal["dark", "bright"]],
-) -> Iterator[_Family]:
-    """The family of each polarity at one scale, if there is one."""
-    factor = 1
-    while sigma >= factor * FULL_SIZE_SIGMA:
-        factor *= 2
-    fine = sigma / factor
-    narrow, wide = _blurred(_shrunk(gray, factor), fine)
-    for sign in polarities:
-        peaks, strength = _peaks(wide - narrow if sign == "dark" else narrow - wide, fine)
-        spots = _surrounded(narrow if sign == "dark" else -narrow, peaks, fine * RADIUS_PER_SIGMA)
-        peaks, strength = peaks[spots] * factor + (factor - 1) / 2, strength[spots]
-        if valid is not None:
-            on_gel = _on_gel(valid, peaks, sigma * RADIUS_PER_SIGMA)
-            peaks, strength = peaks[on_gel], strength[on_gel]
-        kept = _members(peaks, strength, gray.shape, sigma * RADIUS_PER_SIGMA)
-        if len(kept):
-            yield _Family(_score(peaks[kept], strength[kept]), sigma, sign, peaks[kept])
 
 
 def refine_centers(gray: NDArray[np.float32], centers: FloatArray, radius: float) -> FloatArray:
@@ -324,180 +324,6 @@ def refine_centers(gray: NDArray[np.float32], centers: FloatArray, radius: float
         if np.abs(move).max(initial=0) < CENTROID_CONVERGED:
             break
     return result
-
-
-def neighbour_graph(centers: FloatArray, longest: float) -> NDArray[np.int64]:
-    """Which marks are neighbours: a beta-skeleton, free of diagonals on square grids.
-
-    Two marks are neighbours unless a third lies (nearly) inside the circle whose diameter they are.
-
-    Parameters
-    ----------
-    centers : (N, 2) float64, px. longest : neighbours are no farther apart than this, px.
-
-    Returns
-    -------
-    edges : (E, 2) int64, each pair once, smaller index first, sorted. Marks in one place are no neighbours.
-        Distances are float32 relative to the mean of all marks, so that an offset costs nothing: 1e-2 px for
-        marks spread over 1e4 px.
-
-    References
-    ----------
-    Gabriel and Sokal, "A new statistical approach to geographic variation analysis", Systematic Zoology 18
-    (1969); Kirkpatrick and Radke, "A framework for computational morphology" (1985).
-
-    Examples
-    --------
-    >>> square = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
-    >>> neighbour_graph(square, 20.0).tolist()
-    [[0, 1], [0, 2], [1, 3], [2, 3]]
-    """
-    count = len(centers)
-    if count < 2:
-        return np.zeros((0, 2), np.int64)
-    distances, near = _nearest(centers, min(GRAPH_CANDIDATES, count - 1))
-    squared = distances**2
-    between = ((centers[near][:, :, None] - centers[near][:, None, :]) ** 2).sum(axis=3)
-    blocked = squared[:, None, :] + between < BLOCKING * squared[:, :, None]
-    blocked &= ~np.eye(near.shape[1], dtype=bool)
-    # Of marks in one place, the nearest may be the mark itself.
-    keep = ~blocked.any(axis=2) & (distances <= longest) & (distances > 0)
-    first = np.repeat(np.arange(count), keep.sum(axis=1))
-    pairs = np.sort(np.column_stack([first, near[keep]]), axis=1)
-    return np.unique(pairs, axis=0).astype(np.int64)
-
-
-def _sigmas(dot_radius: float | None, shortest: int) -> list[float]:
-    if dot_radius is not None:
-        return [dot_radius / RADIUS_PER_SIGMA]
-    largest = max(SIGMA_STEP, shortest * LARGEST_MARK)
-    count = 1 + int(np.floor(np.log(largest / LEAST_SIGMA) / np.log(SIGMA_STEP)))
-    return [LEAST_SIGMA * SIGMA_STEP**index for index in range(count)]
-
-
-def _shrunk(gray: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Means over blocks of factor x factor pixels; what is left at the right and at the bottom is cut off."""
-    if factor == 1:
-        return gray
-    height, width = gray.shape[0] // factor, gray.shape[1] // factor
-    cut = gray[: height * factor, : width * factor]
-    return np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _blurred(gray: NDArray[np.float32], sigma: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The image at a scale and at the next coarser one; their difference answers to spots of the scale."""
-    narrow = cv2.GaussianBlur(gray, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-    step = sigma * float(np.sqrt(SCALE_RATIO**2 - 1.0))
-    wide = cv2.GaussianBlur(narrow, (0, 0), step, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(narrow, np.float32), np.asarray(wide, np.float32)
-
-
-def _surrounded(smooth: NDArray[np.float32], peaks: FloatArray, radius: float) -> NDArray[np.int64]:
-    """Indices of the peaks that are darker than what lies around them in (almost) every direction.
-
-    Edges and lines also answer to a difference of Gaussians, but are as dark along themselves.
-    """
-    if len(peaks) == 0:
-        return np.zeros(0, np.int64)
-    angles = np.arange(RING_POINTS) * (2 * np.pi / RING_POINTS)
-    ring = peaks[:, None] + RING * radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    limits = np.array([smooth.shape[1] - 1, smooth.shape[0] - 1])
-    column, row = np.clip(np.rint(ring).astype(np.int64), 0, limits).transpose(2, 0, 1)
-    own_column, own_row = np.clip(np.rint(peaks).astype(np.int64), 0, limits).T
-    above = np.sort(smooth[row, column] - smooth[own_row, own_column][:, None], axis=1)
-    return np.flatnonzero(above[:, 1] > RING_CONTRAST * above[:, RING_POINTS // 2])
-
-
-def _on_gel(valid: NDArray[np.uint8], peaks: FloatArray, radius: float) -> NDArray[np.bool_]:
-    """Which peaks have gel in at least half of the square around them."""
-    side = 2 * round(RING * radius) + 1
-    share = cv2.boxFilter((valid > 0).astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE)
-    limits = np.array([valid.shape[1] - 1, valid.shape[0] - 1])
-    column, row = np.clip(np.rint(peaks).astype(np.int64), 0, limits).T
-    return np.asarray(share[row, column] >= 0.5)
-
-
-def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Local maxima, refined to sub-pixels by a parabola along each axis: positions (N, 2), strengths (N,)."""
-    # Marks do not overlap: peaks that are nearer to each other are the border of one spot of a larger scale.
-    size = 2 * max(1, round(OVERLAP * RADIUS_PER_SIGMA * sigma)) + 1
-    highest = cv2.dilate(response, np.ones((size, size), np.uint8))
-    rows, columns = np.nonzero((response >= highest) & (response > LEAST_RESPONSE))
-    inside = (rows > 0) & (columns > 0) & (rows < response.shape[0] - 1) & (columns < response.shape[1] - 1)
-    rows, columns = rows[inside], columns[inside]
-    strongest = np.argsort(-response[rows, columns], kind="stable")[:MOST_PEAKS]
-    rows, columns = rows[strongest], columns[strongest]
-    value = response[rows, columns].astype(np.float64)
-    points = np.column_stack([columns, rows]).astype(np.float64)
-    for axis, (step_y, step_x) in enumerate(((0, 1), (1, 0))):
-        before = response[rows - step_y, columns - step_x]
-        after = response[rows + step_y, columns + step_x]
-        bend = before + after - 2 * value
-        points[:, axis] += np.where(bend < -1e-6, 0.5 * (before - after) / np.minimum(bend, -1e-6), 0.0)
-    return points, value
-
-
-def _members(
-    peaks: FloatArray, strength: FloatArray, shape: tuple[int, ...], radius: float
-) -> NDArray[np.int64]:
-    """Indices of the peaks that belong to one family of marks."""
-    if len(peaks) == 0:
-        return np.zeros(0, np.int64)
-    height, width = shape
-    margin = BORDER_MARGIN * radius
-    inside = (peaks[:, 0] >= margin) & (peaks[:, 0] <= width - 1 - margin)
-    inside &= (peaks[:, 1] >= margin) & (peaks[:, 1] <= height - 1 - margin)
-    kept = np.flatnonzero(inside)
-    order = kept[np.argsort(-strength[kept], kind="stable")]
-    if len(order) == 0:
-        return order
-    # Strengths of marks are alike, those of dirt and grain are a tail: cut at a part of the typical one,
-    # which is found from the top down so that the tail's length does not matter.
-    ranked = strength[order]
-    typical = ranked[0]
-    for _ in range(8):
-        members = ranked[ranked > FAMILY_STRENGTH * typical]
-        typical = float(np.median(members))
-    kept = order[(ranked > FAMILY_STRENGTH * typical) & (ranked > LEAST_STRENGTH)]
-    if len(kept) < 3:
-        return np.asarray(kept, np.int64)
-    for _ in range(3):
-        distances, near = _nearest(peaks[kept], min(4, len(kept) - 1))
-        pitch = float(np.median(distances[:, 0]))
-        between = (distances[:, 0] < BETWEEN * pitch) & (strength[kept] < strength[kept][near[:, 0]])
-        lonely = distances[:, min(1, distances.shape[1] - 1)] > LONELY * pitch
-        if not (between | lonely).any():
-            break
-        kept = kept[~(between | lonely)]
-        if len(kept) < 3:
-            break
-    # Evenly spaced spots that overlap are the ridges of a pattern.
-    if len(kept) > 1 and float(np.median(_nearest(peaks[kept], 1)[0])) < OVERLAP * radius:
-        return np.zeros(0, np.int64)
-    return np.asarray(kept, np.int64)
-
-
-def _score(peaks: FloatArray, strength: FloatArray) -> float:
-    """How much a family looks like marks: strong, many, alike, evenly spaced."""
-    count = len(peaks)
-    typical = float(np.median(strength))
-    even = 0.5
-    if count >= 4:
-        nearest = _nearest(peaks, 1)[0][:, 0]
-        pitch = float(np.median(nearest))
-        even = 1.0 / (1.0 + 4.0 * float(np.mean(np.minimum(np.abs(nearest / pitch - 1.0), 1.0))))
-    return typical * even**2 * float(np.sqrt(min(count, ENOUGH_MARKS)))
-
-
-def _nearest(points: FloatArray, count: int) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Distances to and indices of the `count` nearest other points, nearest first: two (N, count) arrays."""
-    count = min(count, len(points) - 1)
-    if count < 1:
-        return np.zeros((len(points), 0)), np.zeros((len(points), 0), np.int64)
-    flat = np.ascontiguousarray(points - points.mean(axis=0), np.float32)
-    distances, near = cv2.batchDistance(flat, flat, cv2.CV_32F, None, None, cv2.NORM_L2, count + 1)
-    # The nearest is the point itself.
-    return np.asarray(distances[:, 1:], np.float64), np.asarray(near[:, 1:], np.int64)
 
 
 def _reading_order(centers: FloatArray, radius: float) -> NDArray[np.int64]:

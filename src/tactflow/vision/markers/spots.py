@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.compiled import kernel
-from tactflow.vision.markers.detection import RADIUS_PER_SIGMA, SCALE_RATIO, Detection
+from tactflow.vision.markers.detection import Detection
+from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SCALE_RATIO
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]

@@ -1,0 +1,106 @@
+"""The first frames of a source, looked at before they are handed out: which of them are the reference?"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources.base import BgrImage, FrameReader, log
+from tactflow.vision.change import Settling
+
+MEMORY: Final = 128_000_000
+"""Bytes of frames that are kept at most while they are looked at. Chosen by hand."""
+
+
+class Ahead:
+    """A recording, of which frames can be looked at before their turn: none is lost."""
+
+    def __init__(self, reader: FrameReader) -> None:
+        self.live = reader.live
+        self._reader = reader
+        self._waiting: deque[tuple[BgrImage, float]] = deque()
+        self._error: SourceError | None = None
+
+    def peek(self) -> tuple[BgrImage, float] | None:
+        """The next frame that was not looked at yet; None if there is none. An error waits for its turn."""
+        try:
+            item = None if self._error is not None else self._reader.read()
+        except SourceError as error:
+            self._error = error
+            return None
+        if item is not None:
+            self._waiting.append(item)
+        return item
+
+    def read(self) -> tuple[BgrImage, float] | None:
+        """The next frame; as `FrameReader.read`."""
+        if self._waiting:
+            return self._waiting.popleft()
+        if self._error is not None:
+            raise self._error
+        return self._reader.read()
+
+
+class FirstFrames:
+    """Says which of the first frames are the reference, and tells the user if they are not the very first.
+
+    name : of the source, in messages. seconds : after which the light must be steady. count : of references.
+
+    >>> import numpy as np
+    >>> first = FirstFrames("example", seconds=3.0, count=2)
+    >>> [first.look(np.full((48, 64, 3), 100, np.uint8), i / 30) for i in range(10)].index(True)
+    9
+    >>> first.references()
+    [0, 1]
+    """
+
+    def __init__(self, name: str, seconds: float, count: int) -> None:
+        self._name = name
+        self._seconds = seconds
+        self._count = count
+        self._settling = Settling()
+        self._began: float | None = None
+        self._bytes = 0
+
+    def look(self, image: BgrImage, t: float) -> bool:
+        """Look at the next frame, taken at t, s; True once no more need to be looked at."""
+        self._began = t if self._began is None else self._began
+        self._bytes += image.nbytes
+        settling = self._settling
+        settling.add(image)
+        if settling.touched or settling.unrelated or (settling.steady and len(settling) >= self._count):
+            return True
+        return t - self._began >= self._seconds or self._bytes > MEMORY
+
+    def references(self) -> list[int]:
+        """Indices of the frames that show the untouched gel, in order: `count` of them, or as many as do."""
+        settling = self._settling
+        best, alike = settling.best(), settling.alike()
+        begin = max(0, min(alike.index(best) - self._count // 2, len(alike) - self._count))
+        if best > 0:
+            self._tell(best)
+        elif settling.changing:
+            self._warn(best)
+        return alike[begin : begin + self._count]
+
+    def _tell(self, best: int) -> None:
+        if self._settling.changing:
+            self._warn(best)
+        elif self._settling.touched_before(best):
+            log.info("%s: the reference is frame %d; the gel was touched or moved before", self._name, best)
+        else:
+            log.info(
+                "%s: the reference is frame %d; the camera was setting exposure and white balance until then",
+                self._name,
+                best,
+            )
+
+    def _warn(self, best: int) -> None:
+        log.warning(
+            "%s: the light is not steady, it changed by %.0f %% within the last frames looked at; "
+            "the reference is frame %d. Fix exposure and white balance of the camera, or raise settle",
+            self._name,
+            100 * self._settling.drift,
+            best,
+        )

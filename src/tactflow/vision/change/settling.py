@@ -1,0 +1,255 @@
+"""The first frames of a camera: from when on is its light steady, and which frame shows the untouched gel?"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+
+COLUMNS: Final = 40
+"""Cells across a picture, about. Chosen by hand: a cell is smaller than most contacts."""
+SIDE: Final = 4
+"""Samples along the side of a cell. Sixteen of them take the noise of a pixel down to a quarter."""
+DARK, BRIGHT = 8, 247
+"""Grey levels up to which a sample is taken for black, and from which for saturated: such a one does not
+follow the exposure. Chosen by hand."""
+CLIPPED: Final = 0.1
+"""Share of such samples from which a cell is left out. Chosen by hand."""
+
+CALM: Final = 10
+"""Frames in a row that must be alike before the light counts as steady. Chosen on franka_mini, whose first
+frames may still show the grasp before, for at most eight frames."""
+SHORT: Final = 4
+"""Frames that a state of the gel must last to be considered at all. Chosen by hand."""
+STEADY: Final = 0.02
+"""Relative change of a channel that is steady: less than what a contact must exceed (`repeatability`)."""
+SCATTER: Final = 2.5
+"""The same in standard deviations of a light that flickers. Chosen by hand."""
+UNRELATED: Final = 1.0
+"""Ratio of the squared changes from frame to frame to the squared deviations from the mean, above which
+frames scatter without a trend. It is 2 for frames that are independent; in ten of them it falls below 1.06 by
+chance once in twenty times (J. von Neumann, Annals of Mathematical Statistics 12, 1941)."""
+LOCAL: Final = 0.06
+"""Relative change of a place against the rest of the picture from which something moved there, after a mean
+over 3 x 3 cells. Chosen on franka_mini: key frames of its compression stay below."""
+MOVED: Final = 0.01
+"""Share of the cells that must have moved. Chosen by hand."""
+SMOOTH: Final = 3
+"""Degree of the polynomial in x and y that follows the light of an untouched gel. Chosen by hand."""
+MEDIAN: Final = 5
+"""Side, cells, of the median filter that takes dots out. Chosen by hand."""
+EVENER: Final = 0.8
+"""Ratio of two states' unevenness below which the evener one is the untouched gel, where the light was still
+changing. Chosen on franka_mini: a gel that is touched has 1.2 to 50 times the unevenness of the same gel at
+rest, and for faint contacts at least 0.9 times."""
+MUCH_EVENER: Final = 0.5
+"""The same where nothing but this speaks for the later state. Chosen by hand."""
+AS_EVEN: Final = 1.5
+"""Ratio up to which a state with steady light is preferred to one whose light was changing. Chosen on
+franka_mini, where darker pictures have less contrast."""
+
+
+class Look(NamedTuple):
+    """What is kept of a frame: light : (h, w, channels) float32, logarithm of the mean of each cell. seen :
+    the same shape, bool, whether it is neither black nor saturated."""
+
+    light: Float
+    seen: NDArray[np.bool_]
+
+
+def look_at(frame: NDArray[np.uint8]) -> Look:
+    """Sample a frame sparsely: some 160 x 120 of its pixels, whatever its size.
+
+    frame : (H, W) or (H, W, channels) uint8.
+
+    >>> look_at(np.full((480, 640, 3), 100, np.uint8)).light.shape
+    (30, 40, 3)
+    """
+    step = max(1, max(frame.shape[:2]) // (COLUMNS * SIDE))
+    points = np.atleast_3d(frame[step // 2 :: step, step // 2 :: step])
+    side = min(SIDE, *points.shape[:2])
+    high, wide = points.shape[0] // side, points.shape[1] // side
+    cells = points[: high * side, : wide * side].reshape(high, side, wide, side, -1)
+    clipped = ((cells < DARK) | (cells > BRIGHT)).mean(axis=(1, 3))
+    light = np.log1p(cells.mean(axis=(1, 3), dtype=np.float32))
+    return Look(light, clipped < CLIPPED)
+
+
+def change_between(before: Look, after: Look) -> tuple[Float, bool]:
+    """How the light changed from one frame to another, and whether anything else did.
+
+    Returns the logarithm of each channel's gain, (channels,) float32: the median over the picture, which an
+    object that covers less than half of it does not move; and whether places changed against it.
+    """
+    both = before.seen & after.seen
+    change = np.where(both, after.light - before.light, np.float32(np.nan))
+    gain = np.zeros(change.shape[2], np.float32)
+    visible = both.any(axis=(0, 1))
+    gain[visible] = np.nanmedian(change[..., visible], axis=(0, 1))
+    left = cv2.blur(np.where(both, change - gain, np.float32(0)), (3, 3))
+    moved = np.abs(np.atleast_3d(left)).max(axis=2) > LOCAL
+    return gain, bool(moved.mean() > MOVED)
+
+
+def unevenness(look: Look) -> float:
+    """How much the light of a gel deviates from a smooth course over the picture, dots left out.
+
+    Whatever touches a gel bends its surface, which makes parts of it brighter, darker or of another colour.
+    Returns the mean squared residual of a polynomial in x and y, in squared relative changes, summed over the
+    channels; infinite if too little of the picture is seen.
+    """
+    basis = _polynomials(*look.light.shape[:2])
+    total = 0.0
+    for channel in range(look.light.shape[2]):
+        plane = cv2.medianBlur(np.ascontiguousarray(look.light[..., channel]), MEDIAN).ravel()
+        seen = look.seen[..., channel].ravel()
+        if np.count_nonzero(seen) < 2 * basis.shape[1]:
+            continue
+        fitted = basis @ np.linalg.lstsq(basis[seen], plane[seen], rcond=None)[0]
+        total += float(np.square(plane - fitted)[seen].mean())
+    return total or float("inf")
+
+
+@lru_cache(maxsize=4)
+def _polynomials(high: int, wide: int) -> Float:
+    """(high * wide, terms): powers of x and y up to the degree `SMOOTH`."""
+    y, x = np.meshgrid(np.linspace(-1, 1, high), np.linspace(-1, 1, wide), indexing="ij")
+    terms = [x**i * y**j for i in range(SMOOTH + 1) for j in range(SMOOTH + 1 - i)]
+    return np.stack(terms, axis=-1).reshape(high * wide, -1).astype(np.float32)
+
+
+class Settling:
+    """Looks at the first frames of a source, until the light is steady.
+
+    A camera sets exposure and white balance during its first frames, and some still show what was before.
+    Frames in a row that differ by the light alone, a gain for each channel, form a *state* of the gel;
+    another one begins when something moves. The frame that later ones are best compared with is one with
+    steady light, of the state that shows the untouched gel: the first one, unless a later state is much
+    evener, or is as even and has the steady light that the first one had not.
+
+    Examples
+    --------
+    >>> gel = np.full((48, 64, 3), 120, np.uint8)
+    >>> settling = Settling()
+    >>> for exposure in (0.5, 0.8, *[1.0] * 10):
+    ...     settling.add(np.uint8(gel * exposure))
+    >>> settling.steady, settling.best()
+    (True, 2)
+    """
+
+    def __init__(self) -> None:
+        self._looks: list[Look] = []
+        self._gains: list[Float] = []
+        self._states: list[list[int]] = []
+
+    def __len__(self) -> int:
+        return len(self._looks)
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Look at the next frame: (H, W) or (H, W, channels) uint8, all of one size."""
+        now, index = look_at(frame), len(self._looks)
+        if index == 0:
+            gain, moved = np.zeros(now.light.shape[2], np.float32), True
+        else:
+            step, moved = change_between(self._looks[-1], now)
+            gain = self._gains[-1] + step
+            moved = moved or change_between(self._looks[self._states[-1][0]], now)[1]
+        if moved:
+            self._states.append([])
+        self._states[-1].append(index)
+        self._looks.append(now)
+        self._gains.append(gain)
+
+    @property
+    def steady(self) -> bool:
+        """Whether the last frames show the same gel in the same light."""
+        return self._is_steady(self._states[-1]) if self._states else False
+
+    @property
+    def touched(self) -> bool:
+        """Whether the light was steady from the first frame on, until something touched the gel."""
+        first, *later = self._states
+        if not later or len(first) < SHORT:
+            return False
+        spread = np.ptp([self._gains[i] for i in first], axis=0).max()
+        return bool(spread < STEADY) and unevenness(self._looks[-1]) > AS_EVEN * self._unevenness(first)
+
+    @property
+    def unrelated(self) -> bool:
+        """Whether these are separate pictures rather than a video."""
+        return len(self) >= 2 * CALM and 2 * len(self._states) > len(self)
+
+    @property
+    def changing(self) -> bool:
+        """Whether frames in a row show the same gel, but in a light that is not steady."""
+        return not self.steady and len(self._states[-1]) >= CALM
+
+    @property
+    def drift(self) -> float:
+        """By how much the light of a channel changed over the last frames, relative."""
+        gains = np.array(self._gains[-CALM:])
+        return float(np.expm1(np.ptp(gains, axis=0).max()))
+
+    def touched_before(self, index: int) -> bool:
+        """Whether something moved between the first frame and this one."""
+        return index not in self._states[0]
+
+    def best(self) -> int:
+        """Index of the frame that shows the untouched gel in steady light; the first one where it is as good.
+
+        Of all such frames it is the most typical one.
+        """
+        calm = self.alike()
+        if calm[0] == 0:
+            return 0
+        lights = np.array([self._looks[i].light - self._gains[i] for i in calm])
+        typical = np.median(lights, axis=0)
+        return calm[int(np.abs(lights - typical).mean(axis=(1, 2, 3)).argmin())]
+
+    def alike(self) -> list[int]:
+        """Indices of all frames that show the untouched gel in the same steady light, in order."""
+        first, *later = self._states
+        best = first
+        for state in later:
+            if len(self._calm(state)) >= SHORT and self._is_better(state, best):
+                best = state
+        return self._calm(best)
+
+    def _is_better(self, state: list[int], than: list[int]) -> bool:
+        """Whether a later state is the untouched gel rather than the best one so far."""
+        ratio = self._unevenness(state) / self._unevenness(than)
+        calm = self._calm(than)
+        passing = than is not self._states[0] and len(calm) < CALM / 2
+        apart = np.abs(self._level(state)[0] - self._level(than)[0]).max()
+        if passing or calm[0] != than[0] or apart > STEADY:
+            return ratio < (AS_EVEN if self._is_steady(state) else EVENER)
+        return ratio < MUCH_EVENER
+
+    def _unevenness(self, state: list[int]) -> float:
+        calm = self._calm(state)
+        return unevenness(self._looks[calm[len(calm) // 2]])
+
+    def _is_steady(self, state: list[int]) -> bool:
+        gains = np.array([self._gains[i] for i in state[-CALM:]])
+        if len(gains) < CALM:
+            return False
+        scatter = np.square(gains - gains.mean(axis=0)).sum(axis=0)
+        steps = np.square(np.diff(gains, axis=0)).sum(axis=0)
+        return bool(np.all((np.ptp(gains, axis=0) < STEADY) | (steps > UNRELATED * scatter)))
+
+    def _level(self, state: list[int]) -> tuple[Float, Float]:
+        """Where the light of a state ends, and how far from there it is still the same: (channels,) each."""
+        gains = np.array([self._gains[i] for i in state[-CALM:]])
+        level = np.median(gains, axis=0)
+        spread = 1.4826 * np.median(np.abs(gains - level), axis=0)
+        return level, np.maximum(np.float32(STEADY), np.float32(SCATTER) * spread)
+
+    def _calm(self, state: list[int]) -> list[int]:
+        """The frames of a state that have the light of its end."""
+        level, tolerance = self._level(state)
+        return [i for i in state if np.all(np.abs(self._gains[i] - level) <= tolerance)]

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tactflow.bench.gel_labels import DotMotion, Label, labels_of, outlines_by_eye
+from tactflow.bench.gels import GELS, GelTally, left_out, measure_gels
+from tactflow.bench.timing import CopyUnit
+from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline
+from tactflow.sim import open_scene
+from tactflow.vision.geometry import Preprocessor
+from tactflow.vision.types import Contact
+
+SQUARE = np.array([(10, 10), (29, 10), (29, 29), (10, 29)], dtype=np.float64)
+
+
+def contact(hull: np.ndarray, angle: float | None = None) -> Contact:
+    x, y = hull.mean(axis=0)
+    return Contact(400.0, (float(x), float(y)), angle, None, hull, None)
+
+
+def test_the_overlap_is_that_of_the_filled_outline_and_the_hull() -> None:
+    label = Label((SQUARE,))
+    assert label.overlap(contact(SQUARE), (60, 80)) == 1
+    assert label.overlap(contact(SQUARE + np.array((10, 0))), (60, 80)) == pytest.approx(1 / 3)
+    assert label.overlap(None, (60, 80)) == 0
+
+
+def test_outlines_are_scaled_to_the_frame_that_is_judged(tmp_path: Path) -> None:
+    (tmp_path / "handmade_dots").mkdir()
+    entry = {"rec": "handmade_dots", "frame": 3, "downsample": 2, "polygon": SQUARE.tolist()}
+    (tmp_path / "polygons.json").write_text(json.dumps([entry]))
+    drawn = outlines_by_eye(tmp_path)
+    labels = labels_of(tmp_path / "handmade_dots" / "video.avi", tmp_path, 1, drawn)
+    np.testing.assert_array_equal(labels[3].outlines[0], 2 * SQUARE)
+
+
+def test_a_circle_and_an_edge_are_read_with_angles_that_grow_counter_clockwise(tmp_path: Path) -> None:
+    edge = {"line_angle": 4.0, "rect1": SQUARE.tolist(), "rect2": (SQUARE + 5).tolist()}
+    stored = {"001": {"center": [20, 30], "radius": 10}, "002": edge}
+    (tmp_path / "labels.json").write_text(json.dumps(stored))
+    labels = labels_of(tmp_path, tmp_path, 1, {})
+    assert labels[1].center == (20, 30)
+    # The pixels on the outline belong to it: half a pixel more on every side.
+    assert np.count_nonzero(labels[1].mask((60, 60))) == pytest.approx(np.pi * 10.5**2, rel=0.05)
+    assert labels[2].angle == -4
+
+
+def test_the_outlines_of_the_bench_belong_to_known_recordings(tmp_path: Path) -> None:
+    drawn = outlines_by_eye(tmp_path)
+    assert {name.split("/")[0] for name in drawn} <= {gel.folder for gel in GELS}
+    assert sum(len(frames) for frames in drawn.values()) == 20
+    for frames in drawn.values():
+        assert all(len(polygon) >= 3 for _, polygon in frames.values())
+
+
+def test_rest_and_touch_are_told_by_the_dots_whatever_the_light_does() -> None:
+    scene = open_scene("press?frames=40&settle=6&shear=0.6")
+    motion = DotMotion(0)
+    for index in range(22):
+        motion.add(scene.frame(index))
+    known = motion.touched()
+    assert (known[:4] == 0).all()
+    assert known[20] == 1
+    moved = [np.percentile(np.hypot(*np.subtract(*scene.markers(i)).T), 95) for i in range(22)]
+    assert all(known[i] == 1 for i in range(22) if moved[i] > 1.7)
+    assert all(known[i] == 0 for i in range(22) if moved[i] < 0.2)
+
+
+def test_decisions_count_only_where_something_is_known_and_an_early_contact_must_be_seen_in_time() -> None:
+    known = np.array([1, 0, 0, -1, 1, 1, 1, 1, 1, 1], np.int8)
+    late = np.array([0, 1, 0, 1, 0, 0, 0, 0, 1, 1], np.bool_)
+    tally = GelTally()
+    tally.decisions(known, late)
+    tally.first(known, late)
+    assert tally.errors() == {
+        "false_contacts": 50.0,
+        "missed_contacts": pytest.approx(100 * 5 / 7),
+        "early_found": 0.0,
+    }
+    tally.first(known, known == 1)
+    assert tally.errors()["early_found"] == 50
+
+
+def test_what_is_missing_and_what_is_unknown_is_said(tmp_path: Path) -> None:
+    assert left_out(tmp_path) == [f"gels: not in {tmp_path}, left out"]
+    for name in ("mini_ball", "another"):
+        (tmp_path / "gels" / name).mkdir(parents=True)
+    (tmp_path / "gels" / "mini_ball" / "000.png").touch()
+    words = left_out(tmp_path)
+    assert "gels/another: unknown, left out" in words
+    assert "gels/seu_a: missing, left out" in words
+    assert not any("mini_ball" in word for word in words)
+
+
+def test_simulated_balls_in_the_place_of_real_ones_are_measured_against_their_circles(tmp_path: Path) -> None:
+    folder = tmp_path / "gels" / "mini_ball"
+    folder.mkdir(parents=True)
+    scene = open_scene("press?frames=60&noise=1")
+    smaller = Preprocessor(scene.size, downsample=2)
+    labels = {}
+    for number, index in enumerate((0, 20, 25)):
+        cv2.imwrite(str(folder / f"{number:03d}.png"), smaller(scene.frame(index)))
+        truth = scene.truth(index, smaller)
+        if truth.center is not None:
+            radius = float(np.sqrt(truth.contact_mask.sum() / np.pi))
+            labels[f"{number:03d}"] = {"center": truth.center, "radius": radius}
+    (folder / "labels.json").write_text(json.dumps(labels))
+    pipelines = {name: load_pipeline(find_pipeline(name)) for name in ("default", "markerless")}
+    steps: list[int] = []
+    (found,) = measure_gels(
+        ("default", pipelines["default"]),
+        ("markerless", pipelines["markerless"]),
+        tmp_path,
+        tmp_path,
+        CopyUnit(),
+        steps.append,
+        tmp_path / "pictures",
+    )
+    assert found.failure is None
+    assert (found.scene, found.method, found.frames) == ("data:mini_ball", "default", 3)
+    assert found.errors["false_contacts"] == found.errors["missed_contacts"] == 0
+    assert found.errors["outline_iou_min"] > 0.85
+    assert found.errors["label_distance_p50"] < 1
+    assert found.errors["dots_found"] == 100
+    assert sum(steps) > 0
+    assert [path.name for path in (tmp_path / "pictures").iterdir()] == ["mini_ball-mini_ball-default.png"]

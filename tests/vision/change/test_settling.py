@@ -1,0 +1,101 @@
+"""Which of the first frames shows the untouched gel in steady light."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.vision.change.settling import CALM, Settling, change_between, look_at
+
+Image = NDArray[np.uint8]
+
+RNG = np.random.default_rng(7)
+Y, X = np.mgrid[0:120, 0:160]
+GEL = np.stack([90 + 0.3 * X, 120 - 0.2 * Y, 80 + 0.2 * Y + 0.1 * X], axis=-1)
+"""A gel lit from the sides, grey levels."""
+
+
+def picture(gain: float | tuple[float, float, float] = 1.0, pressed: float = 0.0) -> Image:
+    """The gel under another light, with noise; `pressed` in the middle, relative."""
+    bump = pressed * np.exp(-((X - 70) ** 2 + (Y - 60) ** 2) / 2 / 12**2)
+    colours = np.stack([bump, -bump, 0 * bump], axis=-1)
+    light = GEL * np.asarray(gain) * (1 + colours) + RNG.normal(0, 1.5, GEL.shape)
+    return np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
+
+
+def settled(frames: list[Image]) -> Settling:
+    """Look at frames until no more need to be."""
+    settling = Settling()
+    for frame in frames:
+        settling.add(frame)
+        if settling.steady:
+            break
+    return settling
+
+
+def test_light_that_is_steady_from_the_start_leaves_the_first_frame_the_reference() -> None:
+    settling = settled([picture() for _ in range(30)])
+    assert (len(settling), settling.best()) == (CALM, 0)
+    assert settling.alike() == list(range(CALM))
+
+
+@pytest.mark.parametrize("white_balance", [False, True])
+def test_frames_are_passed_over_while_the_camera_sets_its_light(white_balance: bool) -> None:
+    gains = [1.3 - 0.03 * i for i in range(10)]
+    frames = [picture((1.0, 1.0, g) if white_balance else g) for g in gains] + [picture() for _ in range(20)]
+    settling = settled(frames)
+    assert settling.steady
+    assert settling.best() >= 9
+    assert not settling.touched_before(settling.best())
+
+
+def test_saturated_pixels_do_not_hide_that_the_light_changes() -> None:
+    gain, moved = change_between(look_at(picture(2.2)), look_at(picture(1.8)))
+    np.testing.assert_allclose(gain, np.log(1.8 / 2.2), atol=0.01)
+    assert not moved
+
+
+def test_the_touch_of_before_is_not_taken_for_the_untouched_gel() -> None:
+    frames = [picture(0.6, 0.5), *(picture(1, 0.5) for _ in range(5)), *(picture() for _ in range(7))]
+    settling = settled(frames + [picture(1, -0.4) for _ in range(20)])
+    assert settling.steady
+    assert 6 <= settling.best() <= 12
+    assert settling.touched_before(settling.best())
+
+
+def test_a_finger_that_comes_early_is_not_taken_for_the_gel() -> None:
+    settling = settled([picture() for _ in range(6)] + [picture(1, 0.3) for _ in range(20)])
+    assert settling.steady
+    assert settling.best() == 0
+    assert settling.alike() == list(range(6))
+
+
+def test_a_finger_that_comes_slowly_ends_the_frames_that_are_alike() -> None:
+    pressed = [0.0] * 4 + [0.03 * i for i in range(12)]
+    settling = settled([picture(1, depth) for depth in pressed] + [picture(1, 0.33)] * 10)
+    assert settling.best() == 0
+    assert max(settling.alike()) <= 8
+
+
+def test_a_lamp_that_flickers_is_as_steady_as_it_gets() -> None:
+    flicker = RNG.normal(1, 0.03, 40)
+    settling = settled([picture(gain) for gain in flicker])
+    assert settling.steady
+    assert settling.best() <= 2
+
+
+def test_separate_pictures_are_no_video_and_the_first_one_is_the_reference() -> None:
+    settling = Settling()
+    for index in range(2 * CALM):
+        assert not settling.unrelated
+        settling.add(np.roll(picture(1, 0.6 if index else 0), 13 * index, axis=1))
+    assert settling.unrelated
+    assert settling.best() == 0
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (1, 1, 3), (48, 64, 1), (700, 30, 3)])
+def test_pictures_of_any_size_can_be_looked_at(shape: tuple[int, ...]) -> None:
+    settling = settled([np.full(shape, 100, np.uint8)] * CALM)
+    assert settling.steady
+    assert settling.best() == 0
