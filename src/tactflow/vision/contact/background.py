@@ -189,7 +189,6 @@ class BackgroundModel:
         known = self._derived()
         strength, brightness = np.empty((2, 2 * inside.shape[0], 2 * inside.shape[1]), np.float32)
         blurred = np.empty((3, *strength.shape), np.float32)
-        summary = np.empty(2)
         scaled_change(
             change.half.reshape(len(change.half), -1),
             2 * rows.start,
@@ -202,8 +201,8 @@ class BackgroundModel:
             known.half_scale,
             blurred,
         )
-        change_strength(blurred, np.ascontiguousarray(inside).view(np.uint8), strength, brightness, summary)
-        return WindowChange(strength, brightness, *summary.tolist())
+        change_strength(blurred, np.ascontiguousarray(inside).view(np.uint8), strength, brightness)
+        return WindowChange(strength, brightness)
 
     def _derived(self) -> _Derived:
         if self._known is not None:
@@ -218,7 +217,7 @@ class BackgroundModel:
         factor = (variance / (steady + (self._tint * mean) ** 2)).min(axis=0)
         direction = mean * weight
         direction /= np.linalg.norm(direction, axis=0) + np.float32(1e-6)
-        half_scale = self._half_scale(noise)
+        half_scale = self._half_scale(np.asarray(noise, np.float32))
         if self._counts is not None:
             weight = weight * self._counts
             half_scale = half_scale * self._counts.repeat(2, axis=0).repeat(2, axis=1)
@@ -238,9 +237,9 @@ class BackgroundModel:
     def _half_scale(self, noise: Float) -> Float:
         """One over the standard deviation at half resolution, (3, 2h, 2w). noise : variance of cells.
 
-        Half a cell, smoothed, is about as noisy as a smoothed cell. What the light varies by is taken from the
-        brightness of the whole picture: how strongly gel answers to a tilt where a channel is dark, nobody
-        knows, and relative to itself a dark channel would outshine the others.
+        Half a cell, smoothed, is about as noisy as a smoothed cell. How far the light varies is taken from
+        the brightness of the whole picture: relative to itself, a dark channel that a tilt lights up would
+        outshine the others.
         """
         light = self._repeatability * self._half.mean()
         edges = self._shift / 2 * _steepness(self._half)

@@ -132,19 +132,15 @@ def scaled_change(
             row[last] = (before + before) * BESIDE + line[last] * MIDDLE
 
 
-@kernel(
-    "void(float32[:, :, ::1], uint8[:, ::1], float32[:, ::1], float32[:, ::1], float64[::1])", reorder=True
-)
-def change_strength(blurred: Float, inside: Byte, strength: Float, common: Float, summary: Double) -> None:
+@kernel("void(float32[:, :, ::1], uint8[:, ::1], float32[:, ::1], float32[:, ::1])", reorder=True)
+def change_strength(blurred: Float, inside: Byte, strength: Float, common: Float) -> None:
     """Smooth a change along y, and reduce its channels to one.
 
     blurred : (3, h, w), from `scaled_change`. inside : (h / 2, w / 2), cells that count. strength : (h, w),
-    filled with the length of the change over the channels. common : (h, w), filled with their mean. summary :
-    filled with the sum and the sum of squares of `strength`.
+    filled with the length of the change over the channels. common : (h, w), filled with their mean.
     """
     high, wide = strength.shape
     counts, third = np.empty(wide, np.float32), np.float32(1 / 3)
-    sums = squares = 0.0
     for y in range(high):
         above = min(1, high - 1) if y == 0 else y - 1
         below = max(high - 2, 0) if y == high - 1 else y + 1
@@ -158,8 +154,5 @@ def change_strength(blurred: Float, inside: Byte, strength: Float, common: Float
                 length[x] = value * value + (length[x] if c else np.float32(0))
                 tone[x] = value + (tone[x] if c else np.float32(0))
         for x in range(wide):
-            squares += length[x]
             length[x] = np.sqrt(length[x])
             tone[x] *= third
-            sums += length[x]
-    summary[0], summary[1] = sums, squares

@@ -66,10 +66,10 @@ SHARP_SKIRT: Final = 0.11
 """Distance from there to the top where the slope breaks at the border, as on a half-space (Hertz), in half
 widths of the contact."""
 
-SKIRT_BLUR: Final = 0.6
+SKIRT_BLUR: Final = 0.9
 """What smoothing adds to that distance, pixels at half resolution. Chosen by hand."""
 
-SOFTNESS: Final = 2.5
+SOFTNESS: Final = 3.5
 """Where the distance is larger, the gel is coated or soft and the slope has no break: the peak of the profile
 is as blunt as its skirt is wide, and `BORDER` is reached too early by so many times the excess. Chosen on
 mini_ball, whose radii are then 3 % too large in the median."""
@@ -88,6 +88,10 @@ LEAST: Final = 0.1
 SPECK: Final = 0.05
 """Separate parts of one change with less than this fraction of the squared change of the strongest part are
 no contact of their own: what is left of a marker that was removed, a reflection. Chosen by hand."""
+
+COARSE: Final = 2
+"""Pixels of which one is taken where the largest change nearby is sought, which varies little from one to the
+next: a quarter of the time."""
 
 BIN: Final = 0.5
 """Width of the profile's bins, pixels at half resolution. Chosen by hand."""
@@ -111,14 +115,11 @@ class WindowChange:
     """How strongly a window has changed, in standard deviations, without the colour of the change.
 
     strength : (h, w) float32, its length over the channels. brightness : (h, w) float32, its mean over them.
-    Both 0 where it does not belong to the contact. strength_sum, square_sum : sums of `strength` and of its
-    squares.
+    Both 0 where it does not belong to the contact.
     """
 
     strength: Float
     brightness: Float
-    strength_sum: float
-    square_sum: float
 
 
 def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None = None) -> Float:
@@ -144,39 +145,48 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     >>> import numpy as np
     >>> rows, columns = np.mgrid[:32, :32] - 15.5
     >>> brightness = np.clip(8.5 - np.hypot(rows, columns), 0, 1).astype(np.float32)
-    >>> strength = brightness * np.float32(3**0.5)
-    >>> change = WindowChange(strength, brightness, strength.sum(), (strength**2).sum())
+    >>> change = WindowChange(brightness * np.float32(3**0.5), brightness)
     >>> bool(abs((contact_level(change) > 0).sum() / np.pi - 8**2) < 3)
     True
     """
     strength, brightness = change.strength, change.brightness
-    cap = max(GLOSS * change.square_sum / max(change.strength_sum, 1e-9), 1e-9)
-    np.minimum(strength, np.float32(cap), out=strength)
-    np.clip(brightness, -np.float32(cap / 3**0.5), np.float32(cap / 3**0.5), out=brightness)
     if hidden is not None and not cv2.countNonZero(hidden):
         hidden = None
+    cap = GLOSS * _typical(
+        strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, _SQUARE), np.uint8)
+    )
+    np.minimum(strength, np.float32(cap), out=strength)
+    np.clip(brightness, -np.float32(cap / 3**0.5), np.float32(cap / 3**0.5), out=brightness)
     if EVEN * cv2.norm(brightness, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
-        level = _changed_as_a_whole(brightness, hidden)
-    else:
-        level = _tilted(strength, bridge, hidden)
-    return _without_specks(level, strength)
+        return _without_specks(_changed_as_a_whole(brightness, hidden), strength)
+    return _tilted(strength, bridge, hidden)
 
 
-def _largest_nearby(values: Float, hidden: Mask | None) -> Float:
-    """(h, w): the largest value around, smoothed; no less than `FAINT` of the largest anywhere."""
-    peak = _peak(values)
-    changed = cv2.countNonZero((values > OUTER * peak).view(np.uint8))
-    side = 2 * round(math.sqrt(changed / math.pi)) + 1
-    if hidden is not None:
-        grown = np.asarray(cv2.dilate(hidden, _SQUARE), np.uint8)
-        values = np.where(grown > 0, np.float32(0), values)
-    largest = cv2.dilate(cv2.blur(values, (3, 3)), np.ones((side, side), np.uint8))
-    return np.maximum(cv2.blur(largest, (side, side)), np.float32(FAINT * peak), dtype=np.float32)
+def _typical(values: Float, seen: Mask | None) -> float:
+    """Mean of values >= 0, weighted by the values themselves; seen : 0 where one does not count."""
+    squares, total = cv2.norm(values, cv2.NORM_L2SQR, seen), cv2.norm(values, cv2.NORM_L1, seen)
+    return max(squares / max(total, 1e-9), 1e-9)
 
 
-def _peak(values: Float) -> float:
-    """Largest mean over 3 x 3 pixels: a maximum that noise cannot set."""
-    return max(float(cv2.minMaxLoc(cv2.blur(values, (3, 3)))[1]), 1e-9)
+def _largest_nearby(values: Float) -> Float:
+    """(h, w): the largest value around, smoothed; no less than `FAINT` of the largest anywhere.
+
+    "Around" is a square with half the side of the radius of a disc of as many pixels as have clearly changed:
+    it holds a side of the contact, but not its other end.
+    """
+    smooth = cv2.blur(values, (3, 3))
+    peak = max(float(cv2.minMaxLoc(smooth)[1]), 1e-9)
+    radius = math.sqrt(cv2.countNonZero((values > OUTER * peak).view(np.uint8)) / math.pi)
+    reach = round(radius / COARSE)
+    side = 2 * reach + 1
+    high, wide = values.shape
+    coarse = (-(-wide // COARSE), -(-high // COARSE))
+    largest = cv2.resize(smooth, coarse, interpolation=cv2.INTER_AREA)
+    largest = cv2.copyMakeBorder(largest, *(2 * reach,) * 4, cv2.BORDER_CONSTANT, value=(0.0,))
+    largest = cv2.blur(cv2.dilate(largest, np.ones((side, side), np.uint8)), (side, side))
+    largest = largest[2 * reach :, 2 * reach :][: coarse[1], : coarse[0]]
+    largest = cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR)
+    return np.maximum(largest, np.float32(FAINT * peak))
 
 
 def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
@@ -185,8 +195,8 @@ def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
     darker = brighter - brightness
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         brightness, darker = -brightness, brighter
-    around = cv2.norm(darker, cv2.NORM_L2SQR) / max(cv2.norm(darker, cv2.NORM_L1), 1e-9)
-    nearby = _largest_nearby(brightness, hidden)
+    around = _typical(darker, None)
+    nearby = _largest_nearby(brightness)
     level = np.maximum(HALF * nearby - np.float32((1 - HALF) * around), np.float32(LEAST) * nearby)
     level = (brightness - level) / nearby
     if hidden is not None:
@@ -199,18 +209,20 @@ def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
 
 def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> Float:
     """Level set of a contact that shows its slopes."""
-    strength = strength / _largest_nearby(strength, hidden)
-    changed = (strength > OUTER).view(np.uint8)
+    local = strength / _largest_nearby(strength)
+    changed = (local > OUTER).view(np.uint8)
     filled, outlines = outlined(changed, hidden)
     filled = fill_pockets(filled, outlines)
-    if not is_solid(filled):
+    solid = is_solid(filled)
+    if not solid:
         ring = changed if hidden is None else np.asarray(cv2.bitwise_and(changed | hidden, filled), np.uint8)
         reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
         filled = fill(close_gaps(ring, reach) | filled)
     if cv2.countNonZero(filled) == filled.size:
         return np.ones_like(strength)
     depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
-    return np.asarray(depth - np.float32(_border_depth(depth, strength, hidden)), np.float32)
+    level = np.asarray(depth - np.float32(_border_depth(depth, local, hidden)), np.float32)
+    return level if solid else _without_specks(level, strength)
 
 
 def _without_specks(level: Float, strength: Float) -> Float:
@@ -227,7 +239,8 @@ def _without_specks(level: Float, strength: Float) -> Float:
 def _border_depth(depth: Float, strength: Float, hidden: Mask | None) -> float:
     """How far inside the outer edge of the change the contact ends, pixels at half resolution.
 
-    depth : (h, w), distance from the outer edge, 0 outside. strength, hidden : as for `contact_level`.
+    depth : (h, w), distance from the outer edge, 0 outside. strength : (h, w), relative to the largest
+    nearby. hidden : as for `contact_level`.
     """
     every = max(1, depth.size // ENOUGH_PIXELS)
     size = int((depth.shape[0] + depth.shape[1]) / BIN) + 2
@@ -236,10 +249,11 @@ def _border_depth(depth: Float, strength: Float, hidden: Mask | None) -> float:
     known = np.flatnonzero(count >= MIN_BIN_PIXELS)
     if known.size < 2:
         return 0.5
-    profile = total[known] / count[known]
-    profile = np.convolve(np.concatenate([profile[:1], profile, profile[-1:]]), (0.25, 0.5, 0.25), "valid")
-    at = (known + 0.5) * BIN
-    largest = np.maximum.accumulate(profile)
+    steps: Double = total[known] / count[known]
+    padded: Double = np.concatenate([steps[:1], steps, steps[-1:]])
+    profile = np.asarray(padded[:-2] / 4 + padded[1:-1] / 2 + padded[2:] / 4, np.float64)
+    at: Double = (known + 0.5) * BIN
+    largest = np.asarray(np.maximum.accumulate(profile), np.float64)
     over = np.flatnonzero(profile < FALLEN * largest)
     peak = largest[over[0] if over.size else -1]
     border, top, skirt = (_crossing(profile, at, part * peak) for part in (BORDER, TOP, SKIRT))
