@@ -78,12 +78,9 @@ DEEPEST: Final = 0.4
 """The border is sought no further in than this part of the way to the middle: where an object is not round,
 the profile is a mean of borders at several depths. Chosen by hand; a ball's border lies at 0.25 to 0.4."""
 
-HALF: Final = 0.45
-"""A contact that has changed as a whole ends at this part of the way from what surrounds it to the largest
-change nearby: half of the plateau, of which noise and shading make the peak a little more. Chosen by hand."""
-
 LEAST: Final = 0.1
-"""But no further out than where this fraction of the largest change nearby is left. Chosen by hand."""
+"""A contact that has changed as a whole ends half way, but no further out than where this fraction of the
+largest change nearby is left. Chosen by hand."""
 
 SPECK: Final = 0.05
 """Separate parts of one change with less than this fraction of the squared change of the strongest part are
@@ -197,14 +194,15 @@ def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
         brightness, darker = -brightness, brighter
     around = _typical(darker, None)
     nearby = _largest_nearby(brightness)
-    level = np.maximum(HALF * nearby - np.float32((1 - HALF) * around), np.float32(LEAST) * nearby)
-    level = (brightness - level) / nearby
+    half_way = np.maximum((nearby - np.float32(around)) / 2, np.float32(LEAST) * nearby)
+    level = (brightness - half_way) / nearby
     if hidden is not None:
         # The change is smooth here: what is painted next to what is seen is nearly right.
         hidden = np.asarray(cv2.erode(hidden, _SQUARE), np.uint8)
     inside = fill_pockets(*outlined((level > 0).view(np.uint8), hidden)).view(np.bool_)
-    np.minimum(level, np.float32(HALF), out=level)
-    return np.where((level > 0) == inside, level, np.where(inside, np.float32(HALF), np.float32(-HALF)))
+    # What is filled in is as deep inside as the middle of a plateau, what is left out as far outside.
+    np.clip(level, -0.5, 0.5, out=level)
+    return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
 def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> Float:
@@ -252,8 +250,8 @@ def _border_depth(depth: Float, strength: Float, hidden: Mask | None) -> float:
     steps: Double = total[known] / count[known]
     padded: Double = np.concatenate([steps[:1], steps, steps[-1:]])
     profile = np.asarray(padded[:-2] / 4 + padded[1:-1] / 2 + padded[2:] / 4, np.float64)
-    at: Double = (known + 0.5) * BIN
-    largest = np.asarray(np.maximum.accumulate(profile), np.float64)
+    at: Double = np.asarray((known + 0.5) * BIN, np.float64)
+    largest = np.maximum.accumulate(profile)
     over = np.flatnonzero(profile < FALLEN * largest)
     peak = largest[over[0] if over.size else -1]
     border, top, skirt = (_crossing(profile, at, part * peak) for part in (BORDER, TOP, SKIRT))
