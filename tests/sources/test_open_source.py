@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import struct
+import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -416,3 +419,26 @@ def test_a_simulated_scene_is_a_recording() -> None:
     frames = read_all(source)
     assert [t for _, t in frames] == [0.0, 1 / 60, 2 / 60]
     assert all(image.shape == (600, 800, 3) for image, _ in frames)
+
+
+def test_a_file_that_claims_an_absurd_picture_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    sparse = tmp_path / "sparse.npy"
+    np.lib.format.open_memmap(sparse, "w+", np.uint8, (1, 40000, 40000, 3))
+    with pytest.raises(SourceError, match="40000 x 40000, more than"):
+        open_source(str(sparse))
+    picture = tmp_path / "picture.png"
+    # A picture of black that says that it is larger: nothing but its header is looked at.
+    data = bytearray(cv2.imencode(".png", np.zeros((20, 20), np.uint8))[1].tobytes())
+    data[16:24] = struct.pack(">II", 40000, 40000)
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    picture.write_bytes(data)
+    with pytest.raises(SourceError, match=r"has more than|not an image"):
+        open_source(str(picture))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such device")
+def test_a_link_to_a_device_is_no_picture(tmp_path: Path) -> None:
+    link = tmp_path / "a.png"
+    link.symlink_to("/dev/zero")
+    with pytest.raises(SourceError, match="required a file, not a folder or a device"):
+        open_source(str(link))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
+from tactflow.engine.frame import MOST_PIXELS
 from tactflow.files import expanded
 from tactflow.sources.base import BgrImage, Normaliser, find_path, log, quiet_opencv
 
@@ -53,6 +54,8 @@ def read_image(path: Path) -> NDArray[Any]:
         truncated JPEG with gray and says nothing to the caller, so its end is looked for here.
     """
     try:
+        if not path.is_file() and path.exists():
+            raise SourceError(f"{path}: required a file, not a folder or a device")
         data = path.read_bytes()
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -64,7 +67,12 @@ def read_image(path: Path) -> NDArray[Any]:
     try:
         with quiet_opencv():
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
+    except cv2.error as error:
+        if "MAX_IMAGE" in str(error):
+            raise SourceError(
+                f"{path}: has more than {MOST_PIXELS} pixels; if that is right, set the environment variable "
+                "OPENCV_IO_MAX_IMAGE_PIXELS"
+            ) from None
         image = None
     if image is None:
         raise SourceError(f"{path}: not an image that OpenCV can read, or a damaged one")
@@ -200,6 +208,11 @@ class ArrayFile:
         self._rate = fps or DEFAULT_FPS
         self._index = 0
         count, height, width = frames.shape[:3]
+        if height * width > MOST_PIXELS:
+            raise SourceError(
+                f"{path}: its frames are {width} x {height}, more than {MOST_PIXELS} pixels; if that is "
+                "right, set the environment variable OPENCV_IO_MAX_IMAGE_PIXELS"
+            )
         as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,) and frames.flags.c_contiguous
         self._frames: Iterator[BgrImage] = iter(frames) if as_wanted else map(Normaliser(str(path)), frames)
         self.total: int | None = count
