@@ -27,9 +27,10 @@ def plain_smooth_cells(cells: NDArray[np.uint8], smooth: Float) -> None:
     smooth[:] = cv2.blur(picture, (3, 3)).reshape(picture.shape).transpose(2, 0, 1)
 
 
-def _illumination(coefficients: Float, across: Float, down: Float, gain_basis: Float) -> Float:
-    offset, slope_x, slope_y, gain = coefficients.T[:, :, None, None]
-    return np.asarray(gain_basis * gain + offset + slope_x * across + slope_y * down[:, None], np.float32)
+def _lit(mean: Float, coefficients: Float, across: Float, down: Float) -> Float:
+    gain, slope_x, slope_y, offset = coefficients.T[:, :, None, None]
+    gains = 1 + gain + slope_x * across + slope_y * down[:, None]
+    return np.asarray(np.minimum(mean * gains + offset, 255), np.float32)
 
 
 def plain_weigh_change(
@@ -38,7 +39,6 @@ def plain_weigh_change(
     across: Float,
     down: Float,
     mean: Float,
-    gain_basis: Float,
     weight: Float,
     brightness: Float,
     colour_factor: Float,
@@ -50,7 +50,7 @@ def plain_weigh_change(
     summary: NDArray[np.float64],
 ) -> None:
     """Squared length of the weighted change; of its colour, without the part along the brightness."""
-    change = smooth - (mean + _illumination(coefficients, across, down, gain_basis))
+    change = smooth - _lit(mean, coefficients, across, down)
     squared[:] = ((change * weight) ** 2).sum(axis=0)
     colour[:] = squared * colour_factor - (change * brightness).sum(axis=0) ** 2
     np.maximum(squared, colour, out=evidence)
@@ -67,7 +67,6 @@ def plain_relative_change(
     across: Float,
     down: Float,
     mean: Float,
-    gain_basis: Float,
     scale: Float,
     blurred: Float,
 ) -> None:
@@ -76,8 +75,7 @@ def plain_relative_change(
     rows, columns = slice(top, top + high), slice(left, left + wide)
     planes = half.reshape(len(half), -1, 3)[rows, columns].transpose(2, 0, 1)
     window = slice(None), rows, columns
-    change = planes - mean[window]
-    change -= _illumination(coefficients, across[columns], down[rows], gain_basis[window])
+    change = planes - _lit(mean[window], coefficients, across[columns], down[rows])
     change *= scale[window]
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
     for plane, smooth in zip(change, blurred, strict=True):

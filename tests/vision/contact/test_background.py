@@ -21,7 +21,7 @@ from tactflow.vision.contact import (
     resolution,
 )
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
-from tactflow.vision.contact.illumination import illumination_change
+from tactflow.vision.contact.illumination import under_illumination
 from tests.oracles.background import (
     plain_change_strength,
     plain_relative_change,
@@ -236,15 +236,14 @@ def test_a_frame_that_must_not_be_written_is_compared() -> None:
     assert detector.detect(frames[1]).mask.shape == (64, 64)
 
 
-def test_the_illumination_is_the_sum_of_what_its_coefficients_say() -> None:
-    gain_basis = np.zeros((3, 5, 7), np.float32)
-    gain_basis[1, 2, 3] = 1
-    coefficients = np.array([[1, 0, 0, 9], [0, 0, 0, 2], [0, 4, 8, 9]], np.float32)
-    change = illumination_change(coefficients, gain_basis)
-    assert np.all(change[0] == 1)
-    assert change[1].sum() == change[1, 2, 3] == 2
-    assert change[2, 0].tolist() == pytest.approx(np.linspace(-6, -2, 7).tolist())
-    assert change[2, :, 0].tolist() == pytest.approx(np.linspace(-6, 2, 5).tolist())
+def test_a_gel_is_lit_as_the_coefficients_say_and_saturates() -> None:
+    gel = np.full((3, 5, 7), 100, np.float32)
+    coefficients = np.array([[0.5, 0, 0, 9], [0, 0.4, 0.8, 0], [2, 0, 0, 0]], np.float32)
+    lit = under_illumination(gel, coefficients)
+    assert np.all(lit[0] == 159)
+    assert lit[1, 0].tolist() == pytest.approx(np.linspace(40, 80, 7).tolist())
+    assert lit[1, :, 0].tolist() == pytest.approx(np.linspace(40, 120, 5).tolist())
+    assert np.all(lit[2] == 255)
 
 
 def test_the_kernels_of_the_comparison_do_not_wait_for_the_first_frame() -> None:
