@@ -11,14 +11,14 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, lead_nowhere, make_folder
+from tactflow.files import expanded, lead_nowhere, make_folder, status
 from tactflow.message import Results, encode_message
 
 log = logging.getLogger("tactflow")
@@ -104,8 +104,11 @@ class Jsonl(Sink):
                 f"{path}: this file exists; set overwrite: true to replace it, append: true to continue it, "
                 "or give another path"
             )
-        mode: Literal["wb", "r+b", "xb"] = "wb" if self.params.overwrite else "r+b" if path.exists() else "xb"
-        file = path.open(mode, buffering=0)
+        replace = os.O_TRUNC if self.params.overwrite else 0
+        create = os.O_CREAT if path.exists() else os.O_CREAT | os.O_EXCL
+        # At the end whatever happens: where another program has cut the file, no gap of NULs may follow.
+        flags = os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0) | replace | create
+        file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
         try:
             self._complete = _continue_at(file, path) if self.params.append and file.readable() else 0
         except BaseException:
@@ -142,6 +145,8 @@ class Jsonl(Sink):
         """Write what is left and close the file."""
         try:
             self._flush()
+            if self._complete is not None and self._file is not None:
+                self._check_file(0)
         finally:
             if self._file is not None and self.params.path != "-":
                 self._file.close()
@@ -169,16 +174,36 @@ class Jsonl(Sink):
             ) from error
         self._lines += len(lines)
         if self._complete is not None:
-            self._complete += len(data)
+            self._check_file(len(data))
+
+    def _check_file(self, written: int) -> None:
+        """Find out that others have removed, replaced or cut the file.
+
+        written : bytes since the last look.
+        """
+        assert self._file is not None
+        assert self._complete is not None
+        path, ours = expanded(self.params.path), os.fstat(self._file.fileno())
+        expected, self._complete = self._complete + written, ours.st_size
+        there = status(self.params.path)
+        if there is None or not os.path.samestat(there, ours):
+            what = "removed" if there is None else "replaced"
+            self._complete = None
+            raise StageError(
+                f"{path}: was {what} by another program while the run wrote to it; {self._lines} lines are "
+                "not in it"
+            )
+        if ours.st_size < expected:
+            gone = expected - ours.st_size
+            log.warning("%s: was cut by another program: %d bytes that were written are gone", path, gone)
 
     def _cut_at_complete_line(self, written: memoryview) -> None:
         """After a failed write, leave the file with complete lines only."""
         kept = bytes(written).rfind(b"\n") + 1
         self._lines += bytes(written).count(b"\n")
         if self._file is not None and self._complete is not None:
-            self._complete += kept
+            self._complete = os.fstat(self._file.fileno()).st_size - len(written) + kept
             self._file.truncate(self._complete)
-            self._file.seek(self._complete)
 
     def _reader_left(self) -> None:
         log.debug("standard output was closed by its reader")

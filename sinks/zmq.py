@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-import errno
 import logging
+import re
 import threading
 import time
 
 import orjson
 import zmq
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.message import Results, encode_message
+from tactflow.publisher import bind_publisher
 
 log = logging.getLogger("tactflow")
 
 STATS_TOPIC = b"tactflow.stats "
+EVENTS_AT_ONCE = 100
+"""Subscriptions that are looked at for one frame, so that a flood of them holds nothing up."""
+MOST_OTHERS = 1000
+"""Subscriptions up to which also those to other sensors are counted."""
+HIGHEST_PORT = 65535
+"""Ports are numbers of 16 bits."""
 
 
 class Zmq(Sink):
@@ -72,6 +79,15 @@ class Zmq(Sink):
             description="time between two messages of statistics (topic tactflow.stats), s; 0: none",
         )
 
+        @field_validator("endpoint")
+        @classmethod
+        def _port_is_one(cls, endpoint: str) -> str:
+            # ZeroMQ takes a larger number and binds another port.
+            port = re.fullmatch(r"tcp://.*:(\d+)", endpoint)
+            if port is not None and int(port[1]) > HIGHEST_PORT:
+                raise ValueError(f"required a port up to {HIGHEST_PORT}, got {port[1]}")
+            return endpoint
+
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is bound yet.
 
@@ -116,15 +132,13 @@ class Zmq(Sink):
             If the address is taken or cannot be bound.
         """
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        socket = context.socket(zmq.XPUB)
-        socket.sndhwm = self.params.backlog
-        socket.setsockopt(zmq.SNDBUF, self.params.send_buffer)
         try:
-            socket.bind(self.params.endpoint)
-        except zmq.ZMQError as error:
-            socket.close(linger=0)
+            socket = bind_publisher(
+                context, self.params.endpoint, self.params.backlog, self.params.send_buffer
+            )
+        except StageError:
             context.term()
-            raise StageError(_bind_problem(self.params.endpoint, error)) from error
+            raise
         self._context, self._socket = context, socket
         self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
         self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
@@ -200,28 +214,26 @@ class Zmq(Sink):
         if not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             return
         try:
-            while True:
+            for _ in range(EVENTS_AT_ONCE):
                 event = self._socket.recv(zmq.NOBLOCK)
-                if event[:1] == b"\x01":
+                if event[:1] == b"\x01" and self._is_kept(event[1:]):
                     self._subscriptions.add(event[1:])
                 elif event[:1] == b"\x00":
                     self._subscriptions.discard(event[1:])
         except zmq.Again:
             pass
-        # A subscription is a prefix of the message; it may be longer than the topic.
-        topic = self._topic
-        self._wanted = any(topic.startswith(s) or s.startswith(topic) for s in self._subscriptions)
-        self._stats_wanted = any(s.startswith(STATS_TOPIC.rstrip()) for s in self._subscriptions)
+        self._wanted = any(map(self._asks_for_results, self._subscriptions))
+        self._stats_wanted = any(map(_asks_for_statistics, self._subscriptions))
+
+    def _is_kept(self, subscription: bytes) -> bool:
+        """Of those to others only some are counted, or their memory would have no bound."""
+        ours = self._asks_for_results(subscription) or _asks_for_statistics(subscription)
+        return ours or len(self._subscriptions) < MOST_OTHERS
+
+    def _asks_for_results(self, subscription: bytes) -> bool:
+        """A subscription is a prefix of the message; it may be longer than the topic."""
+        return self._topic.startswith(subscription) or subscription.startswith(self._topic)
 
 
-def _bind_problem(endpoint: str, error: zmq.ZMQError) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return (
-            f"{endpoint} is in use: another tactflow run, or another program, publishes there. End it, "
-            "choose another address (--set sinks.zmq.endpoint=tcp://127.0.0.1:5557) or publish nothing "
-            "(--set sinks.zmq=null)"
-        )
-    return (
-        f"{endpoint} cannot be bound: {error.strerror}; required an address of this machine such as "
-        "tcp://127.0.0.1:5556, tcp://*:5556 or ipc:///tmp/tactflow"
-    )
+def _asks_for_statistics(subscription: bytes) -> bool:
+    return subscription.startswith(STATS_TOPIC.rstrip())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
@@ -10,7 +12,7 @@ from tactflow.ports import ContactMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import moments
 from tactflow.vision.geometry.hull import contact_geometry
-from tactflow.vision.types import Contact
+from tactflow.vision.types import Contact, Evidence
 
 
 class Hull(Stage):
@@ -41,7 +43,7 @@ class Hull(Stage):
         self._params = params
         compiled.load(moments)
 
-    def process(self, contact_mask: ContactMask) -> Contact | Absent:
+    def process(self, contact_mask: ContactMask, evidence: Evidence | None = None) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
         params = self._params
         contact = contact_geometry(
@@ -50,4 +52,6 @@ class Hull(Stage):
             max_gap=params.max_gap,
             min_confidence=params.min_confidence,
         )
-        return Absent("no_contact") if contact is None else contact
+        if contact is None:
+            return Absent("no_contact")
+        return contact if evidence is None else replace(contact, evidence=evidence)

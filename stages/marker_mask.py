@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -59,4 +60,4 @@ class MarkerMaskStage(Stage):
         found = find_dot(image, radius=radius, polarity=params.polarity, valid=valid)
         if found is None or params.contrast == "auto":
             return found
-        return Dot(found.radius, found.polarity, params.contrast)
+        return replace(found, contrast=params.contrast)

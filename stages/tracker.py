@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,8 @@ from tactflow.vision.markers import field, matching, spots, template, tracking
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers
+
+logger = logging.getLogger("tactflow")
 
 
 class Tracker(Stage):
@@ -70,6 +73,8 @@ class Tracker(Stage):
         self._detection = detect_markers(
             image, dot_radius=self._params.dot, polarity=self._params.polarity, valid=valid
         )
+        if self._detection.doubt is not None:
+            logger.warning("tracker: %s", self._detection.doubt)
         return self._tracker_of([image], self._detection)
 
     def _tracker_of(self, references: list[NDArray[np.uint8]], detection: Detection) -> MarkerTracker:

@@ -31,6 +31,7 @@ CONTACT = Contact(
     hull=np.array([[1.0, 2.0], [3.0, 4.5], [0.1, 9.0]]),
     ellipse=Ellipse((150.0, 200.0), (90.5, 60.25), -12.9),
     confidence=0.75,
+    evidence="both",
 )
 FLOW = Flow((1.21, -0.33), 9, stderr=(0.1, 0.2), rotation=3.5, divergence=0.01, residual=0.05)
 MARKERS = Markers(
@@ -56,6 +57,7 @@ def test_the_message_has_exactly_the_fields_of_the_contract() -> None:
             "slope": 0.218,
             "hull": [[1.0, 2.0], [3.0, 4.5], [0.1, 9.0]],
             "ellipse": {"center": [150.0, 200.0], "axes": [90.5, 60.25], "angle": -12.9},
+            "evidence": "both",
         },
         "flow": {"mean": [1.21, -0.33], "count": 9},
         "markers": {

@@ -18,7 +18,7 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from tactflow.engine.frame import Tick
 from tactflow.ports import Image
-from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
+from tactflow.vision.types import Contact, Evidence, Flow, Markers, MarkerStatus
 
 SCHEMA = "tactflow.frame/1"
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
@@ -122,6 +122,7 @@ def _contact(contact: Contact, detail: bool) -> dict[str, Any]:
             "axes": _pair(ellipse.axes, "contact.ellipse.axes"),
             "angle": _optional(ellipse.angle, "contact.ellipse.angle"),
         },
+        "evidence": contact.evidence,
     }
     if detail:
         result["confidence"] = _number(contact.confidence, "contact.confidence")
@@ -219,6 +220,9 @@ class _ContactModel(_Strict):
     )
     hull: list[_Point] = Field(description="vertices of the convex hull in order, px")
     ellipse: _EllipseModel | None = Field(description="null where none can be fitted")
+    evidence: Evidence = Field(
+        description="what shows it: a change of the light, motion of the markers (dots), or both"
+    )
     confidence: float = Field(
         0.0, ge=0, le=1, description="of the direction: 0 a disc, towards 1 a line (detail)"
     )

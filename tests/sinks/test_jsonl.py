@@ -244,3 +244,31 @@ print("more text that nobody reads")
     assert child.stderr.read() == b""
     child.stderr.close()
     assert child.wait(PATIENCE) == 0
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+@pytest.mark.parametrize("seqs", [range(5, 5), range(5, 9)], ids=["nothing more", "more"])
+def test_a_file_that_another_program_takes_away_is_an_error(
+    tmp_path: Path, seqs: range, replaced: bool
+) -> None:
+    path = tmp_path / "out.jsonl"
+    sink = opened(path, flush=0)
+    write(sink, range(5))
+    path.rename(tmp_path / "elsewhere.jsonl")
+    if replaced:
+        path.write_text("somebody else's")
+    with pytest.raises(StageError, match="replaced by another" if replaced else "removed by another"):
+        write_and_close(sink, seqs)
+    assert seqs_in(tmp_path / "elsewhere.jsonl")[:5] == [*range(5)]
+
+
+def test_a_file_that_another_program_cuts_goes_on_without_a_gap(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "out.jsonl"
+    sink = opened(path, flush=0)
+    write(sink, range(5))
+    os.truncate(path, 0)
+    write_and_close(sink, range(5, 8))
+    assert seqs_in(path) == [5, 6, 7]
+    assert "was cut by another program" in caplog.text

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+import socket as system_socket
+import sys
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import zmq
+from pydantic import ValidationError
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
-from tactflow.sinks.zmq import Zmq
+from tactflow.sinks.zmq import MOST_OTHERS, Zmq
 from tactflow.vision.types import Markers
 from tests.clock import PATIENCE
 
@@ -228,6 +233,60 @@ def test_an_address_that_makes_no_sense_is_an_error(endpoint: str) -> None:
     sink = Zmq(Zmq.Params(endpoint=endpoint))
     with pytest.raises(StageError, match=r"cannot be bound.*tcp://127"):
         sink.open()
+    sink.close()
+
+
+def test_a_port_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ValidationError, match="required a port up to 65535, got 99999"):
+        Zmq.Params(endpoint="tcp://127.0.0.1:99999")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such addresses")
+def test_an_ipc_address_takes_no_file_and_no_other_runs_place(tmp_path: Path) -> None:
+    file, place = tmp_path / "notes.txt", tmp_path / "tactflow"
+    file.write_text("precious")
+    with pytest.raises(StageError, match=r"notes\.txt is a file"):
+        Zmq(Zmq.Params(endpoint=f"ipc://{file}")).open()
+    assert file.read_text() == "precious"
+    first, second = (Zmq(Zmq.Params(endpoint=f"ipc://{place}")) for _ in range(2))
+    first.open()
+    with pytest.raises(StageError, match="is in use"):
+        second.open()
+    first.close()
+    # What a killed run leaves behind is in nobody's way.
+    with system_socket.socket(system_socket.AF_UNIX) as left:
+        place.unlink(missing_ok=True)
+        left.bind(str(place))
+    second.open()
+    second.close()
+
+
+def subscribe_by_hand(endpoint: str, topic: bytes) -> None:
+    """Send a subscription that no library would, by the wire protocol (ZMTP 3.0), and hang up."""
+    host, _, port = endpoint.removeprefix("tcp://").partition(":")
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
+    ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB"
+    message = b"\x01" + topic
+    with system_socket.create_connection((host, int(port)), timeout=PATIENCE) as connection:
+        connection.sendall(greeting + bytes([4, len(ready)]) + ready)
+        with suppress(OSError):
+            connection.sendall(b"\x02" + len(message).to_bytes(8, "big") + message)
+            while connection.recv(4096):
+                pass
+
+
+def test_hostile_subscriptions_are_neither_kept_nor_read_without_bound(subscribe: Subscribing) -> None:
+    sink = opened()
+    flood = subscribe(sink.endpoint)
+    for number in range(3000):
+        flood.subscribe(b"nonsense %d" % number)
+    # ZeroMQ keeps subscriptions in a tree, and takes a step on the stack for each of its bytes.
+    subscribe_by_hand(sink.endpoint, bytes(1 << 20))
+    good = subscribe(sink.endpoint)
+    wait_until_wanted(sink)
+    write(sink, range(1))
+    assert receive(good)[1]["seq"] == 0
+    assert sink.counters()["subscriptions"] <= MOST_OTHERS + 1
     sink.close()
 
 

@@ -28,7 +28,10 @@ def bar(height: int = 10) -> NDArray[np.uint8]:
 
 def test_it_takes_a_contact_mask_and_may_give_a_contact() -> None:
     ports = read_ports(Hull, "process")
-    assert [port.name for port in ports.inputs] == ["contact_mask"]
+    assert [(port.name, port.optional) for port in ports.inputs] == [
+        ("contact_mask", False),
+        ("evidence", True),
+    ]
     assert [(port.name, port.optional) for port in ports.outputs] == [("contact", True)]
 
 
@@ -42,6 +45,12 @@ def test_a_bar_is_described() -> None:
     assert contact.angle == 0.0
     assert contact.center == (34.5, 24.5)
     assert contact.area == 500
+
+
+def test_the_contact_tells_what_showed_it() -> None:
+    stage = Hull(Hull.Params())
+    told = [stage.process(bar(), evidence) for evidence in (None, "dots", "both")]
+    assert [contact.evidence for contact in told if isinstance(contact, Contact)] == ["light", "dots", "both"]
 
 
 def test_what_is_smaller_than_min_area_is_no_contact() -> None:

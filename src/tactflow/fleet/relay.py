@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import zmq
 
 from tactflow.engine.errors import StageError
+from tactflow.publisher import bind_publisher
 
 SEND_BUFFER = 32_768
 """Kernel send buffer per subscriber, bytes, the ZeroMQ sink's default. Large ones hold seconds of messages.
@@ -31,20 +32,16 @@ def relay(address: str, upstream: Sequence[str], backlog: int) -> Iterator[None]
     StageError : the address cannot be bound.
     """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    front, back = context.socket(zmq.XPUB), context.socket(zmq.XSUB)
+    try:
+        front = bind_publisher(context, address, backlog, SEND_BUFFER)
+    except StageError:
+        context.term()
+        raise
+    back = context.socket(zmq.XSUB)
     front.linger = LINGER_MS
     back.linger = 0
     # As in the sink: a slow reader shall not be seconds behind.
-    front.sndhwm = back.rcvhwm = backlog
-    front.setsockopt(zmq.SNDBUF, SEND_BUFFER)
-    try:
-        front.bind(address)
-    except zmq.ZMQError as error:
-        context.destroy(linger=0)
-        raise StageError(
-            f"{address} cannot be bound: {error.strerror}; end what publishes there, or give the sinks "
-            "another address, such as tcp://127.0.0.1:5557"
-        ) from error
+    back.rcvhwm = backlog
     for publisher in upstream:
         back.connect(publisher)
     stop = threading.Event()

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.floating[Any]]
+
+Evidence = Literal["light", "dots", "both"]
+"""What shows a contact: a change of the light, motion of the markers, or both."""
 
 
 class MarkerStatus(IntEnum):
@@ -56,6 +59,7 @@ class Contact:
     ellipse : fitted ellipse, or None where none can be fitted.
     confidence : of the direction, in [0, 1]: 0 for a disc, towards 1 for a line.
     region_area : number of pixels of the region, px^2.
+    evidence : what shows it.
 
     >>> square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
     >>> Contact(4.0, (1.0, 1.0), None, None, square, None).center
@@ -70,6 +74,7 @@ class Contact:
     ellipse: Ellipse | None
     confidence: float = 0.0
     region_area: float = 0.0
+    evidence: Evidence = "light"
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halve_block
-from tactflow.vision.markers.detection import NoMarkersError, detect_markers
+from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers
 
 Bytes = NDArray[np.uint8]
 Polarity = Literal["dark", "bright"]
@@ -31,6 +31,10 @@ CONTRAST_FRACTION: Final = 0.25
 """Fraction of the dots' median contrast from which on a spot is a dot. Worn dots keep that much.
 Chosen by hand."""
 
+ONE_MASK: Final = 1.6
+"""Ratio of the radii of dots for which one circle serves: it lies a radius outside a dot, so one of 1.6 times
+the radius is still within it. Chosen on handmade_dots."""
+
 LEAST_CONTRAST: Final = 6.0
 """Least contrast of a dot, grey levels: 120 / 20, the threshold of the original script over its gain."""
 
@@ -40,16 +44,18 @@ class Dot:
     """What the markers of a gel look like.
 
     radius : px, > 0. polarity : darker or brighter than the gel. contrast : least difference to the gel that
-    counts as a marker, grey levels, > 0.
+    counts as a marker, grey levels, > 0. others : radii of those of other sizes, px, each > 0.
     """
 
     radius: float
     polarity: Polarity = "dark"
     contrast: float = LEAST_CONTRAST
+    others: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (self.radius > 0 and math.isfinite(self.radius)):
-            raise ValueError(f"radius: required > 0 px, got {self.radius}")
+        for radius in (self.radius, *self.others):
+            if not (radius > 0 and math.isfinite(radius)):
+                raise ValueError(f"radius: required > 0 px, got {radius}")
         if self.polarity not in ("dark", "bright"):
             raise ValueError(f"polarity: required 'dark' or 'bright', got {self.polarity!r}")
         if not (self.contrast > 0 and math.isfinite(self.contrast)):
@@ -91,7 +97,16 @@ def find_dot(
     columns, rows = np.clip(np.rint((found.centers - 0.5) / 2).astype(int).T, 0, None)
     at = contrast[np.minimum(rows, contrast.shape[0] - 1), np.minimum(columns, contrast.shape[1] - 1)]
     least = max(LEAST_CONTRAST, CONTRAST_FRACTION * float(np.median(at)))
-    return Dot(found.dot_radius, found.polarity, least)
+    return Dot(found.dot_radius, found.polarity, least, _other_sizes(found))
+
+
+def _other_sizes(found: Detection) -> tuple[float, ...]:
+    """Radii, px, of marks that a circle around one of the usual size would cut or lead past."""
+    if found.radii is None:
+        return ()
+    step = np.rint(np.log(found.radii / found.dot_radius) / np.log(ONE_MASK))
+    sizes, counts = np.unique(step, return_counts=True)
+    return tuple(found.dot_radius * ONE_MASK ** float(s) for s in sizes[(counts > 1) & (sizes != 0)])
 
 
 def marker_mask(image: Bytes, dot: Dot) -> Bytes:
@@ -128,11 +143,19 @@ def marker_mask(image: Bytes, dot: Dot) -> Bytes:
             f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
         )
     whole = _even(image)
-    own = _contrast(whole, dot.radius, dot.polarity)
+    mask = _mask(whole, dot, dot.radius)
+    for radius in dot.others:
+        mask |= _mask(whole, dot, radius)
+    return np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
+
+
+def _mask(whole: Bytes, dot: Dot, radius: float) -> Bytes:
+    """The mask of dots of one size, of an image of even height and width."""
+    own = _contrast(whole, radius, dot.polarity)
     mask = np.empty(whole.shape[:2], np.uint8)
     threshold = min(255, math.floor(dot.contrast))
-    cover_spots(own.contrast, threshold, own.reach, _corner(dot.radius), own.spots, own.doubled, mask)
-    return np.ascontiguousarray(mask[: image.shape[0], : image.shape[1]])
+    cover_spots(own.contrast, threshold, own.reach, _corner(radius), own.spots, own.doubled, mask)
+    return mask
 
 
 def _even(image: Bytes) -> Bytes:
@@ -160,17 +183,23 @@ class _Buffers:
         self.doubled = np.empty(2 * self.spots.size, np.uint8)
 
 
+KINDS_KEPT: Final = 6
+"""Kinds of frames and dots whose buffers a thread keeps: sizes of dots in one picture. Chosen by hand."""
+
 _kept = threading.local()
-"""The buffers of each thread, for frames of one size and one kind of dot."""
+"""The buffers of each thread, for the kinds of frames and dots that it saw last."""
 
 
 def _contrast(whole: Bytes, radius: float, polarity: Polarity) -> _Buffers:
     """Buffers whose `contrast` is that of an image of even height and width, at half resolution."""
     height, width = whole.shape[0] // 2, whole.shape[1] // 2
     kind = (height, width, radius, polarity)
-    if getattr(_kept, "kind", None) != kind:
-        _kept.kind, _kept.buffers = kind, _Buffers(*kind)
-    own: _Buffers = _kept.buffers
+    buffers: dict[tuple[int, int, float, Polarity], _Buffers] = _kept.__dict__.setdefault("buffers", {})
+    if kind not in buffers:
+        if len(buffers) >= KINDS_KEPT:
+            buffers.clear()
+        buffers[kind] = _Buffers(*kind)
+    own = buffers[kind]
     picture = own.half
     halve_block(whole.reshape(len(whole), -1), 0, 0, picture, own.reach, own.reach, height, width, False)
     if polarity == "bright":

@@ -41,6 +41,9 @@ RIDGE: Final = 1e-6
 """Ridge of the normal equations, relative to their trace: keeps marks without contrast solvable. Such marks
 are never trusted. Chosen by hand."""
 
+ONE_TEMPLATE: Final = 1.5
+"""Ratio of radii of marks whose templates have one size, at most. Chosen by hand."""
+
 LANES: Final = 32
 """Rows of weights are padded to multiples of so many values: whole vector registers."""
 
@@ -157,6 +160,38 @@ class MarkerTemplates:
             np.empty(1, np.int64),
         )
         return Alignment(position, found[0], found[1], found[2])
+
+
+class SizedTemplates:
+    """Templates of marks of several sizes: each holds its mark, and none its neighbours.
+
+    As `MarkerTemplates`, but radii : (N,) float64, px.
+    """
+
+    def __init__(
+        self, reference: Float32Array, origin: FloatArray, radii: FloatArray, dark: bool = True
+    ) -> None:
+        step = np.floor(np.log(radii / radii.min()) / np.log(ONE_TEMPLATE) + 1e-6)
+        sizes, self._size = np.unique(step, return_inverse=True)
+        self._place = np.empty(len(radii), np.int64)
+        self._templates = []
+        for size in range(len(sizes)):
+            marks = np.flatnonzero(self._size == size)
+            self._place[marks] = np.arange(len(marks))
+            radius = float(np.max(radii[marks]))
+            self._templates.append(MarkerTemplates(reference, origin[marks], radius, dark))
+
+    def align(self, image: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None) -> Alignment:
+        """As `MarkerTemplates.align`."""
+        marks = np.arange(len(self._size)) if marks is None else marks
+        found = np.empty((len(marks), 2)), *np.empty((3, len(marks)), np.float32)
+        for size, templates in enumerate(self._templates):
+            those = np.flatnonzero(self._size[marks] == size)
+            if len(those):
+                part = templates.align(image, start[those], self._place[marks[those]])
+                for whole, values in zip(found, part, strict=True):
+                    whole[those] = values
+        return Alignment(*found)
 
 
 class _Sampler:

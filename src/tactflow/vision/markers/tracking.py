@@ -15,7 +15,7 @@ from tactflow.vision.markers.interpolation import Interpolator
 from tactflow.vision.markers.jump import common_displacement
 from tactflow.vision.markers.matching import choose_spots
 from tactflow.vision.markers.spots import NearPoints, SpotFinder
-from tactflow.vision.markers.template import Alignment, MarkerTemplates
+from tactflow.vision.markers.template import Alignment, MarkerTemplates, SizedTemplates
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]
@@ -166,7 +166,11 @@ class MarkerTracker:
         if len(grays) > 1:
             self._origin = refine_centers(mean if dark else 255 - mean, self._origin, self._radius)
         self._count = len(self._origin)
-        self._templates = MarkerTemplates(mean, self._origin, self._radius, dark)
+        self._templates: MarkerTemplates | SizedTemplates = (
+            MarkerTemplates(mean, self._origin, self._radius, dark)
+            if detection.radii is None
+            else SizedTemplates(mean, self._origin, detection.radii, dark)
+        )
         self._spots = SpotFinder(np.rint(mean).astype(np.uint8), detection)
         self._field = DisplacementField(self._origin, detection.edges)
         self._enough_border = BORDER_SEEN * np.count_nonzero(self._field.border)

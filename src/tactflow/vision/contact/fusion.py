@@ -1,0 +1,100 @@
+"""Whether and where something touches the gel, from what the light and what the markers say.
+
+Each has a test with a rate of false alarms of its own, and if either sees a contact there is one: the rates
+add up. The markers also check the light: a change that covers many of them, none of which moves, is one of
+the lamp or the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.flow.inside import inside_mask
+from tactflow.vision.flow.motion import Motion, MotionTest
+from tactflow.vision.types import Evidence, Markers, MarkerStatus
+
+Mask = NDArray[np.uint8]
+
+UNMOVED: Final = 6
+"""Markers below a change of the light, none of which moves, from which on it is no contact. Measured: of the
+frames in contact of the simulator, mini_ball, gelslim_ball, handmade_dots, sts_640 and franka_mini, those in
+which no marker moved had at most 5 below the contact."""
+
+MARGIN: Final = 0.125
+"""How much wider than the hull of its markers a region is, pitches. Chosen by hand."""
+_TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
+
+
+@dataclass(frozen=True, slots=True)
+class FusedContact:
+    """Where a frame shows contact.
+
+    mask : (H, W) uint8, 255 in contact. evidence : what showed it; None where nothing touches.
+    light_changed : whether there is a change of the light that is no contact.
+    """
+
+    mask: Mask
+    evidence: Evidence | None
+    light_changed: bool = False
+
+    @property
+    def touching(self) -> bool:
+        """Whether anything is in contact."""
+        return self.evidence is not None
+
+
+def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContact:
+    """Join the contact that the light shows and the one that the markers show.
+
+    Parameters
+    ----------
+    light : (H, W) uint8, 255 where the light shows contact; returned as it is where it shows the contact.
+    markers : of the same frame. test : of the motion of these markers, given every frame in order.
+
+    Returns
+    -------
+    FusedContact : the region is that of the light if it sees any, for its outline is the finer one; else the
+        convex hull of the most stretched part of the gel.
+
+    Examples
+    --------
+    >>> origin = np.array([[x, y] for y in range(0, 100, 20) for x in range(0, 100, 20)], float)
+    >>> position = origin.copy()
+    >>> position[[6, 7, 8]] += [2.0, 0.0]
+    >>> markers = Markers(origin, position, np.zeros(25, np.uint8), np.full(25, 0.02))
+    >>> fused = fuse_contact(np.zeros((100, 100), np.uint8), markers, MotionTest(origin))
+    >>> fused.evidence, fused.mask[20, 40]
+    ('dots', np.uint8(255))
+    """
+    motion = test(markers)
+    if not light.any():
+        if not motion.moving:
+            return FusedContact(light, None)
+        return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
+    if motion.moving:
+        return FusedContact(light, "both")
+    if _rests(light, markers, motion):
+        return FusedContact(np.zeros_like(light), None, light_changed=True)
+    return FusedContact(light, "light")
+
+
+def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
+    """Whether many markers lie below a change of the light, and all of them are at rest."""
+    seen = markers.status == _TRACKED
+    below = inside_mask(markers.position[seen], light)
+    resting = motion.still[seen][below]
+    return len(resting) >= UNMOVED and bool(resting.all())
+
+
+def _region(points: NDArray[np.float64], pitch: float, like: Mask) -> Mask:
+    """The convex hull of markers, a little wider, so that markers in a line have one, too."""
+    region = np.zeros_like(like)
+    hull = cv2.convexHull(np.rint(points).astype(np.int32))
+    cv2.fillConvexPoly(region, hull, 255)
+    cv2.polylines(region, [hull], True, 255, max(1, round(2 * MARGIN * pitch)))
+    return region

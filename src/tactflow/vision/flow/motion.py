@@ -1,0 +1,200 @@
+"""Whether the markers move as something that touches the gel moves them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.markers.family import LONGEST_LINK
+from tactflow.vision.markers.lattice import neighbour_graph
+from tactflow.vision.types import Markers, MarkerStatus
+
+FloatArray = NDArray[np.float64]
+
+TOGETHER: Final = 3
+"""Neighbouring markers that must have moved: a single one may be mistaken for its neighbour."""
+TRIPLES: Final = 15
+"""Pairs among the neighbours of a marker, with which it makes three that move together, at most: of six."""
+STAY: Final = 0.6
+"""Part of the threshold that is enough to go on moving. Chosen by hand."""
+STILL: Final = 0.5
+"""Part of the threshold up to which a marker is at rest. Chosen by hand."""
+FORGET: Final = 0.96
+"""How fast the strongest recent motion is forgotten, per frame: half in 17 frames, as for the light."""
+STRETCHED: Final = 0.6
+"""Part of the largest strain from which on the gel beside a marker is in contact: a contact drags along all
+gel around, but what it strains most is where it ends. Chosen on the simulator, mini_ball and gelslim_ball,
+where the region then overlaps the true one by 0.4 to 0.65 (IoU, medians), and less where a contact slides."""
+_TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What the markers say of one frame.
+
+    moving : whether neighbouring markers have moved in a way that no motion of the whole gel explains.
+    largest : the third largest of their motions, px; 0 with fewer than three tracked markers.
+    still : (N,) bool, tracked markers that are at rest: not even half of what `moving` asks for.
+    """
+
+    moving: bool
+    largest: float
+    still: NDArray[np.bool_]
+
+
+class MotionTest:
+    """Tests whether markers have moved against each other, beyond their standard errors.
+
+    What the whole gel does, or the camera that looks at it, is no contact: both are stiff, so that it is a
+    shift and a turn. They are estimated by medians, which follow the majority of the markers, and taken out.
+    What is left of a tracked marker is compared with its standard error, joined by `steadiness`. Markers that
+    are inferred or lost have no vote.
+
+    Parameters
+    ----------
+    origin : (N, 2) float64, markers in the reference frame, px.
+    false_alarms : frames of the untouched gel in which markers are said to move, per frame, in (0, 1). Errors
+        of neighbours are taken for independent.
+    steadiness : how far the markers of an untouched gel stray, standard deviation of each coordinate, px.
+        Higher misses lighter contacts.
+    relaxation : part of the strongest recent motion that a gel may still show after it was released, [0, 1).
+
+    Raises
+    ------
+    ValueError : a parameter out of its range.
+
+    References
+    ----------
+    P. J. Rousseeuw, A. M. Leroy, "Robust Regression and Outlier Detection", 1987, for fits by medians.
+
+    Examples
+    --------
+    >>> origin = np.array([[x, y] for y in range(0, 100, 20) for x in range(0, 100, 20)], float)
+    >>> test = MotionTest(origin)
+    >>> status, stderr = np.zeros(25, np.uint8), np.full(25, 0.02)
+    >>> test(Markers(origin, origin + [3.0, 1.0], status, stderr)).moving  # all alike
+    False
+    >>> pressed = origin.copy()
+    >>> pressed[[6, 7, 8]] += [2.0, 0.0]
+    >>> test(Markers(origin, pressed, status, stderr)).moving
+    True
+    """
+
+    def __init__(
+        self,
+        origin: FloatArray,
+        *,
+        false_alarms: float = 1e-6,
+        steadiness: float = 0.14,
+        relaxation: float = 0.1,
+    ) -> None:
+        if not 0 < false_alarms < 1:
+            raise ValueError(f"false_alarms: required in (0, 1), got {false_alarms}")
+        if not (steadiness > 0 and math.isfinite(steadiness)):
+            raise ValueError(f"steadiness: required > 0 px, got {steadiness}")
+        if not 0 <= relaxation < 1:
+            raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
+        origin = np.asarray(origin, np.float64)
+        self._origin = origin
+        x, y = (origin - origin.mean(axis=0)).T if len(origin) else np.zeros((2, 0))
+        self._arms = np.stack([x, y, 1 / np.maximum(x * x + y * y, 1.0)])
+        self._variance = steadiness**2
+        self._relaxation = relaxation
+        self.pitch = median_spacing(origin)
+        """Median distance of a marker to its nearest neighbour, px; 0 for fewer than two."""
+        self._links = neighbour_graph(origin, LONGEST_LINK * self.pitch)
+        self._one, self._other = self._links.T
+        self._lengths = np.hypot(*(origin[self._one] - origin[self._other]).T)
+        # A motion in a plane exceeds k standard deviations with exp(-k^2 / 2); three must at once.
+        alone = (false_alarms / (TRIPLES * max(1, len(origin)))) ** (1 / TOGETHER)
+        self._limit = math.sqrt(-2 * math.log(alone))
+        self._strongest = 0.0
+        self._moving = False
+
+    def __call__(self, markers: Markers) -> Motion:
+        """Test the markers of one frame, in order.
+
+        Raises ValueError if they are not as many as in the reference.
+        """
+        if markers.position.shape != self._origin.shape:
+            raise ValueError(f"required {len(self._origin)} markers, got {len(markers.position)}")
+        tracked = markers.status == _TRACKED
+        left = np.zeros(len(tracked))
+        number = np.count_nonzero(tracked)
+        if number >= TOGETHER:
+            moved = markers.position - self._origin
+            if number == len(left):
+                left = _unexplained(moved, self._arms)
+            else:
+                left[tracked] = _unexplained(moved[tracked], self._arms[:, tracked])
+        remembered = self._relaxation * self._strongest
+        bound = self._limit * np.sqrt(markers.stderr * markers.stderr + self._variance)
+        start = np.maximum(STAY * bound if self._moving else bound, remembered)
+        # Comparing with an unknown standard error, which is NaN, gives False.
+        together = self._together(left > start)
+        largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
+        self._moving = bool(together.any())
+        self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
+        return Motion(self._moving, largest, tracked & (left <= STILL * bound))
+
+    def stretched(self, markers: Markers) -> FloatArray:
+        """Positions (K, 2), px, of the markers at the most strained links between tracked ones.
+
+        Empty where no two neighbours are tracked.
+        """
+        tracked = markers.status == _TRACKED
+        seen = tracked[self._one] & tracked[self._other]
+        moved = markers.position - self._origin
+        strain = np.hypot(*(moved[self._one] - moved[self._other]).T) * seen / self._lengths
+        most = self._links[seen & (strain >= STRETCHED * strain.max(initial=0.0))]
+        return np.asarray(markers.position[np.unique(most)], np.float64)
+
+    def _together(self, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Of the markers that moved, those in a chain of three neighbours."""
+        if not moved.any():
+            return moved
+        count = len(moved)
+        pair = moved[self._one] & moved[self._other]
+        ends = np.concatenate([self._one[pair], self._other[pair]])
+        beside = np.bincount(ends, minlength=count)
+        middle = beside >= TOGETHER - 1
+        near = np.zeros(count, np.bool_)
+        near[self._other[pair & middle[self._one]]] = True
+        near[self._one[pair & middle[self._other]]] = True
+        return np.asarray(middle | near)
+
+
+def median_spacing(points: FloatArray) -> float:
+    """Median distance of points, (N, 2) float64, to their nearest neighbour; 0 for fewer than two.
+
+    >>> median_spacing(np.array([[0.0, 0.0], [3.0, 4.0], [10.0, 4.0]]))
+    5.0
+    """
+    if len(points) < 2:
+        return 0.0
+    away = np.hypot(*(points[:, None] - points).transpose(2, 0, 1))
+    np.fill_diagonal(away, np.inf)
+    return float(np.median(away.min(axis=1)))
+
+
+def _unexplained(moved: FloatArray, arms: FloatArray) -> FloatArray:
+    """What a shift and a small turn of the whole gel leave of the motions of markers: (n,), px.
+
+    moved : (n, 2), px. arms : (3, n), how far each is from the middle in x and in y, px, and one over the
+    square of that distance.
+    """
+    x, y, over_square = arms
+    moved = moved - _median(moved)
+    # Each marker gives an estimate of the turn: its motion across the arm, over the arm's length.
+    turn = _median(((x * moved[:, 1] - y * moved[:, 0]) * over_square)[:, None])[0]
+    return np.asarray(np.hypot(moved[:, 0] + turn * y, moved[:, 1] - turn * x), np.float64)
+
+
+def _median(vectors: FloatArray) -> FloatArray:
+    """Of each coordinate, (2,). A fifth of the time of `np.median` for a hundred vectors."""
+    ordered = np.sort(vectors, axis=0)
+    return np.asarray((ordered[(len(vectors) - 1) // 2] + ordered[len(vectors) // 2]) / 2, np.float64)

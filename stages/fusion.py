@@ -1,0 +1,89 @@
+"""Stage `fusion`: contact from what the light and what the markers say."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from pydantic import Field
+
+from tactflow.engine.contract import Stage, StageParams
+from tactflow.ports import ContactMask, Touching
+from tactflow.vision.contact.fusion import fuse_contact
+from tactflow.vision.flow.motion import MotionTest
+from tactflow.vision.types import Evidence, Markers
+
+
+class FusedPorts(NamedTuple):
+    """contact_mask : 255 in contact. touching : whether anything is. evidence : what showed it."""
+
+    contact_mask: ContactMask
+    touching: Touching
+    evidence: Evidence | None
+
+
+class Fusion(Stage):
+    """Let the markers vote on the contact that the light shows.
+
+    A change of the light that covers markers of which none moves is no contact. While it lasts, a new
+    reference is asked for.
+    """
+
+    memory = "stateful"
+
+    class Params(StageParams):
+        """When markers have moved."""
+
+        false_alarms: float = Field(
+            1e-6,
+            gt=0,
+            lt=1,
+            description="frames of the untouched gel in which markers are said to move, per frame; those of "
+            "difference come on top",
+        )
+        steadiness: float = Field(
+            0.14,
+            gt=0,
+            le=100,
+            description="how far markers of the untouched gel stray, standard deviation of x and of y, px",
+        )
+        relaxation: float = Field(
+            0.1,
+            ge=0,
+            lt=1,
+            description="what the markers of a released gel still show, relative to the strongest motion",
+        )
+        patience: int = Field(
+            30,
+            ge=0,
+            description="frames in a row in which the light has changed but nothing moves, after which a "
+            "new reference is taken; 0: none",
+        )
+
+    def __init__(self, params: Params) -> None:
+        super().__init__(params)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the reference; a new one follows."""
+        self._motion: MotionTest | None = None
+        self._changed = 0
+
+    def process(
+        self, contact_mask: ContactMask, touching: Touching, markers: Markers | None = None
+    ) -> FusedPorts:
+        """What touches the gel, by both."""
+        if markers is None:
+            return FusedPorts(contact_mask, touching, "light" if touching else None)
+        if self._motion is None:
+            params = self.params
+            self._motion = MotionTest(
+                markers.origin,
+                false_alarms=params.false_alarms,
+                steadiness=params.steadiness,
+                relaxation=params.relaxation,
+            )
+        fused = fuse_contact(contact_mask, markers, self._motion)
+        self._changed = self._changed + 1 if fused.light_changed else 0
+        if self._changed == self.params.patience > 0:
+            self.wants_reference = "light_changed"
+        return FusedPorts(fused.mask, fused.touching, fused.evidence)
