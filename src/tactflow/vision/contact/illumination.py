@@ -21,9 +21,9 @@ MAX_STEPS: Final = 12
 CONVERGED: Final = 0.05
 """The fit ends when no coefficient moves by as much, grey levels. Chosen by hand."""
 RIDGE: Final = (0.0, 0.05, 0.05, 0.01)
-"""Weights, relative to the data, that draw slopes and offset towards zero: an offset is nearly the same as a
-gain on a gel of one brightness, and slopes follow wide, faint contacts. Chosen on wedge_grasp, where slopes of
-0.01 miss 8 of 324 frames more than of 0.1, and seu_a, whose light they follow better the smaller they are."""
+"""Weights, relative to the data, that draw slopes and offset towards zero: an offset is nearly the same as
+a gain on a gel of one brightness, and slopes follow wide, faint contacts. Chosen on wedge_grasp, where slopes
+of 0.01 miss 8 of 324 frames more than of 0.1, and seu_a, whose light smaller ones follow better."""
 SATURATED: Final = 250.0
 """Mean of a block, grey levels, from which on it tells nothing of the light: parts are clipped. By hand."""
 WHITE: Final = np.float32(255)
@@ -40,8 +40,9 @@ class IlluminationModel:
     scattered light add. The four coefficients of a channel are fitted to means over blocks of 8 x 8 cells
     by Huber's method of modified residuals: residuals are clipped to twice their standard deviation before
     each least-squares step, in which blocks count by one over their variance, so a contact, however strong,
-    pulls no harder than noise; the matrix of the step is constant. The fit starts at the median, so a contact may cover nearly half of the frame. Saturated
-    blocks are left out. Computed in float32, to 1e-3 grey levels of what float64 gives.
+    pulls no harder than noise; the matrix of the step is constant. The fit starts at the median, so a
+    contact may cover nearly half of the frame. Saturated blocks are left out. Computed in float32, to 1e-3
+    grey levels of what float64 gives.
 
     Parameters
     ----------
