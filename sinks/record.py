@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import platform
+import re
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -373,12 +374,24 @@ class Record(Recorder):
         if self._control is not None:
             pipeline = self._control.pipeline
             facts["source"] = str((self._control.source and self._control.source.description) or "")
-            texts["pipeline.yaml"] = yaml.safe_dump(dict(pipeline.settings), sort_keys=False)
+            texts["pipeline.yaml"] = without_secrets(yaml.safe_dump(dict(pipeline.settings), sort_keys=False))
             try:
-                texts["pipeline.original.yaml"] = Path(pipeline.file).read_text(encoding="utf-8")
+                texts["pipeline.original.yaml"] = without_secrets(
+                    Path(pipeline.file).read_text(encoding="utf-8")
+                )
             except (OSError, UnicodeDecodeError) as error:
                 log.debug("%s: not recorded: %s", pipeline.file, error)
         return About(self._sensor, facts, texts)
+
+
+def without_secrets(text: str) -> str:
+    """The text of a pipeline without passwords in addresses and without tokens: a recording is handed on.
+
+    >>> print(without_secrets("{source: rtsp://me:pass@camera/1, token: abc, host: null}"))
+    {source: rtsp://camera/1, token: removed, host: null}
+    """
+    text = re.sub(r"(?<=//)[^/@\s]*@", "", text)
+    return re.sub(r"\b((?:token|password)['\"]?\s*[:=]\s*)(?!null\b)[^,}\s]+", r"\1removed", text)
 
 
 def _refuses(params: Record.Params) -> bool:

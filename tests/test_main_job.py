@@ -292,3 +292,11 @@ def test_importing_tactflow_does_not_import_opencv() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
     )
     assert done.stdout.strip() == "False"
+
+
+def test_a_failure_keeps_its_exit_code_though_nobody_reads_standard_error(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "tactflow", "run", "--source", "missing.mp4"]
+    with os.fdopen(writing, "wb") as unread:
+        assert subprocess.run(command, cwd=tmp_path, stderr=unread, timeout=PATIENCE).returncode == 4

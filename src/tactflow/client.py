@@ -26,6 +26,8 @@ DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 LONGEST_WAIT = 3600.0
 """ZeroMQ counts in milliseconds and not for ever; longer waits are made of several of these, s."""
 
+HEARTBEAT_MS = 2000
+"""Time between two questions whether the publisher is alive, ms. Chosen by hand."""
 FIRST_RETRY_MS = 50
 LAST_RETRY_MS = 250
 """Time between attempts to connect again, which doubles from the first to the last: after a pause of the
@@ -88,6 +90,9 @@ class Subscriber:
         self._socket.linger = 0
         self._socket.setsockopt(zmq.RECONNECT_IVL, FIRST_RETRY_MS)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, LAST_RETRY_MS)
+        # A publisher that has lost its power says no goodbye; without a sign of life it is sought again.
+        self._socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
+        self._socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3 * HEARTBEAT_MS)
         if latest:
             self._socket.setsockopt(zmq.CONFLATE, 1)
         else:

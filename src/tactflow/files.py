@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
+import signal
 import stat
 import sys
+from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, TextIO
 
 if sys.platform != "win32":
     import fcntl
+
+
+ENDING_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+"""Signals that ask a program to end: Ctrl-C, a service manager, a terminal that is closed."""
 
 
 def expanded(text: str) -> Path:
@@ -67,6 +74,30 @@ else:
         except OSError:
             return True
         return True
+
+
+class Unheard(io.TextIOWrapper):
+    """Standard error that raises nothing when its reader has left: what went wrong shall decide how we end.
+
+    stream : the present standard error, which it takes the place of.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__(stream.buffer, stream.encoding, stream.errors, line_buffering=True)
+
+    def write(self, text: str) -> int:
+        """Write, or lose it."""
+        with suppress(OSError):
+            return super().write(text)
+        lead_nowhere(self)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, or lose it."""
+        try:
+            super().flush()
+        except OSError:
+            lead_nowhere(self)
 
 
 def lead_nowhere(stream: IO[str]) -> None:

@@ -103,8 +103,8 @@ def test_rectifying_replaces_the_preprocessing_only(default: Pipeline) -> None:
         assert name == "preprocess" or changed.nodes[name] == node
 
 
-def test_a_sensor_without_markers_is_given_no_tracker(default: Pipeline) -> None:
-    left = without_markers(default)
+def test_the_script_is_given_no_tracker_for_a_sensor_without_markers() -> None:
+    left = without_markers(load_pipeline(find_pipeline("classic")))
     assert "tracker" not in left.nodes
     assert "hull" in left.nodes
 

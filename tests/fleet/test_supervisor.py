@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import signal
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -24,10 +25,12 @@ class Clock:
 
 
 class Process:
-    """Ends by itself after so many seconds with an exit code; a signal ends it at once."""
+    """Ends by itself after so many seconds with an exit code; a signal ends it at once, unless it hangs."""
+
+    hangs = False
 
     def __init__(self, clock: Clock, lasts: float, code: int) -> None:
-        self.stdout, self.stderr = io.BytesIO(), io.BytesIO()
+        self.stdin, self.stdout, self.stderr = io.BytesIO(), io.BytesIO(), io.BytesIO()
         self._clock, self._ends, self._code = clock, clock.now + lasts, code
         self.signals: list[int] = []
 
@@ -36,7 +39,11 @@ class Process:
 
     def send_signal(self, number: int) -> None:
         self.signals.append(number)
-        self._ends, self._code = self._clock.now, -number
+        if not self.hangs:
+            self._ends, self._code = self._clock.now, -number
+
+    def kill(self) -> None:
+        self._ends, self._code = self._clock.now, -signal.SIGKILL
 
 
 class Machine:
@@ -85,3 +92,17 @@ def test_a_mistake_in_the_command_line_ends_the_other_sensors() -> None:
     assert machine.run() == 2
     assert machine.clock.now < 10
     assert machine.starts == {"left": [0.0], "right": [0.0]}
+
+
+def test_a_process_that_does_not_end_is_killed_at_the_third_signal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Process, "hangs", True)
+    machine = Machine({"left": [(1e9, 0)]})
+    before = machine.clock.pause
+
+    def pause(seconds: float) -> None:
+        before(seconds)
+        if machine.clock.now > 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(machine.clock, "pause", pause)
+    assert machine.run() == 130

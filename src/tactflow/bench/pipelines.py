@@ -305,7 +305,7 @@ def growth(pipeline: Pipeline, rendered: Rendered, folder: Path, unit: CopyUnit)
             ready,
             folder,
             unit,
-            lambda _, outcome: "contact" if rendered.deep(outcome.frame.seq) else "idle",
+            lambda _, outcome: _depth_kind(outcome, rendered),
             lambda: None,
         )
     finally:
@@ -314,6 +314,13 @@ def growth(pipeline: Pipeline, rendered: Rendered, folder: Path, unit: CopyUnit)
         return None
     large_ms, small_ms = (times.samples[n]["contact"].summary()["cpu_ms_p50"] for n in ("large", "small"))
     return large_ms / small_ms
+
+
+def _depth_kind(outcome: Outcome, rendered: Rendered) -> str:
+    """Whether a frame's time belongs to contact or not; the reference in front of a recording is neither."""
+    if outcome.frame.seq < 0:
+        return "reference"
+    return "contact" if rendered.deep(outcome.frame.seq) else "idle"
 
 
 _MEASURE_MEMORY = """

@@ -292,7 +292,7 @@ def _grasps(
             trusted: NDArray[np.bool_] = trusted,
         ) -> str:
             index = outcome.frame.seq
-            if index >= len(contact):
+            if not 0 <= index < len(contact):
                 return "idle"
             if trusted[index]:
                 judged[name] += 1

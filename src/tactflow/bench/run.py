@@ -39,6 +39,7 @@ from tactflow.bench.scenes import (
 from tactflow.bench.targets import judge
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 
@@ -169,10 +170,11 @@ class _Run:
             for name, pipeline in self.loaded.items()
             if not _needs_rectifying(pipeline) and name != MARKERLESS
         }
-        # For gels without markers: the pipeline made for them, else the default one without its tracker.
-        self.bare = {name: recordings.without_markers(self.loaded[name]) for name in (DEFAULT, CLASSIC)}
-        if MARKERLESS in self.loaded:
-            self.bare = {MARKERLESS: self.loaded[MARKERLESS], CLASSIC: self.bare[CLASSIC]}
+        made_for_them = self.loaded.get(MARKERLESS) or load_pipeline(find_pipeline(MARKERLESS))
+        self.bare = {
+            MARKERLESS: made_for_them,
+            CLASSIC: recordings.without_markers(self.loaded[CLASSIC]),
+        }
         self.result = Result(quick=plan.quick, machine=machine())
         self.unit = CopyUnit()
         self.unit.take(20)
@@ -244,10 +246,9 @@ class _Run:
         )
         for measurements in measured:
             self.result.measurements += measurements
-        bare = MARKERLESS if MARKERLESS in self.bare else DEFAULT
         self.result.measurements += gels.measure_gels(
             (DEFAULT, self.loaded[DEFAULT]),
-            (bare, self.bare[bare]),
+            (MARKERLESS, self.bare[MARKERLESS]),
             self.plan.data,
             scratch,
             self.unit,
@@ -259,8 +260,8 @@ class _Run:
         """The result, its promises judged."""
         result = self.result
         result.copy_ms, result.touch_ms = self.unit.copy_ms, self.unit.touch_ms
-        markerless, wedge = (name if name in self.loaded else DEFAULT for name in (MARKERLESS, WEDGE))
-        result.targets = judge(result, DEFAULT, growth, wedge=wedge, markerless=markerless)
+        wedge = WEDGE if WEDGE in self.loaded else DEFAULT
+        result.targets = judge(result, DEFAULT, growth, wedge=wedge, markerless=MARKERLESS)
         self.progress("done", self.total, self.total)
         return result
 

@@ -147,6 +147,8 @@ def compare(pipeline: Pipeline, source: str | Path, scene: str, scratch: Path) -
                 mine, fresh = outcomes["on"], outcomes["off"]
                 if mine is None or fresh is None:
                     break
+                if mine.frame.seq < 0:  # the reference, handed over in front of the recording
+                    continue
                 repeated = last is not None and mine.image is last.image
                 last = mine
                 for name, outcome in (("on", mine), ("off", fresh)):

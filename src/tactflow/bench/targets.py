@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from statistics import median
 
-from tactflow.bench.gels import OUTLINES
+from tactflow.bench.gels import GELS, OUTLINES
 from tactflow.bench.pipelines import ORIGINAL
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import RECORDING, Measurement, Result, Target
@@ -125,6 +125,9 @@ def _gels(result: Result, default: str, markerless: str) -> list[Target]:
     decisions = [("false_contacts", 0.5), ("missed_contacts", 2.0), ("early_found", 95.0)]
     dots = [("dots_found", 95.0), ("dots_beyond", 2.0)]
     counted = [m for m in result.of("pipeline", default) if m.scene in _COUNTED]
+    names = {RECORDING + gel.folder for gel in GELS}
+    if not any(m.scene in names for m in result.measurements):
+        return [Target("real gels of many labs", "-", "-", None, "give the recordings with --data")]
     return [
         _recording(result, default, "franka_mini", decisions),
         _recording(result, default, "seu_a", [("false_contacts", 0.0)]),

@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError, TactflowError
-from tactflow.files import lead_nowhere
+from tactflow.files import ENDING_SIGNALS, Unheard, lead_nowhere
 
 COMMANDS = {
     "run": "run a pipeline",
@@ -45,8 +45,12 @@ def entry() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
-    # To be ended by a service or by Ctrl-C is the same.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sys.stderr = Unheard(sys.stderr)
+    # To be ended by a service, by a terminal that is closed or by Ctrl-C is the same.
+    for number in ENDING_SIGNALS:
+        # Who started it with nohup wants it to go on.
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
     try:
         code = main(sys.argv[1:])
         sys.stdout.flush()
@@ -59,6 +63,9 @@ def entry() -> None:
                 f"tactflow: {error.filename or 'standard output'}: {error.strerror or error}", file=sys.stderr
             )
             code = StageError.exit_code
+    # The code is known; what comes now shall not change it.
+    for number in ENDING_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     sys.exit(code)
 
 

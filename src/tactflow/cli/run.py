@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,7 +28,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
 from tactflow.engine.trace import TRACE_BEGINS, Trace
-from tactflow.files import is_device
+from tactflow.files import ENDING_SIGNALS, is_device
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 from tactflow.vision import compiled
@@ -67,6 +69,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--trace",
         metavar="FILE",
         help="write what each thread did when, as Chrome trace events; open it at ui.perfetto.dev",
+    )
+    parser.add_argument(
+        "--end-with-stdin",
+        action="store_true",
+        help="end well when standard input ends: when the program that started this one is gone",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
     parser.add_argument(
@@ -162,6 +169,8 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
     _refuse_unwritable("--stats", args.stats, begins=STATISTICS_BEGIN)
     _refuse_unwritable("--trace", args.trace, begins=TRACE_BEGINS)
+    if args.end_with_stdin:
+        threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
     with _logging_to(console), _signals(runner):
         logger = logging.getLogger("tactflow")
         for warning in runner.pipeline.warnings:
@@ -179,6 +188,14 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     if not args.quiet:
         console.print(summary(result, runner), markup=False)
     return result.exit_code
+
+
+def _stop_at_end_of_input(runner: Runner) -> None:
+    """Body of a thread: reads until nobody can write any more."""
+    with suppress(OSError):
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+    runner.stop("signal")
 
 
 def _positive(text: str) -> int:
@@ -238,7 +255,7 @@ def _logging_to(console: Console) -> Iterator[None]:
 
 @contextmanager
 def _signals(runner: Runner) -> Iterator[None]:
-    """One Ctrl-C or SIGTERM drains the pipeline; a second one ends it at once; a third is not caught.
+    """One Ctrl-C, SIGTERM or SIGHUP drains the pipeline; a second one ends it at once; a third is not caught.
 
     While kernels are compiled there is nothing to drain, and the first one ends it.
     """
@@ -253,7 +270,11 @@ def _signals(runner: Runner) -> Iterator[None]:
         signal.signal(number, signal.SIG_DFL)
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, handle)
+        for number in ENDING_SIGNALS
+        if signal.getsignal(number) != signal.SIG_IGN
+    }
     try:
         yield
     finally:

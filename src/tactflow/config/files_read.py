@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import stat
 from collections.abc import Iterator
@@ -62,6 +61,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _folder_of_pattern(name: str) -> str:
-    while glob.has_magic(name):
+    # A `?` begins the options.
+    while "*" in name or "[" in name:
         name = os.path.dirname(name)
     return name

@@ -83,6 +83,8 @@ def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequenc
     sinks = [added(node) for node in pipeline.sinks if str(node.mark) in request.added]
     # Without -P, Python would look for its own modules in the current folder first.
     command = [sys.executable, "-P", "-m", "tactflow", "run", str(request.file), "--sensor", sensor]
+    # Nobody else ends it if the supervisor is killed.
+    command.append("--end-with-stdin")
     for text in (*request.overrides, *sinks, *changed):
         command += ["--set", text]
     for option, path in request.files.items():

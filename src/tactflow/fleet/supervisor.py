@@ -15,7 +15,7 @@ from typing import IO, TextIO
 
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.run import INTERRUPTED
-from tactflow.files import lead_nowhere
+from tactflow.files import ENDING_SIGNALS, lead_nowhere
 from tactflow.fleet.sinks import WatchedSink
 
 FIRST_PAUSE = 1.0
@@ -26,6 +26,8 @@ GIVE_UP_AFTER = 5
 """Failures in a row after which a sensor is not started again. Chosen by hand."""
 GOOD_RUN = 30.0
 """A process that ran so long, s, starts with the first pause again when it fails. Chosen by hand."""
+KILL_AT = 3
+"""Signals after which processes that have not ended are killed; the first lets them finish."""
 LOOK_EVERY = 0.05
 """Time between two looks at the processes, s. Chosen by hand."""
 
@@ -35,7 +37,14 @@ Process = subprocess.Popen[bytes]
 def start_process(command: Sequence[str]) -> Process:
     """Start the process of a sensor; its output comes through pipes."""
     # A session of its own: Ctrl-C on the terminal reaches the supervisor alone, which passes it on once.
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+    # Its standard input ends with the supervisor.
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
 
 
 @dataclass(slots=True)
@@ -125,12 +134,17 @@ class Supervisor:
             return
         code = member.process.poll()
         if code is None:
-            if member.told < self._ends:
+            if self._signals >= KILL_AT and member.told < KILL_AT:
+                member.told = KILL_AT
+                member.process.kill()
+            elif member.told < self._ends:
                 # Not SIGINT, for which a process that is still importing shows a traceback. And one at a
                 # time: two at once may arrive as one.
                 member.process.send_signal(signal.SIGTERM)
                 member.told += 1
             return
+        if member.process.stdin is not None:
+            member.process.stdin.close()
         member.process = None
         if code in (0, ConfigError.exit_code, INTERRUPTED) or self._ends:
             member.code = self._last_code(member, code)
@@ -207,7 +221,7 @@ class Supervisor:
             # Nothing else: this may be in the middle of starting a process, which would not be told.
             self._signals += 1
 
-        before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, handle) for number in ENDING_SIGNALS}
         try:
             yield
         finally:

@@ -196,7 +196,9 @@ SCENES: dict[str, Recipe] = {
         motion.Programme(_one(shapes.finger), place=(0.93, 0.5), wander=(40.0, 150.0), angles=(-40.0, 40.0)),
         {"sink": 0.5, "rim": 1.0},
     ),
-    "dark_channel": Recipe("a gel that the red light hardly lights", _PRESS, {"light": "dark_channel"}),
+    "dark_channel": Recipe(
+        "a gel that is nearly dark in red until it is touched", _PRESS, {"light": "dark_channel"}
+    ),
     "halo": Recipe(
         "a gel without markers that a contact darkens, with a bright halo around it",
         _PRESS,

@@ -102,6 +102,7 @@ class Scene:
         self._delivered = optics.delivered_frames(
             settings.frames, settings.dropped, settings.repeated, settings.seed
         )
+        self._moments = int(self._delivered[-1]) + 1
         if settings.stale:
             kept = max(range(min(len(self), 300)), key=self._depth)
             self._delivered = [kept] * settings.stale + list(self._delivered[settings.stale :])
@@ -201,7 +202,7 @@ class Scene:
             self._programme,
             self._shapes,
             moment,
-            int(self._delivered[-1]) + 1,
+            self._moments,
             seed=settings.seed,
             size=SIZE,
             pitch=min(self.layout.pitch, _LARGEST_STROKE),
@@ -348,7 +349,7 @@ class Scene:
         if index < settings.settle:
             gains = np.append(light.settling(index, settings.settle), 1.0)
             canvas = np.asarray(cv2.multiply(canvas, gains, dtype=cv2.CV_16S), np.int16)
-        if settings.lamp and moment >= _LAMP_AT * (int(self._delivered[-1]) + 1):
+        if settings.lamp and moment >= _LAMP_AT * self._moments:
             canvas = np.asarray(cv2.multiply(canvas, self._lamp, dtype=cv2.CV_16S), np.int16)
         return canvas
 

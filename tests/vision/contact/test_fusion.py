@@ -18,7 +18,7 @@ def markers(displacement: float = 0.0, status: MarkerStatus = MarkerStatus.TRACK
     away = (ORIGIN - [147, 118]) / 40
     moved = displacement * away * np.exp((1 - (away**2).sum(axis=1, keepdims=True)) / 2)
     count = len(ORIGIN)
-    return Markers(ORIGIN, ORIGIN + moved, np.full(count, status, np.uint8), np.full(count, 0.02))
+    return Markers(ORIGIN, ORIGIN + moved, np.full(count, status, np.uint8), np.full(count, 0.02), radius=4.0)
 
 
 def light(*rectangle: int) -> NDArray[np.uint8]:
@@ -72,3 +72,15 @@ def test_markers_that_are_not_seen_do_not_rest() -> None:
     everywhere = light(0, 0, 320, 240)
     lost = markers(status=MarkerStatus.LOST)
     assert fuse_contact(everywhere, lost, MotionTest(ORIGIN)).evidence == "light"
+
+
+def test_what_the_removal_of_a_marker_leaves_at_its_rim_is_no_contact() -> None:
+    sliver = light(24, 16, 28, 24)
+    assert not fuse_contact(sliver, markers(), MotionTest(ORIGIN)).touching
+    with_contact = sliver | light(125, 100, 140, 110)
+    fused = fuse_contact(with_contact, markers(), MotionTest(ORIGIN))
+    assert (fused.mask == light(125, 100, 140, 110)).all()
+
+
+def test_a_touch_on_a_marker_that_is_larger_than_it_counts() -> None:
+    assert fuse_contact(light(10, 10, 32, 32), markers(), MotionTest(ORIGIN)).evidence == "light"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.flow.motion import MotionTest, median_spacing
+from tactflow.vision.flow.motion import MotionTest
 from tactflow.vision.types import Markers, MarkerStatus
 
 ORIGIN = np.array([[x, y] for y in range(20, 220, 25) for x in range(20, 300, 25)], np.float64)
@@ -134,8 +134,3 @@ def test_the_markers_must_be_those_of_the_reference() -> None:
 def test_parameters_out_of_range_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="required"):
         MotionTest(ORIGIN, **values)
-
-
-def test_the_spacing_of_a_grid_is_its_pitch() -> None:
-    assert median_spacing(ORIGIN) == 25.0
-    assert median_spacing(ORIGIN[:1]) == 0.0

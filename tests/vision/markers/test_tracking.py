@@ -15,7 +15,7 @@ from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.markers.matching import choose_spots
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers, MarkerStatus
-from tests.vision.dots import FloatArray, grid, rectified, render
+from tests.vision.dots import FloatArray, grid, match, rectified, render
 
 SIZE = (300, 400)
 PITCH = 34.0
@@ -102,6 +102,46 @@ def test_identities_survive_a_jump_of_up_to_nine_tenths_of_the_pitch(fraction: f
     assert np.abs(errors(markers, now)).max() < 0.1
     back = under_test.track(picture(TRUTH, seed=3))
     assert np.abs(back.displacement).max() < 0.1
+
+
+ISLANDS = np.concatenate([
+    grid(5, 6, 22.0, corner=(60, 50), jitter=0.3),
+    grid(5, 6, 22.0, corner=(260, 50), jitter=0.3),
+])  # fmt: skip
+
+
+def marks_a_pitch_off(path: list[float], angle: float) -> list[int]:
+    """How many marks are tracked elsewhere than they are, in each frame, when one of two grids without links
+    moves along a path, pitches, in a direction, and the other one rests."""
+
+    def drawn(shift: FloatArray, seed: int) -> NDArray[np.uint8]:
+        return render(
+            (430, 210), ISLANDS + np.repeat([shift, 0 * shift], 30, axis=0), 4.0, noise=1, seed=seed
+        )
+
+    reference = drawn(np.zeros(2), 0)
+    detection = detect_markers(reference)
+    which, _ = match(detection.centers, ISLANDS)
+    under_test, wrong = MarkerTracker(reference, detection), []
+    for number, distance in enumerate(path):
+        shift = 22.0 * distance * np.array([np.cos(angle), np.sin(angle)])
+        markers = under_test.track(drawn(shift, number + 1))
+        away = np.hypot(*(markers.displacement - np.where(which[:, None] < 30, shift, 0)).T)
+        wrong.append(int(((away > 6) & (markers.status == MarkerStatus.TRACKED)).sum()))
+    return wrong
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 2])
+@pytest.mark.parametrize("jump", [0.55, 0.75, 0.95, 1.2])
+def test_one_grid_of_two_that_jumps_is_not_a_pitch_off(jump: float, angle: float) -> None:
+    back = [jump * (1 - step / 6) for step in range(1, 7)]
+    assert marks_a_pitch_off([0.0, jump, *back, 0.0], angle) == [0] * 9
+
+
+@pytest.mark.parametrize("far", [1.6, 2.0])
+def test_a_grid_that_is_let_go_from_afar_is_found_at_its_rest(far: float) -> None:
+    out = np.arange(0, far, 0.3).tolist()
+    assert marks_a_pitch_off([*out, far, 0.0, 0.0], 0.0) == [0] * (len(out) + 3)
 
 
 def test_marks_of_several_sizes_are_followed_like_those_of_one() -> None:

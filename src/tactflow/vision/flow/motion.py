@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.markers.family import LONGEST_LINK
+from tactflow.vision.markers.family import LONGEST_LINK, pitch_of
 from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -104,7 +104,7 @@ class MotionTest:
         self._arms = np.stack([x, y, 1 / np.maximum(x * x + y * y, 1.0)])
         self._variance = steadiness**2
         self._relaxation = relaxation
-        self.pitch = median_spacing(origin)
+        self.pitch = pitch_of(origin) if len(origin) > 1 else 0.0
         """Median distance of a marker to its nearest neighbour, px; 0 for fewer than two."""
         self._links = neighbour_graph(origin, LONGEST_LINK * self.pitch)
         self._one, self._other = self._links.T
@@ -166,19 +166,6 @@ class MotionTest:
         near[self._other[pair & middle[self._one]]] = True
         near[self._one[pair & middle[self._other]]] = True
         return np.asarray(middle | near)
-
-
-def median_spacing(points: FloatArray) -> float:
-    """Median distance of points, (N, 2) float64, to their nearest neighbour; 0 for fewer than two.
-
-    >>> median_spacing(np.array([[0.0, 0.0], [3.0, 4.0], [10.0, 4.0]]))
-    5.0
-    """
-    if len(points) < 2:
-        return 0.0
-    away = np.hypot(*(points[:, None] - points).transpose(2, 0, 1))
-    np.fill_diagonal(away, np.inf)
-    return float(np.median(away.min(axis=1)))
 
 
 def _unexplained(moved: FloatArray, arms: FloatArray) -> FloatArray:

@@ -21,6 +21,10 @@ BORDER_WEIGHT: Final = 3
 move, so the component that holds them is the right one."""
 
 
+LEAST_GRID: Final = 6
+"""Marks of a grid beside others, at least: fewer are a group whose neighbours are hidden. Chosen by hand."""
+
+
 class DisplacementField:
     """Marks and the links between neighbours.
 
@@ -61,8 +65,12 @@ class DisplacementField:
         usual = sorted(degree)[len(degree) // 2]
         self.border = np.array([links < usual for links in degree])
         """(N,) bool, marks with fewer neighbours than most."""
+        home = np.array(_grids(neighbours), np.int64)
+        grids = [np.flatnonzero(home == name) for name in np.unique(home)]
+        self.grids = [grid for grid in grids if len(grid) >= LEAST_GRID] or [np.arange(count)]
+        """The marks of each grid without links to others, small groups left out unless all are."""
         self._votes = np.where(self.border, BORDER_WEIGHT, 1).astype(np.int64)
-        self._grid = np.array(_grids(neighbours), np.int64)
+        self._grid = home
         links = [link for of_mark in neighbours for link in of_mark]
         self._links = np.array(links, np.int64).reshape(-1, 2)
         self._begin = np.cumsum([0, *degree], dtype=np.int64)

@@ -65,6 +65,15 @@ BORDER_SEEN: Final = 0.85
 """Fraction of the marks at the grid's border below which a jump of the whole grid is looked for. Chosen by
 hand."""
 
+HALF_PITCH: Final = 0.5
+"""Displacement of a grid, pitches, from which on it might be a pitch off."""
+
+REST: Final = 0.1
+"""Distance of a mark from its rest within which it rests, pitches. Chosen by hand."""
+
+WHOLE: Final = 0.95
+"""Fraction of the marks of a grid that rest and are seen, beyond which the grid rests. Chosen by hand."""
+
 SPOT_STRENGTH: Final = 0.25
 """Strength of a spot that may be a mark, against a typical one. Chosen by hand."""
 
@@ -173,7 +182,6 @@ class MarkerTracker:
         )
         self._spots = SpotFinder(np.rint(mean).astype(np.uint8), detection)
         self._field = DisplacementField(self._origin, detection.edges)
-        self._enough_border = BORDER_SEEN * np.count_nonzero(self._field.border)
         self._nearness = NearPoints(self._shape, self._pitch)
         self._same, self._claimed = map(self._nearness.disc, (SAME_SPOT, CLAIMED_SPOT))
         self._interpolator = Interpolator(self._origin, self._pitch)
@@ -240,15 +248,12 @@ class MarkerTracker:
     ) -> tuple[FloatArray, BoolArray, NDArray[Any]]:
         """Joint choice among the spots, for marks outside the largest smooth component: positions, which
         marks are found, standard errors."""
-        if np.count_nonzero(self._field.border & seen) < self._enough_border:
-            spots, _ = self._spots.find(image, JUMP_STRENGTH, np.zeros(2), np.array(self._shape[::-1], float))
-            jump = common_displacement(self._position, spots, pitch=self._pitch, farthest=self._farthest)
-            if jump is not None:
-                start = self._position + jump
-                found = self._templates.align(image, start)
-                short = _lengths(found.position - start) < LONGEST_STEP * self._radius
-                seen = trusted(found.gain, found.r_squared) & short
-                strain = self._field.strain(found.position)
+        jumped = self._jumps(image, seen)
+        if jumped is not None:
+            found = self._templates.align(image, jumped)
+            short = _lengths(found.position - jumped) < LONGEST_STEP * self._radius
+            seen = trusted(found.gain, found.r_squared) & short
+            strain = self._field.strain(found.position)
         inliers = self._field.largest_component(seen, strain)
         free = np.flatnonzero(~inliers)
         if len(free) == 0:
@@ -268,6 +273,38 @@ class MarkerTracker:
         if not result.found.all() and unused.any():
             self._take_left_over(image, spots[unused], result)
         return result.position, result.found, result.stderr
+
+    def _jumps(self, image: NDArray[np.uint8], seen: BoolArray) -> FloatArray | None:
+        """Where the marks (N, 2) are, px, if a whole grid jumped or is a pitch off; None if none.
+
+        A grid apart from the others that is off by a pitch is as smooth as before. What tells is its border,
+        where a row of marks is missing on one side, and that more of it is seen at its rest.
+        """
+        border, spots, jumped = self._field.border, None, self._position.copy()
+        for grid in self._field.grids:
+            if seen[grid].all():
+                continue
+            if self._is_at_rest(image, grid, seen):
+                jumped[grid] = self._origin[grid]
+            elif np.count_nonzero((border & seen)[grid]) < BORDER_SEEN * np.count_nonzero(border[grid]):
+                if spots is None:
+                    corner = np.array(self._shape[::-1], float)
+                    spots, _ = self._spots.find(image, JUMP_STRENGTH, np.zeros(2), corner)
+                start = self._position[grid]
+                jump = common_displacement(start, spots, pitch=self._pitch, farthest=self._farthest)
+                if jump is not None:
+                    jumped[grid] += jump
+        return jumped if (jumped != self._position).any() else None
+
+    def _is_at_rest(self, image: NDArray[np.uint8], grid: IntArray, seen: BoolArray) -> bool:
+        """Whether a grid that was half a pitch away or farther is seen whole, and better, where it rests."""
+        moved = _median(self._position[grid] - self._origin[grid])
+        if np.hypot(*moved) < HALF_PITCH * self._pitch:
+            return False
+        found = self._templates.align(image, self._origin[grid], grid)
+        near = _lengths(found.position - self._origin[grid]) < REST * self._pitch
+        there = int(np.count_nonzero(trusted(found.gain, found.r_squared) & near))
+        return there > int(np.count_nonzero(seen[grid])) and there > WHOLE * len(grid)
 
     def _candidates(
         self,
