@@ -13,8 +13,13 @@ used.
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+# Pixels of a picture at most, so that no file takes all memory by what it claims: more than any camera has.
+# OpenCV reads it when it is imported.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
 
 if TYPE_CHECKING:
     from tactflow.api import check as check

@@ -55,7 +55,7 @@ def test_troubles_and_real_gels_have_tables_of_their_own(result: Result) -> None
     (halo,) = [line for line in lines if line.startswith("| halo |")]
     assert "| `markerless` | - | - | - | 0 | - | - | 0.91 | - |" in halo
     (gel,) = [line for line in lines if line.startswith("| sts_640 |")]
-    assert "| chosen on | `default` | 296 | 165 | 97.6 | 0 | - |" in gel
+    assert "| chosen on | 296 | 165 | 97.6 (0) | - | - |" in gel
 
 
 def test_an_existing_page_keeps_its_own_text(result: Result, tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ def script(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     ("words", "expected"),
     [
         (["che"], {"check"}),
+        (["det"], {"detect"}),
+        (["detect", "no"], {"notes.txt"}),
         (["run", ""], {"left.yaml", "folder"}),
         (["run", "le"], {"left.yaml"}),
         (["run", "left.yaml", "--max"], {"--max-frames"}),

@@ -1,41 +1,23 @@
-"""Plain versions of the kernels of a contact's outline, and of what prepares a change for it."""
+"""Plain version of the kernel of a contact's outline, and of what prepares a change for it."""
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.contact_outline import (
-    BIN,
-    BRIGHTENED_SCALE,
-    HALF,
-    RelativeChange,
-    agree_with_region,
-    sum_profile,
-)
+from tactflow.vision.contact.contact_outline import BIN, WindowChange, sum_profile
 from tests.oracles.gains import Gain
-from tests.oracles.typical import Arguments
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
 
 
-def change_of(picture: Float, inside: Mask) -> RelativeChange:
-    """A relative change of three channels, (h, w, 3) float32; only what is not 0 in `inside` counts."""
+def change_of(picture: Float, inside: Mask) -> WindowChange:
+    """A change of three channels, (h, w, 3) float32; only what is not 0 in `inside` counts."""
     counts = (inside > 0)[..., None] * picture
     strength = np.asarray(np.sqrt((counts * counts).sum(axis=2)), np.float32)
-    mean = np.asarray(counts.mean(axis=2), np.float32)
-    return RelativeChange(
-        strength, mean, float(mean.sum()), float(strength.sum()), float((strength**2).sum())
-    )
-
-
-def plain_agree_with_region(level: Float, filled: Mask) -> None:
-    """The level where its sign agrees with the region, else the region's side."""
-    sides = np.where(filled > 0, np.float32(HALF), np.float32(-HALF))
-    agree = (level > 0) == (filled > 0)
-    level[:] = np.where(agree, np.minimum(level, np.float32(HALF)), sides) * np.float32(BRIGHTENED_SCALE)
+    brightness = np.asarray(counts.mean(axis=2), np.float32)
+    return WindowChange(strength, brightness)
 
 
 def plain_sum_profile(
@@ -56,14 +38,4 @@ def plain_sum_profile(
     sums += np.bincount(bins, weights=strength[rows][within], minlength=len(sums))
 
 
-def _brightened() -> Arguments:
-    """A level set of the size of a contact, and a region that disagrees with it here and there."""
-    rng = np.random.default_rng(0)
-    level = rng.normal(0, 0.3, (90, 90)).astype(np.float32)
-    return level, (cv2.blur(level, (3, 3)) > 0).view(np.uint8)
-
-
-GAINS = [
-    Gain(agree_with_region, plain_agree_with_region, arguments=_brightened),
-    Gain(sum_profile, plain_sum_profile, tolerance=1e-9),
-]
+GAINS = [Gain(sum_profile, plain_sum_profile, tolerance=1e-9)]

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
+import struct
+import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -153,17 +157,6 @@ def test_numbers_in_names_are_sorted_by_value_and_hidden_files_are_left_out(tmp_
     (tmp_path / "labels.csv").write_text("frame,force")
     frames = read_all(open_source(str(tmp_path)))
     assert [int(image[0, 0, 0]) for image, _ in frames] == [10, 20, 30, 40]
-
-
-def test_frames_of_an_array_are_views_of_the_mapped_file(tmp_path: Path) -> None:
-    source = open_source(make_bgr_array(tmp_path / "recording"))
-    item = source.read()
-    assert item is not None
-    image, _ = item
-    assert not image.flags.owndata
-    assert not image.flags.writeable
-    source.close()
-    np.testing.assert_array_equal(image, numbered(0))
 
 
 def test_an_array_larger_than_memory_opens_at_once(tmp_path: Path) -> None:
@@ -416,3 +409,37 @@ def test_a_simulated_scene_is_a_recording() -> None:
     frames = read_all(source)
     assert [t for _, t in frames] == [0.0, 1 / 60, 2 / 60]
     assert all(image.shape == (600, 800, 3) for image, _ in frames)
+
+
+def test_a_file_that_claims_an_absurd_picture_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    sparse = tmp_path / "sparse.npy"
+    np.lib.format.open_memmap(sparse, "w+", np.uint8, (1, 40000, 40000, 3))
+    with pytest.raises(SourceError, match="40000 x 40000, more than"):
+        open_source(str(sparse))
+    picture = tmp_path / "picture.png"
+    # A picture of black that says that it is larger: nothing but its header is looked at.
+    data = bytearray(cv2.imencode(".png", np.zeros((20, 20), np.uint8))[1].tobytes())
+    data[16:24] = struct.pack(">II", 40000, 40000)
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    picture.write_bytes(data)
+    with pytest.raises(SourceError, match=r"has more than|not an image"):
+        open_source(str(picture))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such device")
+def test_a_link_to_a_device_is_no_picture(tmp_path: Path) -> None:
+    link = tmp_path / "a.png"
+    link.symlink_to("/dev/zero")
+    with pytest.raises(SourceError, match="required a file, not a folder or a device"):
+        open_source(str(link))
+
+
+def test_an_array_that_is_cut_during_the_run_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.stack([numbered(index) for index in range(5)]))
+    source = open_source(str(path))
+    assert source.read() is not None
+    os.truncate(path, 4000)
+    with pytest.raises(SourceError, match="was cut off during the run, within frame 1"):
+        source.read()
+    source.close()

@@ -120,14 +120,19 @@ def present(data: Path) -> list[Gel]:
 
 
 def left_out(data: Path) -> list[str]:
-    """A line for each recording that is missing, and for each folder that nothing is known of."""
+    """A line that names the recordings that are missing, and one the folders that nothing is known of."""
     if not (data / FOLDER).is_dir():
         return [f"{FOLDER}: not in {data}, left out"]
-    here = {gel.folder for gel in present(data)}
-    missing = [f"{FOLDER}/{gel.folder}: missing, left out" for gel in GELS if gel.folder not in here]
-    unknown = sorted(path.name for path in (data / FOLDER).iterdir() if path.is_dir())
-    known = {gel.folder for gel in GELS}
-    return missing + [f"{FOLDER}/{name}: unknown, left out" for name in unknown if name not in known]
+    here, known = {gel.folder for gel in present(data)}, {gel.folder for gel in GELS}
+    missing = [gel.folder for gel in GELS if gel.folder not in here]
+    unknown = sorted(
+        path.name for path in (data / FOLDER).iterdir() if path.is_dir() and path.name not in known
+    )
+    return [
+        f"{FOLDER}: left out, because {why}: {', '.join(names)}"
+        for why, names in (("missing", missing), ("unknown", unknown))
+        if names
+    ]
 
 
 def step_count(data: Path) -> int:

@@ -27,6 +27,7 @@ COMMANDS = {
     "warmup": "compile what `run` would compile on its first use",
     "record": "run a pipeline and record its frames and results",
     "repair": "give a recording that was cut off its index",
+    "detect": "find the marks of a gel and show what was found and why, in one picture",
     "cameras": "list the cameras that are plugged in, with names that stay the same",
     "sim": "write a simulated recording and its ground truth",
     "schema": "print the JSON Schema of the result message or of a pipeline file",

@@ -13,7 +13,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from tactflow.engine.frame import Frame
+from tactflow.engine.frame import MOST_PIXELS, Frame
 from tactflow.recording.packing import unpacked
 from tactflow.recording.protobuf import FieldType, decode, describe, encode, timestamp, unzigzag, zigzag
 
@@ -23,9 +23,6 @@ ENCODING = "bgr8"
 """Names of how pixels are packed and ordered, which a reader compares."""
 LEVEL = 1
 """Level of zstd: the fastest that still does entropy coding."""
-MOST_PIXELS = 1 << 27
-"""Pixels of a frame at most: more than any camera gives; unpacked they take 0.4 GB."""
-
 _FIELDS: tuple[tuple[str, int, FieldType], ...] = (
     ("timestamp", 1, "Timestamp"),
     ("sensor", 2, "string"),

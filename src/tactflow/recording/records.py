@@ -50,6 +50,9 @@ _LONGEST_BEGINNING: Final = _PREFIX.size + _CHUNK.size + _LONGEST_NAME + _LENGTH
 _WINDOW: Final = 1 << 20
 """Bytes that are searched at a time for the next chunk after damage."""
 
+_LONGEST_RECORD: Final = 1 << 40
+"""Bytes of a record at most: more than a disk holds, and less than eight bytes that mean something else."""
+
 _READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT: Attachment.read,
     Opcode.CHANNEL: Channel.read,
@@ -124,7 +127,16 @@ def _end_of_record(file: BinaryIO, at: int, size: int) -> int | None:
     if kind == Opcode.CHUNK:
         beginning = file.read(_LONGEST_BEGINNING - _PREFIX.size)
         return end if _chunk_is_consistent(beginning, length) else None
-    return end
+    # The length is right if it leads to another record, or to the end.
+    file.seek(end)
+    return end if _can_begin_record(file.read(_PREFIX.size)) else None
+
+
+def _can_begin_record(data: bytes) -> bool:
+    if len(data) < _PREFIX.size:
+        return MAGIC.startswith(data)
+    kind, length = _PREFIX.unpack(data)
+    return bool((kind in _KINDS or kind >= _PRIVATE) and length < _LONGEST_RECORD)
 
 
 def _chunk_is_consistent(beginning: bytes, length: int) -> bool:

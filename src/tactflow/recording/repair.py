@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
+from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from tactflow.recording.reader import read_summary
@@ -50,8 +51,7 @@ def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -
         copy = _Copy(Writer(target, chunk_size=NEVER, compression=CompressionType.NONE))
         summary = read_summary(source)
         if summary is not None:
-            # What the first chunk says about the others is there once more.
-            copy.know([*summary.schemas.values(), *summary.channels.values()])
+            copy.know(summary)
         for record in intact_records(source):
             if isinstance(record, Damage):
                 damage.append(record)
@@ -75,12 +75,12 @@ class _Copy:
         self._started = False
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
-        self._known: list[Schema | Channel] = []
+        self._summary = Summary()
         self._pending = 0
 
-    def know(self, records: Sequence[Schema | Channel]) -> None:
-        """Schemas and channels that the copy has even where the chunk that brings them is damaged."""
-        self._known.extend(records)
+    def know(self, summary: Summary) -> None:
+        """Where to look up the schemas and channels of a chunk that is damaged."""
+        self._summary = summary
 
     def add(self, record: object) -> int:
         """Copy one record; returns the number of messages in it."""
@@ -90,6 +90,8 @@ class _Copy:
             return 0
         if not self._started:
             self._start()
+        if isinstance(record, Message) and record.channel_id not in self._channels:
+            self._look_up(record.channel_id)
         if isinstance(record, Schema) and record.id not in self._schemas:
             self._schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
         elif isinstance(record, Channel) and record.id not in self._channels:
@@ -119,11 +121,19 @@ class _Copy:
             return 1
         return 0
 
+    def _look_up(self, channel_id: int) -> None:
+        """Describe a channel as the index does."""
+        channel = self._summary.channels.get(channel_id)
+        if channel is None:
+            return
+        schema = self._summary.schemas.get(channel.schema_id)
+        if schema is not None:
+            self.add(schema)
+        self.add(channel)
+
     def _start(self, profile: str = "", library: str = "") -> None:
         self._writer.start(profile, library)
         self._started = True
-        for record in self._known:
-            self.add(record)
 
     def finish(self) -> None:
         """Write what is pending, and the index."""

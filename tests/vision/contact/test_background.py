@@ -24,12 +24,11 @@ from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tests.oracles.background import (
     plain_change_strength,
-    plain_relative_change,
-    plain_smooth_cells,
+    plain_scaled_change,
     plain_weigh_change,
 )
 from tests.oracles.components import plain_close_changes
-from tests.oracles.contact_outline import plain_agree_with_region, plain_sum_profile
+from tests.oracles.contact_outline import plain_sum_profile
 from tests.oracles.continuation import plain_continue_outline
 from tests.oracles.illumination import plain_fit_robustly
 from tests.oracles.resolution import plain_halve_window, plain_raise_mask
@@ -40,13 +39,11 @@ SIZES = st.tuples(st.integers(1, 70), st.integers(1, 70))
 """Heights and widths: also of less than a cell, and of no whole number of cells."""
 
 ORACLES = (
-    (background, "smooth_cells", plain_smooth_cells),
     (background, "weigh_change", plain_weigh_change),
-    (background, "relative_change", plain_relative_change),
+    (background, "scaled_change", plain_scaled_change),
     (background, "change_strength", plain_change_strength),
     (illumination, "fit_robustly", plain_fit_robustly),
     (components, "close_changes", plain_close_changes),
-    (contact_outline, "agree_with_region", plain_agree_with_region),
     (contact_outline, "sum_profile", plain_sum_profile),
     (continuation, "continue_outline", plain_continue_outline),
     (resolution, "raise_mask", plain_raise_mask),
@@ -132,18 +129,14 @@ def test_the_loops_find_a_window_as_strong_as_the_plain_version(
     bottom, right = data.draw(st.integers(top + 1, high)), data.draw(st.integers(left + 1, wide))
     inside = np.random.default_rng(seed).random((bottom - top, right - left)) < 0.8
     window = slice(top, bottom), slice(left, right), inside
-    fast = model.relative_change(changes[1], *window)
+    fast = model.window_change(changes[1], *window)
     oracles = _with_oracles()
     try:
-        slow = model.relative_change(changes[1], *window)
+        slow = model.window_change(changes[1], *window)
     finally:
         oracles.undo()
     _close(fast.strength, slow.strength)
-    _close(fast.mean, slow.mean)
-    for name in ("mean_sum", "strength_sum", "square_sum"):
-        # Sums of so many numbers, each as right as `_close` says.
-        slack = 1e-5 * fast.strength.size * max(1.0, float(slow.strength.max()))
-        assert getattr(fast, name) == pytest.approx(getattr(slow, name), rel=1e-5, abs=slack)
+    _close(fast.brightness, slow.brightness)
 
 
 @settings(max_examples=100, deadline=None)
@@ -269,7 +262,7 @@ def test_exposure_and_white_balance_are_compensated_to_a_third_and_black_stays_b
     model = IlluminationModel(gel, 0.25 + (0.025 * gel) ** 2)
     frame = gel * np.array(gains, np.float32)[:, None, None]
     rest = slice(round(touched * 80), None)
-    frame[:, :, : rest.start] *= 1.5
+    frame[:, :, : rest.start] *= 1.8
     left = np.abs(under_illumination(gel, model.fit(frame)) - frame)[..., rest]
     assert np.all(left < 1 + 0.025 * gel[..., rest])
 

@@ -14,13 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.background_kernels import (
-    change_strength,
-    relative_change,
-    smooth_cells,
-    weigh_change,
-)
-from tactflow.vision.contact.contact_outline import RelativeChange
+from tactflow.vision.contact.background_kernels import change_strength, scaled_change, weigh_change
+from tactflow.vision.contact.contact_outline import WindowChange
 from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
@@ -40,11 +35,6 @@ MAD_TO_SIGMA: Final = 1.4826
 NOISE_CORRELATION: Final = 2.0
 """How much less than white noise the guessed noise shrinks by smoothing: demosaicing and video compression
 leave little noise between neighbours, and more over distances. Chosen by hand."""
-DARK_OFFSET: Final = 0.1
-"""Part of the mean brightness that is added before changes are taken relative to the brightness. By hand."""
-EDGE_CHANGE: Final = 0.05
-"""Relative change by which an edge, moved by `shift`, begins to count less for the outline. By hand."""
-
 CELL_VALID: Final = 128
 """Mean of a valid area, 0 to 255, over a cell that counts, at least: half of it."""
 
@@ -80,7 +70,7 @@ class _Derived:
 
     weight : one over the standard deviation. brightness : weight of a change along the background's own
     colour. colour_factor : (h, w), how much more a change of colour counts than one of brightness.
-    half_scale : turns grey levels into a relative change.
+    half_scale : turns grey levels into standard deviations.
     """
 
     illumination: IlluminationModel
@@ -185,19 +175,18 @@ class BackgroundModel:
         remaining = math.sqrt(now / was) if was > 0 else 1.0
         return Change(half, coefficients, squared, colour, evidence, largest, largest_colour, remaining)
 
-    def relative_change(
+    def window_change(
         self, change: Change, rows: slice, columns: slice, inside: NDArray[np.bool_]
-    ) -> RelativeChange:
-        """How strongly a window has changed relative to its brightness, at half resolution.
+    ) -> WindowChange:
+        """How strongly a window has changed, in standard deviations, at half resolution.
 
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
         count.
         """
         known = self._derived()
-        strength, mean = np.empty((2, 2 * inside.shape[0], 2 * inside.shape[1]), np.float32)
+        strength, brightness = np.empty((2, 2 * inside.shape[0], 2 * inside.shape[1]), np.float32)
         blurred = np.empty((3, *strength.shape), np.float32)
-        summary = np.empty(3)
-        relative_change(
+        scaled_change(
             change.half.reshape(len(change.half), -1),
             2 * rows.start,
             2 * columns.start,
@@ -208,15 +197,15 @@ class BackgroundModel:
             known.half_scale,
             blurred,
         )
-        change_strength(blurred, np.ascontiguousarray(inside).view(np.uint8), strength, mean, summary)
-        return RelativeChange(strength, mean, *summary.tolist())
+        change_strength(blurred, np.ascontiguousarray(inside).view(np.uint8), strength, brightness)
+        return WindowChange(strength, brightness)
 
     def _derived(self) -> _Derived:
         if self._known is not None:
             return self._known
         mean, half, count = self._mean, self._half, self._count
-        variance = (PRIOR_FRAMES * self._noise**2 + self._squares) / (PRIOR_FRAMES + count - 1)
-        steady = variance * (1 + 1 / count) + (self._shift / CELL * _steepness(mean)) ** 2
+        noise = (PRIOR_FRAMES * self._noise**2 + self._squares) / (PRIOR_FRAMES + count - 1)
+        steady = noise * (1 + 1 / count) + (self._shift / CELL * _steepness(mean)) ** 2
         variance = steady + (self._repeatability * mean) ** 2
         illumination = IlluminationModel(mean, np.asarray(variance, np.float32), self._counts)
         weight = 1 / np.sqrt(variance)
@@ -224,9 +213,7 @@ class BackgroundModel:
         factor = (variance / (steady + (self._tint * mean) ** 2)).min(axis=0)
         direction = mean * weight
         direction /= np.linalg.norm(direction, axis=0) + np.float32(1e-6)
-        dark = DARK_OFFSET * half.mean(axis=(1, 2), keepdims=True) + 1
-        edge = self._shift / 2 * _steepness(half) / (EDGE_CHANGE * (half + dark))
-        half_scale = 1 / ((half + dark) * np.sqrt(1 + edge**2))
+        half_scale = self._half_scale(np.asarray(noise, np.float32))
         if self._counts is not None:
             weight = weight * self._counts
             half_scale = half_scale * self._counts.repeat(2, axis=0).repeat(2, axis=1)
@@ -241,6 +228,18 @@ class BackgroundModel:
         )
         return self._known
 
+    def _half_scale(self, noise: Float) -> Float:
+        """One over the standard deviation at half resolution, (3, 2h, 2w). noise : variance of cells.
+
+        Half a cell, smoothed, is about as noisy as a smoothed cell. How far the light varies is taken from
+        the brightness of the whole picture: relative to itself, a dark channel that a tilt lights up would
+        outshine the others.
+        """
+        light = self._repeatability * self._half.mean()
+        edges = self._shift / 2 * _steepness(self._half)
+        variance = noise.mean(axis=(1, 2), keepdims=True) + light**2 + edges**2
+        return np.asarray(1 / np.sqrt(variance), np.float32)
+
 
 def _planes(picture: NDArray[np.uint8]) -> Float:
     """(3, h, w) float32 of (h, w, 3)."""
@@ -249,10 +248,8 @@ def _planes(picture: NDArray[np.uint8]) -> Float:
 
 def _smoothed(cells: NDArray[np.uint8]) -> Float:
     """(3, h, w) float32: means over 3 x 3 cells of (h, w, 3)."""
-    high, wide = cells.shape[:2]
-    smooth = np.empty((3, high, wide), np.float32)
-    smooth_cells(cells.reshape(high, -1), smooth)
-    return smooth
+    smooth = cv2.boxFilter(cells, cv2.CV_32F, (3, 3)).reshape(cells.shape)
+    return np.ascontiguousarray(smooth.transpose(2, 0, 1))
 
 
 def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -20,36 +20,11 @@ Double = NDArray[np.float64]
 Byte = NDArray[np.uint8]
 
 BLUR_SIGMA: Final = 0.8
-"""Standard deviation by which relative changes are smoothed, pixels at half resolution. Chosen by hand."""
+"""Standard deviation by which changes are smoothed, pixels at half resolution. Chosen by hand."""
 _AT_ONE: Final = math.exp(-1 / (2 * BLUR_SIGMA**2))
 MIDDLE: Final = np.float32(1 / (1 + 2 * _AT_ONE))
 BESIDE: Final = np.float32(_AT_ONE / (1 + 2 * _AT_ONE))
 """Weights of a pixel and of each of its two neighbours, those of a Gaussian with that standard deviation."""
-
-
-@kernel("void(uint8[:, ::1], float32[:, :, ::1])")
-def smooth_cells(cells: Byte, smooth: Float) -> None:
-    """Means over 3 x 3 cells, plane by plane.
-
-    cells : (h, 3 w). smooth : (3, h, w), filled.
-    """
-    high, wide = smooth.shape[1:]
-    sums = np.empty(3 * wide, np.uint16)
-    ninth = np.float32(1 / 9)
-    for y in range(high):
-        above = min(1, high - 1) if y == 0 else y - 1
-        below = max(high - 2, 0) if y == high - 1 else y + 1
-        upper, line, lower = cells[above], cells[y], cells[below]
-        for x in range(3 * wide):
-            sums[x] = np.uint16(upper[x]) + np.uint16(line[x]) + np.uint16(lower[x])
-        for channel in range(3):
-            row, part = smooth[channel, y], sums[channel:]
-            inner = row[1:]
-            for x in range(wide - 2):
-                inner[x] = np.float32(part[3 * x] + part[3 * x + 3] + part[3 * x + 6]) * ninth
-            last = wide - 1
-            row[0] = np.float32(part[0] + 2 * part[3 * min(1, last)]) * ninth
-            row[last] = np.float32(part[3 * last] + 2 * part[3 * max(last - 1, 0)]) * ninth
 
 
 @kernel(
@@ -89,13 +64,14 @@ def weigh_change(
     for y in range(high):
         total, rest, both = squared[y], colour[y], evidence[y]
         for c in range(3):
-            gain = np.float32(1) + coefficients[c, 0] + coefficients[c, 2] * down[y]
+            gain = coefficients[c, 0] + coefficients[c, 2] * down[y]
             slope, offset = coefficients[c, 1], coefficients[c, 3]
             line, usual = smooth[c, y], mean[c, y]
             scale, tone = weight[c, y], brightness[c, y]
             for x in range(wide):
-                expected = usual[x] * (gain + slope * across[x]) + offset
-                change = line[x] - (expected if expected < WHITE else WHITE)
+                light = usual[x] * (gain + slope * across[x]) + offset
+                change, least = line[x] - usual[x] - light, line[x] - WHITE
+                change = change if change > least else least
                 deviation = change * scale[x]
                 total[x] = deviation * deviation + (total[x] if c else np.float32(0))
                 along[x] = change * tone[x] + (along[x] if c else np.float32(0))
@@ -121,7 +97,7 @@ def weigh_change(
     " float32[:, :, ::1], float32[:, :, ::1])",
     reorder=True,
 )
-def relative_change(
+def scaled_change(
     half: Byte,
     top: int,
     left: int,
@@ -132,7 +108,7 @@ def relative_change(
     scale: Float,
     blurred: Float,
 ) -> None:
-    """How a window has changed at half resolution, relative to its brightness, smoothed along x.
+    """How a window has changed at half resolution, in standard deviations, smoothed along x.
 
     half : (H, 3 W), the frame. top, left : of the window. coefficients, across, down : as for
     `weigh_change`, at this resolution. mean, scale : (3, H, W). blurred : (3, h, w), filled.
@@ -143,12 +119,14 @@ def relative_change(
     for y in range(high):
         picture = half[top + y, 3 * left :]
         for c in range(3):
-            gain = np.float32(1) + coefficients[c, 0] + coefficients[c, 2] * down[top + y]
+            gain = coefficients[c, 0] + coefficients[c, 2] * down[top + y]
             slope, offset = coefficients[c, 1], coefficients[c, 3]
             usual, unit, row = mean[c, top + y, left:], scale[c, top + y, left:], blurred[c, y]
             for x in range(wide):
-                expected = usual[x] * (gain + slope * place[x]) + offset
-                change = np.float32(picture[3 * x + c]) - (expected if expected < WHITE else WHITE)
+                light = usual[x] * (gain + slope * place[x]) + offset
+                value = np.float32(picture[3 * x + c])
+                change, least = value - usual[x] - light, value - WHITE
+                change = change if change > least else least
                 line[x] = change * unit[x]
             for x in range(1, wide - 1):
                 row[x] = (line[x - 1] + line[x + 1]) * BESIDE + line[x] * MIDDLE
@@ -157,19 +135,15 @@ def relative_change(
             row[last] = (before + before) * BESIDE + line[last] * MIDDLE
 
 
-@kernel(
-    "void(float32[:, :, ::1], uint8[:, ::1], float32[:, ::1], float32[:, ::1], float64[::1])", reorder=True
-)
-def change_strength(blurred: Float, inside: Byte, strength: Float, common: Float, summary: Double) -> None:
-    """Smooth a relative change along y, and reduce its channels to one.
+@kernel("void(float32[:, :, ::1], uint8[:, ::1], float32[:, ::1], float32[:, ::1])", reorder=True)
+def change_strength(blurred: Float, inside: Byte, strength: Float, common: Float) -> None:
+    """Smooth a change along y, and reduce its channels to one.
 
-    blurred : (3, h, w), from `relative_change`. inside : (h / 2, w / 2), cells that count. strength : (h, w),
-    filled with the length of the change over the channels. common : (h, w), filled with their mean. summary :
-    filled with the sum of `common`, the sum and the sum of squares of `strength`.
+    blurred : (3, h, w), from `scaled_change`. inside : (h / 2, w / 2), cells that count. strength : (h, w),
+    filled with the length of the change over the channels. common : (h, w), filled with their mean.
     """
     high, wide = strength.shape
     counts, third = np.empty(wide, np.float32), np.float32(1 / 3)
-    sums = squares = commons = 0.0
     for y in range(high):
         above = min(1, high - 1) if y == 0 else y - 1
         below = max(high - 2, 0) if y == high - 1 else y + 1
@@ -183,9 +157,5 @@ def change_strength(blurred: Float, inside: Byte, strength: Float, common: Float
                 length[x] = value * value + (length[x] if c else np.float32(0))
                 tone[x] = value + (tone[x] if c else np.float32(0))
         for x in range(wide):
-            squares += length[x]
             length[x] = np.sqrt(length[x])
             tone[x] *= third
-            sums += length[x]
-            commons += tone[x]
-    summary[0], summary[1], summary[2] = commons, sums, squares

@@ -288,9 +288,9 @@ class ContactDetector:
         assert self._background is not None
         rows, columns, inside = component
         top, left = CELL * rows.start, CELL * columns.start
-        strength = self._background.relative_change(change, rows, columns, inside)
+        window = self._background.window_change(change, rows, columns, inside)
         below = None if hidden is None else halve_mask(hidden, top, left, inside)
-        draw_level(contact_level(strength, BRIDGE, below), top, left, mask)
+        draw_level(contact_level(window, BRIDGE, below), top, left, mask)
 
     def _clear(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
         """Contact by the size of the change, so that its outline can be seen.

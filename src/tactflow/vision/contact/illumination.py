@@ -46,9 +46,10 @@ class IlluminationModel:
     by Huber's method of modified residuals: residuals are clipped to twice their standard deviation before
     each least-squares step, in which blocks count by one over their variance, so a contact, however strong,
     pulls no harder than noise; the matrix of the step is constant. A second fit goes on from there without
-    residuals of several times that size, so that a contact does not pull at all. The first starts at the median, so a
-    contact may cover nearly half of the frame. Saturated blocks are left out; where a channel has no others,
-    its gain is the least that saturates them. Computed in float32, to 1e-3 grey levels of what float64 gives.
+    residuals of several times that size, so that a strong contact does not pull at all. The first starts at
+    the median, so a contact may cover nearly half of the frame. Saturated blocks are left out; where a
+    channel has no others, its gain is the least that saturates them. Computed in float32, to 1e-3 grey levels
+    of what float64 gives.
 
     Parameters
     ----------

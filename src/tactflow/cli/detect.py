@@ -1,0 +1,143 @@
+"""`tactflow detect`: which marks of a gel are found, and why, in words and in one picture."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import ConfigError, SourceError, StageError
+from tactflow.sources import open_source
+from tactflow.vision.geometry import Preprocessor
+from tactflow.vision.geometry.valid_area import valid_area
+from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers
+from tactflow.vision.markers.picture import draw_detection
+
+PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+"""Endings of files that a picture can be written to."""
+
+
+SHOWN: Final = 0.25
+"""Score of the next best spots over that of the marks, from which on they are shown. Chosen by hand."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `detect`."""
+    parser.add_argument("source", metavar="SRC", help="as in 'tactflow run --source': of the untouched gel")
+    parser.add_argument(
+        "--picture", type=Path, metavar="FILE", help="write what was found and why, to look at or to send"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
+    parser.add_argument("--frame", type=int, default=0, metavar="N", help="which frame, the first is 0")
+    parser.add_argument("--rotate", type=int, default=0, choices=(0, 90, 180, 270), help="as in preprocess")
+    parser.add_argument(
+        "--downsample", type=int, default=1, choices=(1, 2, 4, 8, 16), help="as in preprocess"
+    )
+    parser.add_argument("--dot", type=float, metavar="PX", help="radius of a mark, if it is known")
+    parser.add_argument("--polarity", default="auto", choices=("auto", "dark", "bright"), help="of the marks")
+    parser.add_argument("--all", action="store_true", help="look everywhere, also where no gel seems to be")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what was found, and draw it; returns 0 also where there are no marks.
+
+    Raises
+    ------
+    ConfigError, SourceError, StageError
+        If the options are wrong, the frame cannot be read, or the picture cannot be written.
+    """
+    if args.frame < 0:
+        raise ConfigError(f"--frame: required 0 or more, got {args.frame}")
+    _check_picture(args.picture, args.overwrite)
+    image = _frame(args.source, args.frame)
+    image = Preprocessor(image.shape[1::-1], rotate=args.rotate, downsample=args.downsample)(image)
+    valid = None if args.all else valid_area(image)
+    marks: Detection | None = None
+    try:
+        marks = detect_markers(image, dot_radius=args.dot, polarity=args.polarity, valid=valid)
+        rival = _near_rival(marks)
+        lines = list(_found(marks, rival))
+    except NoMarkersError as error:
+        rival, lines = error.best, [str(error), *_best(error.best)]
+    except ValueError as error:
+        raise ConfigError(f"--dot: {error}") from None
+    title = f"{args.source}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
+    without = 0.0 if valid is None else float(np.mean(valid == 0))
+    if without > 0:
+        lines.append(f"dim: {100 * without:.0f} % of the picture show no gel; --all looks there, too")
+    text = "\n".join([title, *lines])
+    print(text)
+    if args.picture is not None:
+        _write(args.picture, draw_detection(image, marks, text, rival=rival, valid=valid))
+    return 0
+
+
+def _near_rival(marks: Detection) -> Candidate | None:
+    """The next best spots, if they are worth showing."""
+    if marks.rival is None or marks.chosen is None or marks.rival.score < SHOWN * marks.chosen.score:
+        return None
+    return marks.rival
+
+
+def _found(marks: Detection, rival: Candidate | None) -> Iterator[str]:
+    """Lines that say what was found."""
+    sizes = f"radius {marks.dot_radius:.1f} px"
+    if marks.radii is not None:
+        sizes = f"radii {marks.radii.min():.1f} to {marks.radii.max():.1f} px, most {marks.dot_radius:.1f} px"
+    yield f"yellow: {len(marks.centers)} {marks.polarity} marks, {sizes}, {marks.pitch:.1f} px apart"
+    if marks.chosen is not None:
+        closed = f"{100 * marks.chosen.lattice:.0f} % of the parallelograms of neighbours close"
+        grids = "grids: 80 % and more, random: 30 % and less"
+        yield f"green: {len(marks.edges)} links; {closed} ({grids}); score {marks.chosen.score:.1f}"
+    yield from _best(rival, "next best")
+    if rival is None:
+        yield "nothing else in the picture looks like marks"
+    if marks.doubt is not None:
+        yield f"warning: {marks.doubt}"
+
+
+def _best(spots: Candidate | None, what: str = "best") -> Iterator[str]:
+    """A line on spots that are no marks, if there are any."""
+    if spots is not None:
+        closed = f"{100 * spots.lattice:.0f} % of their parallelograms close"
+        yield f"magenta: {what}, {spots}; {closed}; score {spots.score:.1f}"
+
+
+def _check_picture(path: Path | None, overwrite: bool) -> None:
+    if path is None:
+        return
+    if path.suffix.lower() not in PICTURES:
+        raise ConfigError(f"--picture: required a file whose name ends in .png or .jpg, got {path}")
+    if not path.absolute().parent.is_dir():
+        raise ConfigError(f"--picture: there is no folder {path.absolute().parent}")
+    if path.is_dir():
+        raise ConfigError(f"--picture: {path} is a folder; required a file")
+    if path.exists() and not overwrite:
+        raise ConfigError(f"--picture: {path} is already there; give --overwrite to replace it")
+
+
+def _frame(source: str, number: int) -> NDArray[np.uint8]:
+    """One frame of a source."""
+    reader = open_source(source)
+    try:
+        count = 0
+        while (frame := reader.read()) is not None:
+            if count == number:
+                return frame[0]
+            count += 1
+        raise SourceError(f"{source}: --frame {number} is beyond its {count} frames, counted from 0")
+    finally:
+        reader.close()
+
+
+def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+    _, encoded = cv2.imencode(path.suffix.lower(), picture)
+    try:
+        path.write_bytes(encoded.tobytes())
+    except OSError as error:
+        raise StageError(f"--picture {path}: {error.strerror or error}") from error

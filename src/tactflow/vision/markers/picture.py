@@ -1,0 +1,105 @@
+"""A picture of what detection found and why, for people."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.draw import DARK, GRAY, GREEN, MAGENTA, WHITE, YELLOW, Colour
+from tactflow.vision.lettering import Lettering
+from tactflow.vision.markers.detection import Candidate, Detection
+
+SHORTEST_SIDE: Final = 480
+"""Shorter side of the drawn frame, px, at least: smaller frames are enlarged. Chosen by hand."""
+
+TEXT: Final = 15
+"""Size of the letters, px. Chosen by hand."""
+
+LINE_SPACING: Final = 21
+"""Distance of two lines of text, px. Chosen by hand."""
+
+LETTER_WIDTH: Final = 0.52
+"""Width of a letter on average, over the letters' size: where lines are broken. Chosen by hand."""
+
+_SHIFT: Final = 4
+"""Binary digits after the point in drawing coordinates: they are exact to 1/16 px. Chosen by hand."""
+
+
+def draw_detection(
+    image: NDArray[np.uint8],
+    marks: Detection | None,
+    caption: str,
+    *,
+    rival: Candidate | None = None,
+    valid: NDArray[np.uint8] | None = None,
+) -> NDArray[np.uint8]:
+    """The frame with the marks, their neighbours, what else might be marks, and a caption below.
+
+    image : (H, W, 3) or (H, W) uint8. marks : drawn as yellow circles of their radii and green links.
+    caption : lines. rival : drawn as thin magenta circles. valid : (H, W) uint8, where it is 0 the frame is
+    dim.
+
+    Returns (h, w, 3) uint8, a new picture, enlarged by a whole factor where the frame is small.
+
+    >>> gel = np.full((240, 320, 3), 120, np.uint8)
+    >>> draw_detection(gel, None, "0 marks")[0, 0].tolist()
+    [120, 120, 120]
+    """
+    frame = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+    if valid is not None:
+        frame = np.where(valid[:, :, None] > 0, frame, frame // 3)
+    factor = max(1, -(-SHORTEST_SIDE // min(frame.shape[:2])))
+    size = (frame.shape[1] * factor, frame.shape[0] * factor)
+    picture = np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_CUBIC), np.uint8).copy()
+    if rival is not None:
+        _circles(picture, rival.centers, np.full(len(rival.centers), rival.radius), MAGENTA, factor)
+    if marks is not None:
+        for link in marks.centers[marks.edges]:
+            one, other = (_fixed(point, factor) for point in link)
+            cv2.line(picture, one, other, GREEN, 1, cv2.LINE_AA, _SHIFT)
+        sizes = np.full(len(marks.centers), marks.dot_radius) if marks.radii is None else marks.radii
+        _circles(picture, marks.centers, sizes, DARK, factor, 3)
+        _circles(picture, marks.centers, sizes, YELLOW, factor)
+    return np.concatenate([picture, _caption(caption, picture.shape[1])])
+
+
+def _fixed(point: NDArray[np.float64], factor: int) -> tuple[int, int]:
+    """A point of the frame in drawing coordinates of the enlarged one."""
+    x, y = np.rint(((point + 0.5) * factor - 0.5) * 2**_SHIFT).astype(int).tolist()
+    return x, y
+
+
+def _circles(
+    picture: NDArray[np.uint8],
+    centers: NDArray[np.float64],
+    radii: NDArray[np.float64],
+    colour: Colour,
+    factor: int,
+    width: int = 1,
+) -> None:
+    for center, radius in zip(centers, radii.tolist(), strict=True):
+        outline = round((radius * factor + 1) * 2**_SHIFT)
+        cv2.circle(picture, _fixed(center, factor), outline, colour, width, cv2.LINE_AA, _SHIFT)
+
+
+def _caption(text: str, width: int) -> NDArray[np.uint8]:
+    """(h, width, 3) uint8 with the lines of a text, broken where they are too long.
+
+    A line that begins with the name of a colour and a colon has that colour.
+    """
+    columns = max(20, int((width - 16) / (TEXT * LETTER_WIDTH)))
+    colours = {"yellow": YELLOW, "green": GREEN, "magenta": MAGENTA, "dim": GRAY}
+    lines = [
+        (part, colours.get(line.partition(":")[0], WHITE))
+        for line in text.splitlines()
+        for part in textwrap.wrap(line, columns)
+    ]
+    strip = np.full((LINE_SPACING * len(lines) + 12, width, 3), DARK, np.uint8)
+    letters = Lettering()
+    for number, (line, colour) in enumerate(lines):
+        letters.write(strip, line, (8, LINE_SPACING * (number + 1)), colour, TEXT)
+    return strip

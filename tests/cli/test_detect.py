@@ -1,0 +1,71 @@
+"""`detect` says what marks a gel has, and draws it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tactflow.cli.main import main
+
+GEL = "sim:press?frames=2"
+
+
+def test_what_was_found_is_told_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "found.png"
+    assert main(["detect", GEL, "--downsample", "2", "--rotate", "90", "--picture", str(file)]) == 0
+    title, *lines = capsys.readouterr().out.splitlines()
+    assert title == f"{GEL}, frame 0: 300 x 400 px"
+    assert lines[0].startswith("yellow: 80 dark marks, radius 4.9 px, 34.0 px apart")
+    assert lines[1].startswith("green: 142 links; 98 % of the parallelograms")
+    picture = cv2.imread(str(file))
+    assert picture is not None
+    # Enlarged to 600 x 800, and the caption below.
+    assert picture.shape[1] == 600
+    assert picture.shape[0] > 800
+    assert ((picture == (0, 255, 255)).all(axis=2)).any()
+
+
+def test_a_gel_without_marks_is_no_error_and_the_best_spots_are_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    speckle = np.random.default_rng(1).normal(0, 1, (240, 320))
+    speckle = cv2.GaussianBlur(speckle, (0, 0), 2.0)
+    image, file = tmp_path / "speckle.png", tmp_path / "found.jpg"
+    cv2.imwrite(str(image), np.where(speckle > 0.1, 40, 170).astype(np.uint8))
+    assert main(["detect", str(image), "--picture", str(file)]) == 0
+    out = capsys.readouterr().out
+    assert "0 markers found" in out
+    assert "form no lattice" in out
+    assert "magenta: best, " in out
+    assert cv2.imread(str(file)) is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["nowhere.mp4"], 4, "no such file"),
+        ([GEL, "--frame", "5"], 4, "--frame 5 is beyond its 2 frames, counted from 0"),
+        ([GEL, "--frame", "-1"], 2, "--frame: required 0 or more, got -1"),
+        ([GEL, "--dot", "900"], 2, "--dot: required dot_radius 1 to 150 px, got 900"),
+        ([GEL, "--dot", "nan"], 2, "--dot: required dot_radius"),
+        ([GEL, "--picture", "found.txt"], 2, "ends in .png or .jpg, got found.txt"),
+        ([GEL, "--picture", "missing/found.png"], 2, "there is no folder"),
+        ([GEL, "--picture", "here.png"], 2, "here.png is already there; give --overwrite"),
+    ],
+)
+def test_wrong_input_is_refused_in_words(
+    options: list[str],
+    code: int,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "here.png").write_bytes(b"mine")
+    assert main(["detect", *options]) == code
+    assert words in capsys.readouterr().err
+    assert (tmp_path / "here.png").read_bytes() == b"mine"
