@@ -164,7 +164,7 @@ class View(Sink):
         frame = tick.frame
         contact, markers = results.contact, results.markers
         if contact is not None:
-            contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1))
+            contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1), separate=())
         message = encode_message(tick, results._replace(contact=contact, markers=None), detail=True)
         image = frame.image if results.image is None else results.image
         jpeg = self._encode(image if valid is None else dimmed(image, valid))

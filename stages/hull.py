@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import ContactMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import moments
-from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry, contact_parts
 from tactflow.vision.types import Contact, Evidence
 
 
 class Hull(Stage):
-    """Hull, area, centroid, direction and ellipse of the contact."""
+    """Hull, area, centroid, direction and ellipse of the contact, and of each separate one."""
 
     memory = "pure"
 
@@ -26,10 +27,15 @@ class Hull(Stage):
         min_area: float = Field(
             20.0, ge=0, description="smaller components are ignored, px^2; too large misses light contacts"
         )
+        merge: Literal["all", "largest", "near"] = Field(
+            "all",
+            description="all: everything that touches is one contact; largest: the one with the most pixels; "
+            "near: the same, where those up to max_gap apart are one. The separate ones are told as well",
+        )
         max_gap: float | None = Field(
             None,
             ge=0,
-            description="components farther apart than this are not one contact, px; null: all are",
+            description="components farther apart than this are not one contact, px; implies merge: near",
         )
         min_confidence: float = Field(
             0.3,
@@ -39,6 +45,14 @@ class Hull(Stage):
             "which 5 % of 200 real presses of a ball exceed, since light makes a mask lopsided",
         )
 
+        @model_validator(mode="after")
+        def _gap_of_near(self) -> Self:
+            if self.merge == "near" and self.max_gap is None:
+                raise ValueError("merge: near requires max_gap, px")
+            if self.merge == "largest" and self.max_gap is not None:
+                raise ValueError("max_gap is for merge: near, not for merge: largest")
+            return self
+
     def __init__(self, params: Params) -> None:
         self._params = params
         compiled.load(moments)
@@ -46,12 +60,21 @@ class Hull(Stage):
     def process(self, contact_mask: ContactMask, evidence: Evidence | None = None) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
         params = self._params
-        contact = contact_geometry(
+        parts = contact_parts(
             contact_mask,
             min_area=params.min_area,
-            max_gap=params.max_gap,
+            max_gap=params.max_gap or 0.0,
             min_confidence=params.min_confidence,
         )
-        if contact is None:
+        if not parts:
             return Absent("no_contact")
+        contact = parts[0]
+        if len(parts) > 1:
+            if params.merge == "all" and params.max_gap is None:
+                whole = contact_geometry(
+                    contact_mask, min_area=params.min_area, min_confidence=params.min_confidence
+                )
+                contact = whole or contact
+            shown = evidence or contact.evidence
+            contact = replace(contact, separate=tuple(replace(part, evidence=shown) for part in parts))
         return contact if evidence is None else replace(contact, evidence=evidence)

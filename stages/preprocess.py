@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
@@ -46,6 +47,12 @@ class Homography(StageParams):
         return self
 
 
+logger = logging.getLogger("tactflow")
+
+_SHRUNK = {2: "halved", 4: "quartered", 8: "shrunk 8 times", 16: "shrunk 16 times"}
+"""Factor of `downsample` -> what it does, in words."""
+
+
 class Preprocessed(NamedTuple):
     """image : the processed frame. mapping : between its pixels and those of the raw frame."""
 
@@ -84,7 +91,24 @@ class Preprocess(Stage):
         if self._preprocessor is None:
             height, width = frame.image.shape[:2]
             self._preprocessor = self._build(width, height)
+            image = self._preprocessor(frame.image)
+            self._told((width, height), (image.shape[1], image.shape[0]))
+            return Preprocessed(image, self._preprocessor.mapping)
         return Preprocessed(self._preprocessor(frame.image), self._preprocessor.mapping)
+
+    def _told(self, before: tuple[int, int], after: tuple[int, int]) -> None:
+        """Say what becomes of the picture, once. before, after : (width, height), px."""
+        params = self._params
+        steps = [
+            *(["straightened"] if params.undistort else []),
+            *(["rectified"] if params.homography else []),
+            *(["cut"] if params.crop else []),
+            *([f"turned by {params.rotate} degrees"] if params.rotate else []),
+            *([_SHRUNK[params.downsample]] if params.downsample > 1 else []),
+        ]
+        if steps:
+            done = " and ".join(filter(None, (", ".join(steps[:-1]), steps[-1])))
+            logger.info("%d x %d %s to %d x %d: stages.preprocess", *before, done, *after)
 
     def _build(self, width: int, height: int) -> Preprocessor:
         params = self._params

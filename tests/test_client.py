@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zmq
 
 from tactflow import client
 from tactflow.cli import listen
 from tactflow.client import Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message import Results, encode_message
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
 from tests.clock import PATIENCE, ManualClock
@@ -323,3 +324,16 @@ def test_a_contact_without_direction_is_described_without_one(publisher: Publish
         publisher.wait()
         publisher.send(0, contact=round_contact)
         assert "angle -  " in listen.describe(messages.receive())
+
+
+def test_what_is_no_result_message_is_passed_over_and_counted() -> None:
+    with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
+        port = publisher.bind_to_random_port("tcp://127.0.0.1")
+        with Subscriber(f"tcp://127.0.0.1:{port}", timeout=PATIENCE) as results:
+            good = encode_message(Tick(Frame("main", 3, 0.1, np.zeros((4, 4, 3), np.uint8))), Results())
+            while not results._socket.poll(20):
+                publisher.send(b"tactflow.main " + good)
+            for body in (b"{", b'{"seq": []}', b"{}", good):
+                publisher.send(b"tactflow.main " + body)
+            while results.malformed < 3:
+                assert results.receive()["seq"] == 3

@@ -59,6 +59,7 @@ def test_the_message_has_exactly_the_fields_of_the_contract() -> None:
             "ellipse": {"center": [150.0, 200.0], "axes": [90.5, 60.25], "angle": -12.9},
             "evidence": "both",
         },
+        "contacts": [message["contact"]],
         "flow": {"mean": [1.21, -0.33], "count": 9},
         "markers": {
             "origin": [[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]],
@@ -75,6 +76,7 @@ def test_detail_adds_what_is_documented_and_nothing_else() -> None:
     detailed = build_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS), detail=True)
     VALIDATOR.validate(detailed)
     assert detailed["contact"].pop("confidence") == 0.75
+    assert detailed["contacts"][0].pop("confidence") == 0.75
     assert detailed["flow"].pop("stderr") == [0.1, 0.2]
     assert detailed["flow"].pop("rotation") == 3.5
     assert detailed["flow"].pop("divergence") == 0.01
@@ -105,6 +107,15 @@ def test_whatever_is_unknown_is_null_and_the_message_stays_valid(
     assert (message["contact"] is None) == (contact is None)
     assert (message["flow"] is None) == (flow is None)
     assert (message["markers"] is None) == (markers is None)
+
+
+def test_separate_contacts_are_listed_and_nothing_is_an_empty_list() -> None:
+    parts = (CONTACT, replace(CONTACT, area=5.0))
+    message = build_message(TICK, Results(PROCESSED, replace(CONTACT, area=9000.0, separate=parts)))
+    VALIDATOR.validate(message)
+    assert message["contact"]["area"] == 9000.0
+    assert [part["area"] for part in message["contacts"]] == [5123.5, 5.0]
+    assert build_message(TICK, Results())["contacts"] == []
 
 
 def test_without_a_processed_image_the_size_is_that_of_the_raw_one() -> None:

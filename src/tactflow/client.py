@@ -37,6 +37,10 @@ STATISTICS = b"tactflow.stats"
 """Topic of a run's statistics, which no sensor may be called after."""
 
 
+REQUIRED = frozenset(["schema", "sensor", "seq", "t", "contact", "flow", "markers", "skipped"])
+"""Keys that every result message has."""
+
+
 class Subscriber:
     """Receives result messages (`tactflow.frame/1`) as dicts; a context manager and an iterator.
 
@@ -57,6 +61,7 @@ class Subscriber:
     lost : frames missing between the messages received so far, told by gaps in `seq`: those that tactflow
         dropped to stay live, those that did not fit a queue on the way, and with `latest` those skipped.
     received : messages received so far.
+    malformed : of these, ones that were no result messages: somebody else publishes there.
 
     Raises
     ------
@@ -83,6 +88,7 @@ class Subscriber:
         self.timeout = timeout
         self.lost = 0
         self.received = 0
+        self.malformed = 0
         self._sensor = sensor
         self._last_seq: dict[str, int] = {}
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -108,16 +114,19 @@ class Subscriber:
             ) from None
 
     def receive(self) -> dict[str, Any]:
-        """The next message; waits for it.
+        """The next message; waits for it. What is no result message is passed over and counted.
 
         Raises
         ------
         TimeoutError
             If nothing comes for `timeout` seconds.
         """
-        message: dict[str, Any] = orjson.loads(self.receive_json())
-        self._count(message["sensor"], message["seq"])
-        return message
+        while True:
+            message = _parsed(self.receive_json())
+            if message is not None:
+                self._count(message["sensor"], message["seq"])
+                return message
+            self.malformed += 1
 
     def receive_json(self) -> bytes:
         """The next message as it was sent, JSON in UTF-8; not counted in `lost`. Raises as `receive`."""
@@ -167,3 +176,14 @@ class Subscriber:
     def __iter__(self) -> Iterator[dict[str, Any]]:
         while True:
             yield self.receive()
+
+
+def _parsed(body: bytes) -> dict[str, Any] | None:
+    """A result message, or None if it is none."""
+    try:
+        message = orjson.loads(body)
+    except ValueError:
+        return None
+    if not isinstance(message, dict) or not message.keys() >= REQUIRED:
+        return None
+    return message if isinstance(message["sensor"], str) and isinstance(message["seq"], int) else None

@@ -91,6 +91,8 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
     frame = tick.frame
     image, contact, flow, markers = results
     pixels = frame.image if image is None else image
+    described = None if contact is None else _contact(contact, detail)
+    separate = () if contact is None else contact.separate
     return orjson.dumps(
         {
             "schema": SCHEMA,
@@ -98,7 +100,9 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
             "seq": frame.seq,
             "t": _number(frame.t, "t"),
             "size": [pixels.shape[1], pixels.shape[0]],
-            "contact": None if contact is None else _contact(contact, detail),
+            "contact": described,
+            "contacts": [_contact(part, detail) for part in separate]
+            or [one for one in (described,) if one is not None],
             "flow": None if flow is None else _flow(flow, detail),
             "markers": None if markers is None else _markers(markers, detail),
             "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
@@ -270,6 +274,9 @@ class _Message(_Strict):
         description="(width, height) of the processed frame, px"
     )
     contact: _ContactModel | None = Field(description="null when nothing touches the gel")
+    contacts: list[_ContactModel] = Field(
+        description="every separate contact, that with the most pixels first; empty when nothing touches"
+    )
     flow: _FlowModel | None = Field(description="null when there is no contact")
     markers: _MarkersModel | None = Field(description="null when markers were not computed")
     skipped: dict[str, str] = Field(

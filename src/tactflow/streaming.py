@@ -56,6 +56,13 @@ class Result:
     image: NDArray[np.uint8] | None = None
     frame: NDArray[np.uint8] | None = None
 
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """Every separate contact, that with the most pixels first; empty without one."""
+        if self.contact is None:
+            return ()
+        return self.contact.separate or (self.contact,)
+
 
 def stream(
     pipeline: str | Path | Pipeline | None = None,
@@ -177,6 +184,8 @@ def _locked(value: Any) -> Any:
         return None
     parts = {field.name: getattr(value, field.name) for field in fields(value)}
     arrays = {name: _locked(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
+    if isinstance(value, Contact):
+        arrays["separate"] = tuple(map(_locked, value.separate))
     return replace(value, **arrays)
 
 

@@ -79,7 +79,11 @@ def test_lines_on_standard_output_do_not_mix(folder: Path) -> None:
     assert counts == {"left": 40, "right": 30}
 
 
-def test_all_sensors_publish_at_one_address(folder: Path) -> None:
+def test_all_sensors_publish_at_one_address(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The addresses between the processes have to be short, wherever temporary files go.
+    long = folder / ("x" * 100)
+    long.mkdir()
+    monkeypatch.setenv("TMPDIR", str(long))
     with zmq.Context() as context, context.socket(zmq.SUB) as socket, context.socket(zmq.REP) as finder:
         port = finder.bind_to_random_port("tcp://127.0.0.1")
         finder.unbind(f"tcp://127.0.0.1:{port}")

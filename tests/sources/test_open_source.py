@@ -443,3 +443,10 @@ def test_an_array_that_is_cut_during_the_run_is_an_error(tmp_path: Path) -> None
     with pytest.raises(SourceError, match="was cut off during the run, within frame 1"):
         source.read()
     source.close()
+
+
+def test_a_pattern_for_all_folders_follows_no_links_in_circles(tmp_path: Path) -> None:
+    make_folder(tmp_path / "pictures")
+    for name in ("one", "two"):
+        (tmp_path / "pictures" / name).symlink_to(tmp_path / "pictures", target_is_directory=True)
+    assert len(read_all(open_source(str(tmp_path / "**" / "*.png")))) == 5

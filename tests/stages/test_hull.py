@@ -59,13 +59,36 @@ def test_what_is_smaller_than_min_area_is_no_contact() -> None:
 
 
 def test_max_gap_reaches_the_geometry() -> None:
-    mask = bar()
-    mask[20:30, 80:85] = 255
-    near, far = run(mask.copy(), max_gap=5), run(mask.copy())
+    near, far = run(two(), max_gap=5), run(two())
     assert isinstance(near, Contact)
     assert isinstance(far, Contact)
     assert near.hull[:, 0].max() == 59
     assert far.hull[:, 0].max() == 84
+
+
+def two() -> NDArray[np.uint8]:
+    mask = bar()
+    mask[20:30, 80:85] = 255
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("params", "right"),
+    [({}, 84), ({"merge": "largest"}, 59), ({"merge": "near", "max_gap": 5}, 59)],
+    ids=str,
+)
+def test_separate_contacts_are_told_whatever_the_contact_is(params: Any, right: int) -> None:
+    contact = run(two(), **params)
+    assert isinstance(contact, Contact)
+    assert contact.hull[:, 0].max() == right
+    assert [part.region_area for part in contact.separate] == [500, 50]
+    assert [part.separate for part in contact.separate] == [(), ()]
+
+
+def test_a_contact_that_is_the_only_one_has_no_parts() -> None:
+    for contact in (run(bar()), run(two(), max_gap=30), run(two(), min_area=100)):
+        assert isinstance(contact, Contact)
+        assert contact.separate == ()
 
 
 def test_a_stubby_contact_has_no_direction_unless_asked_for() -> None:
@@ -78,7 +101,16 @@ def test_a_stubby_contact_has_no_direction_unless_asked_for() -> None:
 
 
 @pytest.mark.parametrize(
-    "params", [{"min_area": -1}, {"max_gap": -1}, {"method": "x"}, {"min_aera": 3}], ids=str
+    "params",
+    [
+        {"min_area": -1},
+        {"max_gap": -1},
+        {"method": "x"},
+        {"min_aera": 3},
+        {"merge": "near"},
+        {"merge": "largest", "max_gap": 3},
+    ],
+    ids=str,
 )
 def test_wrong_parameters_are_refused(params: Any) -> None:
     with pytest.raises(ValidationError):

@@ -112,3 +112,29 @@ def test_a_real_wedge_is_rectified_to_the_full_picture(shared_data: Path) -> Non
     np.testing.assert_allclose(result.mapping.to_processed(WEDGE["from"]), WEDGE["to"], atol=1e-9)
     # The four points lie on the gel, so no part of the result is outside the raw frame, where it is black.
     assert result.image.max(axis=2).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("params", "told"),
+    [
+        (
+            {"rotate": 90, "downsample": 2},
+            "80 x 60 turned by 90 degrees and halved to 30 x 40: stages.preprocess",
+        ),
+        ({"crop": [0, 0, 40, 20]}, "80 x 60 cut to 40 x 20: stages.preprocess"),
+        (
+            {"crop": [0, 0, 40, 20], "rotate": 180, "downsample": 4},
+            "80 x 60 cut, turned by 180 degrees and quartered to 10 x 5: stages.preprocess",
+        ),
+        ({}, None),
+    ],
+)
+def test_what_becomes_of_the_picture_is_told_once(
+    params: dict[str, Any], told: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    preprocess = stage(**params)
+    image = np.zeros((60, 80, 3), np.uint8)
+    with caplog.at_level("INFO", "tactflow"):
+        for seq in range(2):
+            preprocess.process(Frame("main", seq, 0.0, image))
+    assert [record.getMessage() for record in caplog.records] == ([told] if told else [])

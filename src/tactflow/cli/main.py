@@ -21,6 +21,7 @@ COMMANDS = {
     "check": "validate a pipeline file without running it; prints every mistake at once",
     "explain": "why each stage runs, is skipped or is left out, and what it cost",
     "graph": "print a pipeline as a Mermaid flowchart",
+    "pipelines": "list the pipelines that come with tactflow, one for each kind of sensor",
     "stages": "list the stages and sinks that can be used, their ports and parameters",
     "listen": "print what a running tactflow publishes",
     "bench": "measure run time against error, per method and for whole pipelines",

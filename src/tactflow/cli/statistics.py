@@ -16,7 +16,7 @@ def read_statistics(path: Path) -> Mapping[str, Any]:
         data = json.loads(path.read_bytes())
     except OSError as error:
         raise ConfigError(f"--stats {path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"--stats {path}: not JSON: {error}") from None
     if not _are_statistics(data):
         raise ConfigError(f"--stats {path}: not a statistics file; tactflow run --stats writes one")

@@ -216,7 +216,8 @@ def code_place(trace: TracebackType | None, file: str | None = None) -> str | No
 
 def _find_class(module: ModuleType, name: str, section: Section) -> type:
     """The class called `name`, or the one public stage or sink class that the module defines."""
-    where = module.__file__ or module.__name__
+    # What is built into Python has no file.
+    where = getattr(module, "__file__", None) or module.__name__
     here = {
         key: value
         for key, value in vars(module).items()

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import re
+from difflib import get_close_matches
 from importlib.resources import as_file, files
+from itertools import takewhile
 from pathlib import Path
+
+from tactflow.engine.errors import ConfigError
 
 
 def packaged_pipelines() -> list[str]:
@@ -12,11 +17,23 @@ def packaged_pipelines() -> list[str]:
     return sorted(item.name.removesuffix(".yaml") for item in folder.iterdir() if item.name.endswith(".yaml"))
 
 
+def described_pipelines() -> dict[str, str]:
+    """Name -> what it is for: the first sentence of the comment at the top of its file."""
+    found = {}
+    for name in packaged_pipelines():
+        lines = _packaged(name).read_text(encoding="utf-8").splitlines()
+        comment = " ".join(line[2:] for line in takewhile(lambda line: line.startswith("# "), lines))
+        found[name] = re.split(r"\. |\.$", comment)[0]
+    return found
+
+
 def find_pipeline(name: str | None) -> Path:
     """The file that PIPELINE names.
 
     Without a name: `./pipeline.yaml` if it is there, else the packaged default. A name that is no file, such
     as `classic` or `pipelines/classic.yaml`, finds the packaged pipeline of that name.
+
+    Raises ConfigError, with the names that there are, for a word that is neither.
     """
     if name is None:
         local = Path("pipeline.yaml")
@@ -25,6 +42,14 @@ def find_pipeline(name: str | None) -> Path:
     stem = path.name.removesuffix(".yaml")
     if not path.exists() and stem in packaged_pipelines() and path.parent in (Path(), Path("pipelines")):
         return _packaged(stem)
+    if not path.exists() and name == stem and path.parent == Path():
+        known = packaged_pipelines()
+        close = get_close_matches(name, known, 1)
+        advice = f"; did you mean {close[0]}?" if close else "."
+        raise ConfigError(
+            f"there is no file {name}, and no pipeline of that name comes with tactflow{advice} "
+            f"Those that do: {', '.join(known)} (tactflow pipelines)"
+        )
     return path
 
 

@@ -24,6 +24,9 @@ from tactflow.fleet.sinks import (
 )
 from tactflow.fleet.supervisor import Member, Supervisor
 
+LONGEST_ADDRESS = 107
+"""Bytes that the path of a local socket may have (Linux; elsewhere four less)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Request:
@@ -60,7 +63,7 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
         raise ConfigError("\n".join(problems))
     shared = shared_addresses(pipelines)
     with ExitStack() as stack:
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-")))
+        scratch = Path(stack.enter_context(_scratch_folder(pipelines)))
         for one in shared:
             upstream = [_private(scratch, sensor, node) for sensor, node in one.sinks]
             stack.enter_context(relay(one.address, upstream, one.backlog))
@@ -73,6 +76,16 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
             for sensor, pipeline in pipelines.items()
         ]
         return Supervisor(members).run()
+
+
+def _scratch_folder(pipelines: Mapping[str, Pipeline]) -> tempfile.TemporaryDirectory[str]:
+    """A folder for addresses, whose paths may not be long."""
+    longest = max(
+        len(f"{sensor}.{node.id}") for sensor, one in pipelines.items() for node in one.nodes.values()
+    )
+    room = LONGEST_ADDRESS - len("/tactflow-01234567/") - longest
+    folder = tempfile.gettempdir()
+    return tempfile.TemporaryDirectory(prefix="tactflow-", dir=folder if len(folder) <= room else "/tmp")
 
 
 def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequence[str]) -> list[str]:

@@ -170,13 +170,26 @@ def open_glob(pattern: str, directory: Path | None = None, fps: float | None = N
 
     The pattern is relative to the current directory, or to `directory` if nothing matches there.
     """
-    wanted = str(expanded(pattern))
-    for base in (None, directory):
-        found = [Path(base or "", name) for name in glob.glob(wanted, root_dir=base, recursive=True)]
-        files = sorted((path for path in found if path.is_file()), key=lambda path: natural_key(str(path)))
+    wanted = expanded(pattern)
+    for base in (Path(), directory):
+        files = (
+            [] if base is None else sorted(_matching(base / wanted), key=lambda path: natural_key(str(path)))
+        )
         if files:
             return ImageFiles(files, pattern, fps)
     raise SourceError(f"{pattern}: no file matches this pattern; on a command line, quote it")
+
+
+def _matching(pattern: Path) -> list[Path]:
+    """Files that match, but hidden ones. `**` follows no links: they may lead in circles."""
+    parts = pattern.parts
+    fixed = next((index for index, part in enumerate(parts) if glob.has_magic(part)), len(parts))
+    folder = Path(*parts[:fixed])
+    return [
+        path
+        for path in folder.glob(str(Path(*parts[fixed:])))
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    ]
 
 
 class ArrayFile:

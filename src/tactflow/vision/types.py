@@ -60,6 +60,8 @@ class Contact:
     confidence : of the direction, in [0, 1]: 0 for a disc, towards 1 for a line.
     region_area : number of pixels of the region, px^2.
     evidence : what shows it.
+    separate : every separate contact of the frame, that with the most pixels first; empty where there is only
+        this one.
 
     >>> square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
     >>> Contact(4.0, (1.0, 1.0), None, None, square, None).center
@@ -75,6 +77,7 @@ class Contact:
     confidence: float = 0.0
     region_area: float = 0.0
     evidence: Evidence = "light"
+    separate: tuple[Contact, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -62,6 +62,53 @@ def contact_geometry(
     ((29.5, 24.5), 400.0, 0.0)
     """
     _check(mask, min_area, max_gap, min_confidence)
+    seen = _components(mask, min_area)
+    if seen is None:
+        return None
+    if max_gap is not None and len(seen.contours) > 1:
+        groups = _groups(seen.contours, seen.box, max_gap)
+        seen = _part(seen, max(groups, key=_pixels)) if len(groups) > 1 else seen
+    return _describe(seen, min_confidence)
+
+
+def contact_parts(
+    mask: NDArray[np.uint8], *, min_area: float = 1.0, max_gap: float = 0.0, min_confidence: float = 0.0
+) -> list[Contact]:
+    """Describe each separate contact region of a mask, the one with the most pixels first.
+
+    The parameters and what is raised are those of `contact_geometry`, which describes one of these contacts,
+    or all of them as one.
+
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> mask[20:30, 10:50] = mask[50:55, 10:20] = 255
+    >>> [contact.region_area for contact in contact_parts(mask)]
+    [400.0, 50.0]
+    """
+    _check(mask, min_area, max_gap, min_confidence)
+    seen = _components(mask, min_area)
+    if seen is None:
+        return []
+    groups = _groups(seen.contours, seen.box, max_gap) if len(seen.contours) > 1 else [seen.contours]
+    if len(groups) == 1:
+        return [_describe(seen, min_confidence)]
+    ordered = sorted(groups, key=_pixels, reverse=True)
+    return [_describe(_part(seen, group), min_confidence) for group in ordered]
+
+
+class _Seen(NamedTuple):
+    """Components of a mask. roi : the mask inside `box`. contours : their outlines, in pixels of the mask.
+
+    moments : of their pixels, relative to the corner of the box.
+    """
+
+    roi: NDArray[Any]
+    box: Box
+    contours: Contours
+    moments: Moments
+
+
+def _components(mask: NDArray[np.uint8], min_area: float) -> _Seen | None:
+    """The components of a mask that are large enough; None where there is none."""
     if mask.size == 0:
         return None
     box, moments = region_moments(mask)
@@ -70,14 +117,19 @@ def contact_geometry(
     roi: NDArray[Any] = mask[box.top : box.top + box.height, box.left : box.left + box.width]
     contours: Contours
     contours, _ = cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(box.left, box.top))
+    seen = _Seen(roi, box, contours, moments)
     if len(contours) > 1 or moments.pixels < min_area:
-        kept = _select(contours, box, min_area, max_gap)
+        kept = [contour for contour in contours if _filled_area(contour) >= min_area]
         if not kept:
             return None
         if len(kept) < len(contours):
-            moments = _moments_inside(roi, kept, box)
-        contours = kept
-    return _describe(contours, moments, box, min_confidence)
+            seen = _part(seen, kept)
+    return seen
+
+
+def _part(seen: _Seen, contours: Contours) -> _Seen:
+    """Some of the components."""
+    return seen._replace(contours=contours, moments=_moments_inside(seen.roi, contours, seen.box))
 
 
 def _check(mask: NDArray[np.uint8], min_area: float, max_gap: float | None, min_confidence: float) -> None:
@@ -91,8 +143,9 @@ def _check(mask: NDArray[np.uint8], min_area: float, max_gap: float | None, min_
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
 
 
-def _describe(contours: Contours, moments: Moments, box: Box, min_confidence: float) -> Contact:
-    """The contact with these outlines, and moments relative to the corner of the box."""
+def _describe(seen: _Seen, min_confidence: float) -> Contact:
+    """The contact that these components are together."""
+    _, box, contours, moments = seen
     outline = contours[0] if len(contours) == 1 else np.concatenate(contours)
     polygon = cv2.convexHull(outline)
     # Whole numbers: no cancellation, a vertical bar is exactly vertical.
@@ -124,14 +177,6 @@ def _describe(contours: Contours, moments: Moments, box: Box, min_confidence: fl
     )
 
 
-def _select(contours: Contours, box: Box, min_area: float, max_gap: float | None) -> list[NDArray[Any]]:
-    """The outlines of the components that are the contact: large enough, and of the largest group."""
-    kept = [contour for contour in contours if _filled_area(contour) >= min_area]
-    if len(kept) > 1 and max_gap is not None:
-        return _largest_group(kept, box, max_gap)
-    return kept
-
-
 def _moments_inside(roi: NDArray[Any], contours: Contours, box: Box) -> Moments:
     """Moments of those pixels in the box that the outlines enclose, relative to its corner."""
     filled = np.zeros(roi.shape, np.uint8)
@@ -158,11 +203,18 @@ def _pixels_in_hull(polygon: NDArray[Any]) -> float:
     return (abs(twice) + on_border) / 2 + 1
 
 
-def _largest_group(contours: Contours, box: Box, max_gap: float) -> list[NDArray[Any]]:
-    """The contours of the group with the most pixels; groups are linked by gaps of at most max_gap px.
+def _pixels(contours: Contours) -> float:
+    """Pixels of some components, holes filled."""
+    return sum(map(_filled_area, contours))
+
+
+def _groups(contours: Contours, box: Box, max_gap: float) -> list[Contours]:
+    """The contours in groups that are linked by gaps of at most max_gap px.
 
     box : the window that holds them.
     """
+    if max_gap == 0:
+        return [[contour] for contour in contours]
     reach = min(max_gap, float(box.height + box.width))
     border = math.ceil(reach / 2) + 1
     left, top = box.left - border, box.top - border
@@ -171,12 +223,8 @@ def _largest_group(contours: Contours, box: Box, max_gap: float) -> list[NDArray
     # Two components grown by half the gap each touch where the gap was bridged.
     distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
     _, labels = cv2.connectedComponents((distance <= reach / 2).astype(np.uint8))
-    sizes: dict[int, float] = {}
-    groups = []
+    groups: dict[int, list[NDArray[Any]]] = {}
     for contour in contours:
         x, y = contour[0, 0]
-        group = int(labels[y - top, x - left])
-        groups.append(group)
-        sizes[group] = sizes.get(group, 0.0) + _filled_area(contour)
-    largest = max(sizes, key=lambda group: sizes[group])
-    return [contour for contour, group in zip(contours, groups, strict=True) if group == largest]
+        groups.setdefault(int(labels[y - top, x - left]), []).append(contour)
+    return list(groups.values())

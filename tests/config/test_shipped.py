@@ -1,0 +1,44 @@
+"""The pipelines that come with tactflow, and how they are found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import tactflow
+from tactflow.config.shipped import described_pipelines, find_pipeline, packaged_pipelines
+from tactflow.engine.errors import ConfigError
+
+PLAIN = ("9dtact", "digit", "markerless", "mini_plain")
+
+
+@pytest.mark.parametrize("name", packaged_pipelines())
+def test_a_shipped_pipeline_has_no_mistakes_and_says_what_it_is_for(name: str) -> None:
+    assert tactflow.check(name) == []
+    assert 10 < len(described_pipelines()[name]) < 90
+
+
+@pytest.mark.parametrize("name", sorted({*packaged_pipelines()} - {"default", "classic", "wedge"}))
+def test_a_shipped_pipeline_sees_a_simulated_press(name: str) -> None:
+    scene = "unmarked" if name in PLAIN else "bright_dots" if name == "tactip" else "press"
+    settings = {"stages.preprocess.downsample": 2, "stages.preprocess.rotate": 90}
+    found = list(tactflow.stream(name, source=f"sim:{scene}?frames=60", settings=settings))
+    assert found[0].contact is None
+    assert any(result.contact is not None for result in found)
+    assert (found[-1].markers is None) == (name in PLAIN)
+
+
+def test_a_name_that_is_no_file_finds_the_shipped_pipeline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert find_pipeline("mini").name == "mini.yaml"
+    (tmp_path / "mini").touch()
+    assert find_pipeline("mini") == Path("mini")
+
+
+def test_an_unknown_name_is_told_with_those_that_there_are() -> None:
+    with pytest.raises(ConfigError, match=r"did you mean tactip\?.*digit, gelslim"):
+        find_pipeline("tactipp")
+    assert find_pipeline("no_such.yaml") == Path("no_such.yaml"), "a file, which the reader reports"
