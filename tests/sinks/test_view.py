@@ -11,9 +11,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -31,6 +32,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
 from tactflow.message import Results
 from tactflow.sinks.view import View
+from tactflow.view import server
 from tactflow.view.address import address, bind, is_loopback
 from tactflow.vision.types import Contact, Markers
 from tests.clock import PATIENCE, until
@@ -559,6 +561,22 @@ def test_a_websocket_under_a_foreign_name_is_refused(view: Callable[..., View]) 
     ):
         pass
     assert refusal.value.response.status_code == 403
+
+
+def test_connections_that_ask_for_nothing_keep_nobody_out(
+    view: Callable[..., View], stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "SILENT_SECONDS", 0.2)
+    sink = view()
+    where = urlsplit(str(sink.description))
+    silent = [
+        stack.enter_context(socket.create_connection((str(where.hostname), where.port or 0), PATIENCE))
+        for _ in range(2 * server.MAX_CONNECTIONS)
+    ]
+    for connection in silent:
+        with suppress(ConnectionError):
+            assert connection.recv(1) == b"", "closed by the server"
+    assert get(sink).status == 200
 
 
 def test_another_address_needs_a_token() -> None:

@@ -25,6 +25,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from tactflow.view.address import LOOPBACK_NAMES, WILDCARDS, bracketed
 from tactflow.view.hub import MAX_PAGES, Hub
@@ -37,6 +38,11 @@ START_SECONDS = 10.0
 CLOSE_SECONDS = 3.0
 """How long the server may take to start, and to end, s. Chosen by hand."""
 
+MAX_CONNECTIONS = 128
+"""Connections at a time: each page opens up to seven. Each takes a file, of which a process may have 1024."""
+SILENT_SECONDS = 10.0
+"""Time within which a connection must have asked for something, s. Chosen by hand."""
+
 WRONG_TOKEN = 4401
 TOO_MANY = 4429
 """WebSocket close codes of our own: the page must be told why, and a refused handshake tells it nothing.
@@ -48,6 +54,22 @@ TYPES = {
     "js": "text/javascript; charset=utf-8",
     "svg": "image/svg+xml",
 }
+
+
+class _BoundedConnection(H11Protocol):
+    """A connection that is closed if there are too many, or if it asks for nothing."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        if len(self.connections) > MAX_CONNECTIONS:
+            transport.abort()
+        else:
+            self.loop.call_later(SILENT_SECONDS, self._close_if_silent)
+
+    def _close_if_silent(self) -> None:
+        # One that became a page's WebSocket has another protocol now.
+        if self.cycle is None and self.transport.get_protocol() is self:
+            self.transport.abort()
 
 
 class Server:
@@ -72,7 +94,7 @@ class Server:
         config = uvicorn.Config(
             _Guard(app, host),
             loop="asyncio",
-            http="h11",
+            http=_BoundedConnection,
             ws="websockets-sansio",
             # Commands are short; pictures are compressed already.
             ws_max_size=4096,

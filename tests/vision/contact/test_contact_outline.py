@@ -177,3 +177,26 @@ def test_the_detector_asks_for_a_mask_of_the_images_size(hidden: Any) -> None:
     detector.add_reference(image)
     with pytest.raises(ValueError, match=r"required a uint8 mask of shape \(50, 60\)"):
         detector.detect(image, hidden)
+
+
+def test_a_darkened_contact_with_a_bright_halo_ends_where_it_turns_bright() -> None:
+    away = disc(24)
+    darker = np.clip(-away / 6, 0, 1) - 0.4 * np.exp(-((away - 8) ** 2) / 50) * (away > 0)
+    mask = found(-np.repeat(darker[..., None], 3, axis=2).astype(np.float32))
+    # It darkens over 6 px: half of that alone lies at 21 px; half way to a halo of a third as much at 22 px.
+    assert math.sqrt(mask.sum() / math.pi) == pytest.approx(22, abs=0.5)
+
+
+def test_relief_of_an_object_that_is_steeper_than_its_border_does_not_draw_the_outline_in() -> None:
+    relief = 3 * tilted(np.abs(disc(12)) - 1.5, ring=1.0, skirt=0.0)
+    mask = found(tilted(disc()) + relief)
+    assert math.sqrt(mask.sum() / math.pi) == pytest.approx(30, abs=1.0)
+
+
+def test_what_holds_little_of_the_change_beside_a_contact_is_no_part_of_it() -> None:
+    clean = np.repeat((disc(20) < 0)[..., None], 3, axis=2).astype(np.float32)
+    speck = clean.copy()
+    speck[4:9, 4:9] = 1
+    assert np.array_equal(found(speck), found(clean))
+    speck[4:20, 4:20] = 1
+    assert found(speck)[12, 12]

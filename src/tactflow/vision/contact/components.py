@@ -13,9 +13,10 @@ from tactflow.vision.compiled import kernel
 Float = NDArray[np.float32]
 Cells = NDArray[np.bool_]
 
-WRINKLE: Final = 0.02
-"""Components with less of the summed squared deviation than this part of the largest one's are wrinkles of
-it. Chosen by hand."""
+STRAY: Final = 0.05
+"""Separate changes with less of the summed squared deviation than this part of the strongest one's are no
+contacts of their own: wrinkles, reflections, what is left of a marker that was removed. Chosen on wrs_cam1,
+whose stray reflections hold 0.01 to 0.03; the lesser of two simulated contacts holds 0.55 and more."""
 MAX_COMPONENTS: Final = 12
 """At most so many contacts are outlined. Chosen by hand."""
 MIN_CELLS: Final = 8
@@ -110,12 +111,12 @@ def contact_components(
 
 
 def _strongest(components: list[Component], squared: Float) -> list[Component]:
-    """The components without wrinkles, by their summed squared deviation."""
+    """The components without stray ones, by their summed squared deviation."""
     if len(components) < 2:
         return components
     sums = [float(squared[rows, columns][inside].sum()) for rows, columns, inside in components]
     order = sorted(range(len(components)), key=lambda index: -sums[index])
-    return [components[index] for index in order[:MAX_COMPONENTS] if sums[index] >= WRINKLE * sums[order[0]]]
+    return [components[index] for index in order[:MAX_COMPONENTS] if sums[index] >= STRAY * sums[order[0]]]
 
 
 @kernel("void(float32[:, ::1], float32, uint8[:, ::1])")

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.compiled import kernel
+from tactflow.vision.contact.components import STRAY
 from tactflow.vision.contact.filling import close_gaps, fill, fill_pockets, is_solid, outlined
 
 Float = NDArray[np.float32]
@@ -81,10 +82,6 @@ the profile is a mean of borders at several depths. Chosen by hand; a ball's bor
 LEAST: Final = 0.1
 """A contact that has changed as a whole ends half way, but no further out than where this fraction of the
 largest change nearby is left. Chosen by hand."""
-
-SPECK: Final = 0.05
-"""Separate parts of one change with less than this fraction of the squared change of the strongest part are
-no contact of their own: what is left of a marker that was removed, a reflection. Chosen by hand."""
 
 COARSE: Final = 2
 """Pixels of which one is taken where the largest change nearby is sought, which varies little from one to the
@@ -229,7 +226,7 @@ def _without_specks(level: Float, strength: Float) -> Float:
     if count < 3:
         return level
     squares = np.bincount(labels.ravel(), np.square(strength).ravel(), count)
-    specks = squares < SPECK * squares[1:].max()
+    specks = squares < STRAY * squares[1:].max()
     specks[0] = False
     return np.where(specks[labels], -np.abs(level), level) if specks.any() else level
 
