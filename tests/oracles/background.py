@@ -20,9 +20,10 @@ from tests.oracles.gains import Gain
 Float = NDArray[np.float32]
 
 
-def _illumination(coefficients: Float, across: Float, down: Float, gain_basis: Float) -> Float:
-    offset, slope_x, slope_y, gain = coefficients.T[:, :, None, None]
-    return np.asarray(gain_basis * gain + offset + slope_x * across + slope_y * down[:, None], np.float32)
+def _change(planes: Float, mean: Float, coefficients: Float, across: Float, down: Float) -> Float:
+    gain, slope_x, slope_y, offset = coefficients.T[:, :, None, None]
+    light = mean * (gain + slope_y * down[:, None] + slope_x * across) + offset
+    return np.asarray(np.maximum(planes - mean - light, planes - np.float32(255)), np.float32)
 
 
 def plain_weigh_change(
@@ -31,7 +32,6 @@ def plain_weigh_change(
     across: Float,
     down: Float,
     mean: Float,
-    gain_basis: Float,
     weight: Float,
     brightness: Float,
     colour_factor: Float,
@@ -43,7 +43,7 @@ def plain_weigh_change(
     summary: NDArray[np.float64],
 ) -> None:
     """Squared length of the weighted change; of its colour, without the part along the brightness."""
-    change = smooth - (mean + _illumination(coefficients, across, down, gain_basis))
+    change = _change(smooth, mean, coefficients, across, down)
     squared[:] = ((change * weight) ** 2).sum(axis=0)
     colour[:] = squared * colour_factor - (change * brightness).sum(axis=0) ** 2
     np.maximum(squared, colour, out=evidence)
@@ -60,7 +60,6 @@ def plain_scaled_change(
     across: Float,
     down: Float,
     mean: Float,
-    gain_basis: Float,
     scale: Float,
     blurred: Float,
 ) -> None:
@@ -69,8 +68,7 @@ def plain_scaled_change(
     rows, columns = slice(top, top + high), slice(left, left + wide)
     planes = half.reshape(len(half), -1, 3)[rows, columns].transpose(2, 0, 1)
     window = slice(None), rows, columns
-    change = planes - mean[window]
-    change -= _illumination(coefficients, across[columns], down[rows], gain_basis[window])
+    change = _change(planes, mean[window], coefficients, across[columns], down[rows])
     change *= scale[window]
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
     for plane, smooth in zip(change, blurred, strict=True):

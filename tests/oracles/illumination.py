@@ -12,12 +12,13 @@ Float = NDArray[np.float32]
 
 
 def plain_fit_robustly(
-    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
+    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, reject: float, coefficients: Float
 ) -> None:
     """Least-squares steps with clipped residuals."""
     for _ in range(MAX_STEPS):
         model = np.einsum("ck,ckn->cn", coefficients, basis)
         residual = np.clip(excess - model, -limit, limit)
+        residual[np.abs(excess - model) >= reject * limit] = 0
         change = np.einsum("cn,ckn->ck", residual, step) - np.einsum("cj,cjk->ck", coefficients, shrink)
         coefficients += change
         if np.abs(change).max() < CONVERGED:

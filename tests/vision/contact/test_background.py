@@ -21,7 +21,7 @@ from tactflow.vision.contact import (
     resolution,
 )
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
-from tactflow.vision.contact.illumination import illumination_change
+from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tests.oracles.background import (
     plain_change_strength,
     plain_scaled_change,
@@ -101,8 +101,12 @@ def test_the_loops_see_the_change_that_the_plain_version_sees(size: tuple[int, i
     for one, other in zip(fast, slow, strict=True):
         assert np.array_equal(one.half, other.half)
         # The fit stops within 0.05 of a step, wherever that is: rounding may decide which step is the last.
-        np.testing.assert_allclose(one.illumination, other.illumination, atol=0.05)
-        if np.abs(one.illumination - other.illumination).max() < 1e-3:
+        lights = [
+            under_illumination(np.full((3, *one.squared.shape), 100, np.float32), c.illumination)
+            for c in (one, other)
+        ]
+        np.testing.assert_allclose(*lights, atol=0.05)
+        if np.abs(lights[0] - lights[1]).max() < 1e-3:
             # A light that differs by so much moves a deviation by 1e-3 / 0.29 grey levels, the least noise.
             least = 1e-3 / (12**-0.5 * 2 / 3)
             for name in ("squared", "colour", "evidence"):
@@ -229,15 +233,46 @@ def test_a_frame_that_must_not_be_written_is_compared() -> None:
     assert detector.detect(frames[1]).mask.shape == (64, 64)
 
 
-def test_the_illumination_is_the_sum_of_what_its_coefficients_say() -> None:
-    gain_basis = np.zeros((3, 5, 7), np.float32)
-    gain_basis[1, 2, 3] = 1
-    coefficients = np.array([[1, 0, 0, 9], [0, 0, 0, 2], [0, 4, 8, 9]], np.float32)
-    change = illumination_change(coefficients, gain_basis)
-    assert np.all(change[0] == 1)
-    assert change[1].sum() == change[1, 2, 3] == 2
-    assert change[2, 0].tolist() == pytest.approx(np.linspace(-6, -2, 7).tolist())
-    assert change[2, :, 0].tolist() == pytest.approx(np.linspace(-6, 2, 5).tolist())
+def test_a_gel_is_lit_as_the_coefficients_say_and_saturates() -> None:
+    gel = np.full((3, 5, 7), 100, np.float32)
+    coefficients = np.array([[0.5, 0, 0, 9], [0, 0.4, 0.8, 0], [2, 0, 0, 0]], np.float32)
+    lit = under_illumination(gel, coefficients)
+    assert np.all(lit[0] == 159)
+    assert lit[1, 0].tolist() == pytest.approx(np.linspace(40, 80, 7).tolist())
+    assert lit[1, :, 0].tolist() == pytest.approx(np.linspace(40, 120, 5).tolist())
+    assert np.all(lit[2] == 255)
+
+
+def _lit_gel(black: bool) -> NDArray[np.float32]:
+    """Cells of a gel lit from the sides, with a black surround or without, grey levels."""
+    y, x = np.mgrid[0:60, 0:80].astype(np.float32)
+    gel = np.stack([60 + x, 170 - y, 100 + 0.5 * x + 0.5 * y])
+    if black:
+        gel[:, (x - 40) ** 2 + (y - 30) ** 2 > 28**2] = 2
+    return gel
+
+
+@pytest.mark.parametrize("black", [False, True])
+@pytest.mark.parametrize("gains", [(0.7, 0.7, 0.7), (1.35, 1.35, 1.35), (1.3, 1.0, 0.75)])
+@pytest.mark.parametrize("touched", [0.0, 0.4])
+def test_exposure_and_white_balance_are_compensated_to_a_third_and_black_stays_black(
+    gains: tuple[float, float, float], touched: float, black: bool
+) -> None:
+    gel = _lit_gel(black)
+    model = IlluminationModel(gel, 0.25 + (0.025 * gel) ** 2)
+    frame = gel * np.array(gains, np.float32)[:, None, None]
+    rest = slice(round(touched * 80), None)
+    frame[:, :, : rest.start] *= 1.8
+    left = np.abs(under_illumination(gel, model.fit(frame)) - frame)[..., rest]
+    assert np.all(left < 1 + 0.025 * gel[..., rest])
+
+
+def test_saturated_blocks_tell_nothing_of_the_light() -> None:
+    gel = _lit_gel(black=False)
+    model = IlluminationModel(gel, 0.25 + (0.025 * gel) ** 2)
+    frame = np.minimum(2.2 * gel, 255).astype(np.float32)
+    left = np.abs(under_illumination(gel, model.fit(frame)) - frame)
+    assert left.max() < 0.025 * 255
 
 
 def test_the_kernels_of_the_comparison_do_not_wait_for_the_first_frame() -> None:

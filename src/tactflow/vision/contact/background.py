@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.contact.background_kernels import change_strength, scaled_change, weigh_change
 from tactflow.vision.contact.contact_outline import WindowChange
-from tactflow.vision.contact.illumination import IlluminationModel, illumination_change, positions
+from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 
@@ -75,12 +75,10 @@ class _Derived:
 
     illumination: IlluminationModel
     mean: Float
-    gain_basis: Float
     weight: Float
     brightness: Float
     colour_factor: Float
     half_mean: Float
-    half_gain_basis: Float
     half_scale: Float
 
 
@@ -132,7 +130,7 @@ class BackgroundModel:
         half, cells = _cells(image)
         smooth = _smoothed(cells)
         coefficients = known.illumination.fit(smooth)
-        change: Float = smooth - (illumination_change(coefficients, known.gain_basis) + known.mean)
+        change: Float = smooth - under_illumination(known.mean, coefficients)
         count = self._count
         self._squares = self._squares + change * change * np.float32(count / (count + 1))
         self._mean = self._mean + change / np.float32(count + 1)
@@ -163,7 +161,6 @@ class BackgroundModel:
             positions(wide),
             positions(high),
             known.mean,
-            known.gain_basis,
             known.weight,
             known.brightness,
             known.colour_factor,
@@ -197,7 +194,6 @@ class BackgroundModel:
             positions(change.half.shape[1]),
             positions(len(change.half)),
             known.half_mean,
-            known.half_gain_basis,
             known.half_scale,
             blurred,
         )
@@ -224,12 +220,10 @@ class BackgroundModel:
         self._known = _Derived(
             illumination=illumination,
             mean=np.ascontiguousarray(mean, np.float32),
-            gain_basis=illumination.gain_basis(mean),
             weight=np.asarray(weight, np.float32),
             brightness=np.asarray(direction * weight * np.sqrt(factor), np.float32),
             colour_factor=np.asarray(factor, np.float32),
             half_mean=half,
-            half_gain_basis=illumination.gain_basis(half),
             half_scale=np.asarray(half_scale, np.float32),
         )
         return self._known

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.compiled import kernel
+from tactflow.vision.contact.illumination import WHITE
 
 Float = NDArray[np.float32]
 Double = NDArray[np.float64]
@@ -28,7 +29,7 @@ BESIDE: Final = np.float32(_AT_ONE / (1 + 2 * _AT_ONE))
 
 @kernel(
     "void(float32[:, :, ::1], float32[:, ::1], float32[::1], float32[::1], float32[:, :, ::1],"
-    " float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1], uint8[:, ::1],"
+    " float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1], uint8[:, ::1],"
     " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float64[::1])",
     reorder=True,
 )
@@ -38,7 +39,6 @@ def weigh_change(
     across: Float,
     down: Float,
     mean: Float,
-    gain_basis: Float,
     weight: Float,
     brightness: Float,
     colour_factor: Float,
@@ -51,7 +51,7 @@ def weigh_change(
 ) -> None:
     """Squared deviations of each cell from the background under this frame's illumination.
 
-    smooth, mean, gain_basis, weight, brightness : (3, h, w). coefficients : (3, 4). across, down : positions,
+    smooth, mean, weight, brightness : (3, h, w). coefficients : (3, 4). across, down : positions,
     (w,) and (h,). before : (h, w), cells in contact in the previous frame, and evidence_before : the evidence
     there; both (0, 0) if none. squared, colour, evidence : (h, w), filled. summary : filled with the largest
     of squared and of colour, and the sums of the evidence over `before`, now and then.
@@ -64,12 +64,14 @@ def weigh_change(
     for y in range(high):
         total, rest, both = squared[y], colour[y], evidence[y]
         for c in range(3):
-            offset = coefficients[c, 0] + coefficients[c, 2] * down[y]
-            slope, gain = coefficients[c, 1], coefficients[c, 3]
-            line, usual, basis = smooth[c, y], mean[c, y], gain_basis[c, y]
+            gain = coefficients[c, 0] + coefficients[c, 2] * down[y]
+            slope, offset = coefficients[c, 1], coefficients[c, 3]
+            line, usual = smooth[c, y], mean[c, y]
             scale, tone = weight[c, y], brightness[c, y]
             for x in range(wide):
-                change = line[x] - (usual[x] + (basis[x] * gain + (offset + slope * across[x])))
+                light = usual[x] * (gain + slope * across[x]) + offset
+                change, least = line[x] - usual[x] - light, line[x] - WHITE
+                change = change if change > least else least
                 deviation = change * scale[x]
                 total[x] = deviation * deviation + (total[x] if c else np.float32(0))
                 along[x] = change * tone[x] + (along[x] if c else np.float32(0))
@@ -92,7 +94,7 @@ def weigh_change(
 
 @kernel(
     "void(uint8[:, ::1], int64, int64, float32[:, ::1], float32[::1], float32[::1], float32[:, :, ::1],"
-    " float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1])",
+    " float32[:, :, ::1], float32[:, :, ::1])",
     reorder=True,
 )
 def scaled_change(
@@ -103,14 +105,13 @@ def scaled_change(
     across: Float,
     down: Float,
     mean: Float,
-    gain_basis: Float,
     scale: Float,
     blurred: Float,
 ) -> None:
     """How a window has changed at half resolution, in standard deviations, smoothed along x.
 
     half : (H, 3 W), the frame. top, left : of the window. coefficients, across, down : as for
-    `weigh_change`, at this resolution. mean, gain_basis, scale : (3, H, W). blurred : (3, h, w), filled.
+    `weigh_change`, at this resolution. mean, scale : (3, H, W). blurred : (3, h, w), filled.
     """
     high, wide = blurred.shape[1:]
     line, place = np.empty(wide, np.float32), across[left:]
@@ -118,13 +119,15 @@ def scaled_change(
     for y in range(high):
         picture = half[top + y, 3 * left :]
         for c in range(3):
-            offset = coefficients[c, 0] + coefficients[c, 2] * down[top + y]
-            slope, gain = coefficients[c, 1], coefficients[c, 3]
-            usual, basis = mean[c, top + y, left:], gain_basis[c, top + y, left:]
-            unit, row = scale[c, top + y, left:], blurred[c, y]
+            gain = coefficients[c, 0] + coefficients[c, 2] * down[top + y]
+            slope, offset = coefficients[c, 1], coefficients[c, 3]
+            usual, unit, row = mean[c, top + y, left:], scale[c, top + y, left:], blurred[c, y]
             for x in range(wide):
-                change = np.float32(picture[3 * x + c]) - usual[x]
-                line[x] = (change - (basis[x] * gain + (offset + slope * place[x]))) * unit[x]
+                light = usual[x] * (gain + slope * place[x]) + offset
+                value = np.float32(picture[3 * x + c])
+                change, least = value - usual[x] - light, value - WHITE
+                change = change if change > least else least
+                line[x] = change * unit[x]
             for x in range(1, wide - 1):
                 row[x] = (line[x - 1] + line[x + 1]) * BESIDE + line[x] * MIDDLE
             row[0] = (line[second] + line[second]) * BESIDE + line[0] * MIDDLE

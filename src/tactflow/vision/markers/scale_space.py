@@ -168,10 +168,16 @@ def _clearance(smooth: NDArray[np.float32], peaks: FloatArray, radius: float) ->
     angles = np.arange(RING_POINTS) * (2 * np.pi / RING_POINTS)
     ring = peaks[:, None] + RING * radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     limits = np.array([smooth.shape[1] - 1, smooth.shape[0] - 1])
-    column, row = np.clip(np.rint(ring).astype(np.int64), 0, limits).transpose(2, 0, 1)
+    ring = np.rint(ring).astype(np.int64)
+    column, row = np.clip(ring, 0, limits).transpose(2, 0, 1)
     own_column, own_row = np.clip(np.rint(peaks).astype(np.int64), 0, limits).T
-    above = np.sort(smooth[row, column] - smooth[own_row, own_column][:, None], axis=1)
-    median = above[:, RING_POINTS // 2]
+    above = smooth[row, column] - smooth[own_row, own_column][:, None]
+    # What the ring meets beyond the border is not known, and says nothing.
+    inside = ((ring >= 0) & (ring <= limits)).all(axis=2)
+    above = np.sort(np.where(inside, above, np.float32(np.inf)), axis=1)
+    half = np.maximum(inside.sum(axis=1) // 2, RING_MISSES)
+    median = np.take_along_axis(above, half[:, None], axis=1)[:, 0]
+    median = np.where(np.isfinite(median), median, 0.0)
     return np.asarray(np.where(median > 0, above[:, RING_MISSES] / np.maximum(median, 1e-3), 0.0), np.float64)
 
 
