@@ -165,8 +165,8 @@ def _typical(values: Float, seen: Mask | None) -> float:
 def _largest_nearby(values: Float) -> Float:
     """(h, w): the largest value around, smoothed; no less than `FAINT` of the largest anywhere.
 
-    "Around" is a square with half the side of the radius of a disc of as many pixels as have clearly changed:
-    it holds a side of the contact, but not its other end.
+    "Around" reaches as far as the radius of a disc of as many pixels as have clearly changed: it holds a side
+    of the contact, but not its other end.
     """
     smooth = cv2.blur(values, (3, 3))
     peak = max(float(cv2.minMaxLoc(smooth)[1]), 1e-9)
@@ -222,9 +222,10 @@ def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> Float:
 
 def _without_specks(level: Float, strength: Float) -> Float:
     """The level without those separate parts that hold little of the change."""
-    count, labels = cv2.connectedComponents((level > 0).view(np.uint8))
-    if count < 3:
+    inside = (level > 0).view(np.uint8)
+    if len(cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]) < 2:
         return level
+    count, labels = cv2.connectedComponents(inside)
     squares = np.bincount(labels.ravel(), np.square(strength).ravel(), count)
     specks = squares < STRAY * squares[1:].max()
     specks[0] = False

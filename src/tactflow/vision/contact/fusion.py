@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.flow.in_mask import HIDDEN
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
@@ -28,6 +27,9 @@ which no marker moved had at most 5 below the contact."""
 
 MARGIN: Final = 0.125
 """How much wider than the hull of its markers a region is, pitches. Chosen by hand."""
+SPREAD: Final = 5.0
+"""How far beyond a marker's border what is left of it may be drawn, px: a cell of `background`, and a pixel
+more for smoothing. Chosen by hand."""
 RIM: Final = 2.0
 """Distance of a region from the centre of a marker, radii, up to which it may be what is left of it. Chosen
 by hand: on sts_640 and tactip_video such remains are 0 to 1.9 away."""
@@ -105,7 +107,7 @@ def _without_rims(light: Mask, markers: Markers) -> Mask:
     if radius is None or not len(markers.position):
         return light
     count, labels, boxes, centers = cv2.connectedComponentsWithStats(light)
-    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + HIDDEN) ** 2)
+    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + SPREAD) ** 2)
     away = np.hypot(*(centers[small, None] - markers.position).transpose(2, 0, 1)).min(axis=1)
     rims = small[(away <= RIM * radius) & (small > 0)]
     if not len(rims):

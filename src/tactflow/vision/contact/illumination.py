@@ -87,6 +87,10 @@ class IlluminationModel:
         penalty = weight.sum(axis=2)[:, :, None] * np.diag(RIDGE)
         inverse = np.linalg.inv(fitted @ basis.transpose(0, 2, 1) + penalty + 1e-6 * np.eye(4))
         self._basis: Float = np.ascontiguousarray(basis, np.float32)
+        brightness = self._basis[:, 0]
+        lit = brightness > DARK if self._fitted is None else (brightness > DARK) & self._fitted
+        self._lit: NDArray[np.bool_] = lit
+        self._per_brightness: Float = np.asarray(1 / np.maximum(brightness, DARK), np.float32)
         self._step: Float = np.ascontiguousarray(inverse @ fitted, np.float32)
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
@@ -101,19 +105,24 @@ class IlluminationModel:
         """
         blocks = self._block_means(cells)
         excess = blocks - self._reference
-        brightness = self._basis[:, 0]
-        lit = brightness > DARK if self._fitted is None else (brightness > DARK) & self._fitted
+        below = blocks < SATURATED
         coefficients = np.zeros((3, 4), np.float32)
-        for channel, seen in enumerate(lit & (blocks < SATURATED)):
-            known = seen if seen.any() else lit[channel]
-            ratios = np.sort(excess[channel, known] / brightness[channel, known])
-            if len(ratios):
-                coefficients[channel, 0] = ratios[len(ratios) // 2 if seen.any() else -1]
-        limit = np.where(blocks < SATURATED, self._limit, np.float32(0))
+        coefficients[:, 0] = self._typical_ratio(excess, self._lit & below)
+        limit = self._limit * below
         for reject in (NEVER, REJECT):
             fit_robustly(excess, self._basis, self._step, self._shrink, limit, reject, coefficients)
         coefficients[:, :3] /= self._center[:, :, 0]
         return coefficients
+
+    def _typical_ratio(self, excess: Float, known: NDArray[np.bool_]) -> Float:
+        """(3,) float32: median of the relative change of the blocks, (3, n), whose light is known."""
+        ratios = np.sort(np.where(known, excess * self._per_brightness, np.float32(np.inf)), axis=1)
+        typical = ratios[np.arange(3), np.count_nonzero(known, axis=1) // 2]
+        for channel in np.flatnonzero(np.isinf(typical)):
+            lit = self._lit[channel]
+            most = (excess[channel] * self._per_brightness[channel])[lit]
+            typical[channel] = most.max(initial=0)
+        return np.asarray(typical, np.float32)
 
     def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         """Blocks (n,) of which at least half counts; None for all, also where there is none of them."""

@@ -25,10 +25,10 @@ STILL: Final = 0.5
 """Part of the threshold up to which a marker is at rest. Chosen by hand."""
 FORGET: Final = 0.96
 """How fast the strongest recent motion is forgotten, per frame: half in 17 frames, as for the light."""
-STRETCHED: Final = 0.6
+STRETCHED: Final = 0.7
 """Part of the largest strain from which on the gel beside a marker is in contact: a contact drags along all
 gel around, but what it strains most is where it ends. Chosen on the simulator, mini_ball and gelslim_ball,
-where the region then overlaps the true one by 0.4 to 0.65 (IoU, medians), and less where a contact slides."""
+where the region then overlaps the true one by 0.3 to 0.7 (IoU, medians), and less where a contact slides."""
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 
 
