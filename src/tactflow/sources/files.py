@@ -193,10 +193,9 @@ def _matching(pattern: Path) -> list[Path]:
 
 
 class ArrayFile:
-    """A .npy file: uint8, N x H x W x 3 BGR or N x H x W gray; read frame by frame, never loaded whole.
+    """A .npy file: uint8, N x H x W x 3 BGR or N x H x W gray; memory-mapped, never loaded whole.
 
-    Frames are not mapped into memory: where another program cuts the file during the run, that would end the
-    process. To read one takes as long as one copy more.
+    Frames of a BGR array are views of the file, not copies.
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
@@ -227,10 +226,8 @@ class ArrayFile:
                 f"{path}: its frames are {width} x {height}, more than {MOST_PIXELS} pixels; if that is "
                 "right, set the environment variable OPENCV_IO_MAX_IMAGE_PIXELS"
             )
-        # In Fortran order the bytes of a frame lie all over the file.
-        found = _read_frames(path, frames) if frames.flags.c_contiguous else iter(np.asarray(frames))
-        as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,)
-        self._frames: Iterator[BgrImage] = found if as_wanted else map(Normaliser(str(path)), found)
+        as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,) and frames.flags.c_contiguous
+        self._frames: Iterator[BgrImage] = iter(frames) if as_wanted else map(Normaliser(str(path)), frames)
         self.total: int | None = count
         self.size: tuple[int, int] | None = (width, height)
         self.description = f"{path}, {count} frames"
@@ -245,29 +242,11 @@ class ArrayFile:
         return image, index / self._rate
 
     def close(self) -> None:
-        """Read no more."""
+        """Read no more; the file stays mapped for as long as a frame of it is in use."""
         self._frames = iter(())
 
 
-def _read_frames(path: Path, array: np.memmap[Any, Any]) -> Iterator[NDArray[Any]]:
-    """One frame after the other of an array in a file.
-
-    Raises SourceError if the file has become shorter, or cannot be read.
-    """
-    with path.open("rb", buffering=0) as file:
-        file.seek(array.offset)
-        for index in range(len(array)):
-            frame = np.empty(array.shape[1:], array.dtype)
-            try:
-                whole = file.readinto(frame.data) == frame.nbytes
-            except OSError as error:
-                raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
-            if not whole:
-                raise SourceError(f"{path}: was cut off during the run, within frame {index}")
-            yield frame
-
-
-def _map_array(path: Path) -> np.memmap[Any, Any]:
+def _map_array(path: Path) -> NDArray[Any]:
     wanted = "required a uint8 array of N x H x W x 3 (BGR) or N x H x W (gray)"
     try:
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -279,10 +258,10 @@ def _map_array(path: Path) -> np.memmap[Any, Any]:
                 f"{path}: the file is cut off: it holds fewer bytes than its header promises; copy it again"
             ) from error
         raise SourceError(f"{path}: not a .npy file, or a damaged one; {wanted}") from error
-    if not isinstance(mapped, np.memmap):
+    if not isinstance(mapped, np.ndarray):
         mapped.close()
         raise SourceError(f"{path}: a .npz archive; save its array with np.save; {wanted}")
-    array = mapped
+    array = np.asarray(mapped)
     got = f"got {array.dtype} of shape {' x '.join(map(str, array.shape)) or '()'}"
     if array.dtype not in (np.uint8, np.uint16):
         raise SourceError(f"{path}: {wanted}, {got}")
