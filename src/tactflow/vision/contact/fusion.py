@@ -71,7 +71,7 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
     --------
     >>> origin = np.array([[x, y] for y in range(0, 100, 20) for x in range(0, 100, 20)], float)
     >>> position = origin.copy()
-    >>> position[[6, 7, 8]] += [2.0, 0.0]
+    >>> position[[6, 7, 8]] += [4.0, 0.0]
     >>> markers = Markers(origin, position, np.zeros(25, np.uint8), np.full(25, 0.02))
     >>> fused = fuse_contact(np.zeros((100, 100), np.uint8), markers, MotionTest(origin))
     >>> fused.evidence, fused.mask[20, 40]
@@ -79,7 +79,7 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
     """
     motion = test(markers)
     if not light.any():
-        if not motion.moving:
+        if not motion.clearly:
             return FusedContact(light, None)
         return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
