@@ -245,26 +245,35 @@ def _border_depth(depth: Float, strength: Float, hidden: Mask | None) -> float:
     known = np.flatnonzero(count >= MIN_BIN_PIXELS)
     if known.size < 2:
         return 0.5
-    steps: Double = total[known] / count[known]
-    padded: Double = np.concatenate([steps[:1], steps, steps[-1:]])
-    profile = np.asarray(padded[:-2] / 4 + padded[1:-1] / 2 + padded[2:] / 4, np.float64)
-    at: Double = np.asarray((known + 0.5) * BIN, np.float64)
-    largest = np.maximum.accumulate(profile)
-    over = np.flatnonzero(profile < FALLEN * largest)
-    peak = largest[over[0] if over.size else -1]
+    # Of some thirty steps, numbers are quicker than arrays.
+    steps: list[float] = (total[known] / count[known]).tolist()
+    at: list[float] = ((known + 0.5) * BIN).tolist()
+    around = zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False)
+    profile = [before / 4 + here / 2 + after / 4 for before, here, after in around]
+    peak = _first_peak(profile)
     border, top, skirt = (_crossing(profile, at, part * peak) for part in (BORDER, TOP, SKIRT))
-    middle = float(depth.max())
+    middle = float(cv2.minMaxLoc(depth)[1])
     soft = top - skirt - SHARP_SKIRT * (middle - top) - SKIRT_BLUR
     return min(border + SOFTNESS * max(soft, 0.0), DEEPEST * middle)
 
 
-def _crossing(profile: Double, at: Double, wanted: float) -> float:
+def _first_peak(profile: list[float]) -> float:
+    """The largest value before the profile falls clearly for the first time."""
+    peak = profile[0]
+    for value in profile:
+        if value < FALLEN * peak:
+            break
+        peak = max(peak, value)
+    return peak
+
+
+def _crossing(profile: list[float], at: list[float], wanted: float) -> float:
     """Where, coming from outside, a profile first reaches a value."""
-    first = int(np.argmax(profile >= wanted))
+    first = next(index for index, value in enumerate(profile) if value >= wanted)
     if first == 0:
-        return float(at[0])
+        return at[0]
     fraction = (wanted - profile[first - 1]) / (profile[first] - profile[first - 1])
-    return float(at[first - 1] + fraction * (at[first] - at[first - 1]))
+    return at[first - 1] + fraction * (at[first] - at[first - 1])
 
 
 @kernel("void(float32[:, ::1], float32[:, ::1], uint8[:, ::1], int64, int64[::1], float64[::1])")

@@ -38,6 +38,12 @@ DARK: Final = 0.25
 begin with. Chosen by hand."""
 
 
+_CHANNELS: Final = np.arange(3)
+"""Blue, green, red."""
+_NO_CHANGE: Final = np.zeros(3, np.float32)
+"""Of the light, in each channel."""
+
+
 class IlluminationModel:
     """Robust fit of gain, slopes of the gain and offset per channel between a frame and the untouched gel.
 
@@ -90,7 +96,9 @@ class IlluminationModel:
         brightness = self._basis[:, 0]
         lit = brightness > DARK if self._fitted is None else (brightness > DARK) & self._fitted
         self._lit: NDArray[np.bool_] = lit
-        self._per_brightness: Float = np.asarray(1 / np.maximum(brightness, DARK), np.float32)
+        # Blocks that tell nothing are sorted behind all others.
+        self._per_brightness: Float = np.where(lit, 1 / np.maximum(brightness, DARK), np.float32(np.nan))
+        self._middle = np.count_nonzero(lit, axis=1) // 2
         self._step: Float = np.ascontiguousarray(inverse @ fitted, np.float32)
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
@@ -107,22 +115,26 @@ class IlluminationModel:
         excess = blocks - self._reference
         below = blocks < SATURATED
         coefficients = np.zeros((3, 4), np.float32)
-        coefficients[:, 0] = self._typical_ratio(excess, self._lit & below)
+        coefficients[:, 0] = self._typical_ratio(excess, below)
         limit = self._limit * below
         for reject in (NEVER, REJECT):
             fit_robustly(excess, self._basis, self._step, self._shrink, limit, reject, coefficients)
         coefficients[:, :3] /= self._center[:, :, 0]
         return coefficients
 
-    def _typical_ratio(self, excess: Float, known: NDArray[np.bool_]) -> Float:
-        """(3,) float32: median of the relative change of the blocks, (3, n), whose light is known."""
-        ratios = np.sort(np.where(known, excess * self._per_brightness, np.float32(np.inf)), axis=1)
-        typical = ratios[np.arange(3), np.count_nonzero(known, axis=1) // 2]
-        for channel in np.flatnonzero(np.isinf(typical)):
-            lit = self._lit[channel]
-            most = (excess[channel] * self._per_brightness[channel])[lit]
-            typical[channel] = most.max(initial=0)
-        return np.asarray(typical, np.float32)
+    def _typical_ratio(self, excess: Float, below: NDArray[np.bool_]) -> Float:
+        """(3,) float32: median of the relative change of the blocks, (3, n), that are not saturated."""
+        ratios = excess * self._per_brightness
+        middle = self._middle
+        most: Float = _NO_CHANGE
+        if not below.all():
+            most = np.fmax.reduce(ratios, axis=1, initial=0)
+            ratios[~below] = np.nan
+            middle = np.count_nonzero(self._lit & below, axis=1) // 2
+        ratios.sort(axis=1)
+        typical: Float = ratios[_CHANNELS, middle]
+        # Where all of a channel is saturated, or black, there is no median.
+        return np.where(np.isnan(typical), most, typical)
 
     def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         """Blocks (n,) of which at least half counts; None for all, also where there is none of them."""
