@@ -200,3 +200,10 @@ def test_what_holds_little_of_the_change_beside_a_contact_is_no_part_of_it() -> 
     assert np.array_equal(found(speck), found(clean))
     speck[4:20, 4:20] = 1
     assert found(speck)[12, 12]
+
+
+def test_a_faint_band_of_light_through_a_contact_does_not_move_its_outline() -> None:
+    ball = tilted(disc(16))
+    band = np.zeros_like(ball)
+    band[:, 56:72] = 0.2 * np.linalg.norm(ball, axis=2).max() / 3**0.5
+    assert overlap(found(ball + band), found(ball)) > 0.95

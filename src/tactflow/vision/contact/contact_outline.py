@@ -121,7 +121,7 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
 
     Parameters
     ----------
-    change : of the contact's window, at half resolution. Its arrays are used up.
+    change : of the contact's window, at half resolution.
     bridge : half the width of gaps that are closed in any case, px: what a removed marker can leave.
     hidden : (h, w) uint8, 1 where a marker was removed and the change belongs to the contact, else 0; None
         where that is not known. What was painted there smears the border outwards and leaves gaps in it; the
@@ -143,16 +143,24 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     >>> bool(abs((contact_level(change) > 0).sum() / np.pi - 8**2) < 3)
     True
     """
-    strength, brightness = change.strength, change.brightness
     if hidden is not None and not cv2.countNonZero(hidden):
         hidden = None
+    level, near = _level(change, bridge, hidden)
+    if near is not None:
+        # Faint changes that only touch the contact's, such as bands of light, have pulled what is typical.
+        level, _ = _level(WindowChange(change.strength * near, change.brightness * near), bridge, hidden)
+    return level
+
+
+def _level(change: WindowChange, bridge: float, hidden: Mask | None) -> tuple[Float, Float | None]:
+    """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0."""
     cap = GLOSS * _typical(
-        strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, _SQUARE), np.uint8)
+        change.strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, _SQUARE), np.uint8)
     )
-    np.minimum(strength, np.float32(cap), out=strength)
-    np.clip(brightness, -np.float32(cap / 3**0.5), np.float32(cap / 3**0.5), out=brightness)
+    strength = np.minimum(change.strength, np.float32(cap))
+    brightness = np.clip(change.brightness, -np.float32(cap / 3**0.5), np.float32(cap / 3**0.5))
     if EVEN * cv2.norm(brightness, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
-        return _without_specks(_changed_as_a_whole(brightness, hidden), strength)
+        return _without_specks(_changed_as_a_whole(brightness, hidden), strength), None
     return _tilted(strength, bridge, hidden)
 
 
@@ -202,8 +210,8 @@ def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
-def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> Float:
-    """Level set of a contact that shows its slopes."""
+def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float, Float | None]:
+    """`_level` of a contact that shows its slopes."""
     local = strength / _largest_nearby(strength)
     changed = (local > OUTER).view(np.uint8)
     filled, outlines = outlined(changed, hidden)
@@ -214,19 +222,24 @@ def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> Float:
         reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
         filled = fill(close_gaps(ring, reach) | filled)
     if cv2.countNonZero(filled) == filled.size:
-        return np.ones_like(strength)
+        return np.ones_like(strength), None
     depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
-    level = np.asarray(depth - np.float32(_border_depth(depth, local, hidden)), np.float32)
-    return level if solid else _without_specks(level, strength)
+    parts = depth if solid else _without_specks(depth, strength)
+    level = np.asarray(parts - np.float32(_border_depth(parts, local, hidden)), np.float32)
+    if parts is depth:
+        return level if solid else _without_specks(level, strength), None
+    away = cv2.distanceTransform((parts <= 0).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return level, np.asarray((away < parts.max()) & (parts >= 0), np.float32)
 
 
 def _without_specks(level: Float, strength: Float) -> Float:
-    """The level without those separate parts that hold little of the change."""
+    """The level without those separate parts that hold little of the change that is not faint."""
     inside = (level > 0).view(np.uint8)
     if len(cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]) < 2:
         return level
     count, labels = cv2.connectedComponents(inside)
-    squares = np.bincount(labels.ravel(), np.square(strength).ravel(), count)
+    clear = np.where(strength > FAINT * strength.max(), strength, np.float32(0))
+    squares = np.bincount(labels.ravel(), np.square(clear).ravel(), count)
     specks = squares < STRAY * squares[1:].max()
     specks[0] = False
     return np.where(specks[labels], -np.abs(level), level) if specks.any() else level
