@@ -304,7 +304,8 @@ def test_the_run_goes_on_when_nobody_reads_its_lines_any_more(folder: Path) -> N
     with process.stderr as stream:
         errors = stream.read()
     assert process.wait(PATIENCE) == 0
-    assert errors == b""
+    # What is done to the frames is told as ever; nobody complains.
+    assert [line for line in errors.splitlines() if not line.endswith(b": stages.preprocess")] == []
     assert len(rows(folder / "out-left.jsonl")) == 40
     assert len(rows(folder / "out-right.jsonl")) == 30
 

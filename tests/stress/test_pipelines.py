@@ -152,9 +152,10 @@ def test_a_whole_pipeline_follows_a_doubling(name: str, tmp_path: Path) -> None:
     pictures = [DOUBLED.picture(frame[::2, ::2]) for frame in sequence(name)]
     there = ran(name, pictures, tmp_path, PLAIN[0], "stages.preprocess.downsample=1")
     contact, contact2 = here.last[2], there.last[2]
-    # Both see the same border through cells of 4 x 4 px; measured 0.32 px, 0.1 degrees.
+    # Both see the same border through cells of 4 x 4 px, and look for the largest change nearby in squares of
+    # whole pixels; measured 0.32 px, 0.34 degrees.
     np.testing.assert_allclose(contact2.center, 2 * np.array(contact.center) + 0.5, rtol=0, atol=0.64)
-    assert axis_difference(contact2.angle, contact.angle) < 0.2
+    assert axis_difference(contact2.angle, contact.angle) < 0.68
     if name == "default":
         expected = DOUBLED.points(here.last[4].position, *SIZE)
         # As for the tracker alone.
