@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import io
 import os
-import signal
 import stat
 import sys
 from contextlib import suppress
@@ -14,10 +13,6 @@ from typing import IO, TextIO
 
 if sys.platform != "win32":
     import fcntl
-
-
-ENDING_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""Signals that ask a program to end: Ctrl-C, a service manager, a terminal that is closed."""
 
 
 def expanded(text: str) -> Path:

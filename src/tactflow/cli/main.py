@@ -14,7 +14,8 @@ from typing import NoReturn
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError, TactflowError
-from tactflow.files import ENDING_SIGNALS, Unheard, lead_nowhere
+from tactflow.files import Unheard, lead_nowhere
+from tactflow.signals import ENDING, on_ending
 
 COMMANDS = {
     "run": "run a pipeline",
@@ -49,10 +50,7 @@ def entry() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
     sys.stderr = Unheard(sys.stderr)
     # To be ended by a service, by a terminal that is closed or by Ctrl-C is the same.
-    for number in ENDING_SIGNALS:
-        # Who started it with nohup wants it to go on.
-        if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler)
+    on_ending(signal.default_int_handler)
     try:
         code = main(sys.argv[1:])
         sys.stdout.flush()
@@ -66,7 +64,7 @@ def entry() -> None:
             )
             code = StageError.exit_code
     # The code is known; what comes now shall not change it.
-    for number in ENDING_SIGNALS:
+    for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
     sys.exit(code)
 

@@ -79,7 +79,7 @@ def _refuse_if_in_use(path: Path) -> None:
 
 
 def _repair(path: Path, copy: Path, out: Path, *, quiet: bool) -> int:
-    from tactflow.recording.reader import NotARecordingError
+    from tactflow.recording.records import NotARecordingError
     from tactflow.recording.repair import repair
 
     console = Console(stderr=True)

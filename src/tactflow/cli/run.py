@@ -28,9 +28,10 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
 from tactflow.engine.trace import TRACE_BEGINS, Trace
-from tactflow.files import ENDING_SIGNALS, is_device
+from tactflow.files import is_device
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
+from tactflow.signals import ending_handled
 from tactflow.vision import compiled
 
 STATISTICS_BEGIN = '{\n "frames":'
@@ -270,13 +271,5 @@ def _signals(runner: Runner) -> Iterator[None]:
         signal.signal(number, signal.SIG_DFL)
         raise KeyboardInterrupt
 
-    before = {
-        number: signal.signal(number, handle)
-        for number in ENDING_SIGNALS
-        if signal.getsignal(number) != signal.SIG_IGN
-    }
-    try:
+    with ending_handled(handle):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

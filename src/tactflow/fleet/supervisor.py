@@ -7,16 +7,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import IO, TextIO
 
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.run import INTERRUPTED
-from tactflow.files import ENDING_SIGNALS, lead_nowhere
+from tactflow.files import lead_nowhere
 from tactflow.fleet.sinks import WatchedSink
+from tactflow.signals import ending_handled
 
 FIRST_PAUSE = 1.0
 """Time before the first new start after a failure, s; it doubles with each further one. Chosen by hand."""
@@ -106,7 +106,7 @@ class Supervisor:
         -------
         0 if all ended well, 130 after a second signal, else the exit code of the first sensor that failed.
         """
-        with self._counting_signals():
+        with ending_handled(self._count_signal):
             while any(member.code is None for member in self._members):
                 for member in self._members:
                     self._attend(member)
@@ -215,15 +215,6 @@ class Supervisor:
                     self._unwritten = True
                     sys.stderr.write(f"tactflow: standard output: {error.strerror}; the run ends\n")
 
-    @contextmanager
-    def _counting_signals(self) -> Iterator[None]:
-        def handle(_number: int, _frame: FrameType | None) -> None:
-            # Nothing else: this may be in the middle of starting a process, which would not be told.
-            self._signals += 1
-
-        before = {number: signal.signal(number, handle) for number in ENDING_SIGNALS}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+    def _count_signal(self, _number: int, _frame: FrameType | None) -> None:
+        # Nothing else: this may be in the middle of starting a process, which would not be told.
+        self._signals += 1

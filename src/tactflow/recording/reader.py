@@ -13,11 +13,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.summary import Summary
 
 from tactflow.recording.frames import TYPE_NAME
-from tactflow.recording.records import DAMAGE, MAGIC, Damage, intact_records
-
-
-class NotARecordingError(Exception):
-    """The file is no MCAP file, or holds no frames of ours."""
+from tactflow.recording.records import DAMAGE, Damage, NotARecordingError, intact_records
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +85,7 @@ def _topics(ours: set[str], known: set[str]) -> tuple[str, str]:
 
 
 def read_summary(file: BinaryIO) -> Summary | None:
-    """The index at the end of the file, or None where it was cut off."""
-    if file.read(len(MAGIC)) != MAGIC:
-        raise NotARecordingError("is not an MCAP file")
+    """The index at the end of the file, or None where it was cut off, or the file is another kind."""
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     try:

@@ -68,6 +68,10 @@ _PRIVATE: Final = 0x80
 """Kinds from here on belong to whoever wrote the file."""
 
 
+class NotARecordingError(Exception):
+    """The file is no MCAP file, or holds no frames of ours."""
+
+
 @dataclass(frozen=True, slots=True)
 class Damage:
     """Bytes of the file, from `start` up to `end`, that belong to no intact record."""
@@ -88,12 +92,12 @@ def intact_records(file: BinaryIO, since: int | None = None) -> Iterator[McapRec
 
     Raises
     ------
-    ValueError : it is no MCAP file. OSError : it cannot be read.
+    NotARecordingError : it is no MCAP file. OSError : it cannot be read.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
-        raise ValueError("is not an MCAP file")
+        raise NotARecordingError("is not an MCAP file")
     at = len(MAGIC)
     while at < size:
         end = _end_of_record(file, at, size)

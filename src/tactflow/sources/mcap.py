@@ -72,7 +72,8 @@ class Recording:
             )
 
     def _look(self) -> Contents:
-        from tactflow.recording.reader import NotARecordingError, look_into
+        from tactflow.recording.reader import look_into
+        from tactflow.recording.records import NotARecordingError
 
         try:
             return look_into(self._path)
