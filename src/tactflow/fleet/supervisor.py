@@ -97,7 +97,8 @@ class Supervisor:
         self._signals = 0
         self._refused = False
         self._unwritten = False
-        self._output = threading.Lock()
+        # Who does not read results shall not keep messages back.
+        self._results, self._messages = threading.Lock(), threading.Lock()
 
     def run(self) -> int:
         """Until every process has ended for good; the exit code.
@@ -204,7 +205,7 @@ class Supervisor:
 
     def _write(self, target: TextIO, line: bytes) -> None:
         """Write at once. When the reader has gone away, fall silent; when the disk is full, end the run."""
-        with self._output:
+        with self._results if target is sys.stdout else self._messages:
             try:
                 target.flush()
                 target.buffer.write(line)
