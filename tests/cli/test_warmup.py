@@ -32,7 +32,6 @@ def python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_run_after_it_compiles_nothing(tmp_path: Path) -> None:
     warm = python("-m", "tactflow", "warmup", cwd=tmp_path)
