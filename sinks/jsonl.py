@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, lead_nowhere, make_folder, status
+from tactflow.files import expanded, lead_nowhere, make_folder, taken_away
 from tactflow.message import Results, encode_message
 
 log = logging.getLogger("tactflow")
@@ -184,10 +184,9 @@ class Jsonl(Sink):
         assert self._file is not None
         assert self._complete is not None
         path, ours = expanded(self.params.path), os.fstat(self._file.fileno())
+        what = taken_away(path, ours)
         expected, self._complete = self._complete + written, ours.st_size
-        there = status(self.params.path)
-        if there is None or not os.path.samestat(there, ours):
-            what = "removed" if there is None else "replaced"
+        if what is not None:
             self._complete = None
             raise StageError(
                 f"{path}: was {what} by another program while the run wrote to it; {self._lines} lines are "

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -24,7 +24,7 @@ from tactflow.cli.options import add_pipeline
 from tactflow.cli.progress import progress_display, summary, with_statistics
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import find_pipeline
-from tactflow.engine.errors import ConfigError
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
 from tactflow.engine.trace import TRACE_BEGINS, Trace
@@ -180,15 +180,29 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
             logger.info("not run, as no sink needs it: %s", ", ".join(n.id for n in runner.plan.pruned))
         with progress_display(console, runner, shown=not args.quiet) as on_progress:
             result = runner.run(with_statistics(on_progress, runner, args.stats_every, console))
-    if trace is not None:
-        trace.write(Path(args.trace))
-    if args.stats:
-        Path(args.stats).write_text(json.dumps(result.stats, indent=1) + "\n", encoding="utf-8")
     if result.error is not None:
         print(f"tactflow: {result.error}", file=sys.stderr)
+    written = [
+        trace is None or _write_report("--trace", args.trace, trace.lines()),
+        args.stats is None or _write_report("--stats", args.stats, [json.dumps(result.stats, indent=1)]),
+    ]
     if not args.quiet:
         console.print(summary(result, runner), markup=False)
-    return result.exit_code
+    return result.exit_code or (0 if all(written) else StageError.exit_code)
+
+
+def _write_report(option: str, path: str, lines: Iterable[str]) -> bool:
+    """Write a file of statistics or events; whether that went well. Half of one is none: it is emptied."""
+    try:
+        with open(path, "w", encoding="utf-8") as file:
+            file.writelines(f"{line}\n" for line in lines)
+    except OSError as error:
+        print(f"tactflow: {option} {path}: cannot be written: {error.strerror or error}", file=sys.stderr)
+        if not is_device(path):
+            with suppress(OSError):
+                os.truncate(path, 0)
+        return False
+    return True
 
 
 def _stop_at_end_of_input(runner: Runner) -> None:
