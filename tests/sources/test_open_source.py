@@ -340,8 +340,16 @@ BAD = {
         _bytes("a.npy", b"\x93NUMPY\x01\x00" + bytes(200)),
         ["not a .npy", "or a damaged one"],
     ),
+    "header that is not Python": (
+        _bytes("a.npy", b"\x93NUMPY\x01\x00\x76\x00" + b"{'shape': (1, \n".ljust(118)),
+        ["not a .npy", "or a damaged one"],
+    ),
     "archive of arrays": (_archive, [".npz", "np.save"]),
     "text as image": (_bytes("a.png", b"hello"), ["not an image"]),
+    "PNG with a piece of 2 GB": (
+        _bytes("a.png", b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + bytes(17) + b"\x7f\xff\xff\xffIDATIEND"),
+        ["cut off"],
+    ),
     "empty image": (_bytes("a.png", b""), ["empty"]),
     "text as video": (_bytes("a.avi", b"hello"), ["neither a video"]),
     "empty video": (_bytes("a.mp4", b""), ["empty"]),
