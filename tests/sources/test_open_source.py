@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources import FrameReader, open_source
+from tactflow.sources import FrameReader, base, open_source
 
 Pixels = NDArray[np.uint8]
 
