@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources import FrameReader, open_source
+from tactflow.sources import FrameReader, base, open_source
 
 Pixels = NDArray[np.uint8]
 
@@ -252,6 +252,18 @@ def test_a_video_that_was_cut_off_gives_what_it_has_and_a_warning(
         frames = read_all(open_source(str(path)))
     assert 5 < len(frames) < 25
     assert f"ended after {len(frames)} of 30 frames" in caplog.text
+
+
+def test_a_video_with_larger_pictures_than_a_camera_has_is_refused_before_they_are_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    monkeypatch.setattr(base, "MOST_PIXELS", 3000)
+    with pytest.raises(SourceError, match=r"64 x 48, more than 3000 pixels"):
+        open_source(str(path))
 
 
 # -- what cannot be opened ---------------------------------------------------------------------------------

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
 from tactflow.files import expanded
-from tactflow.sources.base import BgrImage, Normaliser, find_path, log, quiet_opencv
+from tactflow.sources.base import (
+    BgrImage,
+    Normaliser,
+    find_path,
+    frame_size,
+    log,
+    quiet_opencv,
+    refuse_too_large,
+)
 
 IMAGE_SUFFIXES = frozenset(
     [".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"]
@@ -238,11 +246,7 @@ class ArrayFile:
         self._rate = fps or DEFAULT_FPS
         self._index = 0
         count, height, width = frames.shape[:3]
-        if height * width > MOST_PIXELS:
-            raise SourceError(
-                f"{path}: its frames are {width} x {height}, more than {MOST_PIXELS} pixels; if that is "
-                "right, set the environment variable OPENCV_IO_MAX_IMAGE_PIXELS"
-            )
+        refuse_too_large(str(path), width, height)
         as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,) and frames.flags.c_contiguous
         self._frames: Iterator[BgrImage] = iter(frames) if as_wanted else map(Normaliser(str(path)), frames)
         self.total: int | None = count
@@ -313,15 +317,12 @@ class VideoFile:
                 f"{path}: neither a video that OpenCV can open, nor an image, nor a .npy array; "
                 "an .mp4 or .avi that was not closed properly cannot be opened either"
             )
+        self.size: tuple[int, int] | None = frame_size(self._capture, str(path))
         said = self._capture.get(cv2.CAP_PROP_FPS)
         self._rate = said if 0 < said < LARGEST_FPS else fps or DEFAULT_FPS
         self.fps: float | None = self._rate
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.total: int | None = count if count > 0 else None
-        self.size: tuple[int, int] | None = (
-            int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-            int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-        )
         self._path = path
         self._normalise = Normaliser(str(path))
         self._index = 0
