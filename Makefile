@@ -1,6 +1,7 @@
 # make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
 # make test         lint, types, tests
 # make soak         the tests that take longer: faults in running processes, load over time
+# make fuzz         damaged input to every parser, SECONDS for each
 # make kernels      measures what compiling gains, and writes docs/kernels.md
 # make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
@@ -11,7 +12,7 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak lint types kernels system-deps clean
+.PHONY: run test soak fuzz lint types kernels system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -22,6 +23,10 @@ test: lint types
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
 soak: $(VENV)/.installed-test
 	$(PY) -m pytest -m slow
+
+fuzz: SECONDS := 300
+fuzz: $(VENV)/.installed-test
+	$(PY) -m tests.fuzz --seconds $(SECONDS) --seed $$(date +%s)
 
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources import FrameReader, open_source
+from tactflow.sources import FrameReader, base, open_source
 
 Pixels = NDArray[np.uint8]
 
@@ -254,6 +254,18 @@ def test_a_video_that_was_cut_off_gives_what_it_has_and_a_warning(
     assert f"ended after {len(frames)} of 30 frames" in caplog.text
 
 
+def test_a_video_with_larger_pictures_than_a_camera_has_is_refused_before_they_are_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    monkeypatch.setattr(base, "MOST_PIXELS", 3000)
+    with pytest.raises(SourceError, match=r"64 x 48, more than 3000 pixels"):
+        open_source(str(path))
+
+
 # -- what cannot be opened ---------------------------------------------------------------------------------
 
 
@@ -340,8 +352,16 @@ BAD = {
         _bytes("a.npy", b"\x93NUMPY\x01\x00" + bytes(200)),
         ["not a .npy", "or a damaged one"],
     ),
+    "header that is not Python": (
+        _bytes("a.npy", b"\x93NUMPY\x01\x00\x76\x00" + b"{'shape': (1, \n".ljust(118)),
+        ["not a .npy", "or a damaged one"],
+    ),
     "archive of arrays": (_archive, [".npz", "np.save"]),
     "text as image": (_bytes("a.png", b"hello"), ["not an image"]),
+    "PNG with a piece of 2 GB": (
+        _bytes("a.png", b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + bytes(17) + b"\x7f\xff\xff\xffIDATIEND"),
+        ["cut off"],
+    ),
     "empty image": (_bytes("a.png", b""), ["empty"]),
     "text as video": (_bytes("a.avi", b"hello"), ["neither a video"]),
     "empty video": (_bytes("a.mp4", b""), ["empty"]),
