@@ -181,6 +181,11 @@ class Runner:
         """Whether capturing is held."""
         return self._paused
 
+    @property
+    def hurried(self) -> bool:
+        """Whether the run was told to end before its source did, or has failed."""
+        return self._hurried
+
     def step(self) -> None:
         """While paused, let one frame through; steps that wait are forgotten at the end. From any thread."""
         with self._turn:

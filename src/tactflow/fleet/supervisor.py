@@ -100,7 +100,8 @@ class Supervisor:
         self._signals = 0
         self._refused = False
         self._unwritten = False
-        self._output = threading.Lock()
+        # Who does not read results shall not keep messages back.
+        self._results, self._messages = threading.Lock(), threading.Lock()
 
     def run(self, members: Sequence[Member]) -> int:
         """Until every process has ended for good; the exit code.
@@ -160,7 +161,7 @@ class Supervisor:
         """Kill a process that hangs."""
         if member.told >= KILL_AT:
             return
-        if self._output.locked():
+        if self._results.locked() or self._messages.locked():
             # It may wait for us, who wait for somebody that reads what we write.
             member.sign.excuse(self._clock())
         elif member.sign.look(self._clock()) > self._hang_after:
@@ -220,7 +221,7 @@ class Supervisor:
 
     def _write(self, target: TextIO, line: bytes) -> None:
         """Write at once. When the reader has gone away, fall silent; when the disk is full, end the run."""
-        with self._output:
+        with self._results if target is sys.stdout else self._messages:
             try:
                 target.flush()
                 target.buffer.write(line)
