@@ -1,5 +1,7 @@
 # make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
 # make test         lint, types, tests
+# make soak         the tests that take longer: faults in running processes, load over time
+# make fuzz         damaged input to every parser, SECONDS for each
 # make kernels      measures what compiling gains, and writes docs/kernels.md
 # make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
@@ -10,13 +12,21 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test lint types kernels system-deps clean
+.PHONY: run test soak fuzz lint types kernels system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
 
 test: lint types
-	$(PY) -m pytest --numprocesses auto --dist loadfile
+	$(PY) -m pytest -m "not slow" --numprocesses auto --dist loadfile
+
+# One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
+soak: $(VENV)/.installed-test
+	$(PY) -m pytest -m slow
+
+fuzz: SECONDS := 300
+fuzz: $(VENV)/.installed-test
+	$(PY) -m tests.fuzz --seconds $(SECONDS) --seed $$(date +%s)
 
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .

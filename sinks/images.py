@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Literal
 
 import cv2
@@ -11,8 +12,11 @@ from pydantic import Field
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, make_folder
+from tactflow.files import expanded, make_folder, next_name
 from tactflow.ports import Picture
+
+UNFINISHED = ".unfinished"
+"""Name of a picture until all of it is written: none is ever seen in half."""
 
 
 class Images(Sink):
@@ -56,6 +60,11 @@ class Images(Sink):
         """The folder."""
         return (Output(expanded(params.folder), "folder", "folder", refuses_existing=not params.overwrite),)
 
+    @classmethod
+    def on_restart(cls, params: Images.Params) -> Images.Params:
+        """It goes on in another folder, `images-001`, beside the one that it has begun."""
+        return params.changed(folder=str(next_name(expanded(params.folder))), overwrite=False)
+
     def open(self) -> None:
         """Create the folder.
 
@@ -93,8 +102,15 @@ class Images(Sink):
         self._next = seq - seq % every + every
         path = self._folder / f"frame-{seq:06d}.{self.params.format}"
         _, data = cv2.imencode(path.suffix, annotated, self._options)
+        unfinished = self._folder / UNFINISHED
         try:
-            path.write_bytes(data.tobytes())
+            unfinished.write_bytes(data.tobytes())
+            unfinished.replace(path)
         except OSError as error:
-            raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
+            with suppress(OSError):
+                unfinished.unlink()
+            raise StageError(
+                f"{path}: cannot be written: {error.strerror or error}; "
+                f"the {self._files} pictures written before are whole"
+            ) from error
         self._files += 1

@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 import errno
-import json
 import logging
-import os
-import stat
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import BinaryIO
+from contextlib import suppress
 
 from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Output, Sink, StageParams
+from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, lead_nowhere, make_folder, status
+from tactflow.files import expanded, is_device, lead_nowhere, make_folder
+from tactflow.lines import LineFile, LineStream, open_pipe
 from tactflow.message import Results, encode_message
 
 log = logging.getLogger("tactflow")
 
 
 class Jsonl(Sink):
-    """Writes result messages to a file or to standard output, complete lines only.
+    """Writes result messages to a file, a pipe or standard output, complete lines only.
 
     Lines reach a file at least every `flush` seconds of frames and at the end, and standard output at once.
-    When the reader of standard output goes away, the sink falls silent and wants nothing more.
+    When the reader of standard output goes away, the sink falls silent and wants nothing more. A recording
+    waits for a reader who is slow; in a live run, the lines that he does not take are dropped and counted.
     """
+
+    threaded = True
+    queue_capacity = 16
 
     class Params(StageParams):
         """Where to write, and what to do with a file that is there already."""
@@ -52,16 +54,19 @@ class Jsonl(Sink):
                 raise ValueError("overwrite and append exclude each other")
             return self
 
-    def __init__(self, params: Params) -> None:
-        """Prepare; nothing is opened yet."""
+    def __init__(self, params: Params, control: Control | None = None) -> None:
+        """Prepare; nothing is opened yet.
+
+        control : the run, which knows whether a slow reader is waited for; None: he is.
+        """
         super().__init__(params)
+        self._control = control
         self._name = "standard output" if params.path == "-" else params.path
         self.description = self._name
-        self._file: BinaryIO | None = None
+        self._out: LineFile | LineStream | None = None
         self._pending: list[bytes] = []
         self._flushed = 0.0
-        self._complete: int | None = None
-        self._lines = 0
+        self._counts = {"lines": 0}
 
     @classmethod
     def outputs(cls, params: Jsonl.Params) -> Sequence[Output]:
@@ -77,52 +82,54 @@ class Jsonl(Sink):
         return params.changed(overwrite=False, append=True)
 
     def open(self) -> None:
-        """Open or create the file, and its folder.
+        """Open or create the file, and its folder; of a pipe, wait for its reader.
 
         Raises
         ------
         StageError
             If the file exists and neither `overwrite` nor `append` is set, or it cannot be written.
         """
-        if self.params.path == "-":
-            self._file = sys.stdout.buffer
-            return
-        path = expanded(self.params.path)
+        path, p = expanded(self.params.path), self.params
         try:
-            make_folder(path.parent)
-            self._file = self._open_file(path)
+            if p.path == "-":
+                self._out = LineStream(sys.stdout.buffer, self._waits)
+            elif is_device(p.path):
+                pipe = open_pipe(path, lambda: not self._hurried)
+                self._out = None if pipe is None else LineStream(pipe, self._waits)
+            elif path.is_file() and path.stat().st_size > 0 and not (p.overwrite or p.append):
+                raise StageError(
+                    f"{path}: this file exists; set overwrite: true to replace it, append: true to continue "
+                    "it, or give another path"
+                )
+            else:
+                make_folder(path.parent)
+                self._out = LineFile(path, replaces=p.overwrite, continues=p.append)
         except OSError as error:
             raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
         self._flushed = time.monotonic()
 
-    def _open_file(self, path: Path) -> BinaryIO:
-        regular = not path.exists() or stat.S_ISREG(path.stat().st_mode)
-        if not regular:
-            return path.open("wb", buffering=0)
-        if path.exists() and path.stat().st_size > 0 and not (self.params.overwrite or self.params.append):
-            raise StageError(
-                f"{path}: this file exists; set overwrite: true to replace it, append: true to continue it, "
-                "or give another path"
-            )
-        replace = os.O_TRUNC if self.params.overwrite else 0
-        create = os.O_CREAT if path.exists() else os.O_CREAT | os.O_EXCL
-        # At the end whatever happens: where another program has cut the file, no gap of NULs may follow.
-        flags = os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0) | replace | create
-        file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
-        try:
-            self._complete = _continue_at(file, path) if self.params.append and file.readable() else 0
-        except BaseException:
-            file.close()
-            raise
-        return file
+    @property
+    def _hurried(self) -> bool:
+        return self._control is not None and self._control.hurried
+
+    @property
+    def _live(self) -> bool:
+        source = None if self._control is None else self._control.source
+        return source is not None and source.live
+
+    def _waits(self) -> bool:
+        """Whether to wait for a slow reader."""
+        return not self._live and not self._hurried
 
     def wants(self) -> bool:
         """False once the reader of standard output has gone away."""
-        return self._file is not None
+        return self._out is not None
 
     def counters(self) -> dict[str, int]:
-        """lines : written so far."""
-        return {"lines": self._lines}
+        """lines : written so far. dropped : lines that the reader of a pipe did not take."""
+        if isinstance(self._out, LineStream):
+            return {"lines": self._out.delivered, "dropped": self._out.dropped}
+        return self._counts if self._out is None else {"lines": self._out.delivered}
 
     def write(self, tick: Tick, results: Results) -> None:
         """Add one line.
@@ -133,103 +140,56 @@ class Jsonl(Sink):
             If the file cannot be written, for instance because the disk is full. The file then ends with the
             last line that fitted.
         """
-        if self._file is None:
+        if self._out is None:
             return
         self._pending.append(encode_message(tick, results, detail=self.params.detail))
         now = time.monotonic()
         if self.params.path == "-" or now - self._flushed >= self.params.flush:
             self._flushed = now
-            self._flush()
+            self._flush(self._out)
 
     def close(self) -> None:
-        """Write what is left and close the file."""
-        try:
-            self._flush()
-            if self._complete is not None and self._file is not None:
-                self._check_file(0)
-        finally:
-            if self._file is not None and self.params.path != "-":
-                self._file.close()
-            self._file = None
+        """Write what is left and close the file.
 
-    def _flush(self) -> None:
-        if self._file is None or not self._pending:
+        Raises
+        ------
+        StageError
+            If that is not possible, or the reader of a pipe did not take all lines of a recording.
+        """
+        out = self._out
+        if out is None:
             return
-        lines, self._pending = self._pending, []
-        data = memoryview(b"\n".join([*lines, b""]))
-        written = 0
         try:
-            # An unbuffered file may take only a part, and says why at the next attempt.
-            while written < len(data):
-                written += self._file.write(data[written:])
-            self._file.flush()
+            self._flush(out, last=True)
+            if out.dropped and not self._live:
+                raise StageError(
+                    f"{self._name}: its reader took only {out.delivered} lines before the run was stopped; "
+                    f"{out.dropped} more are lost"
+                )
+        finally:
+            self._counts = self.counters()
+            self._out = None
+            if self.params.path != "-":
+                with suppress(OSError):
+                    out.close()
+
+    def _flush(self, out: LineFile | LineStream, *, last: bool = False) -> None:
+        lines, self._pending = self._pending, []
+        already = out.dropped
+        try:
+            out.send(lines)
+            if last:
+                out.finish()
         except OSError as error:
             if self.params.path == "-" and error.errno in (errno.EPIPE, errno.ECONNRESET):
-                self._reader_left()
+                log.debug("standard output was closed by its reader")
+                self._counts = self.counters()
+                self._out = None
+                lead_nowhere(sys.stdout)
                 return
-            self._cut_at_complete_line(data[:written])
             raise StageError(
                 f"{self._name}: cannot be written: {error.strerror or error}; "
-                f"the {self._lines} lines written before are complete"
+                f"the {out.delivered} lines written before are complete"
             ) from error
-        self._lines += len(lines)
-        if self._complete is not None:
-            self._check_file(len(data))
-
-    def _check_file(self, written: int) -> None:
-        """Find out that others have removed, replaced or cut the file.
-
-        written : bytes since the last look.
-        """
-        assert self._file is not None
-        assert self._complete is not None
-        path, ours = expanded(self.params.path), os.fstat(self._file.fileno())
-        expected, self._complete = self._complete + written, ours.st_size
-        there = status(self.params.path)
-        if there is None or not os.path.samestat(there, ours):
-            what = "removed" if there is None else "replaced"
-            self._complete = None
-            raise StageError(
-                f"{path}: was {what} by another program while the run wrote to it; {self._lines} lines are "
-                "not in it"
-            )
-        if ours.st_size < expected:
-            gone = expected - ours.st_size
-            log.warning("%s: was cut by another program: %d bytes that were written are gone", path, gone)
-
-    def _cut_at_complete_line(self, written: memoryview) -> None:
-        """After a failed write, leave the file with complete lines only."""
-        kept = bytes(written).rfind(b"\n") + 1
-        self._lines += bytes(written).count(b"\n")
-        if self._file is not None and self._complete is not None:
-            self._complete = os.fstat(self._file.fileno()).st_size - len(written) + kept
-            self._file.truncate(self._complete)
-
-    def _reader_left(self) -> None:
-        log.debug("standard output was closed by its reader")
-        self._file = None
-        lead_nowhere(sys.stdout)
-
-
-def _continue_at(file: BinaryIO, path: Path) -> int:
-    """Seek to the end of the last complete line, completing or cutting off what follows it; its offset."""
-    end = file.seek(0, os.SEEK_END)
-    tail = b""
-    start = end
-    while start > 0 and b"\n" not in tail:
-        step = min(start, 65536)
-        start = file.seek(start - step)
-        tail = (file.read(step) or b"") + tail
-    rest = tail[tail.rfind(b"\n") + 1 :]
-    if rest:
-        try:
-            json.loads(rest)
-        except ValueError:
-            end -= len(rest)
-            file.truncate(end)
-            log.warning("%s: its last line was cut off (%d bytes) and has been removed", path, len(rest))
-        else:
-            file.seek(end)
-            file.write(b"\n")
-            end += 1
-    return file.seek(end)
+        if out.dropped and not already:
+            log.warning("%s: its reader is too slow: lines are dropped", self._name)

@@ -23,11 +23,10 @@ from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.rate import SLACK, RateLimit
-from tactflow.files import expanded
+from tactflow.files import expanded, next_name
 from tactflow.message import Results, encode_message
 from tactflow.ports import Image
 from tactflow.recording import missing_packages
-from tactflow.recording.names import next_name
 from tactflow.vision import compiled
 
 if TYPE_CHECKING:
@@ -336,17 +335,29 @@ class Record(Recorder):
                 self._counts["frames"] += 1
         except OSError as error:
             self._give_up(file, error)
+        self._refuse_interference(file)
 
     def _finish(self) -> None:
         file, self._file = self._file, None
         self._ends = False
         assert file is not None
+        self._refuse_interference(file)
         try:
             file.finish()
         except OSError as error:
             self._give_up(file, error)
         self._counts["files"] += 1
-        self._counts["bytes"] += file.path.stat().st_size
+        self._counts["bytes"] += file.bytes
+
+    def _refuse_interference(self, file: RecordingWriter) -> None:
+        what = file.interference()
+        if what is None:
+            return
+        self._file = None
+        self._backlog.clear()
+        file.abandon()
+        lost = "what was cut off is lost" if what == "cut" else f"its {file.frames} frames are not in it"
+        raise StageError(f"{file.path}: was {what} by another program while the run recorded to it; {lost}")
 
     def _give_up(self, file: RecordingWriter, error: OSError) -> None:
         self._file = None

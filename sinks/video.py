@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import statistics
 import tempfile
@@ -18,7 +19,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, make_folder
+from tactflow.files import expanded, is_device, make_folder, next_name, taken_away
 from tactflow.ports import Picture
 
 log = logging.getLogger("tactflow")
@@ -28,9 +29,7 @@ LOSSLESS_CODECS = {".avi": ("HFYU", "FFV1"), ".mkv": ("HFYU", "FFV1")}
 FRAMES_TO_MEASURE_RATE = 12
 """Frames held back at the start, because their rate is not known before. Chosen by hand."""
 MIN_FREE_BYTES = 16 << 20
-"""Free space, bytes, at which the disk counts as full: some 50 uncompressed frames of 400 x 300. By hand."""
-FRAMES_BETWEEN_DISK_CHECKS = 50
-"""Frames after which the disk is looked at again. Chosen by hand."""
+"""Free space, bytes, at which the disk counts as full: what is under way and the index still fit. By hand."""
 
 
 class Video(Sink):
@@ -80,6 +79,7 @@ class Video(Sink):
         self._held: list[tuple[float, Picture]] = []
         self._writer: cv2.VideoWriter | None = None
         self._size: tuple[int, int] | None = None
+        self._ours: os.stat_result | None = None
         self._frames = 0
 
     @classmethod
@@ -87,17 +87,21 @@ class Video(Sink):
         """The file."""
         return (Output(expanded(params.path), "file", "path", refuses_existing=not params.overwrite),)
 
+    @classmethod
+    def on_restart(cls, params: Video.Params) -> Video.Params:
+        """It goes on in another file, `annotated-001.avi`, beside the one that it has begun."""
+        return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
+
     def open(self) -> None:
         """Choose the codec and create the folder; the file itself follows with the first frames.
 
         Raises
         ------
         StageError
-            If the file exists, its folder cannot be written, or this OpenCV cannot encode it: a lossless
-            codec is tried on a small picture and must give back every bit.
+            If the file exists, is a pipe or device, its folder cannot be written, or this OpenCV cannot
+            encode it: a lossless codec is tried on a small picture and must give back every bit.
         """
-        if self._path.exists() and not self.params.overwrite:
-            raise StageError(f"{self._path}: this file exists; set overwrite: true or give another path")
+        self._refuse_what_is_there()
         try:
             make_folder(self._path.parent)
             with tempfile.TemporaryDirectory(dir=self._path.parent, prefix=".tactflow-") as folder:
@@ -123,7 +127,8 @@ class Video(Sink):
         Raises
         ------
         StageError
-            If the picture changes its size, or the disk is nearly full.
+            If the picture changes its size, or the disk is nearly full. The film then ends with the frame
+            before.
         """
         size = (annotated.shape[1], annotated.shape[0])
         if self._size is not None and size != self._size:
@@ -145,19 +150,46 @@ class Video(Sink):
         Raises
         ------
         StageError
-            If fewer frames can be found in it than were written.
+            If not all frames are in it: the disk, or a limit on the size of files, ended it early, or another
+            program has taken it away.
         """
         try:
             if self._held:
                 self._start()
         finally:
-            written = self._writer is not None
             if self._writer is not None:
                 self._writer.release()
                 self._writer = None
-        if written and (found := count_frames(self._path)) < self._frames:
+        if self._frames:
+            self._check_file()
+
+    def _refuse_what_is_there(self) -> None:
+        # FFmpeg would wait for the reader of a pipe for ever.
+        if is_device(str(self._path)):
+            raise StageError(f"{self._path}: required a file, not a pipe or device; give another path")
+        if self._path.exists() and not self.params.overwrite:
+            raise StageError(f"{self._path}: this file exists; set overwrite: true or give another path")
+
+    def _refuse_full_disk(self) -> None:
+        if shutil.disk_usage(self._path.parent).free < MIN_FREE_BYTES:
             raise StageError(
-                f"{self._path}: only {found} of {self._frames} frames could be written; is the disk full?"
+                f"{self._path}: the disk is full; the {self._frames} frames written before can be played"
+            )
+
+    def _check_file(self) -> None:
+        """The encoder tells nobody that a write failed: look at the file."""
+        assert self._ours is not None
+        what = taken_away(self._path, self._ours)
+        if what is not None:
+            raise StageError(
+                f"{self._path}: was {what} by another program while the run wrote to it; its {self._frames} "
+                "frames are not in it"
+            )
+        problem = film_problem(self._path, self._frames)
+        if problem is not None:
+            raise StageError(
+                f"{self._path}: {problem}: its end could not be written; is the disk full, or the size of "
+                "files limited?"
             )
 
     def _start(self) -> None:
@@ -165,32 +197,37 @@ class Video(Sink):
         rate = self.params.fps or _rate([t for t, _ in self._held])
         width, height = (side + side % 2 for side in self._size)
         code = cv2.VideoWriter.fourcc(*self._codec)
+        held, self._held = self._held, []
+        self._refuse_what_is_there()
+        self._refuse_full_disk()
         self._writer = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, (width, height))
         if not self._writer.isOpened():
             raise StageError(f"{self._path}: cannot be written; may this folder be written to?")
+        self._ours = self._path.stat()
         log.info("%s: %d x %d, %g fps, %s", self._path, width, height, rate, self._codec)
-        held, self._held = self._held, []
         for _, picture in held:
             self._add(picture)
 
     def _add(self, picture: Picture) -> None:
         assert self._writer is not None
-        if self._frames % FRAMES_BETWEEN_DISK_CHECKS == 0:
-            self._check_disk()
+        self._refuse_full_disk()
         self._writer.write(_padded(picture))
         self._frames += 1
 
-    def _check_disk(self) -> None:
-        # The encoder does not tell anybody that a write failed.
-        if shutil.disk_usage(self._path.parent).free < MIN_FREE_BYTES:
-            raise StageError(f"{self._path}: the disk is full, after {self._frames} frames")
 
+def film_problem(path: Path, frames: int) -> str | None:
+    """What keeps a film from being read to its last frame, or None.
 
-def count_frames(path: Path) -> int:
-    """How many frames a video file says that it holds; 0 if it cannot be opened."""
+    frames : how many there are to be. A file that was cut off may still claim all of them.
+    """
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
-        return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+        if not capture.isOpened():
+            return "it cannot be played"
+        claimed = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        capture.set(cv2.CAP_PROP_POS_FRAMES, frames - 1)
+        there = capture.get(cv2.CAP_PROP_POS_FRAMES) == frames - 1 and capture.grab()
+        return None if claimed == frames and there else f"it ends before its {frames} frames"
     finally:
         capture.release()
 

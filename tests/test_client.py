@@ -333,7 +333,9 @@ def test_what_is_no_result_message_is_passed_over_and_counted() -> None:
             good = encode_message(Tick(Frame("main", 3, 0.1, np.zeros((4, 4, 3), np.uint8))), Results())
             while not results._socket.poll(20):
                 publisher.send(b"tactflow.main " + good)
-            for body in (b"{", b'{"seq": []}', b"{}", good):
+            contact = good.replace(b'"contact":null', b'"contact":{"area":"large"}')
+            assert contact != good
+            for body in (b"{", b'{"seq": []}', b"{}", contact, good):
                 publisher.send(b"tactflow.main " + body)
-            while results.malformed < 3:
+            while results.malformed < 4:
                 assert results.receive()["seq"] == 3

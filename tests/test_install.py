@@ -34,7 +34,6 @@ def modules() -> set[str]:
     }
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_wheel_runs_its_packaged_pipeline_in_a_fresh_environment(tmp_path: Path) -> None:
     pip = ("-m", "pip", "--disable-pip-version-check", "--no-input", "--quiet")

@@ -211,6 +211,21 @@ class Slow(Stage):
 """
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_signal_while_a_run_starts_ends_it_well(number: int, tmp_path: Path) -> None:
+    (tmp_path / "late.py").write_text(f"open('began', 'w').close()\nimport time\ntime.sleep({PATIENCE})\n")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactflow", "run", "--set", "stages.late={use: './late.py:Late'}"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    until(lambda: process.poll() is not None or (tmp_path / "began").exists())
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, errors) == (0, "")
+
+
 def test_a_second_signal_ends_at_once_with_130(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(SLOW)
     (tmp_path / "pipeline.yaml").write_text(

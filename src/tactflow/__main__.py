@@ -1,8 +1,31 @@
-"""`python -m tactflow` is the same as `tactflow`."""
+"""Where the program begins: `tactflow`, and `python -m tactflow`, which is the same."""
 
 from __future__ import annotations
 
-from tactflow.cli.main import entry
+import signal
+import sys
+from collections.abc import Sequence
+
+from tactflow.signals import leave, on_ending
+
+RUNS = ("run", "record")
+"""Commands that one signal ends well."""
+
+
+def entry() -> None:
+    """Entry point of the console script."""
+    # Before all else is imported, which takes a while. To be ended by a service, by a terminal that is closed
+    # or by Ctrl-C is the same.
+    on_ending(leave if wanted(sys.argv[1:]) in RUNS else signal.default_int_handler)
+    from tactflow.cli import main
+
+    main.entry()
+
+
+def wanted(argv: Sequence[str]) -> str | None:
+    """The word of a command line that stands for the command."""
+    return next((word for word in argv if not word.startswith("-")), None)
+
 
 if __name__ == "__main__":
     entry()

@@ -184,6 +184,46 @@ def _parsed(body: bytes) -> dict[str, Any] | None:
         message = orjson.loads(body)
     except ValueError:
         return None
-    if not isinstance(message, dict) or not message.keys() >= REQUIRED:
-        return None
-    return message if isinstance(message["sensor"], str) and isinstance(message["seq"], int) else None
+    return message if isinstance(message, dict) and _is_result(message) else None
+
+
+def _is_result(message: dict[str, Any]) -> bool:
+    """Whether what programs rely on is there and of its type; there may be more."""
+    if not message.keys() >= REQUIRED:
+        return False
+    contact, flow, markers = message["contact"], message["flow"], message["markers"]
+    return (
+        isinstance(message["sensor"], str)
+        and isinstance(message["seq"], int)
+        and _is_number(message["t"])
+        and isinstance(message["skipped"], dict)
+        and (contact is None or (isinstance(contact, dict) and _is_contact(contact)))
+        and (flow is None or (isinstance(flow, dict) and _is_flow(flow)))
+        and (markers is None or (isinstance(markers, dict) and _are_markers(markers)))
+    )
+
+
+def _is_contact(contact: dict[str, Any]) -> bool:
+    return (
+        _is_number(contact.get("area"))
+        and _is_pair(contact.get("center"))
+        and all(contact.get(key, "") is None or _is_number(contact.get(key)) for key in ("angle", "slope"))
+        and isinstance(contact.get("hull"), list)
+    )
+
+
+def _is_flow(flow: dict[str, Any]) -> bool:
+    mean = flow.get("mean", "")
+    return isinstance(flow.get("count"), int) and (mean is None or _is_pair(mean))
+
+
+def _are_markers(markers: dict[str, Any]) -> bool:
+    return all(isinstance(markers.get(key), list) for key in ("origin", "position", "status"))
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import re
 import stat
 import sys
 from contextlib import suppress
@@ -32,6 +33,36 @@ def is_device(text: str) -> bool:
     """Whether it is there and neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
     there = status(text)
     return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
+
+
+def next_name(path: Path) -> Path:
+    """The first numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ...
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     Path(folder, "press-007.mcap").touch()
+    ...     print(next_name(Path(folder, "press.mcap")).name)
+    press-008.mcap
+    """
+    taken = 0
+    pattern = re.compile(re.escape(path.stem) + r"-(\d+)" + re.escape(path.suffix))
+    if path.parent.is_dir():
+        for name in os.listdir(path.parent):
+            found = pattern.fullmatch(name)
+            taken = max(taken, int(found[1]) if found else 0)
+    return path.with_name(f"{path.stem}-{taken + 1:03d}{path.suffix}")
+
+
+def taken_away(path: Path, ours: os.stat_result) -> str | None:
+    """What another program has done to a file that we write: "removed", "replaced" or None, nothing.
+
+    ours : what the system says about the file that we have open.
+    """
+    try:
+        there = path.stat()
+    except OSError:
+        return "removed"
+    return None if os.path.samestat(there, ours) else "replaced"
 
 
 def make_folder(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,14 @@ ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if h
 """Ctrl-C, a service manager, a terminal that is closed."""
 
 Handler = Callable[[int, FrameType | None], None]
+
+
+def leave(_number: int, _frame: FrameType | None) -> None:
+    """Handler while a run starts: nothing is under way that could be finished, so it ends well, at once.
+
+    Nothing is raised: what is being imported might swallow it, or show it.
+    """
+    os._exit(0)
 
 
 def on_ending(handler: Handler) -> dict[int, object]:
@@ -24,10 +33,13 @@ def on_ending(handler: Handler) -> dict[int, object]:
 
 @contextmanager
 def ending_handled(handler: Handler) -> Iterator[None]:
-    """Have a handler called for each of them while a block lasts."""
+    """Have a handler called for each of them while a block lasts.
+
+    After a start that `leave` could have ended, the block was the run, whose end no signal changes any more.
+    """
     before = on_ending(handler)
     try:
         yield
     finally:
         for number, earlier in before.items():
-            signal.signal(number, earlier)  # type: ignore[arg-type]
+            signal.signal(number, signal.SIG_IGN if earlier is leave else earlier)  # type: ignore[arg-type]

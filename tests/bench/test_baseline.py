@@ -11,7 +11,6 @@ from tactflow.cli.bench import packaged_files
 BASELINE = Path(__file__).with_name("baseline_quick.json")
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_no_error_of_the_quick_bench_got_worse_than_the_stored_one() -> None:
     """After a change that is meant to move errors, store them anew: `bench --quick --write-baseline FILE`."""

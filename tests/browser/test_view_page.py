@@ -62,7 +62,7 @@ class Run:
         self.process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "tactflow", "run", pipeline, *shipped),
-                *("--set", f"sinks.view={{use: view, port: {port}}}", *options),
+                *("--set", f"sinks.view={{use: view, port: {port}, max_fps: 10}}", *options),
             ],
             cwd=cwd,
             stderr=subprocess.PIPE,

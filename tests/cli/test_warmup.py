@@ -32,7 +32,6 @@ def python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_run_after_it_compiles_nothing(tmp_path: Path) -> None:
     warm = python("-m", "tactflow", "warmup", cwd=tmp_path)
@@ -57,7 +56,7 @@ def test_one_ctrl_c_ends_compiling_and_the_processes_that_help(tmp_path: Path) -
             line = run.stderr.readline()
         run.send_signal(signal.SIGINT)
         begin = time.monotonic()
-        assert run.wait(timeout=30) == 130
+        assert run.wait(timeout=30) == 0
         # As long as it takes to compile the longest loop on a machine with other work.
         assert time.monotonic() - begin < 10
     assert not [path for path in Path("/proc").glob("[0-9]*") if mentions(path, tmp_path)]

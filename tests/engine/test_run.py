@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tactflow.engine import run
-from tactflow.engine.run import Runner, RunResult
+from tactflow.engine.run import MOST_STEPS, Runner, RunResult
 from tests.clock import PATIENCE, until
 
 MakeRunner = Callable[..., Runner]
@@ -593,6 +593,34 @@ def test_a_run_that_is_stopped_before_its_sinks_are_open_opens_none(toy_runner: 
     result = ran(runner)
     assert (result.stats["frames"], result.stats["end"]) == (0, "signal")
     assert not runner.nodes
+
+
+def test_a_slow_stage_may_finish_what_waits_after_a_stop(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 1.0)
+    queue = {"capacity": 8, "when_full": "block"}
+    runner = toy_runner({"join": {"seconds": 0.2, "segment": "slow", "queue": queue}})
+
+    def stop_when_full(_: object) -> None:
+        if any(link.stats().high_water == 8 for link in runner._links):
+            runner.stop()
+
+    result = runner.run(on_progress=stop_when_full)
+    assert (result.exit_code, result.stats["end"]) == (0, "signal")
+    assert [row[0] for row in rows(runner)] == list(range(result.stats["frames"]))
+
+
+def test_steps_wait_only_while_paused_and_not_without_bound(toy_runner: MakeRunner) -> None:
+    runner = toy_runner()
+    runner.step()
+    assert runner._steps == 0
+    runner.pause(True)
+    for _ in range(MOST_STEPS + 1):
+        runner.step()
+    assert runner._steps == MOST_STEPS
+    runner.pause(False)
+    assert runner._steps == 0
 
 
 @pytest.mark.parametrize("frames", [0, -1])

@@ -24,7 +24,7 @@ def run(toy_runner: MakeRunner, tmp_path: Path) -> tuple[Runner, list[Event]]:
     runner = toy_runner(SEGMENTS)
     runner.trace = Trace("tactflow toy")
     assert runner.run().exit_code == 0
-    runner.trace.write(tmp_path / "trace.json")
+    (tmp_path / "trace.json").write_text("\n".join(runner.trace.lines()))
     document = json.loads((tmp_path / "trace.json").read_text())
     assert document["displayTimeUnit"] in ("ms", "ns")
     return runner, document["traceEvents"]

@@ -145,6 +145,21 @@ def test_a_sensor_that_fails_is_started_again_and_the_others_are_not_disturbed(f
     assert done.stderr.count("right failed") == 0
 
 
+@pytest.mark.slow
+def test_a_sensor_that_hangs_is_killed_and_started_again(folder: Path) -> None:
+    hanging = FLAKY.replace('raise OSError("the cable is loose")', "os.kill(os.getpid(), signal.SIGSTOP)")
+    (folder / "flaky.py").write_text(f"import os\nimport signal\n{hanging}")
+    text = GRAPH.replace(
+        'capture: {source: "sim:press', "capture: {use: './flaky.py:Flaky', source: \"sim:press"
+    )
+    (folder / "pipeline.yaml").write_text(text)
+    done = run("--quiet", "--hang-after", "15", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "left has given no sign of life for 15 s; it is killed" in done.stderr
+    assert "left failed (exit code -9); starting again in 1 s" in done.stderr
+    assert [row["seq"] for row in rows(folder / "out-left.jsonl")][-40:] == list(range(40))
+
+
 LATE = """
 from pathlib import Path
 

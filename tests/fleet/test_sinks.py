@@ -28,13 +28,35 @@ def test_a_folder_with_pictures_is_refused_unless_they_may_be_replaced(
     tmp_path: Path, pictures: dict[str, Any]
 ) -> None:
     folder, use = pictures["folder"], pictures["use"]
-    watched = WatchedSink(sink(tmp_path, f"{{{use}, folder: {folder}}}"))
-    assert watched.refused is None
     folder.mkdir()
-    assert watched.refused is None
+    settings = f"{{{use}, folder: {folder}}}"
+    assert WatchedSink(sink(tmp_path, settings)).refused is None
     (folder / "frame-000000.png").touch()
-    assert watched.refused == folder
+    assert WatchedSink(sink(tmp_path, settings)).refused == folder
     assert WatchedSink(sink(tmp_path, f"{{{use}, folder: {folder}, overwrite: true}}")).refused is None
+
+
+@pytest.mark.parametrize(
+    ("use", "parameter", "begun", "next_one"),
+    [
+        ("use: images, in: {annotated: preprocess.image}", "folder", "shots/frame-000000.png", "shots-001"),
+        ("use: video, in: {annotated: preprocess.image}", "path", "film.avi", "film-001.avi"),
+        ("use: record", "path", "press.mcap", "press-001.mcap"),
+    ],
+)
+def test_what_cannot_be_continued_goes_on_beside_what_was_begun(
+    tmp_path: Path, use: str, parameter: str, begun: str, next_one: str
+) -> None:
+    output = tmp_path / Path(begun).parts[0]
+    watched = WatchedSink(sink(tmp_path, f"{{{use}, {parameter}: {output}, overwrite: true}}"))
+    assert watched.overrides == []
+    (tmp_path / begun).parent.mkdir(exist_ok=True)
+    (tmp_path / begun).write_text("begun")
+    for number in ("-001", "-002"):
+        expected = tmp_path / next_one.replace("-001", number)
+        assert watched.overrides == [f'sinks.out.{parameter}="{expected}"', "sinks.out.overwrite=false"]
+        assert watched.refused is None
+        expected.touch()
 
 
 def test_a_file_that_was_begun_is_continued_and_one_from_before_is_replaced(tmp_path: Path) -> None:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import io
+import math
+import os
 import signal
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tactflow.fleet.heartbeat import HANG_AFTER, LONGEST_LOOK, Headway, SignOfLife
 from tactflow.fleet.supervisor import FIRST_PAUSE, GIVE_UP_AFTER, GOOD_RUN, LONGEST_PAUSE, Member, Supervisor
+from tactflow.signals import ending_handled
 
 
 class Clock:
@@ -25,16 +30,26 @@ class Clock:
 
 
 class Process:
-    """Ends by itself after so many seconds with an exit code; a signal ends it at once, unless it hangs."""
+    """Ends by itself after so many seconds with an exit code; a signal ends it at once, unless it hangs.
+
+    Until `silent_after` seconds it touches a file.
+    """
 
     hangs = False
 
-    def __init__(self, clock: Clock, lasts: float, code: int) -> None:
+    def __init__(
+        self, clock: Clock, lasts: float, code: int, alive: Path, silent_after: float = math.inf
+    ) -> None:
+        alive.touch()
+        self._alive, self._silent_at = alive, clock.now + silent_after
         self.stdin, self.stdout, self.stderr = io.BytesIO(), io.BytesIO(), io.BytesIO()
         self._clock, self._ends, self._code = clock, clock.now + lasts, code
         self.signals: list[int] = []
 
     def poll(self) -> int | None:
+        if self._clock.now < self._silent_at:
+            now = round(self._clock.now * 1e9)
+            os.utime(self._alive, ns=(now, now))
         return self._code if self._clock.now >= self._ends else None
 
     def send_signal(self, number: int) -> None:
@@ -47,9 +62,15 @@ class Process:
 
 
 class Machine:
-    """Starts processes as planned: sensor -> how long each of its processes lasts, and its exit code."""
+    """Starts processes as planned: sensor -> how long each of its processes lasts, and its exit code.
 
-    def __init__(self, plans: dict[str, list[tuple[float, int]]]) -> None:
+    After that, a third number says when it falls silent.
+    """
+
+    def __init__(
+        self, folder: Path, plans: dict[str, list[tuple[float, int] | tuple[float, int, float]]]
+    ) -> None:
+        self.folder = folder
         self.clock = Clock()
         self._plans = plans
         self.starts: dict[str, list[float]] = {sensor: [] for sensor in plans}
@@ -58,19 +79,22 @@ class Machine:
         sensor = command[0]
         starts = self.starts[sensor]
         plan = self._plans[sensor]
-        lasts, code = plan[min(len(starts), len(plan) - 1)]
+        lasts, code, *silent_after = plan[min(len(starts), len(plan) - 1)]
         starts.append(self.clock.now)
-        return Process(self.clock, lasts, code)
+        return Process(self.clock, lasts, code, self.folder / sensor, *silent_after)
 
     def run(self) -> int:
-        members = [Member(sensor, [sensor]) for sensor in self._plans]
-        return Supervisor(members, self.start, self.clock, self.clock.pause).run()
+        members = [Member(sensor, [sensor], SignOfLife(self.folder / sensor)) for sensor in self._plans]
+        supervisor = Supervisor(HANG_AFTER, self.start, self.clock, self.clock.pause)
+        with ending_handled(supervisor.count_signal):
+            return supervisor.run(members)
 
 
 def test_the_pause_before_a_new_start_doubles_until_the_sensor_is_given_up(
+    tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    machine = Machine({"left": [(0.0, 4)], "right": [(100.0, 0)]})
+    machine = Machine(tmp_path, {"left": [(0.0, 4)], "right": [(100.0, 0)]})
     assert machine.run() == 4
     starts = machine.starts["left"]
     gaps = [later - earlier for earlier, later in pairwise(starts)]
@@ -80,23 +104,25 @@ def test_the_pause_before_a_new_start_doubles_until_the_sensor_is_given_up(
     assert len(machine.starts["right"]) == 1
 
 
-def test_after_a_good_run_the_first_pause_comes_again() -> None:
-    machine = Machine({"left": [(0.0, 3), (0.0, 3), (GOOD_RUN + 1, 3), (1.0, 0)]})
+def test_after_a_good_run_the_first_pause_comes_again(tmp_path: Path) -> None:
+    machine = Machine(tmp_path, {"left": [(0.0, 3), (0.0, 3), (GOOD_RUN + 1, 3), (1.0, 0)]})
     assert machine.run() == 0
     starts = machine.starts["left"]
     assert starts[3] - starts[2] == pytest.approx(GOOD_RUN + 1 + FIRST_PAUSE, abs=0.2)
 
 
-def test_a_mistake_in_the_command_line_ends_the_other_sensors() -> None:
-    machine = Machine({"left": [(1.0, 2)], "right": [(1000.0, 0)]})
+def test_a_mistake_in_the_command_line_ends_the_other_sensors(tmp_path: Path) -> None:
+    machine = Machine(tmp_path, {"left": [(1.0, 2)], "right": [(1000.0, 0)]})
     assert machine.run() == 2
     assert machine.clock.now < 10
     assert machine.starts == {"left": [0.0], "right": [0.0]}
 
 
-def test_a_process_that_does_not_end_is_killed_at_the_third_signal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_does_not_end_is_killed_at_the_third_signal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Process, "hangs", True)
-    machine = Machine({"left": [(1e9, 0)]})
+    machine = Machine(tmp_path, {"left": [(1e9, 0)]})
     before = machine.clock.pause
 
     def pause(seconds: float) -> None:
@@ -106,3 +132,35 @@ def test_a_process_that_does_not_end_is_killed_at_the_third_signal(monkeypatch: 
 
     monkeypatch.setattr(machine.clock, "pause", pause)
     assert machine.run() == 130
+
+
+def test_a_process_that_gives_no_sign_of_life_is_killed_and_started_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    machine = Machine(tmp_path, {"left": [(1e9, 0, 10.0), (1e9, 0, 10.0), (1.0, 0)], "right": [(1000.0, 0)]})
+    assert machine.run() == 0
+    starts = machine.starts["left"]
+    gaps = [later - earlier for earlier, later in pairwise(starts)]
+    # It lived for ten seconds only, so the pause doubles.
+    assert gaps == pytest.approx([10 + HANG_AFTER + FIRST_PAUSE, 10 + HANG_AFTER + 2 * FIRST_PAUSE], abs=0.5)
+    assert capsys.readouterr().err.count("left has given no sign of life for 60 s; it is killed\n") == 2
+    assert machine.starts["right"] == [0.0]
+
+
+def test_what_the_supervisor_has_slept_through_is_no_silence(tmp_path: Path) -> None:
+    sign = SignOfLife(tmp_path / "alive")
+    sign.start(0.0)
+    assert sign.look(1000.0) == LONGEST_LOOK
+
+
+def test_there_is_headway_when_every_thread_is_in_another_call_or_waits() -> None:
+    calls = {"compute": 1, "heavy": 1}
+    headway = Headway(lambda: dict(calls))
+    assert headway()
+    calls["compute"] += 1
+    assert not headway(), "the other one is in the same call"
+    calls["heavy"] += 1
+    assert headway()
+    assert not headway()
+    calls.clear()
+    assert headway()

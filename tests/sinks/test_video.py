@@ -128,15 +128,26 @@ def test_a_folder_that_cannot_be_written_is_an_error() -> None:
         film(Path("/proc/nowhere/film.avi"), pictures(1))
 
 
-def test_a_film_that_did_not_fit_on_the_disk_is_an_error(tmp_path: Path) -> None:
-    sink = Video(Video.Params(path=str(tmp_path / "film.avi"), lossless=True))
+@pytest.mark.parametrize(
+    ("name", "lossless", "limit", "words"),
+    [
+        ("film.avi", True, 100_000, "it ends before its 60 frames"),
+        # What is written last, the header, still says 60.
+        ("film.mkv", False, 50_000, "it ends before its 60 frames"),
+        ("film.mp4", False, 50_000, "it cannot be played"),
+    ],
+)
+def test_a_film_that_did_not_fit_on_the_disk_is_an_error(
+    name: str, lossless: bool, limit: int, words: str, tmp_path: Path
+) -> None:
+    sink = Video(Video.Params(path=str(tmp_path / name), lossless=lossless))
     sink.open()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
     try:
         for index, picture in enumerate(pictures(60)):
             sink.write(Tick(Frame("main", index, index * 0.1, picture)), picture)
-        with pytest.raises(StageError, match="of 60 frames could be written; is the disk full"):
+        with pytest.raises(StageError, match=f"{words}: its end could not be written; is the disk full"):
             sink.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import struct
 import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources import FrameReader, open_source
+from tactflow.sources import FrameReader, base, open_source
 
 Pixels = NDArray[np.uint8]
 
@@ -158,15 +160,16 @@ def test_numbers_in_names_are_sorted_by_value_and_hidden_files_are_left_out(tmp_
     assert [int(image[0, 0, 0]) for image, _ in frames] == [10, 20, 30, 40]
 
 
-def test_frames_of_an_array_are_views_of_the_mapped_file(tmp_path: Path) -> None:
-    source = open_source(make_bgr_array(tmp_path / "recording"))
-    item = source.read()
-    assert item is not None
-    image, _ = item
-    assert not image.flags.owndata
-    assert not image.flags.writeable
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_an_array_that_is_cut_during_the_run_is_an_error(order: Literal["C", "F"], tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.asarray(np.stack([numbered(index) for index in range(5)]), order=order))
+    source = open_source(str(path))
+    assert source.read() is not None
+    os.truncate(path, 4000)
+    with pytest.raises(SourceError, match="was cut off during the run, within frame 1"):
+        source.read()
     source.close()
-    np.testing.assert_array_equal(image, numbered(0))
 
 
 def test_an_array_larger_than_memory_opens_at_once(tmp_path: Path) -> None:
@@ -252,6 +255,18 @@ def test_a_video_that_was_cut_off_gives_what_it_has_and_a_warning(
         frames = read_all(open_source(str(path)))
     assert 5 < len(frames) < 25
     assert f"ended after {len(frames)} of 30 frames" in caplog.text
+
+
+def test_a_video_with_larger_pictures_than_a_camera_has_is_refused_before_they_are_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    monkeypatch.setattr(base, "MOST_PIXELS", 3000)
+    with pytest.raises(SourceError, match=r"64 x 48, more than 3000 pixels"):
+        open_source(str(path))
 
 
 # -- what cannot be opened ---------------------------------------------------------------------------------
@@ -340,8 +355,16 @@ BAD = {
         _bytes("a.npy", b"\x93NUMPY\x01\x00" + bytes(200)),
         ["not a .npy", "or a damaged one"],
     ),
+    "header that is not Python": (
+        _bytes("a.npy", b"\x93NUMPY\x01\x00\x76\x00" + b"{'shape': (1, \n".ljust(118)),
+        ["not a .npy", "or a damaged one"],
+    ),
     "archive of arrays": (_archive, [".npz", "np.save"]),
     "text as image": (_bytes("a.png", b"hello"), ["not an image"]),
+    "PNG with a piece of 2 GB": (
+        _bytes("a.png", b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + bytes(17) + b"\x7f\xff\xff\xffIDATIEND"),
+        ["cut off"],
+    ),
     "empty image": (_bytes("a.png", b""), ["empty"]),
     "text as video": (_bytes("a.avi", b"hello"), ["neither a video"]),
     "empty video": (_bytes("a.mp4", b""), ["empty"]),

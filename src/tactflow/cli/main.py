@@ -13,9 +13,10 @@ from collections.abc import Collection, Sequence
 from typing import NoReturn
 
 from tactflow import __version__
+from tactflow.__main__ import wanted
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.files import Unheard, lead_nowhere
-from tactflow.signals import ENDING, on_ending
+from tactflow.signals import ENDING
 
 COMMANDS = {
     "run": "run a pipeline",
@@ -43,14 +44,12 @@ only when the command is used.
 
 
 def entry() -> None:
-    """Entry point of the console script."""
+    """Run the program with the arguments of this process, and end the process with its exit code."""
     # A service may be started without them.
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
     sys.stderr = Unheard(sys.stderr)
-    # To be ended by a service, by a terminal that is closed or by Ctrl-C is the same.
-    on_ending(signal.default_int_handler)
     try:
         code = main(sys.argv[1:])
         sys.stdout.flush()
@@ -106,12 +105,12 @@ def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    wanted = next((word for word in argv if not word.startswith("-")), None)
-    parser = make_parser([wanted] if wanted in COMMANDS else [])
-    if wanted is not None and wanted not in COMMANDS:
-        guess = difflib.get_close_matches(wanted, COMMANDS, n=1)
+    command = wanted(argv)
+    parser = make_parser([command] if command in COMMANDS else [])
+    if command is not None and command not in COMMANDS:
+        guess = difflib.get_close_matches(command, COMMANDS, n=1)
         hint = f"did you mean {guess[0]}?" if guess else f"there are {', '.join(COMMANDS)}"
-        parser.error(f"there is no command {wanted}; {hint}")
+        parser.error(f"there is no command {command}; {hint}")
     args, unknown = parser.parse_known_args(argv)
     if unknown:
         _refuse(args.parser, unknown)
@@ -125,7 +124,3 @@ def _refuse(command: argparse.ArgumentParser, unknown: Sequence[str]) -> NoRetur
     guess = difflib.get_close_matches(option, options, n=1) if option else []
     hint = f"; did you mean {guess[0]}?" if guess else ""
     command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
-
-
-if __name__ == "__main__":
-    entry()

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -24,11 +24,12 @@ from tactflow.cli.options import add_pipeline
 from tactflow.cli.progress import progress_display, summary, with_statistics
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import find_pipeline
-from tactflow.engine.errors import ConfigError
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.run import Runner
+from tactflow.engine.run import INTERRUPTED, Runner, RunResult
 from tactflow.engine.trace import TRACE_BEGINS, Trace
 from tactflow.files import is_device
+from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 from tactflow.signals import ending_handled
@@ -76,6 +77,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="end well when standard input ends: when the program that started this one is gone",
     )
+    parser.add_argument(
+        "--sign-of-life",
+        type=Path,
+        metavar="FILE",
+        help="touch this file every second while the run is alive and no stage hangs in a frame",
+    )
+    parser.add_argument(
+        "--hang-after",
+        type=_seconds,
+        default=HANG_AFTER,
+        metavar="SECONDS",
+        help="of several sensors, kill and start again one that has given no sign of life for so long "
+        "(%(default)g); more than the slowest stage may take for a frame",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
     parser.add_argument(
         "--check", action="store_true", help="check every array against its port type (slower)"
@@ -111,6 +126,7 @@ def _run_all(
         args.overrides,
         added={option for added in sinks.values() for option in added},
         files={option: path for option, path in _statistics_files(args).items() if path is not None},
+        hang_after=args.hang_after,
         options=_options(args),
     )
     return run_fleet(request, {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors})
@@ -168,11 +184,13 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     trace = None if args.trace is None else Trace(f"tactflow {pipeline.sensor}")
     runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
-    _refuse_unwritable("--stats", args.stats, begins=STATISTICS_BEGIN)
-    _refuse_unwritable("--trace", args.trace, begins=TRACE_BEGINS)
     if args.end_with_stdin:
         threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
-    with _logging_to(console), _signals(runner):
+    if args.sign_of_life is not None:
+        start_beating(args.sign_of_life, Headway(runner.calls))
+    with _logging_to(console), _signals(runner) as caught:
+        _refuse_unwritable("--stats", args.stats, begins=STATISTICS_BEGIN)
+        _refuse_unwritable("--trace", args.trace, begins=TRACE_BEGINS)
         logger = logging.getLogger("tactflow")
         for warning in runner.pipeline.warnings:
             logger.warning("%s", warning)
@@ -180,15 +198,36 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
             logger.info("not run, as no sink needs it: %s", ", ".join(n.id for n in runner.plan.pruned))
         with progress_display(console, runner, shown=not args.quiet) as on_progress:
             result = runner.run(with_statistics(on_progress, runner, args.stats_every, console))
-    if trace is not None:
-        trace.write(Path(args.trace))
-    if args.stats:
-        Path(args.stats).write_text(json.dumps(result.stats, indent=1) + "\n", encoding="utf-8")
+        code = 0 if result.exit_code == INTERRUPTED and len(caught) == 1 else result.exit_code
+        written = _report(args, result, trace)
+        if not args.quiet:
+            console.print(summary(result, runner), markup=False)
+        return code or (0 if written else StageError.exit_code)
+
+
+def _report(args: argparse.Namespace, result: RunResult, trace: Trace | None) -> bool:
+    """Say why a run failed, and write what was asked for about it; whether that could be written."""
     if result.error is not None:
         print(f"tactflow: {result.error}", file=sys.stderr)
-    if not args.quiet:
-        console.print(summary(result, runner), markup=False)
-    return result.exit_code
+    written = [
+        trace is None or _write_report("--trace", args.trace, trace.lines()),
+        args.stats is None or _write_report("--stats", args.stats, [json.dumps(result.stats, indent=1)]),
+    ]
+    return all(written)
+
+
+def _write_report(option: str, path: str, lines: Iterable[str]) -> bool:
+    """Write a file of statistics or events; whether that went well. Half of one is none: it is emptied."""
+    try:
+        with open(path, "w", encoding="utf-8") as file:
+            file.writelines(f"{line}\n" for line in lines)
+    except OSError as error:
+        print(f"tactflow: {option} {path}: cannot be written: {error.strerror or error}", file=sys.stderr)
+        if not is_device(path):
+            with suppress(OSError):
+                os.truncate(path, 0)
+        return False
+    return True
 
 
 def _stop_at_end_of_input(runner: Runner) -> None:
@@ -255,21 +294,20 @@ def _logging_to(console: Console) -> Iterator[None]:
 
 
 @contextmanager
-def _signals(runner: Runner) -> Iterator[None]:
+def _signals(runner: Runner) -> Iterator[Sequence[int]]:
     """One Ctrl-C, SIGTERM or SIGHUP drains the pipeline; a second one ends it at once; a third is not caught.
 
-    While kernels are compiled there is nothing to drain, and the first one ends it.
+    While kernels are compiled there is nothing to drain, and the first one ends it. Gives those that came.
     """
-    caught = 0
+    caught: list[int] = []
 
     def handle(number: int, _: FrameType | None) -> None:
-        nonlocal caught
-        caught += 1
-        if caught == 1 and not compiled.is_loading():
+        caught.append(number)
+        if len(caught) == 1 and not compiled.is_loading():
             runner.stop("signal")
             return
         signal.signal(number, signal.SIG_DFL)
         raise KeyboardInterrupt
 
     with ending_handled(handle):
-        yield
+        yield caught

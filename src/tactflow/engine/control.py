@@ -25,6 +25,10 @@ class Control(Protocol):
     def paused(self) -> bool:
         """Whether capturing is held."""
 
+    @property
+    def hurried(self) -> bool:
+        """Whether the run was told to end before its source did: nobody waits for a slow reader any more."""
+
     def step(self) -> None:
         """While paused, let one frame through."""
 

@@ -30,8 +30,10 @@ INTERRUPTED = 130
 """Exit code of a run that was not allowed to finish the frames under way."""
 
 CLOSE_SECONDS = 10.0
-"""How long, s, the threads may take to end after the run was stopped or has failed, before the one that hangs
-is named. Chosen by hand: the slowest stage takes a second."""
+"""How long, s, no stage and no link may get on after the run was stopped or has failed, before the one that
+hangs is named. Chosen by hand: the slowest stage takes a second."""
+MOST_STEPS = 1000
+"""Steps that may wait while a run is paused. Chosen by hand: more than anybody presses a key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +173,7 @@ class Runner:
         """Hold capturing, or go on. A recording waits; a live source's frames are let go. From any thread."""
         with self._turn:
             self._paused = paused
+            self._steps = 0
             self._turn.notify_all()
 
     @property
@@ -178,10 +181,15 @@ class Runner:
         """Whether capturing is held."""
         return self._paused
 
+    @property
+    def hurried(self) -> bool:
+        """Whether the run was told to end before its source did, or has failed."""
+        return self._hurried
+
     def step(self) -> None:
-        """While paused, let one frame through. From any thread."""
+        """While paused, let one frame through; steps that wait are forgotten at the end. From any thread."""
         with self._turn:
-            self._steps += 1
+            self._steps = min(self._steps + self._paused, MOST_STEPS)
             self._turn.notify_all()
 
     def snapshot(self) -> dict[str, Any]:
@@ -192,6 +200,10 @@ class Runner:
     def source(self) -> Source | None:
         """The instance of the source stage, once it is built."""
         return self._source
+
+    def calls(self) -> dict[str, int]:
+        """The number of the call of a stage that each segment is in; without those that wait."""
+        return {name: segment.calls for name, segment in list(self._segments.items()) if segment.at_work}
 
     def recorder(self) -> Recorder | None:
         """The first sink that can be told to record, or None."""
@@ -291,21 +303,22 @@ class Runner:
 
     def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
         """Wait for the threads: as long as it takes until the source has ended, not for ever after a stop."""
-        deadline: float | None = None
+        headway, since = self._headway(), 0.0
         while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
             self._threads[alive[0]].join(interval_s)
             if on_progress is not None:
                 on_progress(self.progress())
-            if self._hurried and deadline is None:
-                deadline = time.perf_counter() + CLOSE_SECONDS
-            if deadline is not None and time.perf_counter() > deadline and self._no_headway():
+            now, before, headway = time.perf_counter(), headway, self._headway()
+            if not self._hurried or headway != before:
+                since = now
+            if now - since > CLOSE_SECONDS:
                 hanging = ", ".join(
                     f"{name} (in {self._segments[name].current or 'its source'})" for name in alive
                 )
                 for link in self._links:
                     link.abort()
                 raise StageError(
-                    f"the run was stopped, but did not end in {CLOSE_SECONDS:g} s: {hanging} hangs"
+                    f"the run was stopped, but nothing has got on for {CLOSE_SECONDS:g} s: {hanging} hangs"
                 )
 
     @property
@@ -324,11 +337,10 @@ class Runner:
         else:
             logger.warning("realtime_priority: not granted: %s", refused)
 
-    def _no_headway(self) -> bool:
-        """Whether no link has delivered anything for a moment: draining a long queue is not hanging."""
-        before = [link.stats().delivered for link in self._links]
-        time.sleep(0.5)
-        return before == [link.stats().delivered for link in self._links]
+    def _headway(self) -> list[int]:
+        """Changes when a link delivers or a stage or sink has run: draining a long queue is not hanging."""
+        delivered = [link.stats().delivered for link in self._links]
+        return delivered + [node.stats.runs for node in self.nodes.values()]
 
     def _close(self) -> None:
         """Close whatever was opened, last opened first; every one gets its turn."""

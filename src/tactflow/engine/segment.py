@@ -103,9 +103,10 @@ class Segment:
     ----------
     inputs, outputs : links; an output with the ids of the sinks that it leads to, or None where it leads to
     stages too. nodes : in the order of the steps. data_sinks : those that do not only look on. current : id
-    of the node that runs just now. urgent : whether somebody waits for what it does, rather than only looking
-    on or reading it later. epoch : of the last tick; a new one makes all nodes forget. references : makes
-    frames references that its stages ask for; None where other stages may have seen those frames already.
+    of the node that runs just now. calls : how many calls of nodes were begun. urgent : whether somebody
+    waits for what it does, rather than only looking on or reading it later. epoch : of the last tick; a new
+    one makes all nodes forget. references : makes frames references that its stages ask for; None where other
+    stages may have seen those frames already.
     """
 
     def __init__(
@@ -123,6 +124,13 @@ class Segment:
         self.epoch = 0
         self.references: NewReferences | None = None
         self.current: str | None = None
+        self.calls = 0
+
+    @property
+    def at_work(self) -> bool:
+        """Whether a stage runs just now. A sink may wait for those who take its results."""
+        current = self.current
+        return current in self.run.nodes and self.run.nodes[current].sink is None
 
     def handle(self, tick: TickState) -> None:
         """Compute this segment's part of a tick and hand the tick on."""
@@ -178,6 +186,7 @@ class Segment:
 
     def _run(self, node: RunningNode, tick: TickState, inputs: Sequence[Any]) -> None:
         self.current = node.id
+        self.calls += 1
         began = perf_counter()
         try:
             outputs = node(inputs, tick)

@@ -10,7 +10,6 @@ import json
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 KEPT = 300_000
@@ -65,13 +64,12 @@ class Trace:
         self.tracks.append(Track(name))
         return self.tracks[-1]
 
-    def write(self, path: Path) -> None:
-        """Write the events as JSON. Call it when the run has ended."""
-        with path.open("w", encoding="utf-8") as file:
-            file.write(f"{TRACE_BEGINS} [\n")
-            for index, event in enumerate(self.events()):
-                file.write((",\n" if index else "") + json.dumps(event))
-            file.write("\n]}\n")
+    def lines(self) -> Iterator[str]:
+        """The events as JSON, line by line. Call it when the run has ended."""
+        yield f"{TRACE_BEGINS} ["
+        for number, event in enumerate(self.events()):
+            yield ("," if number else "") + json.dumps(event)
+        yield "]}"
 
     def events(self) -> Iterator[dict[str, Any]]:
         """Chrome trace events, in order of time on each track.

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
+from tactflow.fleet.heartbeat import SignOfLife
 from tactflow.fleet.names import with_name
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import (
@@ -23,6 +24,7 @@ from tactflow.fleet.sinks import (
     sink_class,
 )
 from tactflow.fleet.supervisor import Member, Supervisor
+from tactflow.signals import ending_handled
 
 LONGEST_ADDRESS = 107
 """Bytes that the path of a local socket may have (Linux; elsewhere four less)."""
@@ -34,13 +36,15 @@ class Request:
 
     file : the pipeline file. overrides : for `--set`. added : options of the command line that added sinks,
     as in the marks of these. files : option -> the file it names, of which each sensor writes its own.
-    options : all other words of the command line.
+    hang_after : time without a sign of life, s, after which its process is killed. options : all other words
+    of the command line.
     """
 
     file: Path
     overrides: Sequence[str]
     added: Collection[str]
     files: Mapping[str, str]
+    hang_after: float
     options: Sequence[str]
 
 
@@ -62,20 +66,19 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
     if problems:
         raise ConfigError("\n".join(problems))
     shared = shared_addresses(pipelines)
-    with ExitStack() as stack:
+    supervisor = Supervisor(request.hang_after)
+    with ending_handled(supervisor.count_signal), ExitStack() as stack:
         scratch = Path(stack.enter_context(_scratch_folder(pipelines)))
         for one in shared:
             upstream = [_private(scratch, sensor, node) for sensor, node in one.sinks]
             stack.enter_context(relay(one.address, upstream, one.backlog))
-        members = [
-            Member(
-                sensor,
-                _command(request, sensor, pipeline, _side_by_side(sensor, pipeline, shared, scratch)),
-                [WatchedSink(node) for node in pipeline.sinks],
-            )
-            for sensor, pipeline in pipelines.items()
-        ]
-        return Supervisor(members).run()
+        members = []
+        for sensor, pipeline in pipelines.items():
+            sign = SignOfLife(scratch / f"{sensor}.alive")
+            command = _command(request, sensor, pipeline, _side_by_side(sensor, pipeline, shared, scratch))
+            command += ["--sign-of-life", str(sign.path)]
+            members.append(Member(sensor, command, sign, [WatchedSink(node) for node in pipeline.sinks]))
+        return supervisor.run(members)
 
 
 def _scratch_folder(pipelines: Mapping[str, Pipeline]) -> tempfile.TemporaryDirectory[str]:

@@ -15,8 +15,8 @@ from typing import IO, TextIO
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.run import INTERRUPTED
 from tactflow.files import lead_nowhere
+from tactflow.fleet.heartbeat import HANG_AFTER, SignOfLife
 from tactflow.fleet.sinks import WatchedSink
-from tactflow.signals import ending_handled
 
 FIRST_PAUSE = 1.0
 """Time before the first new start after a failure, s; it doubles with each further one. Chosen by hand."""
@@ -51,14 +51,16 @@ def start_process(command: Sequence[str]) -> Process:
 class Member:
     """One sensor's process and its history.
 
-    command : runs the sensor. sinks : what it has written decides how it is started again.
+    command : runs the sensor. sign : whether its process is alive. sinks : what it has written decides how it
+    is started again.
     process : the present one; None between two. started, start_at : when it was started, and when it may be
-    started next, s. told : signals passed on to the process. failures : in a row. code : how the sensor ended
-    for good. readers : threads that pass its output on.
+    started next, s. told : signals passed on to the process; KILL_AT if it was killed. failures : in a row.
+    code : how the sensor ended for good. readers : threads that pass its output on.
     """
 
     sensor: str
     command: Sequence[str]
+    sign: SignOfLife
     sinks: Sequence[WatchedSink] = ()
     process: Process | None = None
     started: float = 0.0
@@ -80,43 +82,44 @@ class Member:
 class Supervisor:
     """Keeps the processes of several sensors running until each has ended for good.
 
-    start : starts a command. clock : seconds. pause : waits so many seconds.
+    hang_after : time without a sign of life, s, after which a process is killed and started again. start :
+    starts a command. clock : seconds. pause : waits so many seconds.
     """
 
     def __init__(
         self,
-        members: Sequence[Member],
+        hang_after: float = HANG_AFTER,
         start: Callable[[Sequence[str]], Process] = start_process,
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._members = members
+        self._hang_after = hang_after
         self._start_process = start
         self._clock = clock
         self._pause = pause
         self._signals = 0
         self._refused = False
         self._unwritten = False
-        self._output = threading.Lock()
+        # Who does not read results shall not keep messages back.
+        self._results, self._messages = threading.Lock(), threading.Lock()
 
-    def run(self) -> int:
+    def run(self, members: Sequence[Member]) -> int:
         """Until every process has ended for good; the exit code.
 
         Returns
         -------
         0 if all ended well, 130 after a second signal, else the exit code of the first sensor that failed.
         """
-        with ending_handled(self._count_signal):
-            while any(member.code is None for member in self._members):
-                for member in self._members:
-                    self._attend(member)
-                self._pause(LOOK_EVERY)
-        for member in self._members:
+        while any(member.code is None for member in members):
+            for member in members:
+                self._attend(member)
+            self._pause(LOOK_EVERY)
+        for member in members:
             for reader in member.readers:
                 reader.join(5)
         if self._signals > 1:
             return INTERRUPTED
-        return next((m.code for m in self._members if m.code), StageError.exit_code if self._unwritten else 0)
+        return next((m.code for m in members if m.code), StageError.exit_code if self._unwritten else 0)
 
     @property
     def _ends(self) -> int:
@@ -142,6 +145,7 @@ class Supervisor:
                 # time: two at once may arrive as one.
                 member.process.send_signal(signal.SIGTERM)
                 member.told += 1
+            self._look_for_life(member, member.process)
             return
         if member.process.stdin is not None:
             member.process.stdin.close()
@@ -152,6 +156,18 @@ class Supervisor:
             self._refused |= code == ConfigError.exit_code
         else:
             self._start_again(member, code)
+
+    def _look_for_life(self, member: Member, process: Process) -> None:
+        """Kill a process that hangs."""
+        if member.told >= KILL_AT:
+            return
+        if self._results.locked() or self._messages.locked():
+            # It may wait for us, who wait for somebody that reads what we write.
+            member.sign.excuse(self._clock())
+        elif member.sign.look(self._clock()) > self._hang_after:
+            self._say(member, f"has given no sign of life for {self._hang_after:g} s; it is killed")
+            member.told = KILL_AT
+            process.kill()
 
     def _last_code(self, member: Member, code: int) -> int:
         """What counts as the exit code of a sensor that is not started again."""
@@ -170,7 +186,7 @@ class Supervisor:
             self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
             member.code = code
             return
-        lasted = self._clock() - member.started
+        lasted = self._clock() - member.started - member.sign.silent
         member.failures = 1 if lasted > GOOD_RUN else member.failures + 1
         if member.failures > GIVE_UP_AFTER:
             self._say(member, f"failed {member.failures} times in a row (exit code {code}); given up")
@@ -182,7 +198,8 @@ class Supervisor:
 
     def _start(self, member: Member) -> None:
         member.process = self._start_process(member.next_command())
-        member.started = self._clock()
+        member.started, member.told = self._clock(), 0
+        member.sign.start(member.started)
         assert member.process.stdout is not None
         assert member.process.stderr is not None
         for stream, target, prefix in (
@@ -204,7 +221,7 @@ class Supervisor:
 
     def _write(self, target: TextIO, line: bytes) -> None:
         """Write at once. When the reader has gone away, fall silent; when the disk is full, end the run."""
-        with self._output:
+        with self._results if target is sys.stdout else self._messages:
             try:
                 target.flush()
                 target.buffer.write(line)
@@ -215,6 +232,7 @@ class Supervisor:
                     self._unwritten = True
                     sys.stderr.write(f"tactflow: standard output: {error.strerror}; the run ends\n")
 
-    def _count_signal(self, _number: int, _frame: FrameType | None) -> None:
+    def count_signal(self, _number: int, _frame: FrameType | None) -> None:
+        """Handler of the signals that ask to end."""
         # Nothing else: this may be in the middle of starting a process, which would not be told.
         self._signals += 1

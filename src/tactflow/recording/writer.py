@@ -13,7 +13,7 @@ from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
-from tactflow.files import claim, make_folder
+from tactflow.files import claim, make_folder, taken_away
 from tactflow.message import message_schema
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
 from tactflow.recording.schemas import PICTURE_DESCRIPTOR, PICTURE_TYPE, RESULT_TYPE, plain_schema
@@ -157,6 +157,10 @@ class RecordingWriter:
         self._file.keep()
         self.frames += 1
 
+    def interference(self) -> str | None:
+        """What another program has done to the file: "removed", "replaced", "cut", or None, nothing."""
+        return self._file.interference(self.path)
+
     def finish(self) -> None:
         """Add the index and close the file. Raises OSError as `write` does."""
         try:
@@ -204,6 +208,10 @@ class _WholeRecords(io.BufferedIOBase):
 
     def tell(self) -> int:
         return self._at
+
+    def interference(self, path: Path) -> str | None:
+        ours = os.fstat(self._file.fileno())
+        return taken_away(path, ours) or ("cut" if ours.st_size < self._at else None)
 
     def keep(self) -> None:
         """Everything so far is whole."""

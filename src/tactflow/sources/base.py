@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
+from tactflow.engine.frame import MOST_PIXELS
 from tactflow.files import expanded
 
 log = logging.getLogger("tactflow")
@@ -87,6 +88,31 @@ class StampedReader(Protocol):
     def read_stamped(self) -> tuple[BgrImage, float, Stamp] | None:
         """Like `FrameReader.read`, with the frame's stamp."""
         ...
+
+
+def refuse_too_large(name: str, width: int, height: int) -> None:
+    """Refuse pictures of more pixels than a camera has, before memory is taken for them.
+
+    name : the file or address. width, height : as it states them, px.
+
+    Raises
+    ------
+    SourceError
+        If they have more than `MOST_PIXELS`.
+    """
+    if width * height > MOST_PIXELS:
+        raise SourceError(
+            f"{name}: its pictures are {width} x {height}, more than {MOST_PIXELS} pixels; if that is right, "
+            "set the environment variable OPENCV_IO_MAX_IMAGE_PIXELS"
+        )
+
+
+def frame_size(capture: cv2.VideoCapture, name: str) -> tuple[int, int]:
+    """(width, height) that a video or stream states, px; raises as `refuse_too_large`."""
+    width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+    height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    refuse_too_large(name, width, height)
+    return width, height
 
 
 class Normaliser:

@@ -13,7 +13,7 @@ import cv2
 
 from tactflow.clock import SYSTEM, Clock
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import BgrImage, Normaliser, log, quiet_opencv
+from tactflow.sources.base import BgrImage, Normaliser, frame_size, log, quiet_opencv
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,10 +201,7 @@ class Stream:
         self._normalise = Normaliser(self._name)
         self._clock = clock or ArrivalClock()
         self._count = 0
-        self.size: tuple[int, int] | None = (
-            int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-            int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-        )
+        self.size: tuple[int, int] | None = frame_size(self._capture, self._name)
         self.description = f"{self._name}, {self.size[0]} x {self.size[1]}"
 
     def read(self) -> tuple[BgrImage, float] | None:

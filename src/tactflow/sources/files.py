@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
 from tactflow.files import expanded
-from tactflow.sources.base import BgrImage, Normaliser, find_path, log, quiet_opencv
+from tactflow.sources.base import (
+    BgrImage,
+    Normaliser,
+    find_path,
+    frame_size,
+    log,
+    quiet_opencv,
+    refuse_too_large,
+)
 
 IMAGE_SUFFIXES = frozenset(
     [".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"]
@@ -25,6 +33,14 @@ DEFAULT_FPS = 30.0
 """Rate of images, arrays and videos that do not know their own, frames per second. Chosen by hand."""
 LARGEST_FPS = 1e4
 """A video file that claims a higher rate, frames per second, does not know its own. Chosen by hand."""
+
+ARCHIVE = r"got b'PK\x03\x04"
+"""What numpy says about a .npz file, which begins as every ZIP file does."""
+
+PNG = b"\x89PNG\r\n\x1a\n"
+"""How a PNG file begins."""
+CHUNK_FRAME = 12
+"""Bytes of a PNG chunk around its data: the length, the kind, the checksum."""
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -90,8 +106,17 @@ def _cut_off(data: bytes) -> bool:
         # Behind the last start-of-scan marker there must be an end-of-image marker. Neither can occur
         # inside compressed data, and an embedded thumbnail brings both.
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return b"IEND" not in data
+    return data.startswith(PNG) and not _has_whole_chunks(data)
+
+
+def _has_whole_chunks(png: bytes) -> bool:
+    """Whether all chunks of a PNG are as long as they say: OpenCV takes the memory before it reads them."""
+    at = len(PNG)
+    while at + CHUNK_FRAME <= len(png):
+        at += CHUNK_FRAME + int.from_bytes(png[at : at + 4], "big")
+        # The last one is empty: its kind stands eight bytes before its end.
+        if at <= len(png) and png[at - 8 : at - 4] == b"IEND":
+            return True
     return False
 
 
@@ -193,9 +218,10 @@ def _matching(pattern: Path) -> list[Path]:
 
 
 class ArrayFile:
-    """A .npy file: uint8, N x H x W x 3 BGR or N x H x W gray; memory-mapped, never loaded whole.
+    """A .npy file: uint8, N x H x W x 3 BGR or N x H x W gray; read frame by frame, never loaded whole.
 
-    Frames of a BGR array are views of the file, not copies.
+    Frames are not mapped into memory: where another program cuts the file during the run, that would end the
+    process at the next look at one. To read one costs one copy of it and half of another.
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
@@ -221,13 +247,10 @@ class ArrayFile:
         self._rate = fps or DEFAULT_FPS
         self._index = 0
         count, height, width = frames.shape[:3]
-        if height * width > MOST_PIXELS:
-            raise SourceError(
-                f"{path}: its frames are {width} x {height}, more than {MOST_PIXELS} pixels; if that is "
-                "right, set the environment variable OPENCV_IO_MAX_IMAGE_PIXELS"
-            )
-        as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,) and frames.flags.c_contiguous
-        self._frames: Iterator[BgrImage] = iter(frames) if as_wanted else map(Normaliser(str(path)), frames)
+        refuse_too_large(str(path), width, height)
+        found = (_read_frames if frames.flags.c_contiguous else _gathered_frames)(path, frames)
+        as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,)
+        self._frames: Iterator[BgrImage] = found if as_wanted else map(Normaliser(str(path)), found)
         self.total: int | None = count
         self.size: tuple[int, int] | None = (width, height)
         self.description = f"{path}, {count} frames"
@@ -242,26 +265,56 @@ class ArrayFile:
         return image, index / self._rate
 
     def close(self) -> None:
-        """Read no more; the file stays mapped for as long as a frame of it is in use."""
+        """Read no more."""
         self._frames = iter(())
 
 
-def _map_array(path: Path) -> NDArray[Any]:
+def _read_frames(path: Path, array: np.memmap[Any, Any]) -> Iterator[NDArray[Any]]:
+    """One frame after the other of an array in a file.
+
+    Raises SourceError if the file has become shorter, or cannot be read.
+    """
+    with path.open("rb") as file:
+        file.seek(array.offset)
+        for index in range(len(array)):
+            frame = np.empty(array.shape[1:], array.dtype)
+            try:
+                whole = file.readinto(frame.data) == frame.nbytes
+            except OSError as error:
+                raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+            if not whole:
+                raise SourceError(f"{path}: was cut off during the run, within frame {index}")
+            yield frame
+
+
+def _gathered_frames(path: Path, array: np.memmap[Any, Any]) -> Iterator[NDArray[Any]]:
+    """The same for Fortran order, in which the bytes of a frame lie all over the file.
+
+    Such a file is mapped all the same: cut while a frame is being copied, it still ends the process.
+    """
+    whole = array.offset + array.nbytes
+    for index, frame in enumerate(np.asarray(array)):
+        if path.stat().st_size < whole:
+            raise SourceError(f"{path}: was cut off during the run, within frame {index}")
+        yield np.ascontiguousarray(frame)
+
+
+def _map_array(path: Path) -> np.memmap[Any, Any]:
     wanted = "required a uint8 array of N x H x W x 3 (BGR) or N x H x W (gray)"
     try:
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        # Not np.load, which would also take archives and pickles.
+        array = np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError) as error:
+    except Exception as error:
+        # The header is read as Python source is: what is wrong with it raises whatever a parser can.
+        if ARCHIVE in str(error):
+            raise SourceError(f"{path}: a .npz archive; save its array with np.save; {wanted}") from error
         if "mmap length" in str(error) or "file size" in str(error):
             raise SourceError(
                 f"{path}: the file is cut off: it holds fewer bytes than its header promises; copy it again"
             ) from error
         raise SourceError(f"{path}: not a .npy file, or a damaged one; {wanted}") from error
-    if not isinstance(mapped, np.ndarray):
-        mapped.close()
-        raise SourceError(f"{path}: a .npz archive; save its array with np.save; {wanted}")
-    array = np.asarray(mapped)
     got = f"got {array.dtype} of shape {' x '.join(map(str, array.shape)) or '()'}"
     if array.dtype not in (np.uint8, np.uint16):
         raise SourceError(f"{path}: {wanted}, {got}")
@@ -296,15 +349,12 @@ class VideoFile:
                 f"{path}: neither a video that OpenCV can open, nor an image, nor a .npy array; "
                 "an .mp4 or .avi that was not closed properly cannot be opened either"
             )
+        self.size: tuple[int, int] | None = frame_size(self._capture, str(path))
         said = self._capture.get(cv2.CAP_PROP_FPS)
         self._rate = said if 0 < said < LARGEST_FPS else fps or DEFAULT_FPS
         self.fps: float | None = self._rate
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.total: int | None = count if count > 0 else None
-        self.size: tuple[int, int] | None = (
-            int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-            int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-        )
         self._path = path
         self._normalise = Normaliser(str(path))
         self._index = 0

@@ -1,0 +1,107 @@
+"""Well-formed input that means nothing: right syntax, any values."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import json
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tactflow.cli import listen
+from tactflow.client import _parsed
+from tactflow.config.load import load_pipeline
+from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.sources import open_source
+from tactflow.view.hub import Hub, Wire
+from tests.conftest import REPOSITORY
+from tests.fuzz.targets import OneMessage, message
+
+few = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+scalars = (
+    st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | st.text()
+)
+values = st.recursive(
+    scalars, lambda part: st.lists(part, max_size=3) | st.dictionaries(st.text(), part, max_size=3)
+)
+PIPELINE = yaml.safe_load((REPOSITORY / "pipeline.yaml").read_text(encoding="utf-8"))
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The path to everything in a document."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [
+        *([path] if path else []),
+        *(found for key, part in inner for found in places(part, (*path, key))),
+    ]
+
+
+def replaced(document: Any, path: tuple[Any, ...], value: Any) -> Any:
+    """A copy with another value at one place."""
+    changed = copy.deepcopy(document)
+    part = changed
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    return changed
+
+
+@few
+@given(path=st.sampled_from(places(PIPELINE)), value=values)
+def test_a_pipeline_with_any_value_anywhere_is_read_or_refused(
+    tmp_path: Path, path: tuple[Any, ...], value: Any
+) -> None:
+    file = tmp_path / "pipeline.yaml"
+    file.write_text(json.dumps(replaced(PIPELINE, path, value)), encoding="utf-8")
+    with suppress(ConfigError):
+        assert load_pipeline(file).nodes
+
+
+@few
+@given(path=st.sampled_from(places(json.loads(message()))), value=values)
+def test_a_result_message_with_any_value_anywhere_is_shown_or_passed_over(
+    path: tuple[Any, ...], value: Any
+) -> None:
+    received = _parsed(json.dumps(replaced(json.loads(message()), path, value)).encode())
+    if received is not None:
+        assert listen.describe(received)
+        assert listen._cells(received)
+
+
+@few
+@given(
+    command=values
+    | st.fixed_dictionaries({"do": st.sampled_from(["pause", "step", "record"])} | {"value": values})
+)
+def test_a_page_that_sends_any_message_gets_an_answer(command: Any) -> None:
+    calls: list[Any] = []
+    recorder = SimpleNamespace(
+        recording=False, start_recording=lambda: calls.append(1), stop_recording=lambda: calls.append(0)
+    )
+    control = SimpleNamespace(
+        source=None,
+        paused=True,
+        pause=calls.append,
+        step=lambda: calls.append("step"),
+        recorder=lambda: recorder,
+        snapshot=dict,
+    )
+    wire = OneMessage(json.dumps(command))
+    asyncio.run(Hub(cast(Any, control), "main").serve(cast(Wire, wire)))
+    assert all(call in (True, False, "step") for call in calls)
+
+
+@few
+@given(options=st.text(st.characters(codec="utf-8"), max_size=20))
+@pytest.mark.parametrize("source", ["sim:press?", "sim:", "press.mcap?", "*.png?", "[", "**/"])
+def test_a_source_with_any_options_is_opened_or_refused(tmp_path: Path, source: str, options: str) -> None:
+    spec = source + options if source.startswith("sim:") else f"{tmp_path}/{source}{options.replace('/', '')}"
+    with suppress(SourceError):
+        open_source(spec).close()
