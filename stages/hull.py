@@ -65,16 +65,16 @@ class Hull(Stage):
             min_area=params.min_area,
             max_gap=params.max_gap or 0.0,
             min_confidence=params.min_confidence,
+            evidence=evidence or "light",
         )
         if not parts:
             return Absent("no_contact")
         contact = parts[0]
-        if len(parts) > 1:
-            if params.merge == "all" and params.max_gap is None:
-                whole = contact_geometry(
-                    contact_mask, min_area=params.min_area, min_confidence=params.min_confidence
-                )
-                contact = whole or contact
-            shown = evidence or contact.evidence
-            contact = replace(contact, separate=tuple(replace(part, evidence=shown) for part in parts))
-        return contact if evidence is None else replace(contact, evidence=evidence)
+        if len(parts) == 1:
+            return contact
+        if params.merge == "all" and params.max_gap is None:
+            whole = contact_geometry(
+                contact_mask, min_area=params.min_area, min_confidence=params.min_confidence
+            )
+            contact = whole or contact
+        return replace(contact, evidence=parts[0].evidence, separate=tuple(parts))

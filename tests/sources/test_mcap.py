@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
+from tactflow.recording import records
 from tactflow.recording.frames import StoredFrame
+from tactflow.recording.protobuf import encode
 from tactflow.recording.records import Damage, intact_records
 from tactflow.recording.repair import repair
 from tactflow.sinks.record import Record
@@ -329,6 +331,23 @@ def test_a_chunk_that_cannot_be_unpacked_is_passed_over(
     assert len(records) == before + 1
     # What the file itself holds, several times over; none of the sizes that it claims.
     assert peak < 10 * len(whole) + len(data)
+
+
+@pytest.mark.parametrize("t", [float("nan"), float("-inf"), 1e300])
+def test_a_time_that_is_none_is_an_error_of_the_recording(tmp_path: Path, t: float) -> None:
+    path = record(tmp_path / "a.mcap", frames(range(4)))
+    stored = encode([(4, 3 / FPS)])
+    whole = path.read_bytes()
+    assert whole.count(stored) == 1
+    path.write_bytes(whole.replace(stored, encode([(4, t)])))
+    # Without the checksum of its chunk, which is zero where a writer made none.
+    unchecked = records.breakup_chunk
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(records, "breakup_chunk", lambda chunk, validate_crc: unchecked(chunk))  # noqa: ARG005
+        source = open_source(str(path))
+        assert [source.read() is None for _ in range(3)] == [False] * 3
+        with pytest.raises(SourceError, match=r"a\.mcap, 0\.3 s: required a frame's time within"):
+            source.read()
 
 
 def test_a_frame_that_claims_more_pixels_than_any_camera_has_is_refused() -> None:

@@ -161,7 +161,7 @@ class Supervisor:
         """Kill a process that hangs."""
         if member.told >= KILL_AT:
             return
-        if self._output.locked():
+        if self._results.locked() or self._messages.locked():
             # It may wait for us, who wait for somebody that reads what we write.
             member.sign.excuse(self._clock())
         elif member.sign.look(self._clock()) > self._hang_after:

@@ -21,6 +21,8 @@ TYPE_NAME = "tactflow.RawFrame"
 CODEC = "up+zstd"
 ENCODING = "bgr8"
 """Names of how pixels are packed and ordered, which a reader compares."""
+LATEST = 2.0**62 / 1e9
+"""Times beyond this, s either side of 1970, are none: their ns, and those between two, fit into 64 bits."""
 LEVEL = 1
 """Level of zstd: the fastest that still does entropy coding."""
 _FIELDS: tuple[tuple[str, int, FieldType], ...] = (
@@ -111,7 +113,7 @@ class StoredFrame:
         Raises
         ------
         ValueError
-            If it is none, or packed in a way that this version does not know.
+            If it is none, its time is no time, or it is packed in a way that this version does not know.
         """
         fields = decode(message)
         for number, known in ((_ENCODING, ENCODING), (_CODEC, CODEC)):
@@ -124,6 +126,8 @@ class StoredFrame:
         t, data = fields.get(_T), fields.get(_DATA)
         if not isinstance(t, float) or not isinstance(data, memoryview):
             raise ValueError("required a frame with t and data")
+        if not abs(t) < LATEST:
+            raise ValueError(f"required a frame's time within {LATEST:g} s, got {t}")
         seq, reference, epoch, width, height = (
             int(value) if isinstance(value := fields.get(number, 0), int) else 0
             for number in (_SEQ, _REFERENCE, _EPOCH, _WIDTH, _HEIGHT)

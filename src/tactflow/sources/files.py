@@ -218,9 +218,10 @@ def _matching(pattern: Path) -> list[Path]:
 
 
 class ArrayFile:
-    """A .npy file: uint8, N x H x W x 3 BGR or N x H x W gray; memory-mapped, never loaded whole.
+    """A .npy file: uint8, N x H x W x 3 BGR or N x H x W gray; read frame by frame, never loaded whole.
 
-    Frames of a BGR array are views of the file, not copies.
+    Frames are not mapped into memory: where another program cuts the file during the run, that would end the
+    process at the next look at one. To read one costs one copy of it and half of another.
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
@@ -247,8 +248,9 @@ class ArrayFile:
         self._index = 0
         count, height, width = frames.shape[:3]
         refuse_too_large(str(path), width, height)
-        as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,) and frames.flags.c_contiguous
-        self._frames: Iterator[BgrImage] = iter(frames) if as_wanted else map(Normaliser(str(path)), frames)
+        found = (_read_frames if frames.flags.c_contiguous else _gathered_frames)(path, frames)
+        as_wanted = frames.dtype == np.uint8 and frames.shape[3:] == (3,)
+        self._frames: Iterator[BgrImage] = found if as_wanted else map(Normaliser(str(path)), found)
         self.total: int | None = count
         self.size: tuple[int, int] | None = (width, height)
         self.description = f"{path}, {count} frames"
@@ -263,15 +265,45 @@ class ArrayFile:
         return image, index / self._rate
 
     def close(self) -> None:
-        """Read no more; the file stays mapped for as long as a frame of it is in use."""
+        """Read no more."""
         self._frames = iter(())
 
 
-def _map_array(path: Path) -> NDArray[Any]:
+def _read_frames(path: Path, array: np.memmap[Any, Any]) -> Iterator[NDArray[Any]]:
+    """One frame after the other of an array in a file.
+
+    Raises SourceError if the file has become shorter, or cannot be read.
+    """
+    with path.open("rb") as file:
+        file.seek(array.offset)
+        for index in range(len(array)):
+            frame = np.empty(array.shape[1:], array.dtype)
+            try:
+                whole = file.readinto(frame.data) == frame.nbytes
+            except OSError as error:
+                raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+            if not whole:
+                raise SourceError(f"{path}: was cut off during the run, within frame {index}")
+            yield frame
+
+
+def _gathered_frames(path: Path, array: np.memmap[Any, Any]) -> Iterator[NDArray[Any]]:
+    """The same for Fortran order, in which the bytes of a frame lie all over the file.
+
+    Such a file is mapped all the same: cut while a frame is being copied, it still ends the process.
+    """
+    whole = array.offset + array.nbytes
+    for index, frame in enumerate(np.asarray(array)):
+        if path.stat().st_size < whole:
+            raise SourceError(f"{path}: was cut off during the run, within frame {index}")
+        yield np.ascontiguousarray(frame)
+
+
+def _map_array(path: Path) -> np.memmap[Any, Any]:
     wanted = "required a uint8 array of N x H x W x 3 (BGR) or N x H x W (gray)"
     try:
         # Not np.load, which would also take archives and pickles.
-        array = np.asarray(np.lib.format.open_memmap(path, mode="r"))
+        array = np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
     except Exception as error:

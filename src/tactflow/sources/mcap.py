@@ -13,6 +13,8 @@ from tactflow.recording import missing_packages
 from tactflow.sources.base import BgrImage, Stamp, find_path, log
 
 if TYPE_CHECKING:
+    from mcap.records import Message
+
     from tactflow.recording.frames import StoredFrame
     from tactflow.recording.reader import Contents
 
@@ -140,7 +142,7 @@ class Recording:
 
     def _lap(self) -> Iterator[tuple[StoredFrame, bool]]:
         """The frames of one lap, and whether each comes at its time (True) or ahead of it."""
-        from tactflow.recording.frames import StoredFrame, nanoseconds
+        from tactflow.recording.frames import nanoseconds
         from tactflow.recording.reader import messages
 
         contents, start = self._contents, self._start
@@ -151,13 +153,21 @@ class Recording:
             if first is None:
                 return
             before = messages(self._path, contents, {contents.reference_topic}, end=start)
-            yield from ((frame, False) for frame in _in_force([StoredFrame.parse(m.data) for m in before]))
+            yield from ((frame, False) for frame in _in_force([self._stored(m) for m in before]))
             played = chain([first], played)
         for message in played:
-            frame = StoredFrame.parse(message.data)
+            frame = self._stored(message)
             # A recording begun late brings the references of before, at the time it began.
             late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
             yield frame, not late and frame.seq >= 0
+
+    def _stored(self, message: Message) -> StoredFrame:
+        from tactflow.recording.frames import StoredFrame
+
+        try:
+            return StoredFrame.parse(message.data)
+        except ValueError as error:
+            raise SourceError(f"{self._path}, {message.log_time / 1e9:g} s: {error}") from error
 
 
 def _in_force(references: list[StoredFrame]) -> list[StoredFrame]:

@@ -249,7 +249,9 @@ def _planes(picture: NDArray[np.uint8]) -> Float:
 def _smoothed(cells: NDArray[np.uint8]) -> Float:
     """(3, h, w) float32: means over 3 x 3 cells of (h, w, 3)."""
     smooth = cv2.boxFilter(cells, cv2.CV_32F, (3, 3)).reshape(cells.shape)
-    return np.ascontiguousarray(smooth.transpose(2, 0, 1))
+    planes = np.empty((3, *cells.shape[:2]), np.float32)
+    cv2.split(smooth, list(planes))
+    return planes
 
 
 def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

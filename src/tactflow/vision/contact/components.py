@@ -97,9 +97,11 @@ def contact_components(
             continue
         rows = slice(max(top - 1, 0), min(top + high + 1, height))
         columns = slice(max(left - 1, 0), min(left + wide + 1, width))
-        filled = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
-        cv2.drawContours(filled, [outline], 0, 1, cv2.FILLED, offset=(-columns.start, -rows.start))
-        filled &= changed[rows, columns]
+        filled = changed[rows, columns].copy()
+        if len(outlines) > 1:
+            own = np.zeros_like(filled)
+            cv2.drawContours(own, [outline], 0, 1, cv2.FILLED, offset=(-columns.start, -rows.start))
+            filled &= own
         if cv2.countNonZero(filled) < least:
             continue
         inside = filled.view(np.bool_)

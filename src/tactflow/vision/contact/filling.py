@@ -83,6 +83,10 @@ def fill_pockets(filled: Mask, outlines: Outlines) -> Mask:
 
     filled, outlines : from `outlined`.
     """
+    height, width = filled.shape
+    left, top, wide, high = cv2.boundingRect(filled)
+    if left and top and left + wide < width and top + high < height:
+        return filled
     border = np.concatenate([filled[0], filled[1:, -1], filled[-1, -2::-1], filled[-2:0:-1, 0]])
     before = np.concatenate([border[-1:], border[:-1]])
     starts = np.flatnonzero(border < before).tolist()
@@ -91,7 +95,6 @@ def fill_pockets(filled: Mask, outlines: Outlines) -> Mask:
     ends = np.flatnonzero(border > before).tolist()
     if ends[0] < starts[0]:
         ends = [*ends[1:], ends[0] + len(border)]
-    height, width = filled.shape
     hull = np.zeros_like(filled)
     cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), (1.0,))
     closed = False

@@ -78,7 +78,7 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
     ('dots', np.uint8(255))
     """
     motion = test(markers)
-    if not light.any():
+    if not cv2.countNonZero(light):
         if not motion.clearly:
             return FusedContact(light, None)
         return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
@@ -87,7 +87,7 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
     light = _without_rims(light, markers)
-    return FusedContact(light, "light" if light.any() else None)
+    return FusedContact(light, "light" if cv2.countNonZero(light) else None)
 
 
 def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:

@@ -40,8 +40,6 @@ begin with. Chosen by hand."""
 
 _CHANNELS: Final = np.arange(3)
 """Blue, green, red."""
-_NO_CHANGE: Final = np.zeros(3, np.float32)
-"""Of the light, in each channel."""
 
 
 class IlluminationModel:
@@ -96,8 +94,9 @@ class IlluminationModel:
         brightness = self._basis[:, 0]
         lit = brightness > DARK if self._fitted is None else (brightness > DARK) & self._fitted
         self._lit: NDArray[np.bool_] = lit
-        # Blocks that tell nothing are sorted behind all others.
-        self._per_brightness: Float = np.where(lit, 1 / np.maximum(brightness, DARK), np.float32(np.nan))
+        # Blocks that tell nothing are sorted behind all others; a channel without light never changes.
+        nothing = np.where(lit.any(axis=1, keepdims=True), np.float32(np.nan), np.float32(0))
+        self._per_brightness: Float = np.where(lit, 1 / np.maximum(brightness, DARK), nothing)
         self._middle = np.count_nonzero(lit, axis=1) // 2
         self._step: Float = np.ascontiguousarray(inverse @ fitted, np.float32)
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
@@ -113,27 +112,28 @@ class IlluminationModel:
         """
         blocks = self._block_means(cells)
         excess = blocks - self._reference
-        below = blocks < SATURATED
         coefficients = np.zeros((3, 4), np.float32)
-        coefficients[:, 0] = self._typical_ratio(excess, below)
-        limit = self._limit * below
-        for reject in (NEVER, REJECT):
-            fit_robustly(excess, self._basis, self._step, self._shrink, limit, reject, coefficients)
+        limit = self._limit
+        if blocks.max() < SATURATED:
+            ratios = excess * self._per_brightness
+            ratios.sort(axis=1)
+            coefficients[:, 0] = ratios[_CHANNELS, self._middle]
+        else:
+            below = blocks < SATURATED
+            limit = limit * below
+            coefficients[:, 0] = self._ratio_below(excess, below)
+        fit_robustly(excess, self._basis, self._step, self._shrink, limit, coefficients)
         coefficients[:, :3] /= self._center[:, :, 0]
         return coefficients
 
-    def _typical_ratio(self, excess: Float, below: NDArray[np.bool_]) -> Float:
+    def _ratio_below(self, excess: Float, below: NDArray[np.bool_]) -> Float:
         """(3,) float32: median of the relative change of the blocks, (3, n), that are not saturated."""
         ratios = excess * self._per_brightness
-        middle = self._middle
-        most: Float = _NO_CHANGE
-        if not below.all():
-            most = np.fmax.reduce(ratios, axis=1, initial=0)
-            ratios[~below] = np.nan
-            middle = np.count_nonzero(self._lit & below, axis=1) // 2
+        most: Float = np.fmax.reduce(ratios, axis=1, initial=0)
+        ratios[~below] = np.nan
         ratios.sort(axis=1)
-        typical: Float = ratios[_CHANNELS, middle]
-        # Where all of a channel is saturated, or black, there is no median.
+        typical: Float = ratios[_CHANNELS, np.count_nonzero(self._lit & below, axis=1) // 2]
+        # Where all of a channel is saturated there is no median.
         return np.where(np.isnan(typical), most, typical)
 
     def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -176,39 +176,42 @@ def _block_weights(blocks: int, count: int) -> Float:
 
 @kernel(
     "void(float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1],"
-    " float32, float32[:, ::1])",
+    " float32[:, ::1])",
     reorder=True,
 )
 def fit_robustly(
-    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, reject: float, coefficients: Float
+    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
 ) -> None:
     """Least-squares steps with clipped residuals; `coefficients`, (3, 4), start and result.
 
-    excess, limit : (3, n), the data and where their residuals are clipped. reject : times the limit, from
-    which a residual does not count at all. basis, step : (3, 4, n), the model
-    and its pseudo-inverse. shrink : (3, 4, 4), what the ridge takes from the coefficients in a step.
+    excess, limit : (3, n), the data and where their residuals are clipped; in the second fit, those of more
+    than `REJECT` times as much do not count. basis, step : (3, 4, n), the model and its
+    pseudo-inverse. shrink : (3, 4, 4), what the ridge takes from the coefficients in a step.
     """
     change = np.empty(4, np.float32)
-    for _ in range(MAX_STEPS):
-        longest = np.float32(0)
-        for c in range(3):
-            f0, f1, f2, f3 = coefficients[c, 0], coefficients[c, 1], coefficients[c, 2], coefficients[c, 3]
-            s0 = s1 = s2 = s3 = np.float32(0)
-            for i in range(excess.shape[1]):
-                model = f0 * basis[c, 0, i] + f1 * basis[c, 1, i] + f2 * basis[c, 2, i] + f3 * basis[c, 3, i]
-                beyond = excess[c, i] - model
-                residual = min(max(beyond, -limit[c, i]), limit[c, i])
-                residual = residual if abs(beyond) < reject * limit[c, i] else np.float32(0)
-                s0 += residual * step[c, 0, i]
-                s1 += residual * step[c, 1, i]
-                s2 += residual * step[c, 2, i]
-                s3 += residual * step[c, 3, i]
-            change[0], change[1], change[2], change[3] = s0, s1, s2, s3
-            for k in range(4):
-                for j in range(4):
-                    change[k] -= (f0, f1, f2, f3)[j] * shrink[c, j, k]
-            for k in range(4):
-                coefficients[c, k] += change[k]
-                longest = max(longest, abs(change[k]))
-        if longest < np.float32(CONVERGED):
-            break
+    for reject in (np.float32(NEVER), np.float32(REJECT)):
+        for _ in range(MAX_STEPS):
+            longest = np.float32(0)
+            for c in range(3):
+                f0, f1 = coefficients[c, 0], coefficients[c, 1]
+                f2, f3 = coefficients[c, 2], coefficients[c, 3]
+                s0 = s1 = s2 = s3 = np.float32(0)
+                for i in range(excess.shape[1]):
+                    model = f0 * basis[c, 0, i] + f1 * basis[c, 1, i]
+                    model = model + f2 * basis[c, 2, i] + f3 * basis[c, 3, i]
+                    beyond = excess[c, i] - model
+                    residual = min(max(beyond, -limit[c, i]), limit[c, i])
+                    residual = residual if abs(beyond) < reject * limit[c, i] else np.float32(0)
+                    s0 += residual * step[c, 0, i]
+                    s1 += residual * step[c, 1, i]
+                    s2 += residual * step[c, 2, i]
+                    s3 += residual * step[c, 3, i]
+                change[0], change[1], change[2], change[3] = s0, s1, s2, s3
+                for k in range(4):
+                    for j in range(4):
+                        change[k] -= (f0, f1, f2, f3)[j] * shrink[c, j, k]
+                for k in range(4):
+                    coefficients[c, k] += change[k]
+                    longest = max(longest, abs(change[k]))
+            if longest < np.float32(CONVERGED):
+                break

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.geometry.direction import anisotropy_limit, axis_direction
 from tactflow.vision.geometry.moments import Box, Moments, region_moments
-from tactflow.vision.types import Contact, Ellipse
+from tactflow.vision.types import Contact, Ellipse, Evidence
 
 Contours = Sequence[NDArray[Any]]
 
@@ -72,12 +72,17 @@ def contact_geometry(
 
 
 def contact_parts(
-    mask: NDArray[np.uint8], *, min_area: float = 1.0, max_gap: float = 0.0, min_confidence: float = 0.0
+    mask: NDArray[np.uint8],
+    *,
+    min_area: float = 1.0,
+    max_gap: float = 0.0,
+    min_confidence: float = 0.0,
+    evidence: Evidence = "light",
 ) -> list[Contact]:
     """Describe each separate contact region of a mask, the one with the most pixels first.
 
-    The parameters and what is raised are those of `contact_geometry`, which describes one of these contacts,
-    or all of them as one.
+    evidence : what shows them. The other parameters and what is raised are those of `contact_geometry`, which
+    describes one of these contacts, or all of them as one.
 
     >>> mask = np.zeros((60, 80), np.uint8)
     >>> mask[20:30, 10:50] = mask[50:55, 10:20] = 255
@@ -90,9 +95,9 @@ def contact_parts(
         return []
     groups = _groups(seen.contours, seen.box, max_gap) if len(seen.contours) > 1 else [seen.contours]
     if len(groups) == 1:
-        return [_describe(seen, min_confidence)]
+        return [_describe(seen, min_confidence, evidence)]
     ordered = sorted(groups, key=_pixels, reverse=True)
-    return [_describe(_part(seen, group), min_confidence) for group in ordered]
+    return [_describe(_part(seen, group), min_confidence, evidence) for group in ordered]
 
 
 class _Seen(NamedTuple):
@@ -143,7 +148,7 @@ def _check(mask: NDArray[np.uint8], min_area: float, max_gap: float | None, min_
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
 
 
-def _describe(seen: _Seen, min_confidence: float) -> Contact:
+def _describe(seen: _Seen, min_confidence: float, evidence: Evidence = "light") -> Contact:
     """The contact that these components are together."""
     _, box, contours, moments = seen
     outline = contours[0] if len(contours) == 1 else np.concatenate(contours)
@@ -174,6 +179,7 @@ def _describe(seen: _Seen, min_confidence: float) -> Contact:
         ellipse=ellipse,
         confidence=confidence,
         region_area=float(count),
+        evidence=evidence,
     )
 
 
