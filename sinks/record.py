@@ -8,7 +8,9 @@ import platform
 import re
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -46,7 +48,9 @@ class Record(Recorder):
     recording always holds the reference frames that its frames are compared with.
 
     A recording from the start goes to `path` itself and all others to `path` with a number, `press-001.mcap`;
-    those never replace a file. `start_recording` and `stop_recording` may be called from any thread.
+    those never replace a file. With `rotate_size` or `rotate_after`, a long recording goes on in further
+    numbered files, each of which can be played by itself. `start_recording` and `stop_recording` may be
+    called from any thread.
     """
 
     threaded = True
@@ -79,6 +83,12 @@ class Record(Recorder):
             "not fit is left out, with a warning",
         )
         after: float = Field(1.0, ge=0, description="a contact's recording ends so long after the contact, s")
+        rotate_size: int | None = Field(
+            None, ge=1, description="go on in another, numbered file when this one has so many MB"
+        )
+        rotate_after: float | None = Field(
+            None, gt=0, description="go on in another, numbered file when this one is so long, s"
+        )
         preview: float = Field(
             10.0, ge=0, le=240, description="rate of the JPEG pictures for people, Hz; 0 leaves them out"
         )
@@ -114,6 +124,8 @@ class Record(Recorder):
         self._ends = False
         self._backlog: deque[Entry] = deque()
         self._late: list[Entry] = []
+        self._in_force: list[Entry] = []
+        self._file_begins = 0
         self._references: list[Entry] = []
         self._ring: deque[Entry] = deque()
         self._ring_bytes = 0
@@ -287,15 +299,28 @@ class Record(Recorder):
             )
 
     def _begin_next(self) -> None:
+        self._with_next_name(self._begin)
+
+    def _with_next_name(self, begin: Callable[..., None]) -> None:
         while True:
-            try:
-                self._begin(next_name(self._path), overwrite=False)
-            except FileExistsError:
-                continue
-            return
+            # Between the two, another run may take the name.
+            with suppress(FileExistsError):
+                begin(next_name(self._path), overwrite=False)
+                return
 
     def _begin(self, path: Path, *, overwrite: bool) -> None:
         """Open a file; the references and what the ring holds are to be written first."""
+        self._open_file(path, overwrite=overwrite)
+        self._ends = False
+        self._backlog = deque(self._ring)
+        first = self._ring[0] if self._ring else None
+        self._late = [
+            reference
+            for reference in self._references
+            if first is None or (reference.epoch == first.epoch and reference.seq < first.seq)
+        ]
+
+    def _open_file(self, path: Path, *, overwrite: bool) -> None:
         from tactflow.recording.writer import RecordingWriter
 
         try:
@@ -309,33 +334,51 @@ class Record(Recorder):
         except OSError as error:
             raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
         self.description = str(path)
-        self._ends = False
-        self._backlog = deque(self._ring)
-        first = self._ring[0] if self._ring else None
-        self._late = [
-            reference
-            for reference in self._references
-            if first is None or (reference.epoch == first.epoch and reference.seq < first.seq)
-        ]
         if path != self._path:
             log.info("record: %s", path)
 
     def _write_backlog(self, most: int) -> None:
-        file = self._file
-        if file is None:
-            return
+        for _ in range(min(most, len(self._backlog))):
+            if self._file is None:
+                return
+            entry = self._backlog.popleft()
+            if self._is_full(self._file, entry):
+                self._rotate(entry)
+            self._write_entry(self._file, entry)
+
+    def _write_entry(self, file: RecordingWriter, entry: Entry) -> None:
+        if file.frames == 0:
+            self._file_begins, self._in_force = entry.time, []
         try:
-            for _ in range(min(most, len(self._backlog))):
-                entry = self._backlog.popleft()
-                # The references of before stand where the file's time line begins.
-                for reference in self._late:
-                    file.write(reference, entry.time)
-                self._late = []
-                file.write(entry)
-                self._counts["frames"] += 1
+            # The references of before stand where the file's time line begins, without results of that time.
+            for reference in self._late:
+                file.write(replace(reference, message=None, picture=None), entry.time)
+            file.write(entry)
         except OSError as error:
             self._give_up(file, error)
         self._refuse_interference(file)
+        new = [*self._late, *([entry] if entry.reference else [])]
+        if new:
+            self._in_force = [reference for reference in self._in_force if reference.epoch == new[-1].epoch]
+            self._in_force += new
+        self._late = []
+        self._counts["frames"] += 1
+
+    def _is_full(self, file: RecordingWriter, entry: Entry) -> bool:
+        """Whether an entry is to go into another file."""
+        size, after = self.params.rotate_size, self.params.rotate_after
+        return file.frames > 0 and (
+            (size is not None and file.bytes >= size * 1_000_000)
+            or (after is not None and entry.time - self._file_begins >= after * 1e9)
+        )
+
+    def _rotate(self, entry: Entry) -> None:
+        """Go on in another file, which has the references of its first entry in it."""
+        ends = self._ends
+        self._finish()
+        self._with_next_name(self._open_file)
+        self._ends = ends
+        self._late = [reference for reference in self._in_force if reference.epoch == entry.epoch]
 
     def _finish(self) -> None:
         file, self._file = self._file, None

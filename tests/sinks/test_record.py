@@ -21,6 +21,7 @@ from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.graph import Pipeline
 from tactflow.message import Results
+from tactflow.recording.frames import StoredFrame
 from tactflow.sinks.record import Record
 from tactflow.sources import open_source
 from tactflow.sources.mcap import Recording
@@ -316,6 +317,48 @@ def test_a_contact_that_no_stage_gives_cannot_begin_a_recording(tmp_path: Path, 
         load_pipeline(file)
     file.write_text(file.read_text().replace("trigger: contact", "trigger: button"))
     load_pipeline(file)
+
+
+def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
+    """Topic, time and data of all that belongs to frames, without references that a file begins with."""
+    with path.open("rb") as file:
+        found = [(channel.topic, m.log_time, m.data) for _, channel, m in make_reader(file).iter_messages()]
+    times = {"/main/frames": 0, "/main/references": 0}
+    return [
+        (topic, time, data)
+        for topic, time, data in found
+        if topic not in times or time == round(StoredFrame.parse(data).t * 1e9)
+    ]
+
+
+@pytest.mark.parametrize("rotation", [{"rotate_after": 0.5}, {"rotate_size": 1}], ids=str)
+def test_a_recording_in_several_files_is_the_same_as_in_one(rotation: dict[str, Any], tmp_path: Path) -> None:
+    one, many = opened(tmp_path / "one.mcap"), opened(tmp_path / "many.mcap", **rotation)
+    for seq in range(21):
+        # Noise of 150 kB; a new epoch begins in the middle.
+        pixels = np.random.default_rng(seq).integers(0, 256, (200, 250, 3), np.uint8)
+        frame = Frame("main", seq, seq / FPS, pixels, reference=seq in (0, 1, 11), epoch=0 if seq < 11 else 1)
+        for sink in (one, many):
+            sink.write(Tick(frame), Results())
+    one.close()
+    many.close()
+    files = [tmp_path / "many.mcap", *sorted(tmp_path.glob("many-*.mcap"))]
+    assert [path.name for path in files[1:3]] == ["many-001.mcap", "many-002.mcap"]
+    lengths = [sum(topic == "/main/results" for topic, *_ in messages_in(path)) for path in files]
+    if "rotate_after" in rotation:
+        assert lengths == [5, 5, 5, 5, 1]
+    else:
+        # With its preview and the index, a frame of noise takes less than 300 kB.
+        assert all(1_000_000 <= path.stat().st_size < 1_300_000 for path in files[:-1])
+    assert [m for path in files for m in messages_in(path)] == messages_in(tmp_path / "one.mcap")
+    assert many.counters()["files"] == len(files)
+    for path, begins in zip(files, np.cumsum([0, *lengths[:-1]]), strict=True):
+        source = open_source(str(path))
+        assert isinstance(source, Recording)
+        stamps = [item[2] for item in iter(source.read_stamped, None)]
+        references = [0, 1] if begins <= 11 else [11]
+        assert [stamp.seq for stamp in stamps if stamp.reference][: len(references)] == references
+        assert stamps[0].reference, "each file begins with the references of its first frame"
 
 
 def test_pictures_come_at_their_own_rate(tmp_path: Path) -> None:

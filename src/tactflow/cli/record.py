@@ -25,6 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     there = parser.add_mutually_exclusive_group()
     there.add_argument("--overwrite", action="store_true", help="replace FILE.mcap if it is there")
     there.add_argument("--number", action="store_true", help="if it is there, record to FILE-001.mcap, ...")
+    parser.add_argument(
+        "--rotate-size", type=int, metavar="MB", help="go on in FILE-001.mcap, ... when a file has so many MB"
+    )
+    parser.add_argument("--rotate-after", type=float, metavar="SECONDS", help="... or when it is so long")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,4 +56,6 @@ def _recording(args: argparse.Namespace, sensor: str | None) -> run_command.Sink
         raise ConfigError(
             f"--out: {out} is already there; give --overwrite to replace it or --number to record beside it"
         )
-    return {"--record": {"use": "record", "path": str(out), "overwrite": args.overwrite}}
+    settings = {"use": "record", "path": str(out), "overwrite": args.overwrite}
+    rotation = {"rotate_size": args.rotate_size, "rotate_after": args.rotate_after}
+    return {"--record": settings | {key: value for key, value in rotation.items() if value is not None}}
