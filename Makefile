@@ -1,6 +1,7 @@
 # make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
 # make test         lint, types, tests
-# make soak         the tests that take longer: faults in running processes, load over time
+# make soak         what takes longer: faults in running processes, a million frames (two hours)
+# make load         results, drops, latency and memory against the load (ten minutes)
 # make fuzz         damaged input to every parser, SECONDS for each
 # make audit        known weaknesses of the packages that are used, where the list can be reached
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
@@ -15,7 +16,7 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak fuzz audit lock lint types kernels system-deps clean
+.PHONY: run test soak load fuzz audit lock lint types kernels system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -26,6 +27,10 @@ test: lint types
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
 soak: $(VENV)/.installed-test
 	$(PY) -m pytest -m slow
+	$(PY) -m tests.load.soak
+
+load: $(VENV)/.installed-test
+	$(PY) -m tests.load.knee
 
 fuzz: SECONDS := 300
 fuzz: $(VENV)/.installed-test
