@@ -54,9 +54,9 @@ class Load:
 class Seen:
     """What one load gave.
 
-    results : that arrived at the first subscriber, of those that were due, 0..1. p50, p99 : age of a result
-    at the subscribers, ms. oldest : of the last second, ms. memory, growth : of all processes, MB, and
-    by how much it grew while it was measured. busy : what the machine's processors did, 0..1.
+    results : that arrived at the first subscriber, 0..1; the others are missing from `seq`. p50, p99 : age of
+    a result at the subscribers, ms. oldest : of the last second, ms. memory, growth : of all processes, MB,
+    and by how much it grew while it was measured. busy : what the machine's processors did, 0..1.
     """
 
     load: Load
@@ -99,13 +99,12 @@ def measure(load: Load, port: int, folder: Path) -> Seen:
         time.sleep(MEASURED)
         seconds = time.monotonic() - began
         ages = 1e3 * np.array(subscribers.ages)
-        got = sum(len(seqs) for seqs in subscribers.seqs.values())
+        got = [len(seqs) / (seqs[-1] - seqs[0] + 1) for seqs in subscribers.seqs.values()]
         busy = 1 - (_idle() - idle) / (seconds * (os.cpu_count() or 1))
         after = _memory(process.pid)
     last = ages[-max(1, round(RATE * load.sensors * load.subscribers)) :]
     p50, p99 = (float(np.percentile(ages, part)) for part in (50, 99))
-    results = got / (RATE * seconds * load.sensors)
-    return Seen(load, results, p50, p99, float(last.max()), after, after - before, busy)
+    return Seen(load, float(np.mean(got)), p50, p99, float(last.max()), after, after - before, busy)
 
 
 def _memory(pid: int) -> float:
@@ -120,8 +119,11 @@ def _idle() -> float:
     return int(words[4]) / os.sysconf("SC_CLK_TCK")
 
 
-def report(found: list[Seen]) -> str:
-    """The section of the page."""
+def report(found: list[Seen], others: float) -> str:
+    """The section of the page.
+
+    others : the machine's load average before.
+    """
     rows = [
         f"| {seen.load.sensors} | {seen.load.subscribers} | {seen.load.pages} | {100 * seen.results:.0f} % | "
         f"{seen.p50:.1f} | {seen.p99:.0f} | {seen.oldest:.0f} | {seen.memory:.0f} | {seen.growth:+.1f} | "
@@ -132,8 +134,9 @@ def report(found: list[Seen]) -> str:
         [
             f"Sensors of {SIZE[0]} x {SIZE[1]} px at {RATE:g} frames a second with a contact that comes and "
             f"goes, each in a process of its own, the default pipeline, on {os.cpu_count()} processors that "
-            f"subscribers and pages share; {MEASURED:g} s each. The rest of the results was dropped and "
-            "counted. Ages from the moment a frame was due to its result at the subscriber.",
+            f"subscribers and pages share; {MEASURED:g} s each (load average of the machine "
+            f"before: {others:.1f}). Results that are not there were dropped: a gap in `seq`, counted in the "
+            "statistics. Ages from the moment a frame was due to its result at the subscriber.",
             "",
             "| sensors | subscribers | pages | results | age, ms: p50 | p99 | oldest at the end | memory, MB "
             "| growth | processors busy |",
@@ -151,11 +154,12 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=5750)
     args = parser.parse_args()
     found = []
+    others = os.getloadavg()[0]
     for load in loads():
         with tempfile.TemporaryDirectory() as folder:
             found.append(measure(load, args.port, Path(folder)))
         print(found[-1], flush=True)
-    write_section("load", report(found))
+    write_section("load", report(found, others))
 
 
 if __name__ == "__main__":

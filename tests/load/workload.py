@@ -26,7 +26,7 @@ from tactflow.bench.stress import memory_of
 from tactflow.sim import open_scene
 from tests.conftest import REPOSITORY
 
-CYCLE = 120
+CYCLE = 60
 """Pictures that are shown again and again: one press and release."""
 PAGE = REPOSITORY / "docs" / "reliability.md"
 _SEQ = re.compile(rb'"seq":(\d+)')
