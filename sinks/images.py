@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Literal
@@ -12,7 +13,7 @@ from pydantic import Field
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, make_folder, next_name
+from tactflow.files import claim_path, expanded, make_folder, next_name
 from tactflow.ports import Picture
 
 UNFINISHED = ".unfinished"
@@ -53,6 +54,7 @@ class Images(Sink):
         self.description = str(self._folder)
         self._next = 0
         self._files = 0
+        self._claim: int | None = None
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
 
     @classmethod
@@ -71,13 +73,16 @@ class Images(Sink):
         Raises
         ------
         StageError
-            If it holds frames already and `overwrite` is not set, or cannot be created.
+            If it holds frames already and `overwrite` is not set, it cannot be created, or another run
+            writes into it.
         """
         try:
             make_folder(self._folder)
             present = next(self._folder.glob("frame-*.[pj][np]g"), None)
+            if present is None or self.params.overwrite:
+                self._claim = claim_path(self._folder)
         except OSError as error:
-            raise StageError(f"{self._folder}: cannot be created: {error.strerror or error}") from error
+            raise StageError(f"{self._folder}: cannot be written into: {error.strerror or error}") from error
         if present is not None and not self.params.overwrite:
             raise StageError(
                 f"{self._folder}: holds frames already ({present.name}, ...); set overwrite: true or give "
@@ -114,3 +119,9 @@ class Images(Sink):
                 f"the {self._files} pictures written before are whole"
             ) from error
         self._files += 1
+
+    def close(self) -> None:
+        """Let others write into the folder."""
+        if self._claim is not None:
+            os.close(self._claim)
+            self._claim = None

@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, is_device, make_folder, next_name, taken_away
+from tactflow.files import claim_path, expanded, is_device, make_folder, next_name, taken_away
 from tactflow.ports import Picture
 
 log = logging.getLogger("tactflow")
@@ -80,6 +80,7 @@ class Video(Sink):
         self._writer: cv2.VideoWriter | None = None
         self._size: tuple[int, int] | None = None
         self._ours: os.stat_result | None = None
+        self._claim: int | None = None
         self._frames = 0
 
     @classmethod
@@ -160,6 +161,9 @@ class Video(Sink):
             if self._writer is not None:
                 self._writer.release()
                 self._writer = None
+            if self._claim is not None:
+                os.close(self._claim)
+                self._claim = None
         if self._ours is not None:
             self._check_file(self._ours)
 
@@ -202,6 +206,11 @@ class Video(Sink):
         held, self._held = self._held, []
         self._refuse_what_is_there()
         self._refuse_full_disk()
+        try:
+            self._path.touch()
+            self._claim = claim_path(self._path)
+        except OSError as error:
+            raise StageError(f"{self._path}: cannot be written: {error.strerror or error}") from error
         self._writer = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, (width, height))
         if not self._writer.isOpened():
             raise StageError(f"{self._path}: cannot be written; may this folder be written to?")

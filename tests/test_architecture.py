@@ -19,6 +19,7 @@ ROOMS = {
     "src/tactflow/engine": ("cv2", "zmq", "numba", "tactflow.vision", "tactflow.config", "tactflow.stages"),
     "src/tactflow/config": ("cv2", "zmq", "tactflow.vision", "tactflow.cli", "tactflow.fleet"),
     "src/tactflow/vision": ("zmq", "tactflow.engine", "tactflow.config", "tactflow.stages"),
+    "src/tactflow/calibration": ("zmq", "tactflow.stages", "tactflow.sinks", "tactflow.cli"),
     "src/tactflow/fleet": ("tactflow.cli", "tactflow.stages", "tactflow.sinks"),
     "src/tactflow/classic": ("tactflow.stages", "tactflow.cli"),
     "stages": ("tactflow.stages", "tactflow.config", "tactflow.cli"),

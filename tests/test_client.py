@@ -17,7 +17,7 @@ import zmq
 
 from tactflow import client
 from tactflow.cli import listen
-from tactflow.client import Subscriber
+from tactflow.client import LONGEST_MESSAGE, Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results, encode_message
@@ -339,3 +339,14 @@ def test_what_is_no_result_message_is_passed_over_and_counted() -> None:
                 publisher.send(b"tactflow.main " + body)
             while results.malformed < 4:
                 assert results.receive()["seq"] == 3
+
+
+def test_whoever_sends_messages_as_long_as_no_result_is_heard_no_more() -> None:
+    with zmq.Context() as context, context.socket(zmq.XPUB) as publisher:
+        port = publisher.bind_to_random_port("tcp://127.0.0.1")
+        publisher.linger = 0
+        publisher.rcvtimeo = round(PATIENCE * 1000)
+        with Subscriber(f"tcp://127.0.0.1:{port}"):
+            assert publisher.recv() == b"\x01tactflow."
+            publisher.send(b"tactflow.main {" + bytes(LONGEST_MESSAGE))
+            assert publisher.recv() == b"\x00tactflow."

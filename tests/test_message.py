@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import STATUS_NAMES, Results, encode_message, message_schema
-from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
+from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
 from tests.messages import build_message
 
 VALIDATOR = jsonschema.Draft202012Validator(message_schema())
@@ -291,3 +291,25 @@ def test_the_schema_is_itself_a_valid_schema_without_defaults() -> None:
     schema = message_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     assert '"default"' not in json.dumps(schema)
+
+
+def test_a_calibrated_message_has_millimetres_and_with_detail_their_errors() -> None:
+    scale = Scale(0.1, 0.2, (0.001, 0.004), (50.0, 100.0))
+    depth = Depth(np.zeros((400, 300), np.float32), 0.75, 0.03, 4.5, None)
+    results = Results(PROCESSED, CONTACT, FLOW, MARKERS, scale, depth)
+    plain = build_message(TICK, results)
+    VALIDATOR.validate(plain)
+    assert plain["contact"]["center_mm"] == pytest.approx([10.02, 20.34])
+    assert plain["contact"]["area_mm2"] == pytest.approx(5123.5 * 0.02)
+    assert plain["contact"]["depth_mm"] == 0.75
+    assert plain["contact"]["volume_mm3"] == 4.5
+    assert plain["flow"]["mean_mm"] == pytest.approx([0.121, -0.066])
+    assert "center_mm_stderr" not in plain["contact"]
+    detailed = build_message(TICK, results, detail=True)
+    VALIDATOR.validate(detailed)
+    assert detailed["contact"]["center_mm_stderr"] == pytest.approx([0.1002, 0.4068])
+    assert detailed["contact"]["depth_mm_stderr"] == 0.03
+    assert detailed["contact"]["volume_mm3_stderr"] is None
+    assert detailed["flow"]["mean_mm_stderr"] == pytest.approx(
+        [math.hypot(1.21 * 0.001, 0.1 * 0.1), math.hypot(0.33 * 0.004, 0.2 * 0.2)]
+    )

@@ -166,7 +166,7 @@ def stage(use: str, /, **params: Any) -> Any:
         given = wrap(params, Mark(f'stage("{use}")', 0, 0))
         complain(error, component.params, given, use, problems, noun="parameter")
     problems.raise_if_any()
-    offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None}
+    offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None, "calibration": None}
     instance = build(component.cls, checked, offered)
     instance.open()
     return instance

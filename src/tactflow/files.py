@@ -81,25 +81,53 @@ def make_folder(folder: Path) -> None:
 
 if sys.platform == "win32":
 
-    def claim(_file: IO[bytes]) -> bool:
-        """True: Windows itself refuses to replace a file that is open."""
-        return True
+    def claim(_file: IO[bytes]) -> None:
+        """Nothing: Windows itself refuses to replace a file that is open."""
+
+    def claim_path(_path: Path) -> int | None:
+        """None: as above."""
+        return None
 
 else:
 
-    def claim(file: IO[bytes]) -> bool:
-        """Claim a file for as long as it is open; whether nobody else has claimed it.
+    def claim(file: IO[bytes]) -> None:
+        """Claim a file for as long as it is open; one that is refused is closed.
 
         The claim binds only those who ask. It ends with the process, however that ends; where the file system
         knows no claims, everybody gets one.
+
+        Raises
+        ------
+        BlockingIOError : another run has claimed it.
         """
         try:
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _claim(file.fileno())
         except BlockingIOError:
-            return False
+            file.close()
+            raise
+
+    def claim_path(path: Path) -> int | None:
+        """Claim a file or a folder that is there, as `claim` does, until the descriptor returned is closed.
+
+        Raises
+        ------
+        OSError : another run has claimed it, or it cannot be opened.
+        """
+        number = os.open(path, os.O_RDONLY)
+        try:
+            _claim(number)
+        except BlockingIOError:
+            os.close(number)
+            raise
+        return number
+
+    def _claim(number: int) -> None:
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it") from None
         except OSError:
-            return True
-        return True
+            return
 
 
 class Unheard(io.TextIOWrapper):

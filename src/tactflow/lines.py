@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from tactflow.engine.errors import StageError
-from tactflow.files import taken_away
+from tactflow.files import claim, taken_away
 
 log = logging.getLogger("tactflow")
 
@@ -160,7 +160,7 @@ class LineFile:
 
     Raises
     ------
-    OSError : it cannot be opened.
+    OSError : it cannot be opened, or another run writes to it.
 
     Attributes
     ----------
@@ -183,11 +183,13 @@ class LineFile:
     def __init__(self, path: Path, *, replaces: bool, continues: bool) -> None:
         self.delivered = 0
         self._path = path
-        replace = os.O_TRUNC if replaces else 0
         create = os.O_CREAT if path.exists() else os.O_CREAT | os.O_EXCL
         # At the end whatever happens: where another program has cut the file, no gap of NULs may follow.
-        flags = os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0) | replace | create
+        flags = os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0) | create
         self._file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
+        claim(self._file)
+        if replaces:
+            self._file.truncate(0)
         try:
             self._complete = _continue_at(self._file, path) if continues else 0
         except BaseException:

@@ -18,7 +18,7 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from tactflow.engine.frame import Tick
 from tactflow.ports import Image
-from tactflow.vision.types import Contact, Evidence, Flow, Markers, MarkerStatus
+from tactflow.vision.types import Contact, Depth, Evidence, Flow, Markers, MarkerStatus, Scale
 
 SCHEMA = "tactflow.frame/1"
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
@@ -34,7 +34,8 @@ _OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 class Results(NamedTuple):
     """What the pipeline found in one frame, for sinks: `def write(self, tick: Tick, results: Results)`.
 
-    image : the processed frame. Each is None where it was not computed or nothing was found.
+    image : the processed frame. scale, depth : only with a calibration. Each is None where it was not
+    computed or nothing was found.
 
     >>> Results().contact is None
     True
@@ -44,6 +45,8 @@ class Results(NamedTuple):
     contact: Contact | None = None
     flow: Flow | None = None
     markers: Markers | None = None
+    scale: Scale | None = None
+    depth: Depth | None = None
 
 
 class _Kept:
@@ -81,7 +84,7 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
     results : in pixels of the processed frame; None becomes null. Of the image only the size is told; without
         it, that of the raw frame.
     detail : also tell `contact.confidence`, `flow.stderr`, `flow.rotation`, `flow.divergence`,
-        `flow.residual` and `markers.stderr`.
+        `flow.residual`, `markers.stderr` and the standard errors of all that is in mm.
 
     Raises
     ------
@@ -89,9 +92,9 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
         If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
     """
     frame = tick.frame
-    image, contact, flow, markers = results
+    image, contact, flow, markers, scale, depth = results
     pixels = frame.image if image is None else image
-    described = None if contact is None else _contact(contact, detail)
+    described = None if contact is None else _contact(contact, scale, detail)
     separate = () if contact is None else contact.separate
     return orjson.dumps(
         {
@@ -100,10 +103,10 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
             "seq": frame.seq,
             "t": _number(frame.t, "t"),
             "size": [pixels.shape[1], pixels.shape[0]],
-            "contact": described,
-            "contacts": [_contact(part, detail) for part in separate]
+            "contact": _with_depth(described, depth, detail),
+            "contacts": [_contact(part, scale, detail) for part in separate]
             or [one for one in (described,) if one is not None],
-            "flow": None if flow is None else _flow(flow, detail),
+            "flow": None if flow is None else _flow(flow, scale, detail),
             "markers": None if markers is None else _markers(markers, detail),
             "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
         },
@@ -111,7 +114,7 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
     )
 
 
-def _contact(contact: Contact, detail: bool) -> dict[str, Any]:
+def _contact(contact: Contact, scale: Scale | None, detail: bool) -> dict[str, Any]:
     ellipse = contact.ellipse
     result: dict[str, Any] = {
         "area": _number(contact.area, "contact.area"),
@@ -128,16 +131,39 @@ def _contact(contact: Contact, detail: bool) -> dict[str, Any]:
         },
         "evidence": contact.evidence,
     }
+    if scale is not None:
+        result["center_mm"] = _pair(scale.point(contact.center), "contact.center_mm")
+        result["area_mm2"] = _number(scale.area(contact.area), "contact.area_mm2")
     if detail:
         result["confidence"] = _number(contact.confidence, "contact.confidence")
+        if scale is not None:
+            result["center_mm_stderr"] = list(scale.point_stderr(contact.center))
+            result["area_mm2_stderr"] = scale.area_stderr(contact.area)
     return result
 
 
-def _flow(flow: Flow, detail: bool) -> dict[str, Any]:
+def _with_depth(contact: dict[str, Any] | None, depth: Depth | None, detail: bool) -> dict[str, Any] | None:
+    if contact is None or depth is None:
+        return contact
+    result = contact | {
+        "depth_mm": _number(depth.greatest, "contact.depth_mm"),
+        "volume_mm3": _number(depth.volume, "contact.volume_mm3"),
+    }
+    if detail:
+        result["depth_mm_stderr"] = _optional(depth.greatest_stderr, "contact.depth_mm_stderr")
+        result["volume_mm3_stderr"] = _optional(depth.volume_stderr, "contact.volume_mm3_stderr")
+    return result
+
+
+def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
     result: dict[str, Any] = {
         "mean": None if flow.mean is None else _pair(flow.mean, "flow.mean"),
         "count": int(flow.count),
     }
+    if scale is not None:
+        result["mean_mm"] = None if flow.mean is None else _pair(scale.vector(flow.mean), "flow.mean_mm")
+        if detail and flow.mean is not None and flow.stderr is not None:
+            result["mean_mm_stderr"] = list(scale.vector_stderr(flow.mean, flow.stderr))
     if detail:
         result["stderr"] = None if flow.stderr is None else _pair(flow.stderr, "flow.stderr")
         result["rotation"] = _optional(flow.rotation, "flow.rotation")
@@ -230,6 +256,26 @@ class _ContactModel(_Strict):
     confidence: float = Field(
         0.0, ge=0, le=1, description="of the direction: 0 a disc, towards 1 a line (detail)"
     )
+    center_mm: _Point | None = Field(None, description="center from the scale's origin, mm (calibrated)")
+    center_mm_stderr: _Point | None = Field(
+        None, description="what the scale's error does to center_mm, mm (calibrated, detail)"
+    )
+    area_mm2: Annotated[float, Field(ge=0)] | None = Field(None, description="area, mm^2 (calibrated)")
+    area_mm2_stderr: Annotated[float, Field(ge=0)] | None = Field(
+        None, description="what the scale's error does to area_mm2, mm^2 (calibrated, detail)"
+    )
+    depth_mm: Annotated[float, Field(ge=0)] | None = Field(
+        None, description="how far the surface has been pushed in where it is deepest, mm (calibrated)"
+    )
+    depth_mm_stderr: Annotated[float, Field(ge=0)] | None = Field(
+        None, description="standard error of depth_mm, mm; null when unknown (calibrated, detail)"
+    )
+    volume_mm3: Annotated[float, Field(ge=0)] | None = Field(
+        None, description="between the untouched surface and the pressed one, mm^3 (calibrated)"
+    )
+    volume_mm3_stderr: Annotated[float, Field(ge=0)] | None = Field(
+        None, description="standard error of volume_mm3, mm^3; null when unknown (calibrated, detail)"
+    )
 
 
 class _FlowModel(_Strict):
@@ -237,6 +283,10 @@ class _FlowModel(_Strict):
 
     mean: _Point | None = Field(description="(dx, dy), px; null when count is 0")
     count: int = Field(ge=0, description="number of markers inside the contact")
+    mean_mm: _Point | None = Field(None, description="mean, mm; null when count is 0 (calibrated)")
+    mean_mm_stderr: _Point | None = Field(
+        None, description="standard error of mean_mm, mm (calibrated, detail)"
+    )
     stderr: _Point | None = Field(None, description="standard error of mean, px; null when unknown (detail)")
     rotation: _Finite | None = Field(
         None, description="twist, degrees, counter-clockwise as seen; null when unknown (detail)"
@@ -292,6 +342,6 @@ class _NoDefaults(GenerateJsonSchema):
 
 
 def message_schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of the result message; fields marked (detail) are optional."""
+    """JSON Schema (draft 2020-12) of the result message; what is (detail) or (calibrated) is optional."""
     schema = _Message.model_json_schema(by_alias=True, schema_generator=_NoDefaults)
     return {"$schema": GenerateJsonSchema.schema_dialect, **schema}

@@ -25,6 +25,9 @@ MarkerMask = Annotated[NDArray[np.uint8], ArrayPort("marker_mask", ("H", "W"), "
 Unmarked = Annotated[NDArray[np.uint8], ArrayPort("unmarked", ("H", "W", 3), "uint8", "grey levels, BGR")]
 """The processed frame without its markers."""
 
+Untouched = Annotated[NDArray[np.uint8], ArrayPort("untouched", ("H", "W", 3), "uint8", "grey levels, BGR")]
+"""The untouched gel without its markers; the same array for a whole epoch."""
+
 ContactMask = Annotated[NDArray[np.uint8], ArrayPort("contact_mask", ("H", "W"), "uint8", "0 or 255")]
 """255 where something touches the gel."""
 

@@ -20,7 +20,7 @@ from tactflow.engine.graph import Mark, Node, Pipeline
 from tactflow.engine.link import Link
 from tactflow.engine.run import Runner
 from tactflow.ports import ContactMask, Image
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 
 _SINK = "tactflow.stream"
 """Id of the sink that hands results over; no id of a file has a point in it."""
@@ -35,6 +35,7 @@ class Result:
     contact, flow, markers : None where there is none, or no stage of the pipeline makes it.
     contact_mask : (H, W) uint8, 255 in contact; None without a contact.
     skipped : port -> why it was not computed in this frame: `unchanged` repeats the last value.
+    scale, depth : millimetres per pixel, and how far the gel is pushed in; None without a calibration.
     image : (H, W, 3) uint8 BGR, the processed frame. frame : the raw one. Both None unless asked for, because
         a list of results would hold them all in memory.
 
@@ -53,6 +54,8 @@ class Result:
     markers: Markers | None
     contact_mask: NDArray[np.uint8] | None
     skipped: Mapping[str, str]
+    scale: Scale | None = None
+    depth: Depth | None = None
     image: NDArray[np.uint8] | None = None
     frame: NDArray[np.uint8] | None = None
 
@@ -137,6 +140,8 @@ class _Inputs(NamedTuple):
     flow: Flow | None
     markers: Markers | None
     contact_mask: ContactMask | None
+    scale: Scale | None
+    depth: Depth | None
 
 
 class _Hand(Sink):
@@ -168,6 +173,8 @@ class _Hand(Sink):
                 markers=_locked(inputs.markers),
                 contact_mask=_locked(inputs.contact_mask),
                 skipped=dict(tick.skipped),
+                scale=inputs.scale,
+                depth=_locked(inputs.depth),
                 image=_locked(inputs.image) if self.images else None,
                 frame=frame.image if self.images else None,
             )

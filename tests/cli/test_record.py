@@ -268,7 +268,7 @@ def test_a_file_that_is_being_recorded_is_left_to_its_run(
     writer = RecordingWriter(path, About("main"))
     assert main(["repair", str(path)]) == 2
     assert "is still being recorded" in capsys.readouterr().err
-    with pytest.raises(BlockingIOError, match="another run is recording into it"):
+    with pytest.raises(BlockingIOError, match="another run is writing to it"):
         RecordingWriter(path, About("main"), overwrite=True)
     writer.finish()
     assert main(["repair", str(path)]) == 0

@@ -78,7 +78,7 @@ def test_other_files_in_the_folder_are_left_alone(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(StageError, match=r"cannot be created: .*file is a file, not a folder"):
+    with pytest.raises(StageError, match=r"cannot be written into: .*file is a file, not a folder"):
         run(tmp_path / "file" / "images", [0])
 
 

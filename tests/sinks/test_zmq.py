@@ -230,7 +230,7 @@ def test_an_address_in_use_is_an_error_that_says_what_to_try() -> None:
     "endpoint", ["", "5556", "tcp://127.0.0.1", "tcp://nobody.invalid:5556", "foo://bar"]
 )
 def test_an_address_that_makes_no_sense_is_an_error(endpoint: str) -> None:
-    sink = Zmq(Zmq.Params(endpoint=endpoint))
+    sink = Zmq(Zmq.Params(endpoint=endpoint, open_to_all=True))
     with pytest.raises(StageError, match=r"cannot be bound.*tcp://127"):
         sink.open()
     sink.close()

@@ -71,11 +71,11 @@ def run(args: argparse.Namespace) -> int:
 def _refuse_if_in_use(path: Path) -> None:
     try:
         with path.open("rb") as file:
-            free = claim(file)
+            claim(file)
+    except BlockingIOError:
+        raise ConfigError(f"{path}: is still being recorded; repair it when that run has ended") from None
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if not free:
-        raise ConfigError(f"{path}: is still being recorded; repair it when that run has ended")
 
 
 def _repair(path: Path, copy: Path, out: Path, *, quiet: bool) -> int:

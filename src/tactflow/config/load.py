@@ -23,7 +23,7 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
-from tactflow.files import is_device
+from tactflow.files import expanded, is_device
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 
@@ -73,6 +73,7 @@ def load_pipeline(
     wiring.connect(drafts, problems)
     drafts = wiring.ordered(drafts, problems)
     _check_needs(drafts, problems)
+    calibration = _calibration(root, path.parent, problems)
     problems.raise_if_any()
     assert file is not None, "what is wrong with it was raised"
     entries: dict[str, Entry] = {**file.stages, **file.sinks}
@@ -85,6 +86,7 @@ def load_pipeline(
         opencv_threads=file.opencv_threads,
         realtime_priority=file.realtime_priority,
         runs=max(1, len(sensors.names(root))),
+        calibration=calibration,
         warnings=_warnings(root, drafts),
         settings=_settings(root, name, drafts),
     )
@@ -255,6 +257,22 @@ def _writes_nothing_that_is_read(drafts: Sequence[Draft], directory: Path, probl
             if reader is not None:
                 there = f"{place} is what {reader.path} reads; choose another path"
                 problems.add(draft.mark, f"{draft.path}: {there}")
+
+
+def _calibration(root: Item, directory: Path, problems: Problems) -> Path | None:
+    """The calibration file that the pipeline names; that it is not there is a mistake."""
+    entry = root.entries.get("calibration")
+    if entry is None or not isinstance(entry.item.content, str):
+        return None
+    named = expanded(entry.item.content)
+    for path in (directory / named, named):
+        if path.is_file():
+            return path
+    problems.add(
+        entry.item.mark,
+        f"calibration: there is no file {directory / named}; `tactflow calibrate` makes one",
+    )
+    return None
 
 
 def _does_as_much(there: Draft, added: Draft) -> bool:

@@ -211,6 +211,7 @@ class Changes(Part):
     The values are checked where they are laid over the file's.
     """
 
+    calibration: Any = None
     skipping: Any = None
     opencv_threads: Any = None
     realtime_priority: Any = None
@@ -242,6 +243,11 @@ class PipelineFile(Part):
     sensor: Sensor | None = Field("main", description="the sensor's name in results and topics; null: main")
     sensors: _Sensors = Field(
         {}, description="name -> changes to this file, for several sensors with the same graph"
+    )
+    calibration: Annotated[str, StringConstraints(min_length=1), _says("the path of a file")] | None = Field(
+        None,
+        description="the sensor's calibration file, from the folder of this file or the current one; "
+        "null: results in pixels only",
     )
     skipping: bool = Field(True, description="false runs every stage in every frame")
     opencv_threads: Count | None = Field(

@@ -22,7 +22,7 @@ def pipeline_schema(components: Sequence[Component]) -> Schema:
 
     >>> from tactflow.config.registry import available
     >>> sorted(pipeline_schema(available())["properties"])[:3]
-    ['opencv_threads', 'realtime_priority', 'sensor']
+    ['calibration', 'opencv_threads', 'realtime_priority']
     """
     schema = PipelineFile.model_json_schema()
     definitions: Schema = schema["$defs"]

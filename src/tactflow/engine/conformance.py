@@ -19,7 +19,7 @@ BASES: dict[Kind, type[Part]] = {"source": Source, "stage": Stage, "sink": Sink}
 METHODS: dict[Kind, str] = {"source": "frames", "stage": "process", "sink": "write"}
 """The method whose annotations are the ports."""
 
-OFFERED = ("sensor", "directory", "skipping", "control")
+OFFERED = ("sensor", "directory", "skipping", "control", "calibration")
 """What a constructor may ask for beside `params`."""
 
 _FLAG = ("True or False", lambda value: isinstance(value, bool))

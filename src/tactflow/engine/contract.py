@@ -23,6 +23,7 @@ without the engine. A constructor that takes more than `params` is given, by nam
     directory : Path          folder of the pipeline file, against which relative paths are read
     skipping : bool           whether the run may skip work
     control : Control         handle on the run, see `tactflow.engine.control`
+    calibration : Path | None the sensor's calibration file, if the pipeline names one
 
 For each run, `open()` is called once before the first frame, and `close()` once at the end for every
 part whose `open()` was started, also after an error.
@@ -151,10 +152,15 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Publication:
-    """An address at which a sink publishes. backlog : messages that may wait there for each subscriber."""
+    """An address at which a sink publishes.
+
+    backlog : messages that may wait there for each subscriber. keys : folder that says who may read; None:
+    everybody who can reach the address.
+    """
 
     address: str
     backlog: int
+    keys: str | None = None
 
 
 class Sink(Part):

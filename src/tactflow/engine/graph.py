@@ -118,7 +118,7 @@ class Pipeline:
 
     file, directory : where it was read from. nodes : id -> node. skipping : whether work may be skipped.
     opencv_threads : None leaves them to OpenCV. runs : sensors of the same file, each with a run of its own.
-    warnings : what the user should know before the run.
+    calibration : the sensor's calibration file, or None. warnings : what the user should know before the run.
     settings : what the file and all overrides come to, as plain values that can be written as YAML again.
     """
 
@@ -130,6 +130,7 @@ class Pipeline:
     opencv_threads: int | None = None
     realtime_priority: bool = False
     runs: int = 1
+    calibration: Path | None = None
     warnings: Sequence[str] = field(default_factory=list[str])
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
 

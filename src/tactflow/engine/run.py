@@ -239,7 +239,7 @@ class Runner:
     def _build(self, node: Node, kind: type[TactflowError]) -> Part:
         """Construct a node's class with what its constructor asks for, and open it."""
         pipeline = self.pipeline
-        values = (pipeline.sensor, pipeline.directory, pipeline.skipping, self)
+        values = (pipeline.sensor, pipeline.directory, pipeline.skipping, self, pipeline.calibration)
         offered = dict(zip(OFFERED, values, strict=True))
         try:
             instance = build(node.component.cls, node.params, offered)

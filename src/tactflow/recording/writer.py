@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 import os
@@ -183,9 +182,7 @@ class _WholeRecords(io.BufferedIOBase):
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         super().__init__()
         self._file = path.open("r+b" if overwrite and path.exists() else "xb", buffering=0)
-        if not claim(self._file):
-            self._file.close()
-            raise BlockingIOError(errno.EWOULDBLOCK, "another run is recording into it")
+        claim(self._file)
         self._file.truncate()
         self._kept = 0
         self._at = 0

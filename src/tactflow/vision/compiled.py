@@ -21,7 +21,8 @@ has to wait. The first one that is not on disk yet starts the compiling of all t
 processors; what is compiled is kept on disk (see `kernel_cache`). Kernels run without Python's lock: several
 segments of a pipeline work at the same time.
 
-`NUMBA_DISABLE_JIT=1` runs them as plain Python, slowly, for a debugger.
+`NUMBA_DISABLE_JIT=1` runs them as plain Python, slowly, for a debugger; there, a sum of two uint8 is one too,
+where numba's is wider.
 """
 
 from __future__ import annotations
@@ -161,7 +162,10 @@ class Kernel(Generic[P, R]):
     def _load(self, wait: bool) -> Callable[P, R] | None:
         numba = import_module("numba")
         if numba.config.DISABLE_JIT:
-            _warn_once("NUMBA_DISABLE_JIT is set: kernels run as plain Python, which is very slow")
+            _warn_once(
+                "NUMBA_DISABLE_JIT is set: kernels run as plain Python, for a debugger: very slow, and "
+                "results are wrong where sums of small integers overflow"
+            )
             return self.plain
         function = _with_helpers(self.plain, self._options)
         found = dispatcher_of(function, self._options)

@@ -6,6 +6,7 @@ Coordinates are pixels of the processed frame, x right, y down, with the centre 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Literal
@@ -130,3 +131,74 @@ class Flow:
     rotation: float | None = None
     divergence: float | None = None
     residual: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Millimetres of the gel's surface per pixel of the processed frame.
+
+    x, y : mm per px along each axis of the picture, > 0. stderr : (x, y) of their standard errors, mm per px.
+    origin : (x, y), px: where the mm coordinates are 0.
+
+    The axes of the mm coordinates are those of the picture, x right and y down; z points out of the gel,
+    away from the camera and towards the object, so that the three are right-handed.
+
+    >>> scale = Scale(0.1, 0.1, (0.001, 0.001), (159.5, 119.5))
+    >>> scale.point((169.5, 119.5)), scale.area(100.0)
+    ((1.0, 0.0), 1.0)
+    >>> round(scale.point_stderr((169.5, 119.5))[0], 3)
+    0.01
+    """
+
+    x: float
+    y: float
+    stderr: tuple[float, float]
+    origin: tuple[float, float]
+
+    def point(self, place: tuple[float, float]) -> tuple[float, float]:
+        """(x, y), mm, of a place (x, y), px."""
+        return self.vector((place[0] - self.origin[0], place[1] - self.origin[1]))
+
+    def point_stderr(self, place: tuple[float, float]) -> tuple[float, float]:
+        """What the scale's own error does to `point`, mm; 0 at the origin."""
+        return self.vector_stderr((place[0] - self.origin[0], place[1] - self.origin[1]))
+
+    def vector(self, moved: tuple[float, float]) -> tuple[float, float]:
+        """(x, y), mm, of a displacement (x, y), px."""
+        return (moved[0] * self.x, moved[1] * self.y)
+
+    def vector_stderr(
+        self, moved: tuple[float, float], own: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[float, float]:
+        """Standard error of `vector`, mm. own : of the displacement itself, px."""
+        return (
+            math.hypot(moved[0] * self.stderr[0], own[0] * self.x),
+            math.hypot(moved[1] * self.stderr[1], own[1] * self.y),
+        )
+
+    def area(self, pixels: float) -> float:
+        """Mm^2 of an area of so many px^2."""
+        return pixels * self.x * self.y
+
+    def area_stderr(self, pixels: float) -> float:
+        """What the scale's own error does to `area`, mm^2."""
+        return self.area(pixels) * math.hypot(self.stderr[0] / self.x, self.stderr[1] / self.y)
+
+
+@dataclass(frozen=True, slots=True)
+class Depth:
+    """How far the gel's surface has been pushed in.
+
+    heights : (H, W) float32, mm, >= 0; 0 where nothing touches. Of the processed frame's size.
+    greatest : the largest of them, mm. greatest_stderr : its standard error, mm; None where unknown.
+    volume : between the untouched surface and this one, mm^3. volume_stderr : the same for it.
+
+    >>> Depth(np.zeros((2, 3), np.float32), 0.0, None, 0.0, None).heights.shape
+    (2, 3)
+    """
+
+    heights: NDArray[np.float32]
+    greatest: float
+    greatest_stderr: float | None
+    volume: float
+    volume_stderr: float | None

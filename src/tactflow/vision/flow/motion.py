@@ -43,13 +43,15 @@ class Motion:
     moving : whether neighbouring markers have moved in a way that no motion of the whole gel explains.
     clearly : whether they have moved so far that it is a contact whatever else is seen.
     largest : the third largest of their motions, px; 0 with fewer than three tracked markers.
-    still : (N,) bool, tracked markers that are at rest: not even half of what `moving` asks for.
+    still : (N,) bool, tracked markers that are at rest: not even half of what `moving` asks for. left : (N,)
+    float64, the motion of each tracked marker that no motion of the whole gel explains, px; 0 of others.
     """
 
     moving: bool
     clearly: bool
     largest: float
     still: NDArray[np.bool_]
+    left: FloatArray
 
 
 class MotionTest:
@@ -147,7 +149,7 @@ class MotionTest:
         self._moving = self._clearly or self._together(left > near)
         largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
-        return Motion(self._moving, self._clearly, largest, tracked & (left <= STILL * bound))
+        return Motion(self._moving, self._clearly, largest, tracked & (left <= STILL * bound), left)
 
     def stretched(self, markers: Markers) -> FloatArray:
         """Positions (K, 2), px, of the markers at the most strained links between tracked ones.

@@ -1,0 +1,137 @@
+"""Millimetres per pixel, from what is known about the gel or its picture."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tactflow.vision.markers.lattice import nearest
+from tactflow.vision.types import Scale
+
+FEWEST_LINKS: Final = 8
+"""Distances between neighbouring dots in each direction at least, for a pitch and its error. By hand."""
+LONGER: Final = 1.35
+"""How much longer than the typical one a distance between neighbours may be: less than the diagonal of a
+square, 1.41."""
+
+
+def centre(size: tuple[int, int]) -> tuple[float, float]:
+    """The middle of a picture of size (width, height), px: where its mm coordinates are 0.
+
+    >>> centre((320, 240))
+    (159.5, 119.5)
+    """
+    return ((size[0] - 1) / 2, (size[1] - 1) / 2)
+
+
+def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Scale:
+    """From dots that are printed in a square grid of known pitch.
+
+    The links between neighbours fall into two directions at right angles in mm; the scales of x and y are
+    those that make the mean link of each direction one pitch long. Where the grid stands so askew that this
+    cannot tell x from y, both get one scale.
+
+    Parameters
+    ----------
+    dots : (N, 2), px, on the untouched gel. pitch : mm. size : (width, height) of the picture, px.
+
+    Returns
+    -------
+    The scale, with standard errors from how the links scatter: that of their mean, where the middle of the
+    picture stands for all of it.
+
+    Raises
+    ------
+    ValueError : too few dots in a grid, or a pitch that is none.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.arange(6) * 20.0, np.arange(5) * 25.0)
+    >>> scale = scale_from_pitch(np.column_stack([x.ravel(), y.ravel()]), 2.0, (120, 120))
+    >>> round(scale.x, 6), round(scale.y, 6)
+    (0.1, 0.08)
+    """
+    if not (np.isfinite(pitch) and pitch > 0):
+        raise ValueError(f"pitch: required > 0 mm, got {pitch:g}")
+    groups = _links(np.asarray(dots, np.float64).reshape(-1, 2))
+    fewest = min(len(group) for group in groups)
+    if fewest < FEWEST_LINKS:
+        raise ValueError(
+            f"scale by pitch: required a grid with {FEWEST_LINKS} pairs of neighbours along each direction, "
+            f"found {fewest}; give the corners of a known rectangle instead"
+        )
+    means = np.array([np.median(group, axis=0) for group in groups])
+    spread = np.array([1.4826 * np.median(np.abs(g - m), axis=0) for g, m in zip(groups, means, strict=True)])
+    error = spread / np.sqrt([[len(group)] for group in groups])
+    squares = means**2
+    if abs(np.linalg.det(squares)) < 0.25 * squares.sum() ** 2 / 4:
+        both = pitch / np.sqrt(squares.sum(axis=1)).mean()
+        x = y = float(both)
+    else:
+        x, y = np.sqrt(np.maximum(np.linalg.solve(squares, [pitch**2, pitch**2]), 0)).tolist()
+        if not (x > 0 and y > 0):
+            raise ValueError("scale by pitch: the dots stand in no square grid; give corners instead")
+    # Along an axis the relative error of the scale is that of the links that run along it.
+    along = np.argmax(np.abs(means), axis=0)
+    relative = [float(error[along[k], k] / abs(means[along[k], k])) for k in (0, 1)]
+    return Scale(x, y, (x * relative[0], y * relative[1]), centre(size))
+
+
+def scale_from_corners(pixels: ArrayLike, millimetres: ArrayLike, size: tuple[int, int]) -> Scale:
+    """From points of the processed picture whose places are known in mm.
+
+    Parameters
+    ----------
+    pixels, millimetres : (N, 2) each, N >= 2, not all on one line along an axis. size : of the picture, px.
+
+    Returns
+    -------
+    The scale by least squares, mm = offset + scale px along each axis, with standard errors from what is
+    left; 0 where there are only two points.
+
+    Raises
+    ------
+    ValueError : too few points, or all at one x or y.
+
+    Examples
+    --------
+    >>> scale = scale_from_corners([[0, 0], [240, 0], [0, 320], [240, 320]],
+    ...     [[0, 0], [24, 0], [0, 32], [24, 32]], (240, 320))
+    >>> round(scale.x, 6), round(scale.y, 6)
+    (0.1, 0.1)
+    """
+    known, real = np.asarray(pixels, np.float64), np.asarray(millimetres, np.float64)
+    if known.ndim != 2 or known.shape[1] != 2 or known.shape != real.shape or len(known) < 2:
+        raise ValueError(f"corners: required as many points in px as in mm, got {known.shape}, {real.shape}")
+    values, errors = [], []
+    for axis in (0, 1):
+        away = known[:, axis] - known[:, axis].mean()
+        if (away**2).sum() < 1:
+            raise ValueError(f"corners: all have the same {'xy'[axis]}, which gives no scale along it")
+        slope = float((away * real[:, axis]).sum() / (away**2).sum())
+        if slope <= 0:
+            raise ValueError(
+                f"corners: {'xy'[axis]} in mm falls where it grows in px; both go right and down"
+            )
+        rest = real[:, axis] - real[:, axis].mean() - slope * away
+        left = len(known) - 2
+        variance = float((rest**2).sum() / left / (away**2).sum()) if left else 0.0
+        values.append(slope)
+        errors.append(float(np.sqrt(variance)))
+    return Scale(values[0], values[1], (errors[0], errors[1]), centre(size))
+
+
+def _links(dots: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Links between neighbours, (N, 2) px each: those along x, right, and those along y, down."""
+    distances, near = nearest(dots, 4)
+    if not distances.size:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    typical = np.median(distances[:, : min(2, distances.shape[1])])
+    first = np.repeat(np.arange(len(dots)), near.shape[1])
+    links = dots[near.ravel()] - dots[first]
+    links = links[np.hypot(*links.T) < LONGER * typical]
+    across = np.abs(links[:, 0]) >= np.abs(links[:, 1])
+    # Each pair of neighbours is found from both sides.
+    return links[across & (links[:, 0] > 0)], links[~across & (links[:, 1] > 0)]

@@ -1,0 +1,101 @@
+"""The slope of the gel's surface from its colour.
+
+A surface that tilts answers to each coloured light in proportion to the cosine between its normal and the
+light, so that for a matt surface the horizontal part of the normal is linear in the relative change of the
+three channels. Shadows, gloss and light from near make it a smooth function of the colour that differs from
+place to place: here a cubic polynomial in the colour, without a constant, so that no change is no slope,
+whose coefficients are quadratic polynomials of the place. Nothing of it is learned at run time.
+
+References
+----------
+M. Johnson and E. Adelson, "Retrographic sensing for the measurement of surface texture and shape", CVPR 2009;
+W. Yuan, S. Dong, E. Adelson, "GelSight", Sensors 2017, for photometric stereo by calibration with a ball.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+
+STEEPEST: Final = 0.95
+"""Horizontal part of a unit normal at most: a slope of 3. What is steeper has no colour of its own."""
+
+COLOUR_TERMS: Final = 19
+"""Products of one to three of the three channels."""
+PLACE_TERMS: Final = 6
+"""Products of none to two of the two coordinates."""
+
+
+class SlopeModel:
+    """Normals of the gel's surface from relative changes of its colour.
+
+    coefficients : (6, 19, 2): for each term of the place and of the colour, x and y of the normal.
+
+    Raises ValueError on another shape, or on numbers that are not finite.
+
+    >>> model = SlopeModel(np.zeros((PLACE_TERMS, COLOUR_TERMS, 2)))
+    >>> model.normals(np.ones((4, 5, 3), np.float32), place_terms((5, 4))).shape
+    (2, 4, 5)
+    """
+
+    def __init__(self, coefficients: NDArray[np.floating]) -> None:
+        wanted = (PLACE_TERMS, COLOUR_TERMS, 2)
+        if coefficients.shape != wanted or not np.isfinite(coefficients).all():
+            raise ValueError(f"slopes: required finite coefficients {wanted}, got {coefficients.shape}")
+        self.coefficients: Float = np.asarray(coefficients, np.float32)
+        # All terms of the place at once: one product of matrices.
+        self._flat = np.ascontiguousarray(
+            self.coefficients.transpose(2, 0, 1).reshape(2 * PLACE_TERMS, COLOUR_TERMS)
+        )
+
+    def normals(self, change: Float, place: Float) -> Float:
+        """X and y of the unit normals.
+
+        change : (h, w, 3) float32, change of the light over the light at rest. place : (6, h, w) float32,
+        `place_terms` of the same pixels. Returns (2, h, w) float32; positive where the surface rises to the
+        right, and down, as seen by the camera: towards it. Steeper ones than `STEEPEST` are cut.
+        """
+        height, width = change.shape[:2]
+        by_place = self._flat @ colour_terms(change).reshape(COLOUR_TERMS, -1)
+        by_place = by_place.reshape(2, PLACE_TERMS, height, width)
+        by_place *= place
+        normal: Float = by_place.sum(axis=1)
+        length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1])
+        normal /= np.maximum(length * np.float32(1 / STEEPEST), np.float32(1))
+        return normal
+
+
+def colour_terms(change: Float) -> Float:
+    """(19, h, w) float32: all products of one to three channels of (h, w, 3).
+
+    >>> float(colour_terms(np.full((1, 1, 3), 2, np.float32)).sum())
+    110.0
+    """
+    terms = np.empty((COLOUR_TERMS, *change.shape[:2]), np.float32)
+    terms[:3] = change.transpose(2, 0, 1)
+    blue, green, red = terms[:3]
+    # Squares and products of two.
+    np.multiply(blue, terms[:3], out=terms[3:6])
+    np.multiply(green, terms[1:3], out=terms[6:8])
+    np.multiply(red, red, out=terms[8])
+    # Each of them times a channel that does not come before its own.
+    np.multiply(blue, terms[3:9], out=terms[9:15])
+    np.multiply(green, terms[6:9], out=terms[15:18])
+    np.multiply(red, terms[8], out=terms[18])
+    return terms
+
+
+def place_terms(size: tuple[int, int]) -> Float:
+    """(6, h, w) float32: 1, x, y, x^2, x y, y^2 of every pixel, from -1 to 1 across the picture.
+
+    size : (width, height), px.
+
+    >>> place_terms((3, 2))[1].tolist()
+    [[-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]]
+    """
+    x, y = np.meshgrid(*(np.linspace(-1, 1, side, dtype=np.float32) for side in size))
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])

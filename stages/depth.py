@@ -1,0 +1,46 @@
+"""Stage `depth`: how far the gel is pushed in, as a height map in mm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tactflow.calibration.file import Calibration
+from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.frame import Absent
+from tactflow.ports import ContactMask, Unmarked, Untouched
+from tactflow.vision.depth.surface import Rest, Surface
+from tactflow.vision.types import Depth as HeightMap
+from tactflow.vision.types import Scale
+
+
+class Depth(Stage):
+    """Heights from the colour of the gel, by the photometric part of the sensor's calibration.
+
+    Nothing without a calibration, or with one that only knows the scale.
+    """
+
+    memory = "pure"
+
+    def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
+        """Prepare. calibration : the file."""
+        super().__init__(params)
+        self._known = None if calibration is None else Calibration.load(calibration)
+        self._surface: tuple[Scale, Surface] | None = None
+        self._rest: tuple[Untouched, Rest] | None = None
+
+    def process(
+        self, unmarked: Unmarked, untouched: Untouched, contact_mask: ContactMask, scale: Scale
+    ) -> HeightMap | Absent:
+        """The height map of the contact."""
+        known = self._known
+        if known is None or known.slopes is None or known.photometric is None:
+            return Absent("no_calibration")
+        if not contact_mask.any():
+            return Absent("no_contact")
+        if self._surface is None or self._surface[0] is not scale:
+            errors = known.photometric
+            surface = Surface(known.slopes, scale, errors.depth_stderr, errors.volume_stderr)
+            self._surface = scale, surface
+        if self._rest is None or self._rest[0] is not untouched:
+            self._rest = untouched, Rest(untouched)
+        return self._surface[1].depth(unmarked, self._rest[1], contact_mask)

@@ -1,0 +1,135 @@
+"""The calibration file: written, read, checked against the frames, refused where it does not fit."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import tactflow
+from tactflow.calibration.file import Calibration, raw_corners, small_picture
+from tactflow.engine.errors import ConfigError, StageError
+from tactflow.vision.geometry import Preprocessor
+from tactflow.vision.types import Scale
+
+MAPPING = Preprocessor((800, 600), rotate=90, downsample=2).mapping
+GEL = np.full((400, 300, 3), (90, 120, 100), np.uint8)
+CALIBRATION = Calibration(
+    sensor="left",
+    made_from="sim:press",
+    raw_size=(800, 600),
+    size=(300, 400),
+    corners=raw_corners(MAPPING),
+    look=small_picture(GEL),
+    scale=Scale(0.05, 0.06, (0.001, 0.002), (149.5, 199.5)),
+    scale_by="pitch",
+)
+PIPELINE = """
+sensor: left
+calibration: left.yaml
+stages:
+  capture: {source: "sim:press?frames=40"}
+  preprocess: {rotate: 90, downsample: 2}
+  marker_mask:
+  inpaint:
+  difference:
+  untouched:
+  scale:
+  hull: {when: touching}
+"""
+
+
+@pytest.fixture
+def pipeline(tmp_path: Path) -> Path:
+    """A pipeline file with its calibration beside it."""
+    first = next(tactflow.stream(source="sim:press?frames=40", max_frames=1, images=True))
+    assert first.image is not None
+    replace(CALIBRATION, look=small_picture(first.image)).save(tmp_path / "left.yaml")
+    path = tmp_path / "pipeline.yaml"
+    path.write_text(PIPELINE)
+    return path
+
+
+def test_a_file_reads_back_as_it_was_written(tmp_path: Path) -> None:
+    CALIBRATION.save(tmp_path / "a" / "left.yaml")
+    found = Calibration.load(tmp_path / "a" / "left.yaml")
+    assert found.scale == CALIBRATION.scale
+    assert (found.sensor, found.made_from, found.size) == ("left", "sim:press", (300, 400))
+    assert found.corners.tolist() == CALIBRATION.corners.tolist()
+    assert found.made
+
+
+def test_a_pipeline_gives_millimetres_with_it_and_none_without(pipeline: Path) -> None:
+    result = next(r for r in tactflow.stream(pipeline) if r.contact is not None)
+    assert result.scale is not None
+    assert result.contact is not None
+    x, y = result.contact.center
+    assert result.scale.point((x, y)) == pytest.approx(((x - 149.5) * 0.05, (y - 199.5) * 0.06))
+    plain = tactflow.stream(pipeline, settings={"calibration": None})
+    assert next(r for r in plain if r.contact is not None).scale is None
+
+
+def test_a_calibration_that_is_not_there_is_a_mistake_with_its_place(pipeline: Path) -> None:
+    (pipeline.parent / "left.yaml").unlink()
+    (mistake,) = tactflow.check(pipeline)
+    assert "pipeline.yaml:3:" in mistake
+    assert "there is no file" in mistake
+    assert "tactflow calibrate" in mistake
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"stages.preprocess.rotate": 270}, "raw px elsewhere"),
+        ({"stages.preprocess.downsample": 4}, "gave 300 x 400 px; here it gives 150 x 200 px"),
+    ],
+)
+def test_frames_of_another_preprocess_end_the_run_with_the_numbers(
+    pipeline: Path, settings: dict[str, int], words: str
+) -> None:
+    with pytest.raises(StageError, match=words):
+        list(tactflow.stream(pipeline, settings=settings))
+
+
+def test_a_gel_that_looks_unlike_is_warned_of_with_the_numbers(
+    pipeline: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        list(tactflow.stream(pipeline, max_frames=3))
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        list(tactflow.stream(pipeline, source="sim:round_gel", max_frames=3))
+    assert "differs by" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": "other/1"}, "format"),
+        ({"scale": {"mm_per_pixel": [0.1]}}, "scale"),
+        ({"colour": 1}, "colour"),
+    ],
+)
+def test_a_file_that_is_no_calibration_is_refused(
+    tmp_path: Path, change: dict[str, object], words: str
+) -> None:
+    path = tmp_path / "left.yaml"
+    CALIBRATION.save(path)
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
+    with pytest.raises(ConfigError, match=words):
+        Calibration.load(path)
+
+
+def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "left.yaml"
+    CALIBRATION.save(path)
+    path.with_suffix(".npz").write_bytes(b"PK\x03\x04 broken")
+    with pytest.raises(ConfigError, match="make it anew"):
+        Calibration.load(path)
+    path.with_suffix(".npz").unlink()
+    with pytest.raises(ConfigError, match=r"left\.npz"):
+        Calibration.load(path)

@@ -1,0 +1,62 @@
+"""Millimetres per pixel, from a grid of dots and from corners."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
+
+SIZE = (300, 400)
+
+
+def grid(mm_x: float, mm_y: float, pitch: float, turn: float, noise: float, seed: int) -> NDArray[np.float64]:
+    """Dots of a square grid of so many mm, turned, in a picture with so many mm per pixel."""
+    columns, rows = np.meshgrid(np.arange(10), np.arange(12))
+    square = pitch * np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+    cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    dots = square @ np.array([[cos, sin], [-sin, cos]]) / (mm_x, mm_y)
+    return dots + np.random.default_rng(seed).normal(0, noise, dots.shape)
+
+
+@pytest.mark.parametrize("turn", [0.0, 4.0, -12.0])
+def test_the_pitch_of_a_grid_gives_the_scale_of_both_axes(turn: float) -> None:
+    scale = scale_from_pitch(grid(0.08, 0.1, 2.0, turn, 0.05, 1), 2.0, SIZE)
+    assert scale.x == pytest.approx(0.08, rel=0.01)
+    assert scale.y == pytest.approx(0.1, rel=0.01)
+    assert scale.origin == (149.5, 199.5)
+
+
+def test_the_standard_error_of_a_scale_is_honest() -> None:
+    scales = [scale_from_pitch(grid(0.1, 0.1, 2.0, 0.0, 0.3, seed), 2.0, SIZE) for seed in range(100)]
+    off = np.array([(scale.x - 0.1) / scale.stderr[0] for scale in scales])
+    assert 0.5 < off.std() < 1.5
+
+
+def test_a_grid_at_45_degrees_gives_one_scale_for_both_axes() -> None:
+    scale = scale_from_pitch(grid(0.1, 0.1, 2.0, 45.0, 0.0, 1), 2.0, SIZE)
+    assert scale.x == scale.y == pytest.approx(0.1, rel=1e-6)
+
+
+def test_too_few_dots_are_refused_with_the_way_out() -> None:
+    with pytest.raises(ValueError, match="corners of a known rectangle"):
+        scale_from_pitch([[0, 0], [10, 0], [0, 10]], 2.0, SIZE)
+
+
+@pytest.mark.parametrize("pitch", [0.0, -1.0, float("nan")])
+def test_a_pitch_that_is_none_is_refused(pitch: float) -> None:
+    with pytest.raises(ValueError, match="pitch: required > 0 mm"):
+        scale_from_pitch(grid(0.1, 0.1, 2.0, 0, 0, 1), pitch, SIZE)
+
+
+@pytest.mark.parametrize(
+    ("millimetres", "wrong"),
+    [
+        ([[0, 0], [24, 0], [0, 32]], "as many points"),
+        ([[24, 0], [0, 0], [24, 32], [0, 32]], "falls"),
+    ],
+)
+def test_corners_that_make_no_sense_are_refused(millimetres: list[list[float]], wrong: str) -> None:
+    with pytest.raises(ValueError, match=wrong):
+        scale_from_corners([[0, 0], [240, 0], [0, 320], [240, 320]], millimetres, (240, 320))

@@ -1,0 +1,58 @@
+"""Steps of the system clock, by hand, by NTP, by daylight: they change neither order nor durations."""
+
+from __future__ import annotations
+
+import re
+import time
+from itertools import pairwise
+
+import pytest
+
+from tactflow.sources.devices import ArrivalClock
+from tactflow.sources.simulated import Simulated
+from tactflow.sources.watch import Watch, Watched
+from tests.clock import ManualClock
+from tests.conftest import REPOSITORY
+
+
+class SteppedClock(ManualClock):
+    """Its Unix time jumps by a year to and fro with each look."""
+
+    looks = 0
+
+    def unix(self) -> float:
+        self.looks += 1
+        return super().unix() + (-1) ** self.looks * 3.2e7
+
+
+def test_times_of_live_frames_are_unix_time_at_the_start_and_monotonic_from_there() -> None:
+    clock = SteppedClock()
+    arrival = ArrivalClock(clock)
+    began = arrival.now()
+    assert began == pytest.approx(1e9 + clock.now() - 3.2e7)
+    clock.advance(0.5)
+    assert arrival.now() - began == pytest.approx(0.5)
+    clock.advance(0.5)
+    assert arrival.now() - began == pytest.approx(1.0)
+
+
+def test_a_watched_source_takes_no_step_for_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = iter([1e9 + (-1) ** look * 3.2e7 for look in range(1000)])
+    monkeypatch.setattr(time, "time", lambda: next(steps))
+    source = Watched(lambda: Simulated("sim:idle?frames=1000"), Watch(), "example")
+    times = []
+    for _ in range(10):
+        item = source.read()
+        assert item is not None
+        times.append(item[1])
+        assert source.state == "running"
+    source.close()
+    assert all(later > earlier for earlier, later in pairwise(times))
+
+
+def test_only_one_file_asks_the_system_what_time_it_is() -> None:
+    asks = re.compile(r"\btime\.time(_ns)?\(|\bdatetime\.|\btime\.clock_gettime")
+    files = [file for folder in ("src", "stages", "sinks") for file in (REPOSITORY / folder).rglob("*.py")]
+    assert len(files) > 100
+    asking = [file.name for file in files if asks.search(file.read_text(encoding="utf-8"))]
+    assert asking == ["clock.py"]
