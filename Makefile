@@ -2,6 +2,7 @@
 # make test         lint, types, tests
 # make soak         the tests that take longer: faults in running processes, load over time
 # make fuzz         damaged input to every parser, SECONDS for each
+# make reliability  lets every fault happen, and writes docs/reliability.md
 # make kernels      measures what compiling gains, and writes docs/kernels.md
 # make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
@@ -12,7 +13,7 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak fuzz lint types kernels system-deps clean
+.PHONY: run test soak fuzz lint types reliability kernels system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -36,6 +37,9 @@ types: $(VENV)/.installed-test
 	$(PY) -m mypy
 	$(PY) -m mypy --platform darwin
 	$(PY) -m mypy --platform win32
+
+reliability: $(VENV)/.installed-test
+	$(PY) -m tests.faults
 
 kernels: $(VENV)/.installed-test
 	$(PY) -m tests.oracles
