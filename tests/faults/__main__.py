@@ -1,4 +1,4 @@
-"""Plays every case and writes docs/reliability.md: `make reliability`."""
+"""Plays every case and writes the section "faults" of docs/reliability.md: `make reliability`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import pytest
 
 from tests.faults.rig import Seen
 from tests.faults.table import CASES, SECTIONS, Case
+from tests.load.workload import write_section
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
 LONGEST = 150
 """Letters of what was said that the page shows."""
 
-INTRODUCTION = """# What is promised when something goes wrong
-
+INTRODUCTION = """\
 Each line is a case in tests/faults/table.py: a test lets it happen and compares what is seen with what is
 promised. *Seen* are the exit code, what was said, and what was left behind, when this page was written.
 `make test` plays the quick ones, `make soak` the others too, and `make reliability` writes this page.
@@ -47,7 +46,7 @@ def main() -> int:
     """Play all, write the page; 1 if something is not as promised."""
     text, wrong = INTRODUCTION, 0
     for title, cases in SECTIONS.items():
-        text += f"\n## {title}\n\n| | what happens | promised | seen |\n| --- | --- | --- | --- |\n"
+        text += f"\n### {title}\n\n| | what happens | promised | seen |\n| --- | --- | --- | --- |\n"
         for case in cases:
             with tempfile.TemporaryDirectory() as name:
                 try:
@@ -59,7 +58,7 @@ def main() -> int:
             differences = case.differences(seen)
             wrong += bool(differences)
             print(case.name, *differences, sep="\n    ", file=sys.stderr)
-    PAGE.write_text(text)
+    write_section("faults", text)
     print(f"{len(CASES)} cases, {wrong} not as promised", file=sys.stderr)
     return 1 if wrong else 0
 

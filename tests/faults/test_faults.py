@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.__main__ import PAGE, row
+from tests.faults.__main__ import row
 from tests.faults.table import CASES, Case
+from tests.load.workload import PAGE
 
 
 @pytest.mark.parametrize(
