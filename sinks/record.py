@@ -347,6 +347,7 @@ class Record(Recorder):
             self._write_entry(self._file, entry)
 
     def _write_entry(self, file: RecordingWriter, entry: Entry) -> None:
+        self._refuse_interference(file)
         if file.frames == 0:
             self._file_begins, self._in_force = entry.time, []
         try:
@@ -356,7 +357,6 @@ class Record(Recorder):
             file.write(entry)
         except OSError as error:
             self._give_up(file, error)
-        self._refuse_interference(file)
         new = [*self._late, *([entry] if entry.reference else [])]
         if new:
             self._in_force = [reference for reference in self._in_force if reference.epoch == new[-1].epoch]
