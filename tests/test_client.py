@@ -23,7 +23,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results, encode_message
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.clock import PATIENCE, ManualClock
+from tests.clock import PATIENCE, ManualClock, until
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 CONTACT = Contact(5123.5, (150.2, 201.7), -12.31, 0.218, np.zeros((3, 2)), None)
@@ -331,8 +331,12 @@ def test_what_is_no_result_message_is_passed_over_and_counted() -> None:
         port = publisher.bind_to_random_port("tcp://127.0.0.1")
         with Subscriber(f"tcp://127.0.0.1:{port}", timeout=PATIENCE) as results:
             good = encode_message(Tick(Frame("main", 3, 0.1, np.zeros((4, 4, 3), np.uint8))), Results())
-            while not results._socket.poll(20):
+
+            def heard() -> int:
                 publisher.send(b"tactflow.main " + good)
+                return results._socket.poll(20)
+
+            until(heard)
             contact = good.replace(b'"contact":null', b'"contact":{"area":"large"}')
             assert contact != good
             for body in (b"{", b'{"seq": []}', b"{}", contact, good):
@@ -350,3 +354,11 @@ def test_whoever_sends_messages_as_long_as_no_result_is_heard_no_more() -> None:
             assert publisher.recv() == b"\x01tactflow."
             publisher.send(b"tactflow.main {" + bytes(LONGEST_MESSAGE))
             assert publisher.recv() == b"\x00tactflow."
+
+
+def test_what_a_publisher_sends_commands_no_terminal() -> None:
+    message = json.loads(encode_message(Tick(Frame("main", 3, 0.1, IMAGE)), Results()))
+    message |= {"sensor": "\x1b[2Jmain", "skipped": {"contact": "\x9b2J"}}
+    shown = listen.describe(message)
+    assert "?[2Jmain 3" in shown
+    assert "(?2J)" in shown

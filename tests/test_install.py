@@ -52,8 +52,9 @@ def test_the_wheel_runs_in_a_fresh_environment_and_compiles_nothing_after_warmup
     assert modules() <= set(zipfile.ZipFile(wheel).namelist())
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
-    constraints = REPOSITORY / "constraints.txt"
-    command(python, *pip, "install", "--constraint", constraints, wheel, cwd=tmp_path)
+    pinned = REPOSITORY / "requirements.txt"
+    command(python, *pip, "install", "--require-hashes", "--requirement", pinned, cwd=tmp_path)
+    command(python, *pip, "install", "--no-deps", wheel, cwd=tmp_path)
     program = tmp_path / "venv" / "bin" / "tactflow"
     empty = tmp_path / "empty"
     empty.mkdir()
