@@ -1,18 +1,22 @@
 # make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
 # make test         lint, types, tests
-# make soak         the tests that take longer: faults in running processes, load over time
+# make soak         what takes longer: faults in running processes, a million frames (two hours)
+# make load         results, drops, latency and memory against the load (ten minutes)
 # make fuzz         damaged input to every parser, SECONDS for each
+# make audit        known weaknesses of the packages that are used, where the list can be reached
+# make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
 # make kernels      measures what compiling gains, and writes docs/kernels.md
 # make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
 VENV := .venv
 PY := $(VENV)/bin/python
+TOOLS := $(VENV)-tools
 PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak fuzz lint types kernels system-deps clean
+.PHONY: run test soak load fuzz audit lock lint types kernels system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -23,6 +27,10 @@ test: lint types
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
 soak: $(VENV)/.installed-test
 	$(PY) -m pytest -m slow
+	$(PY) -m tests.load.soak
+
+load: $(VENV)/.installed-test
+	$(PY) -m tests.load.knee
 
 fuzz: SECONDS := 300
 fuzz: $(VENV)/.installed-test
@@ -43,13 +51,35 @@ kernels: $(VENV)/.installed-test
 $(VENV)/bin/python:
 	python3 -m venv $(VENV)
 
-$(VENV)/.installed: pyproject.toml setup.py constraints.txt | $(VENV)/bin/python
-	$(PIP) install --constraint constraints.txt --editable ".[all]"
+# Nothing is installed that is not the file whose hash stands here; what builds is one of them.
+$(VENV)/.installed: pyproject.toml setup.py requirements.txt | $(VENV)/bin/python
+	$(PIP) install --require-hashes --requirement requirements.txt
+	$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@
 
-$(VENV)/.installed-test: pyproject.toml setup.py constraints.txt | $(VENV)/bin/python
-	$(PIP) install --constraint constraints.txt --editable ".[test]"
+$(VENV)/.installed-test: pyproject.toml setup.py requirements-test.txt | $(VENV)/bin/python
+	$(PIP) install --require-hashes --requirement requirements-test.txt
+	$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@ $(VENV)/.installed
+
+$(TOOLS)/.installed:
+	python3 -m venv $(TOOLS)
+	$(TOOLS)/bin/python -m pip --quiet --disable-pip-version-check install pip-audit uv
+	@touch $@
+
+# For every Python from 3.11 on and every system. The second file is a part of the first.
+COMPILE = $(TOOLS)/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
+	--custom-compile-command "make lock"
+lock: $(TOOLS)/.installed
+	echo "setuptools>=77" | $(COMPILE) $(LOCK) --extra test --output-file requirements-test.txt pyproject.toml -
+	echo "setuptools>=77" | $(COMPILE) --extra all --constraint requirements-test.txt \
+		--output-file requirements.txt pyproject.toml -
+
+ADVISORIES := https://pypi.org/pypi/numpy/2.0.0/json
+audit: $(TOOLS)/.installed
+	@$(TOOLS)/bin/python -c "from urllib.request import urlopen; urlopen('$(ADVISORIES)', timeout=30)" 2>/dev/null || \
+		{ echo "audit: $(ADVISORIES) cannot be reached; nothing was checked" >&2; exit 1; }
+	$(TOOLS)/bin/pip-audit --strict --disable-pip --require-hashes --requirement requirements-test.txt
 
 # apt may be busy with something else: try again for a while.
 system-deps:
@@ -60,4 +90,4 @@ system-deps:
 	done; dpkg --status $(SYSTEM_DEPS) >/dev/null
 
 clean:
-	rm -rf $(VENV) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(TOOLS) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

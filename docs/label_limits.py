@@ -2,13 +2,14 @@
 
     python docs/label_limits.py [FOLDER]
 
-FOLDER holds the recording `wedge_ball`; without it, `../shared/data` beside the repository. Prints the table
-and writes label-limits.svg beside this file. Takes half a minute.
+FOLDER holds the recordings `wedge_ball` and `gels/mini_ball`; without it, `../shared/data` beside the
+repository. Prints the tables and writes label-limits.svg beside this file. Takes half a minute.
 """
 
 from __future__ import annotations
 
 import csv
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ WINDOW = 26
 REACH = 8
 """How far from the outline's centre the centre of reflection is sought, px."""
 DRAWS = 4000
+WRONG = "051"
+"""A label of `mini_ball` that is 70 px beside the ball."""
 SIDE, MARGIN, RANGE = 380, 50, 8.0
 
 
@@ -44,6 +47,14 @@ def read(folder: Path) -> tuple[list[NDArray[np.uint8]], Values]:
     files = [folder / "reference.jpg", *(folder / row["file"] for row in rows)]
     pictures = [rectify(np.asarray(cv2.imread(str(file)), np.uint8)) for file in files]
     return pictures, np.array([(float(row["x"]), float(row["y"])) for row in rows])
+
+
+def read_mini(folder: Path) -> tuple[list[NDArray[np.uint8]], Values]:
+    """The pictures of `mini_ball`, the untouched gel first, and the labelled centres, (N, 2) px."""
+    labels = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
+    names = [name for name in sorted(labels) if name != WRONG]
+    pictures = [np.asarray(cv2.imread(str(folder / f"{name}.png")), np.uint8) for name in ["000", *names]]
+    return pictures, np.array([labels[name]["center"] for name in names], np.float64)
 
 
 def by_outline(pictures: list[NDArray[np.uint8]], masks: list[NDArray[np.uint8]]) -> Values:
@@ -129,24 +140,54 @@ def svg(first: Values, second: Values) -> str:
     return "\n".join([*parts, "</svg>", ""])
 
 
-def main() -> None:
-    """Print the table and write the picture."""
-    here = Path(__file__).resolve()
-    data = Path(sys.argv[1]) if len(sys.argv) > 1 else here.parents[2] / "shared" / "data"
-    pictures, labels = read(data / "wedge_ball")
+def both_ways(pictures: list[NDArray[np.uint8]]) -> tuple[Values, Values]:
+    """Centres (N, 2) px by the outline and by reflection; the untouched gel is the first picture."""
     dot = find_dot(pictures[0])
     assert dot is not None
     masks = [marker_mask(picture, dot) for picture in pictures]
     unmarked = [remove_markers(picture, mask) for picture, mask in zip(pictures, masks, strict=True)]
     outline = by_outline(unmarked, masks)
-    reflection = by_reflection(unmarked, outline)
+    return outline, by_reflection(unmarked, outline)
+
+
+def shared_variance(first: Values, second: Values) -> Values:
+    """(2,) px^2: covariance of the errors of both ways, along x and along y."""
+    return np.array([np.cov(first[:, axis], second[:, axis])[0, 1] for axis in (0, 1)])
+
+
+def mini_ball(folder: Path) -> None:
+    """Print the numbers of `mini_ball`, whose promise has no offset taken out."""
+    pictures, labels = read_mini(folder)
+    outline, reflection = both_ways(pictures)
+    for name, centers in (("outline", outline), ("reflection", reflection)):
+        found = centers - labels
+        offset = np.median(found, axis=0)
+        print(
+            f"mini_ball, {name}: {summed_up(found)}, offset {offset.round(2)}, "
+            f"without it {summed_up(found - offset)}"
+        )
+    shared = shared_variance(errors(outline, labels), errors(reflection, labels))
+    draws = np.random.default_rng(0).normal(size=(DRAWS, len(labels), 2)) * np.sqrt(shared)
+    for offset in (np.zeros(2), np.median(outline - labels, axis=0)):
+        median = np.median(np.hypot(*(draws + offset).transpose(2, 0, 1)))
+        print(
+            f"labels: {np.sqrt(shared).round(2)} px; offset {offset.round(2)}: no better than {median:.2f} px"
+        )
+
+
+def main() -> None:
+    """Print the table and write the picture."""
+    here = Path(__file__).resolve()
+    data = Path(sys.argv[1]) if len(sys.argv) > 1 else here.parents[2] / "shared" / "data"
+    pictures, labels = read(data / "wedge_ball")
+    outline, reflection = both_ways(pictures)
     first, second = errors(outline, labels), errors(reflection, labels)
     print("| | median | 95th percentile |\n| --- | --- | --- |")
     print(f"| target | {TARGETS[0]:g} | {TARGETS[1]:g} |")
     print(f"| outline against labels | {summed_up(first)} |")
     print(f"| reflection against labels | {summed_up(second)} |")
     print(f"| outline against reflection | {summed_up(errors(outline, reflection))} |")
-    shared = np.array([np.cov(first[:, axis], second[:, axis])[0, 1] for axis in (0, 1)])
+    shared = shared_variance(first, second)
     draws = np.random.default_rng(0).normal(size=(DRAWS, len(labels), 2)) * np.sqrt(shared)
     distance = np.hypot(draws[..., 0], draws[..., 1])
     medians, tails = np.median(distance, axis=1), np.percentile(distance, 95, axis=1)
@@ -162,6 +203,7 @@ def main() -> None:
         f"{np.sqrt(np.maximum(own, 0)).round(2)} px"
     )
     here.with_name("label-limits.svg").write_text(svg(first, second), encoding="utf-8")
+    mini_ball(data / "gels" / "mini_ball")
 
 
 if __name__ == "__main__":

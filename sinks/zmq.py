@@ -9,14 +9,13 @@ import time
 
 import orjson
 import zmq
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
-from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.message import Results, encode_message
-from tactflow.publisher import bind_publisher
+from tactflow.publisher import Publisher, is_reachable
 
 log = logging.getLogger("tactflow")
 
@@ -49,7 +48,16 @@ class Zmq(Sink):
         endpoint: str = Field(
             "tcp://127.0.0.1:5556",
             description="address to bind: tcp://127.0.0.1:PORT for this machine only (* picks a free port), "
-            "tcp://*:PORT for the network, ipc:///path",
+            "ipc:///path, or tcp://*:PORT for the network, which takes keys",
+        )
+        keys: str | None = Field(
+            None,
+            min_length=1,
+            description="the publisher's folder that tactflow keys new makes, relative to the current "
+            "directory: only subscribers with a key in it are admitted, and all is encrypted",
+        )
+        open_to_all: bool = Field(
+            False, description="publish to other machines without keys: everybody there may read"
         )
         backlog: int = Field(
             32,
@@ -88,6 +96,16 @@ class Zmq(Sink):
                 raise ValueError(f"required a port up to {HIGHEST_PORT}, got {port[1]}")
             return endpoint
 
+        @model_validator(mode="after")
+        def _guarded(self) -> Zmq.Params:
+            if self.keys is None and not self.open_to_all and is_reachable(self.endpoint):
+                raise ValueError(
+                    f"{self.endpoint} can be reached from other machines, so keys are required: make some "
+                    "with tactflow keys new and set keys to the publisher's folder, or endpoint to "
+                    "tcp://127.0.0.1:5556; open_to_all: true lets everybody read who reaches it"
+                )
+            return self
+
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is bound yet.
 
@@ -104,7 +122,7 @@ class Zmq(Sink):
         self._topic = f"tactflow.{sensor} ".encode()
         # Sockets belong to one thread at a time: `wants` is called by another thread than `write`.
         self._lock = threading.Lock()
-        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._publisher: Publisher | None = None
         self._socket: zmq.Socket[bytes] | None = None
         self._subscriptions: set[bytes] = set()
         self._wanted = False
@@ -116,12 +134,12 @@ class Zmq(Sink):
     @classmethod
     def publishes(cls, params: Zmq.Params) -> Publication:
         """At its endpoint."""
-        return Publication(params.endpoint, params.backlog)
+        return Publication(params.endpoint, params.backlog, params.keys)
 
     @classmethod
     def publish_at(cls, params: Zmq.Params, address: str) -> Zmq.Params:
-        """With another endpoint."""
-        return params.changed(endpoint=address)
+        """With another endpoint, of this machine alone: it is the relay that asks for keys."""
+        return params.changed(endpoint=address, keys=None)
 
     def open(self) -> None:
         """Bind the socket; afterwards `endpoint` is the real address.
@@ -129,22 +147,16 @@ class Zmq(Sink):
         Raises
         ------
         StageError
-            If the address is taken or cannot be bound.
+            If the address is taken or cannot be bound, or the keys are wrong.
         """
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        try:
-            socket = bind_publisher(
-                context, self.params.endpoint, self.params.backlog, self.params.send_buffer
-            )
-        except StageError:
-            context.term()
-            raise
-        self._context, self._socket = context, socket
-        self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        p = self.params
+        self._publisher = Publisher(p.endpoint, p.backlog, p.send_buffer, p.keys)
+        self._socket = self._publisher.socket
+        self.endpoint = self._publisher.endpoint
         self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
         log.info("publishing %s", self.description)
-        self._wait_for_subscriber(self.params.wait_for_subscriber)
-        if self._control is not None and self.params.stats_every:
+        self._wait_for_subscriber(p.wait_for_subscriber)
+        if self._control is not None and p.stats_every:
             # Not in the run's threads: statistics shall also come while no frame does.
             self._stats_thread = threading.Thread(
                 target=self._publish_statistics, args=(self._control,), name="tactflow-stats", daemon=True
@@ -200,13 +212,11 @@ class Zmq(Sink):
         if self._stats_thread is not None:
             self._stats_thread.join()
         with self._lock:
-            socket, context = self._socket, self._context
-            self._socket = self._context = None
+            publisher, self._publisher = self._publisher, None
+            self._socket = None
             self._wanted = False
-        if socket is not None:
-            socket.close(linger=int(self.params.linger * 1000))
-        if context is not None:
-            context.term()
+        if publisher is not None:
+            publisher.close(self.params.linger)
 
     def _read_subscriptions(self) -> None:
         if self._socket is None:

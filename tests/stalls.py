@@ -26,6 +26,8 @@ def main() -> int:
     parser.add_argument("--between", type=float, default=1.0, metavar="S", help="longest time between two, s")
     parser.add_argument("--seed", type=int, default=0)
     args, words = parser.parse_known_args()
+    # A shell has what runs in the background ignore it, and programs that tests interrupt would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     failed = 0
     for number in range(args.runs):
         rng = random.Random(args.seed + number)

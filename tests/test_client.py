@@ -17,13 +17,13 @@ import zmq
 
 from tactflow import client
 from tactflow.cli import listen
-from tactflow.client import Subscriber
+from tactflow.client import LONGEST_MESSAGE, Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results, encode_message
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.clock import PATIENCE, ManualClock
+from tests.clock import PATIENCE, ManualClock, until
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 CONTACT = Contact(5123.5, (150.2, 201.7), -12.31, 0.218, np.zeros((3, 2)), None)
@@ -331,11 +331,26 @@ def test_what_is_no_result_message_is_passed_over_and_counted() -> None:
         port = publisher.bind_to_random_port("tcp://127.0.0.1")
         with Subscriber(f"tcp://127.0.0.1:{port}", timeout=PATIENCE) as results:
             good = encode_message(Tick(Frame("main", 3, 0.1, np.zeros((4, 4, 3), np.uint8))), Results())
-            while not results._socket.poll(20):
+
+            def heard() -> int:
                 publisher.send(b"tactflow.main " + good)
+                return results._socket.poll(20)
+
+            until(heard)
             contact = good.replace(b'"contact":null', b'"contact":{"area":"large"}')
             assert contact != good
             for body in (b"{", b'{"seq": []}', b"{}", contact, good):
                 publisher.send(b"tactflow.main " + body)
             while results.malformed < 4:
                 assert results.receive()["seq"] == 3
+
+
+def test_whoever_sends_messages_as_long_as_no_result_is_heard_no_more() -> None:
+    with zmq.Context() as context, context.socket(zmq.XPUB) as publisher:
+        port = publisher.bind_to_random_port("tcp://127.0.0.1")
+        publisher.linger = 0
+        publisher.rcvtimeo = round(PATIENCE * 1000)
+        with Subscriber(f"tcp://127.0.0.1:{port}"):
+            assert publisher.recv() == b"\x01tactflow."
+            publisher.send(b"tactflow.main {" + bytes(LONGEST_MESSAGE))
+            assert publisher.recv() == b"\x00tactflow."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import venv
@@ -13,15 +14,24 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+RUN = """
+from tactflow.cli.main import main
+from tactflow.vision import compiled
+sinks = "sinks={jsonl: {path: out.jsonl}}"
+code = main(["run", "--quiet", "--max-frames", "30", "--source", "sim:press", "--set", sinks])
+kernels = compiled.known()
+print(code, sum(one.ready for one in kernels) > 5, [one.name for one in kernels if one.compiled_here])
+"""
+
 
 def command(*arguments: str | Path, cwd: Path) -> str:
-    """Run a command that must succeed; its output."""
+    """Run a command that must succeed; what it says."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
     done = subprocess.run(
         [str(a) for a in arguments], cwd=cwd, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    return done.stdout + done.stderr
 
 
 def modules() -> set[str]:
@@ -35,21 +45,25 @@ def modules() -> set[str]:
 
 
 @pytest.mark.timeout(300)
-def test_the_wheel_runs_its_packaged_pipeline_in_a_fresh_environment(tmp_path: Path) -> None:
+def test_the_wheel_runs_in_a_fresh_environment_and_compiles_nothing_after_warmup(tmp_path: Path) -> None:
     pip = ("-m", "pip", "--disable-pip-version-check", "--no-input", "--quiet")
     command(sys.executable, *pip, "wheel", "--no-deps", "--wheel-dir", tmp_path, REPOSITORY, cwd=tmp_path)
     (wheel,) = tmp_path.glob("tactflow-*.whl")
     assert modules() <= set(zipfile.ZipFile(wheel).namelist())
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
-    constraints = REPOSITORY / "constraints.txt"
-    command(python, *pip, "install", "--constraint", constraints, wheel, cwd=tmp_path)
+    pinned = REPOSITORY / "requirements.txt"
+    command(python, *pip, "install", "--require-hashes", "--requirement", pinned, cwd=tmp_path)
+    command(python, *pip, "install", "--no-deps", wheel, cwd=tmp_path)
     program = tmp_path / "venv" / "bin" / "tactflow"
     empty = tmp_path / "empty"
     empty.mkdir()
-    options = ("--max-frames", "30", "--set", "sinks.zmq.endpoint=tcp://127.0.0.1:*")
-    command(program, "run", "markerless", *options, cwd=empty)
-    assert len((empty / "out" / "markerless.jsonl").read_text().splitlines()) == 30
+    warm = command(program, "warmup", cwd=empty)
+    said = re.search(r"(\d+) loops are ready; (\d+) of them were compiled", warm)
+    assert said is not None
+    assert said[1] == said[2]
+    assert "0 True []" in command(python, "-c", RUN, cwd=empty).splitlines()
+    assert len((empty / "out.jsonl").read_text().splitlines()) == 30
     where = command(python, "-c", "import tactflow.stages.hull as m; print(m.__file__)", cwd=empty)
     assert str(tmp_path / "venv") in where
     assert "hull" in command(program, "stages", cwd=empty)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -19,6 +20,8 @@ import orjson
 import zmq
 
 from tactflow.clock import SYSTEM, Clock
+from tactflow.files import expanded
+from tactflow.keys import WrongKeysError, secure_subscriber
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Where tactflow publishes unless its pipeline says otherwise."""
@@ -32,6 +35,13 @@ FIRST_RETRY_MS = 50
 LAST_RETRY_MS = 250
 """Time between attempts to connect again, which doubles from the first to the last: after a pause of the
 publisher, be back within a quarter of a second. Chosen by hand, ms."""
+
+LONGEST_MESSAGE = 16 << 20
+"""Bytes of a message at most; one with 140 dots has about 14,000. Whoever sends longer ones is no tactflow,
+and is heard no more, before memory is taken for it. Chosen by hand."""
+
+REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+"""After these, ZeroMQ does not try again."""
 
 STATISTICS = b"tactflow.stats"
 """Topic of a run's statistics, which no sensor may be called after."""
@@ -52,9 +62,12 @@ class Subscriber:
     endpoint : address that tactflow publishes on.
     sensor : receive only this sensor; None for all.
     latest : keep only the newest message: for control loops, which want the present and not what is waiting.
-        Otherwise every message waits until it is read.
+        Otherwise messages wait until they are read.
     timeout : s without any message after which waiting ends in a TimeoutError; None waits for ever.
     clock : tells when the timeout is over.
+    backlog : messages that may wait until they are read, without `latest`; what comes then is lost, and
+        counted. 10,000 are nearly three minutes at 60 Hz, and some 140 MB.
+    keys : the subscriber's folder that `tactflow keys new` makes, where the publisher asks for keys.
 
     Attributes
     ----------
@@ -66,7 +79,7 @@ class Subscriber:
     Raises
     ------
     ValueError
-        If the endpoint is no address.
+        If the endpoint is no address, or the folder has no keys.
 
     Examples
     --------
@@ -82,6 +95,8 @@ class Subscriber:
         latest: bool = False,
         timeout: float | None = None,
         clock: Clock = SYSTEM,
+        backlog: int = 10_000,
+        keys: str | Path | None = None,
     ) -> None:
         self.endpoint = endpoint
         self._clock = clock
@@ -90,6 +105,7 @@ class Subscriber:
         self.received = 0
         self.malformed = 0
         self._sensor = sensor
+        self._has_keys = keys is not None
         self._last_seq: dict[str, int] = {}
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
@@ -102,11 +118,21 @@ class Subscriber:
         if latest:
             self._socket.setsockopt(zmq.CONFLATE, 1)
         else:
-            self._socket.setsockopt(zmq.RCVHWM, 0)
+            self._socket.setsockopt(zmq.RCVHWM, backlog)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_MESSAGE)
         # The space ends the topic: `main` is not to receive `main2`.
         self._socket.subscribe(b"tactflow." if sensor is None else f"tactflow.{sensor} ".encode())
+        self._refused = self._socket.get_monitor_socket(REFUSALS)
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self._refused, zmq.POLLIN)
         try:
+            if keys is not None:
+                secure_subscriber(self._socket, expanded(str(keys)))
             self._socket.connect(endpoint)
+        except WrongKeysError:
+            self.close()
+            raise
         except zmq.ZMQError as error:
             self.close()
             raise ValueError(
@@ -120,6 +146,8 @@ class Subscriber:
         ------
         TimeoutError
             If nothing comes for `timeout` seconds.
+        PermissionError
+            If the publisher does not admit us: it asks for keys, or for others.
         """
         while True:
             message = _parsed(self.receive_json())
@@ -133,7 +161,10 @@ class Subscriber:
         deadline = None if self.timeout is None else self._clock.now() + self.timeout
         while True:
             left = math.inf if deadline is None else deadline - self._clock.now()
-            if not self._socket.poll(max(math.ceil(min(left, LONGEST_WAIT) * 1000), 0)):
+            ready = dict(self._poller.poll(max(math.ceil(min(left, LONGEST_WAIT) * 1000), 0)))
+            if self._refused in ready:
+                raise PermissionError(self._refusal())
+            if not ready:
                 if left <= LONGEST_WAIT:
                     raise TimeoutError(self._silence())
                 continue
@@ -148,7 +179,14 @@ class Subscriber:
         if self.received:
             return f"{what}; has the run ended?"
         hint = "is tactflow running and publishing there"
-        return f"{what}; {hint}{f', and is its sensor called {self._sensor}' if self._sensor else ''}?"
+        named = f", and is its sensor called {self._sensor}" if self._sensor else ""
+        known = ", and are these keys for it" if self._has_keys else ""
+        return f"{what}; {hint}{named}{known}?"
+
+    def _refusal(self) -> str:
+        if self._has_keys:
+            return f"{self.endpoint} does not admit these keys"
+        return f"{self.endpoint} asks for keys, which tactflow keys new makes, or is no tactflow"
 
     def _count(self, sensor: str, seq: int) -> None:
         last = self._last_seq.get(sensor)
@@ -159,6 +197,9 @@ class Subscriber:
 
     def close(self) -> None:
         """Disconnect. May be called twice."""
+        if not self._socket.closed:
+            self._socket.disable_monitor()
+        self._refused.close(0)
         self._socket.close()
         self._context.term()
 

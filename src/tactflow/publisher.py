@@ -8,36 +8,88 @@ import sys
 from pathlib import Path
 
 import zmq
+from zmq.auth.thread import ThreadAuthenticator
 
 from tactflow.engine.errors import StageError
+from tactflow.files import expanded
+from tactflow.keys import DOMAIN, WrongKeysError, secure_publisher, subscribers_folder
+from tactflow.view.address import is_loopback
 
 LONGEST_SUBSCRIPTION = 4096
 """Bytes of a subscription: topics have some twenty. ZeroMQ keeps subscriptions in a tree and takes a step on
 the stack for each of their bytes: one of a megabyte ends the process."""
+LOOPBACK_INTERFACES = frozenset({"lo", "lo0"})
+"""What Linux and macOS call the network that ends in this machine; an address may name it."""
 
 
-def bind_publisher(
-    context: zmq.Context[zmq.Socket[bytes]], endpoint: str, backlog: int, send_buffer: int
-) -> zmq.Socket[bytes]:
-    """An XPUB socket that is bound.
+class Publisher:
+    """An XPUB socket that is bound, and all that belongs to it.
 
-    backlog : messages that may wait for each subscriber. send_buffer : of the kernel for each, bytes.
+    Parameters
+    ----------
+    endpoint : address to bind.
+    backlog : messages that may wait for each subscriber.
+    send_buffer : of the kernel for each, bytes.
+    keys : the publisher's folder as `tactflow keys new` makes it: only who has a key there is admitted, and
+        all is encrypted. None admits everybody who can reach the address.
 
     Raises
     ------
-    StageError : the address is taken, or cannot be bound. Nothing is left open.
+    StageError
+        If the address is taken or cannot be bound, or the keys are wrong. Nothing is left open.
+
+    Attributes
+    ----------
+    socket : belongs to one thread at a time.
+    endpoint : the real address, where a port was to be chosen.
     """
-    _refuse_taken_path(endpoint)
-    socket = context.socket(zmq.XPUB)
-    socket.sndhwm = backlog
-    socket.setsockopt(zmq.SNDBUF, send_buffer)
-    socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_SUBSCRIPTION)
-    try:
-        socket.bind(endpoint)
-    except zmq.ZMQError as error:
-        socket.close(linger=0)
-        raise StageError(_bind_problem(endpoint, error)) from error
-    return socket
+
+    def __init__(self, endpoint: str, backlog: int, send_buffer: int, keys: str | None = None) -> None:
+        _refuse_taken_path(endpoint)
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._authenticator: ThreadAuthenticator | None = None
+        self.socket = self._context.socket(zmq.XPUB)
+        self.socket.sndhwm = backlog
+        self.socket.setsockopt(zmq.SNDBUF, send_buffer)
+        self.socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_SUBSCRIPTION)
+        try:
+            if keys is not None:
+                self._ask_for_keys(expanded(keys))
+            self.socket.bind(endpoint)
+        except WrongKeysError as error:
+            self.close(0)
+            raise StageError(f"keys: {error}") from error
+        except zmq.ZMQError as error:
+            self.close(0)
+            raise StageError(_bind_problem(endpoint, error)) from error
+        self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def _ask_for_keys(self, folder: Path) -> None:
+        secure_publisher(self.socket, folder)
+        allowed = subscribers_folder(folder)
+        self._authenticator = ThreadAuthenticator(self._context)
+        self._authenticator.start()
+        self._authenticator.configure_curve(domain=DOMAIN, location=allowed)
+
+    def close(self, linger: float) -> None:
+        """Deliver what is under way, for at most `linger` seconds, and free the address."""
+        if self._authenticator is not None:
+            self._authenticator.stop()
+        self.socket.close(linger=int(linger * 1000))
+        self._context.term()
+
+
+def is_reachable(endpoint: str) -> bool:
+    """Whether other machines can reach an address.
+
+    >>> is_reachable("tcp://*:5556"), is_reachable("tcp://127.0.0.1:5556"), is_reachable("ipc:///tmp/tactflow")
+    (True, False, False)
+    """
+    scheme, _, place = endpoint.partition("://")
+    if scheme in ("ipc", "inproc"):
+        return False
+    host = place.rpartition(":")[0].strip("[]")
+    return not (scheme == "tcp" and (is_loopback(host) or host in LOOPBACK_INTERFACES))
 
 
 def _refuse_taken_path(endpoint: str) -> None:

@@ -143,8 +143,12 @@ def test_seq_and_time_grow_across_reconnections_even_if_the_devices_clock_does_n
         device.stamp = 0.0
         device.fail("ends", openings=2)
         connection = arrivals[-1].connection
-        while arrivals[-1].connection == connection:
-            arrivals += take(source)
+
+        def again(connection: int = connection) -> bool:
+            arrivals.extend(take(source))
+            return arrivals[-1].connection > connection
+
+        until(again)
     assert [a.seq for a in arrivals] == sorted({a.seq for a in arrivals})
     assert [a.t for a in arrivals] == sorted({a.t for a in arrivals})
     assert [a.connection for a in arrivals] == sorted(a.connection for a in arrivals)
@@ -253,8 +257,7 @@ def test_without_reconnection_a_stream_that_ends_is_the_end(
     source = watched(reconnect=False)
     take(source)
     device.does = "ends"
-    while source.read_arrival() is not None:
-        pass
+    until(lambda: source.read_arrival() is None)
     assert "the stream ended after" in caplog.text
     assert device.opened == 1
 
@@ -272,8 +275,7 @@ def test_stopping_ends_a_read_that_waits(does: str, device: Flaky, watched: Call
     ended = threading.Event()
 
     def run() -> None:
-        while source.read_arrival() is not None:
-            pass
+        until(lambda: source.read_arrival() is None)
         ended.set()
 
     threading.Thread(target=run).start()
@@ -309,8 +311,7 @@ def test_capture_names_the_thread_that_frames_arrive_in_now(device: Flaky) -> No
     names = {thread.native_id: thread.name for thread in threading.enumerate()}
     assert names[first] == "tactflow-read-flaky"
     device.fail("hangs", openings=2)
-    while capture.live_threads == [first]:
-        next(frames)
+    until(lambda: next(frames) and capture.live_threads != [first])
     assert len(capture.live_threads) == 1, "the reader that hangs is not waited for any more"
     capture.stop()
     device.free.set()

@@ -25,6 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"default: {DEFAULT_ENDPOINT}",
     )
     parser.add_argument("--sensor", metavar="NAME", help="only this sensor; default: all")
+    parser.add_argument(
+        "--keys",
+        metavar="FOLDER",
+        help="the subscriber's folder that tactflow keys new makes, where the publisher asks for keys",
+    )
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="the messages as they are, one JSON object a line")
     form.add_argument("--table", action="store_true", help="a live table of the latest values, on a terminal")
@@ -43,7 +48,9 @@ def run(args: argparse.Namespace) -> int:
     if args.table and not sys.stdout.isatty():
         raise ConfigError("--table needs a terminal; for a pipe or a file, leave it out or use --json")
     try:
-        subscriber = Subscriber(args.endpoint, args.sensor, latest=args.latest, timeout=args.timeout)
+        subscriber = Subscriber(
+            args.endpoint, args.sensor, latest=args.latest, timeout=args.timeout, keys=args.keys
+        )
     except ValueError as error:
         raise ConfigError(f"listen: {error}") from None
     if sys.stderr.isatty():
@@ -55,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
         except TimeoutError as error:
             if subscriber.received == 0:
                 raise SourceError(f"listen: {error}") from None
+        except PermissionError as error:
+            raise SourceError(f"listen: {error}") from None
         except KeyboardInterrupt:
             pass
     return 0

@@ -152,10 +152,15 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Publication:
-    """An address at which a sink publishes. backlog : messages that may wait there for each subscriber."""
+    """An address at which a sink publishes.
+
+    backlog : messages that may wait there for each subscriber. keys : folder that says who may read; None:
+    everybody who can reach the address.
+    """
 
     address: str
     backlog: int
+    keys: str | None = None
 
 
 class Sink(Part):

@@ -9,41 +9,38 @@ from contextlib import contextmanager
 
 import zmq
 
-from tactflow.engine.errors import StageError
-from tactflow.publisher import bind_publisher
+from tactflow.publisher import Publisher
 
 SEND_BUFFER = 32_768
 """Kernel send buffer per subscriber, bytes, the ZeroMQ sink's default. Large ones hold seconds of messages.
 Chosen by hand."""
-LINGER_MS = 500
-"""Time to deliver the last messages at the end, ms. Chosen by hand."""
+LINGER = 0.5
+"""Time to deliver the last messages at the end, s. Chosen by hand."""
 POLL_MS = 100
 """How often the thread looks whether it shall end, ms. Chosen by hand."""
 
 
 @contextmanager
-def relay(address: str, upstream: Sequence[str], backlog: int) -> Iterator[None]:
+def relay(address: str, upstream: Sequence[str], backlog: int, keys: str | None = None) -> Iterator[None]:
     """Bind `address` and pass on what the upstream publishers send, while the block lasts.
 
     upstream : addresses of the publishers. backlog : messages that may wait for each subscriber.
+    keys : as of `Publisher`.
 
     Raises
     ------
-    StageError : the address cannot be bound.
+    StageError : the address cannot be bound, or the keys are wrong.
     """
+    publisher = Publisher(address, backlog, SEND_BUFFER, keys)
+    front = publisher.socket
+    # A context of its own: nobody asks the sensors of this run for keys.
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    try:
-        front = bind_publisher(context, address, backlog, SEND_BUFFER)
-    except StageError:
-        context.term()
-        raise
     back = context.socket(zmq.XSUB)
-    front.linger = LINGER_MS
     back.linger = 0
     # As in the sink: a slow reader shall not be seconds behind.
     back.rcvhwm = backlog
-    for publisher in upstream:
-        back.connect(publisher)
+    for source in upstream:
+        back.connect(source)
     stop = threading.Event()
     thread = threading.Thread(target=_pass_on, args=(front, back, stop), name="tactflow-relay", daemon=True)
     thread.start()
@@ -54,7 +51,7 @@ def relay(address: str, upstream: Sequence[str], backlog: int) -> Iterator[None]
     finally:
         stop.set()
         thread.join(5)
-        front.close()
+        publisher.close(LINGER)
         back.close()
         context.term()
 

@@ -90,11 +90,16 @@ def added(node: Node) -> str:
 
 
 def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
-    """One message for each sink that would write where another sensor's does.
+    """One message for each sink that would write where another sensor's does, or publish there otherwise.
 
     pipelines : sensor -> its pipeline.
     """
-    problems = []
+    problems = [
+        f"{node.mark}  sinks.{node.id}.keys: required the same for all sensors that publish at {one.address}"
+        for one in shared_addresses(pipelines)
+        for _, node in one.sinks
+        if (publication := sink_class(node).publishes(node.params)) and publication.keys != one.keys
+    ]
     seen: dict[Path, str] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
@@ -110,11 +115,15 @@ def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
 
 
 class Shared(NamedTuple):
-    """An address at which several sinks would publish. sinks : (sensor, its sink). backlog : messages."""
+    """An address at which several sinks would publish.
+
+    sinks : (sensor, its sink). backlog : messages. keys : as in `Publication`.
+    """
 
     address: str
     sinks: Sequence[tuple[str, Node]]
     backlog: int
+    keys: str | None
 
 
 def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
@@ -128,9 +137,9 @@ def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
             publication = sink_class(node).publishes(node.params)
             if publication is not None:
                 address = publication.address
-                before = found.get(address, Shared(address, (), 0))
-                found[address] = Shared(
-                    address, (*before.sinks, (sensor, node)), before.backlog + publication.backlog
+                before = found.get(address, Shared(address, (), 0, publication.keys))
+                found[address] = before._replace(
+                    sinks=(*before.sinks, (sensor, node)), backlog=before.backlog + publication.backlog
                 )
     return [shared for shared in found.values() if len(shared.sinks) > 1]
 

@@ -1,0 +1,40 @@
+"""`tactflow keys`: keys for results that leave this machine."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from tactflow.engine.errors import ConfigError, StageError
+from tactflow.keys import WrongKeysError, make_keys
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `keys`."""
+    parser.add_argument("action", choices=("new",), help="new: make keys for a subscriber")
+    parser.add_argument(
+        "name", nargs="?", default="subscriber", metavar="NAME", help="of the subscriber; default: subscriber"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        default=Path("keys"),
+        metavar="FOLDER",
+        help="where they go; default: keys. The publisher's, once there, stay",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make them, and print what goes where."""
+    try:
+        publisher, subscriber = make_keys(args.folder, args.name)
+    except WrongKeysError as error:
+        raise ConfigError(f"keys: {error}") from None
+    except OSError as error:
+        raise StageError(f"{args.folder}: keys cannot be written: {error.strerror or error}") from None
+    print(f"{publisher} stays here, for the run: --set sinks.zmq.keys={publisher}")
+    print(
+        f"{subscriber} goes to the subscriber, over a safe way (scp), and to nobody else: "
+        f"tactflow listen tcp://HOST:5556 --keys {subscriber.name}"
+    )
+    return 0

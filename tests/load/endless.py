@@ -1,0 +1,53 @@
+"""A source that shows a few pictures again and again. Copied beside the pipeline file that names it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import Field
+
+from tactflow.engine.contract import Source, StageParams
+from tactflow.engine.frame import Frame
+
+
+class Endless(Source):
+    """Pictures at a rate, like a camera, or as fast as possible, like a recording.
+
+    The time of a live frame is when it was due, on the monotonic clock: all processes have the same one, so
+    a subscriber can tell how old a result is.
+    """
+
+    class Params(StageParams):
+        """What to show, and how fast."""
+
+        pictures: str = Field(description=".npy file")
+        rate: float = Field(0.0, description="frames per second; 0: as fast as possible")
+        frames: int = Field(1_000_000_000, description="how many")
+
+    def __init__(self, params: Params, sensor: str) -> None:
+        super().__init__(params)
+        self.params = params
+        self.live = params.rate > 0
+        self.total = None if self.live else params.frames
+        self._sensor = sensor
+        self._stopped = threading.Event()
+
+    def frames(self) -> Iterator[Frame]:
+        """Every frame when it is due."""
+        pictures = np.load(self.params.pictures)
+        pictures.flags.writeable = False
+        began = time.perf_counter()
+        for seq in range(self.params.frames):
+            t = began + seq / self.params.rate if self.live else seq / 60
+            wait = t - time.perf_counter() if self.live else 0.0
+            if self._stopped.wait(wait) if wait > 0 else self._stopped.is_set():
+                return
+            captured = t if self.live else time.perf_counter()
+            yield Frame(self._sensor, seq, t, pictures[seq % len(pictures)], captured, reference=seq == 0)
+
+    def stop(self) -> None:
+        """Show no more."""
+        self._stopped.set()

@@ -1,0 +1,162 @@
+"""Load until it is too much: results, drops, their age and memory against sensors, subscribers and pages.
+
+    python -m tests.load.knee
+
+writes the section "load" of docs/reliability.md. The subscribers and pages run on the same machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.load.workload import (
+    Subscribers,
+    children,
+    pages,
+    running,
+    sample,
+    write_pipeline,
+    write_section,
+)
+
+SIZE = (800, 600)
+"""Of the pictures, px: the default pipeline halves them."""
+RATE = 30.0
+"""Of each sensor, frames per second."""
+SETTLE = 4.0
+"""Time that a run is given after its first results, s. Chosen by hand."""
+MEASURED = 15.0
+"""Time that each load is measured for, s. Chosen by hand."""
+SENSORS = (1, 2, 4, 6, 8, 12, 16)
+SUBSCRIBERS = (1, 4, 16, 64, 128)
+PAGES = (1, 2, 4, 8, 16)
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What runs at once."""
+
+    sensors: int = 1
+    subscribers: int = 1
+    pages: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What one load gave.
+
+    results : that arrived at the first subscriber, of those that were due, 0..1. p50, p99 : age of a result
+    at the subscribers, ms. oldest : of the last second, ms. memory, growth : of all processes, MB, and
+    by how much it grew while it was measured. busy : what the machine's processors did, 0..1.
+    """
+
+    load: Load
+    results: float
+    p50: float
+    p99: float
+    oldest: float
+    memory: float
+    growth: float
+    busy: float
+
+
+def loads() -> Iterator[Load]:
+    """All that are measured."""
+    yield from (Load(sensors=count) for count in SENSORS)
+    yield from (Load(subscribers=count) for count in SUBSCRIBERS[1:])
+    yield from (Load(pages=count) for count in PAGES)
+
+
+def measure(load: Load, port: int, folder: Path) -> Seen:
+    """Run one load and look at it."""
+    names = [f"s{number}" for number in range(load.sensors)]
+    sinks = {"zmq": {"endpoint": f"tcp://127.0.0.1:{port}"}, "view": {"port": port + 1}}
+    sensors = {"sensors": {name: {} for name in names}} if load.sensors > 1 else {"sensor": "s0"}
+    write_pipeline(folder, SIZE, {"rate": RATE}, {"sinks": sinks, **sensors})
+    subscribers = Subscribers(f"tcp://127.0.0.1:{port}", load.subscribers, keep=True)
+    with ExitStack() as stack:
+        process = stack.enter_context(running(folder))
+        stack.enter_context(subscribers.reading())
+        while len(subscribers.seqs) < load.sensors:
+            if process.poll() is not None:
+                raise SystemExit((folder / "messages.txt").read_text(encoding="utf-8"))
+            time.sleep(0.1)
+        stack.enter_context(pages([port + 1], load.pages))
+        time.sleep(SETTLE)
+        subscribers.ages.clear()
+        subscribers.seqs.clear()
+        before, idle = _memory(process.pid), _idle()
+        began = time.monotonic()
+        time.sleep(MEASURED)
+        seconds = time.monotonic() - began
+        ages = 1e3 * np.array(subscribers.ages)
+        got = sum(len(seqs) for seqs in subscribers.seqs.values())
+        busy = 1 - (_idle() - idle) / (seconds * (os.cpu_count() or 1))
+        after = _memory(process.pid)
+    last = ages[-max(1, round(RATE * load.sensors * load.subscribers)) :]
+    p50, p99 = (float(np.percentile(ages, part)) for part in (50, 99))
+    results = got / (RATE * seconds * load.sensors)
+    return Seen(load, results, p50, p99, float(last.max()), after, after - before, busy)
+
+
+def _memory(pid: int) -> float:
+    """Of a process and those that it has started, MB."""
+    held = [sample(number) for number in [pid, *children(pid)]]
+    return sum(one.memory for one in held if one is not None)
+
+
+def _idle() -> float:
+    """Seconds that the processors have been idle for."""
+    words = Path("/proc/stat").read_text().split("\n", 1)[0].split()
+    return int(words[4]) / os.sysconf("SC_CLK_TCK")
+
+
+def report(found: list[Seen]) -> str:
+    """The section of the page."""
+    rows = [
+        f"| {seen.load.sensors} | {seen.load.subscribers} | {seen.load.pages} | {100 * seen.results:.0f} % | "
+        f"{seen.p50:.1f} | {seen.p99:.0f} | {seen.oldest:.0f} | {seen.memory:.0f} | {seen.growth:+.1f} | "
+        f"{100 * seen.busy:.0f} % |"
+        for seen in found
+    ]
+    return "\n".join(
+        [
+            f"Sensors of {SIZE[0]} x {SIZE[1]} px at {RATE:g} frames a second with a contact that comes and "
+            f"goes, each in a process of its own, the default pipeline, on {os.cpu_count()} processors that "
+            f"subscribers and pages share; {MEASURED:g} s each. The rest of the results was dropped and "
+            "counted. Ages from the moment a frame was due to its result at the subscriber.",
+            "",
+            "| sensors | subscribers | pages | results | age, ms: p50 | p99 | oldest at the end | memory, MB "
+            "| growth | processors busy |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+            *rows,
+            "",
+            "`make load` measures it again.",
+        ]
+    )
+
+
+def main() -> None:
+    """Measure all loads and write what was seen."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--port", type=int, default=5750)
+    args = parser.parse_args()
+    found = []
+    for load in loads():
+        with tempfile.TemporaryDirectory() as folder:
+            found.append(measure(load, args.port, Path(folder)))
+        print(found[-1], flush=True)
+    write_section("load", report(found))
+
+
+if __name__ == "__main__":
+    main()
