@@ -3,8 +3,8 @@
 Where the ball touches, the surface is the ball: at a distance d from the middle of a ball of radius R the
 horizontal part of the unit normal is d / R, towards the middle. Where exactly the middle is, is not known to
 a pixel from the outline, so fit and centres take turns: with a model, each pixel of a press says where the
-middle would be, and the median of them is the press's new centre. No change of colour is no slope, which
-pins all centres.
+middle would be, and the median of them is the press's new centre. What they lie off in common shows as a
+slope of the unchanged colour, which has none.
 
 Around the ball nothing is known of the slope but that it is the same all around and points to the middle: a
 gel that is pressed by a ball is as round as the ball. Colours that a shadow or a reflection gives one side
@@ -52,6 +52,10 @@ STRANGE: Final = 4.0
 rejected. Chosen by hand."""
 MAD_TO_SIGMA: Final = 1.4826
 """Standard deviation of a normal variable in units of its median absolute deviation."""
+FEWEST_PIXELS: Final = 12
+"""Pixels at half resolution inside a contact that a sphere can be fitted to. Chosen by hand."""
+EDGE: Final = 0.1
+"""Half the width of the ring that counts as the rim of a contact, relative to its radius. Chosen by hand."""
 EVERY: Final = 9
 """Of the pixels around the contact every ninth will do: the others cost time and tell the same."""
 
@@ -164,7 +168,16 @@ def _prepare(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> _Sam
     inner[FADE:-FADE, FADE:-FADE] = True
     reach = min(INNER * press.radius * (scale.x * scale.y) ** 0.5, INNER * ball_radius)
     start = np.array(scale.point(press.center))
-    return _Sample(x.ravel(), y.ravel(), np.ascontiguousarray(terms.T), hidden.ravel(), inner.ravel(), start, reach, window)
+    return _Sample(
+        x.ravel(),
+        y.ravel(),
+        np.ascontiguousarray(terms.T),
+        hidden.ravel(),
+        inner.ravel(),
+        start,
+        reach,
+        window,
+    )
 
 
 def _halved(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
@@ -177,31 +190,38 @@ def _fit(samples: list[_Sample], chosen: NDArray[np.intp], ball_radius: float) -
     """Coefficients (2, 114), and the centres (n, 2), mm, of all samples, from the chosen ones."""
     centers = np.array([sample.start for sample in samples])
     for turn in range(TURNS):
-        weights = _solve([(samples[i], centers[i]) for i in chosen], ball_radius)
+        weights, offset = _solve([(samples[i], centers[i]) for i in chosen], ball_radius)
         if turn < TURNS - 1:
+            centers += offset
             centers[chosen] = [_center(samples[i], centers[i], weights, ball_radius) for i in chosen]
     return weights, centers
 
 
-def _solve(presses: list[tuple[_Sample, Double]], ball_radius: float) -> Double:
-    """Coefficients (2, 114) for given centres."""
+def _solve(presses: list[tuple[_Sample, Double]], ball_radius: float) -> tuple[Double, Double]:
+    """Coefficients (2, 114) for given centres, and how far all of these lie off in common, (2,) mm.
+
+    The second is what a constant beside the terms says: where no change of colour would have a slope.
+    """
     count = PLACE_TERMS * COLOUR_TERMS
-    inside = np.zeros((count, count))
-    aim = np.zeros((2, count))
+    inside = np.zeros((count + 1, count + 1))
+    aim = np.zeros((2, count + 1))
     around = np.zeros((2 * count, 2 * count))
     for sample, center in presses:
         dx, dy = sample.x - center[0], sample.y - center[1]
         distance = np.hypot(dx, dy)
         seen = ~sample.hidden
         ball = seen & (distance < sample.reach)
-        terms = sample.terms[ball]
+        terms = np.column_stack([sample.terms[ball], np.ones(np.count_nonzero(ball), np.float32)])
         inside += terms.T @ terms
         aim += np.stack([dx[ball], dy[ball]]) / ball_radius @ terms
         outer = np.flatnonzero(seen & ~ball & sample.inner)[::EVERY]
         around += EVERY * _roundness(sample.terms[outer], dx[outer], dy[outer], distance[outer])
-    matrix = np.kron(np.eye(2), inside) + ROUND * around
+    matrix = np.kron(np.eye(2), inside)
+    free = np.flatnonzero(np.arange(2 * count + 2) % (count + 1) < count)
+    matrix[np.ix_(free, free)] += ROUND * around
     matrix += np.diag(RIDGE * np.diag(matrix) + 1e-9 * np.trace(matrix) / len(matrix))
-    return np.asarray(np.linalg.solve(matrix, aim.ravel()).reshape(2, count))
+    solved = np.linalg.solve(matrix, aim.ravel()).reshape(2, count + 1)
+    return solved[:, :count], ball_radius * solved[:, count]
 
 
 def _roundness(terms: NDArray[np.float32], dx: Double, dy: Double, distance: Double) -> Double:
@@ -264,32 +284,69 @@ def _held_out(
     ball_radius: float,
 ) -> dict[str, float]:
     """Errors of presses that the fit has not seen, for `PhotometricEntry`."""
-    angles, radii, rms, depths, volumes = [], [], [], [], []
-    for learned, tried in ((good[::2], good[1::2]), (good[1::2], good[::2])):
-        weights, centers = _fit(samples, learned, ball_radius)
+    tried = []
+    for learned, others in ((good[::2], good[1::2]), (good[1::2], good[::2])):
+        weights, _ = _fit(samples, learned, ball_radius)
         surface = Surface(SlopeModel(_shaped(weights)), scale)
-        for i in tried:
-            sample = samples[i]
-            center = _center(sample, centers[i], weights, ball_radius)
-            angles.append(_misfit(sample, center, weights, ball_radius))
-            heights = surface.heights(session.presses[i].image, rest, sample.window).ravel().astype(float)
-            dx, dy = sample.x - center[0], sample.y - center[1]
-            ball = np.hypot(dx, dy) < sample.reach
-            radius, distance = fit_sphere(np.stack([dx[ball], dy[ball], heights[ball]], axis=1))
-            radii.append(radius / ball_radius - 1)
-            rms.append(distance)
-            cap = np.sqrt(ball_radius**2 - dx[ball] ** 2 - dy[ball] ** 2)
-            rise = cap - cap.mean()
-            depths.append(float(rise @ heights[ball] / (rise @ rise)) - 1)
-            true = cap.mean() - cap.min()
-            edge = np.abs(np.hypot(dx, dy) - sample.reach) < 2 * scale.x
-            volumes.append(float(heights[ball].mean() - heights[edge].mean()) / true - 1)
+        for i in others:
+            image = session.presses[i].image
+            tried.append(
+                _errors(samples[i], weights, surface.heights(image, rest, samples[i].window), ball_radius)
+            )
+    return _summary(np.array(tried))
+
+
+def try_photometry(session: Session, model: SlopeModel, scale: Scale, ball_radius: float) -> dict[str, float]:
+    """How well a model fits presses of a ball: the errors of `PhotometricEntry`.
+
+    session : what `find_presses` found, at least one press. ball_radius : mm.
+    """
+    rest = Rest(session.untouched)
+    weights = model.coefficients.transpose(2, 0, 1).reshape(2, -1).astype(np.float64)
+    surface = Surface(model, scale)
+    tried = []
+    for press in session.presses:
+        sample = _prepare(press, rest, scale, ball_radius)
+        heights = surface.heights(press.image, rest, sample.window)
+        tried.append(_errors(sample, weights, heights, ball_radius))
+    return _summary(np.array(tried))
+
+
+def _errors(
+    sample: _Sample, weights: Double, heights: NDArray[np.float32], ball_radius: float
+) -> list[float]:
+    """Of one press: mean angle, relative error of the radius, RMS from the sphere, of depth, of volume.
+
+    The depth is judged by how far the surface falls from the middle of the ball to the rim of the contact,
+    and the volume by the mean of that: the gel around the ball is not known.
+    """
+    center = _center(sample, sample.start, weights, ball_radius)
+    angle = _misfit(sample, center, weights, ball_radius)
+    found = heights.ravel().astype(np.float64)
+    dx, dy = sample.x - center[0], sample.y - center[1]
+    distance = np.hypot(dx, dy)
+    ball = distance < sample.reach
+    edge = np.abs(distance - sample.reach) < EDGE * sample.reach
+    if np.count_nonzero(ball) < FEWEST_PIXELS or not edge.any():
+        return [angle, np.nan, np.nan, np.nan, np.nan]
+    radius, rms = fit_sphere(np.stack([dx[ball], dy[ball], found[ball]], axis=1))
+    cap = np.sqrt(ball_radius**2 - distance[ball] ** 2)
+    rise = cap - cap.mean()
+    fall = np.sqrt(ball_radius**2 - distance[edge] ** 2).mean()
+    depth = float(rise @ found[ball] / (rise @ rise)) - 1
+    volume = float((found[ball].mean() - found[edge].mean()) / (cap.mean() - fall)) - 1
+    return [angle, radius / ball_radius - 1, rms, depth, volume]
+
+
+def _summary(tried: Double) -> dict[str, float]:
+    """Numbers of `PhotometricEntry` from what `_errors` says of each press, (n, 5)."""
+    angle, radius, rms, depth, volume = tried.T
     return {
-        "normal_error": float(np.mean(angles)),
-        "radius_error": float(np.median(radii)),
-        "sphere_rms": float(np.mean(rms)),
-        "depth_stderr": float(np.sqrt(np.mean(np.square(depths)))),
-        "volume_stderr": float(np.sqrt(np.mean(np.square(volumes)))),
+        "normal_error": float(np.mean(angle)),
+        "radius_error": float(np.nanmedian(radius)),
+        "sphere_rms": float(np.nanmean(rms)),
+        "depth_stderr": float(np.sqrt(np.nanmean(depth**2))),
+        "volume_stderr": float(np.sqrt(np.nanmean(volume**2))),
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from tactflow.api import make_runner
 from tactflow.engine.conformance import component
 from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.control import Control
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Tick
 from tactflow.engine.graph import Mark, Node, Pipeline
 from tactflow.ports import ContactMask, MarkerMask, Unmarked
+from tactflow.signals import ending_handled
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Markers
 
@@ -59,15 +61,21 @@ class Session:
     frames: int
 
 
-def find_presses(pipeline: Pipeline, report: Callable[[int, int], None] = lambda _f, _p: None) -> Session:
+Report = Callable[[int, Sequence["Press"], bool], bool]
+"""Called with each frame: how many there were, the presses so far, and whether the last one still lasts.
+Returns whether that is enough for a live source; of a recording all is read."""
+
+
+def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, _lasts: False) -> Session:
     """Run a pipeline on its source and collect the presses in it.
 
     A press lasts as long as something touches at about one place; of each, the frame with the largest
-    contact is kept. Pictures of separate presses one after the other will do.
+    contact is kept. Pictures of separate presses one after the other will do. A signal such as Ctrl-C ends
+    it; what was found until then counts.
 
     Parameters
     ----------
-    pipeline : with stages that give `unmarked` and `contact`. report : called with frames and presses so far.
+    pipeline : with stages that give `unmarked` and `contact`. report : see `Report`.
 
     Raises
     ------
@@ -77,13 +85,16 @@ def find_presses(pipeline: Pipeline, report: Callable[[int, int], None] = lambda
     values: dict[str, Any] = {"report": staticmethod(report), "__annotations__": {}}
     sink = component(type("Collect", (_Collect,), values), _COLLECT, "tactflow calibrate", ())
     inputs = {port.name: pipeline.last_output(port.name) for port in sink.ports.inputs}
-    for port, stage in (("unmarked", "inpaint"), ("contact", "hull")):
+    # Of a gel without markers the picture itself is without them.
+    inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
+    for port, stage in (("unmarked", "preprocess"), ("contact", "hull")):
         if inputs[port] is None:
             raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
     kept = {id_: node for id_, node in pipeline.nodes.items() if node.component.kind != "sink"}
     kept[_COLLECT] = Node(_COLLECT, sink, StageParams(), inputs, Mark(_COLLECT, 0, 0))
     runner = make_runner(replace(pipeline, nodes=kept, skipping=False, calibration=None))
-    failure = runner.run().failure
+    with ending_handled(lambda _number, _frame: runner.stop()):
+        failure = runner.run().failure
     if failure is not None:
         raise failure
     collected: Any = runner.nodes[_COLLECT].instance
@@ -93,10 +104,11 @@ def find_presses(pipeline: Pipeline, report: Callable[[int, int], None] = lambda
 class _Collect(Sink):
     """Keeps the largest contact of each press."""
 
-    report: Callable[[int, int], None]
+    report: Report
 
-    def __init__(self, params: StageParams) -> None:
+    def __init__(self, params: StageParams, control: Control) -> None:
         super().__init__(params)
+        self._control = control
         self.rest: list[NDArray[np.uint8]] = []
         self.presses: list[Press] = []
         self.mapping: PixelMapping | None = None
@@ -127,7 +139,9 @@ class _Collect(Sink):
             radius = float(np.sqrt(np.count_nonzero(contact_mask) / np.pi))
             hidden = np.zeros(unmarked.shape[:2], np.bool_) if marker_mask is None else marker_mask > 0
             self._add(Press(tick.frame.seq, unmarked, contact_mask, hidden, contact.center, radius))
-        self.report(self.frames, len(self.presses))
+        enough = self.report(self.frames, self.presses, self._open)
+        if enough and self._control.source is not None and self._control.source.live:
+            self._control.stop()
 
     def _add(self, press: Press) -> None:
         """A press of its own, or another moment of the last one."""

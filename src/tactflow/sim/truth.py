@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim.camera import Camera
-from tactflow.sim.gel import Press, in_contact
+from tactflow.sim.gel import Press, in_contact, reached, surface
 
 AT_EDGE = 0.25
 """Distance to the outline of the contact, px, at which no method can tell whether a marker is inside.
@@ -57,11 +57,17 @@ class Truth:
     mean_flow: tuple[float, float] | None
     depth: float
     _render: Callable[[], NDArray[np.uint8]] = field(repr=False)
+    _lower: Callable[[], NDArray[np.float32]] = field(repr=False)
 
     @cached_property
     def unmarked(self) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 BGR: the frame without markers, dirt and noise. Rendered when first asked for."""
         return self._render()
+
+    @cached_property
+    def sunk(self) -> NDArray[np.float32]:
+        """(H, W) float32, raw px: how far the gel's surface has sunk. Computed when first asked for."""
+        return self._lower()
 
 
 def pixel_mapping(mapping: Any) -> Any:
@@ -180,7 +186,18 @@ def measure(
         mean_flow=mean_flow,
         depth=max((press.depth for press in pressed), default=0.0) if touching else 0.0,
         _render=partial(_processed, clean, mapping),
+        _lower=partial(_sunk, pressed, camera, size, to),
     )
+
+
+def _sunk(pressed: Sequence[Press], camera: Camera, size: tuple[int, int], to: Any) -> NDArray[np.float32]:
+    """How far the surface has sunk at each pixel's centre, (H, W) raw px: the deepest of all presses."""
+    gel_x, gel_y, seen = _pixel_centres(camera, size, to)
+    lowest = np.zeros(gel_x.shape, np.float32)
+    for press in pressed:
+        if press.touching:
+            np.maximum(lowest, surface(press, reached(press, gel_x, gel_y)), out=lowest)
+    return np.where(seen, lowest, np.float32(0))
 
 
 def _contact(
