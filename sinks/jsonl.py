@@ -45,7 +45,11 @@ class Jsonl(Sink):
             0.5, ge=0, description="longest time that lines wait before they reach the file, s; 0 is at once"
         )
         detail: bool = Field(
-            False, description="also write confidence, standard errors, rotation, divergence, residual"
+            False,
+            description="also write confidence, rotation, divergence, shear, residual, standard errors",
+        )
+        field: bool = Field(
+            False, description="also write the displacement field of the stage field: some 100 kB a frame"
         )
 
         @model_validator(mode="after")
@@ -142,7 +146,9 @@ class Jsonl(Sink):
         """
         if self._out is None:
             return
-        self._pending.append(encode_message(tick, results, detail=self.params.detail))
+        self._pending.append(
+            encode_message(tick, results, detail=self.params.detail, field=self.params.field)
+        )
         now = time.monotonic()
         if self.params.path == "-" or now - self._flushed >= self.params.flush:
             self._flushed = now

@@ -77,7 +77,11 @@ class Zmq(Sink):
             0.0, ge=0, description="wait at most this long for a subscriber before the first frame, s"
         )
         detail: bool = Field(
-            False, description="also send confidence, standard errors, rotation, divergence, residual"
+            False,
+            description="also send confidence, rotation, divergence, shear, residual, standard errors",
+        )
+        field: bool = Field(
+            False, description="also publish the displacement field of the stage field: some 100 kB a frame"
         )
 
         stats_every: float = Field(
@@ -187,7 +191,7 @@ class Zmq(Sink):
         """Send one message to whoever has subscribed; never waits."""
         if not self.wants():
             return
-        body = encode_message(tick, results, detail=self.params.detail)
+        body = encode_message(tick, results, detail=self.params.detail, field=self.params.field)
         self._serialised += 1
         with self._lock:
             if self._socket is not None:

@@ -1,6 +1,8 @@
-"""Stage `flow_in_mask`: how the markers inside the contact move."""
+"""Stage `flow_in_mask`: how the gel inside the contact moves."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 from pydantic import Field
 
@@ -8,30 +10,41 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
 from tactflow.vision import compiled
 from tactflow.vision.contact import inside
-from tactflow.vision.flow import flow_in_mask, similarity
+from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field, similarity
 from tactflow.vision.types import Flow, Markers
 
 
 class FlowInMask(Stage):
-    """Mean displacement, rotation and divergence of the markers inside the contact."""
+    """Mean displacement, rotation and divergence of the gel inside the contact."""
 
     memory = "pure"
 
     class Params(StageParams):
-        """Which markers count as inside."""
+        """By what the flow is known, and which markers count as inside."""
+
+        method: Literal["field", "mean"] = Field(
+            "field",
+            description="field: the integral of the displacement field over the contact, where a stage field "
+            "stands above; mean, and where none does: the mean over the markers inside",
+        )
 
         dilate: float = Field(
             0.3,
             ge=0,
             le=1000,
             description="markers whose centre is up to this far outside the contact's outline count too, px; "
-            "more markers make the mean steadier and mix in gel that moves less",
+            "more markers make a mean over markers steadier and mix in gel that moves less",
         )
 
     def __init__(self, params: Params) -> None:
         self._params = params
         compiled.load(similarity, inside)
 
-    def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
-        """The flow inside the contact; its mean is None where no marker is inside."""
-        return flow_in_mask(markers, contact_mask, dilate=self._params.dilate)
+    def process(
+        self, markers: Markers, contact_mask: ContactMask, field: DisplacementField | None = None
+    ) -> Flow:
+        """The flow inside the contact; its mean is None where no marker is inside, or none near."""
+        dilate = self._params.dilate
+        if field is None or self._params.method == "mean":
+            return flow_in_mask(markers, contact_mask, dilate=dilate)
+        return flow_of_field(field, markers, contact_mask, dilate=dilate)

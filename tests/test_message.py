@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import STATUS_NAMES, Results, encode_message, message_schema
+from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
 from tests.messages import build_message
 
@@ -33,7 +34,8 @@ CONTACT = Contact(
     confidence=0.75,
     evidence="both",
 )
-FLOW = Flow((1.21, -0.33), 9, stderr=(0.1, 0.2), rotation=3.5, divergence=0.01, residual=0.05)
+SHEAR = {"shear": (0.02, -0.01), "rotation_stderr": 0.3, "divergence_stderr": 0.01, "shear_stderr": 0.01}
+FLOW = Flow((1.21, -0.33), 9, stderr=(0.1, 0.2), rotation=3.5, divergence=0.01, residual=0.05, **SHEAR)  # type: ignore[arg-type]
 MARKERS = Markers(
     origin=np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]]),
     position=np.array([[10.5, 20.5], [30.25, 40.0], [50.0, 61.0]]),
@@ -81,6 +83,7 @@ def test_detail_adds_what_is_documented_and_nothing_else() -> None:
     assert detailed["flow"].pop("rotation") == 3.5
     assert detailed["flow"].pop("divergence") == 0.01
     assert detailed["flow"].pop("residual") == 0.05
+    assert {key: detailed["flow"].pop(key) for key in SHEAR} == {**SHEAR, "shear": [0.02, -0.01]}
     assert detailed["markers"].pop("stderr") == [0.02, None, None]
     assert detailed == plain
 
@@ -107,6 +110,26 @@ def test_whatever_is_unknown_is_null_and_the_message_stays_valid(
     assert (message["contact"] is None) == (contact is None)
     assert (message["flow"] is None) == (flow is None)
     assert (message["markers"] is None) == (markers is None)
+
+
+def test_the_field_is_told_where_it_is_asked_for() -> None:
+    origin = np.array([[20.0, 20], [40, 20], [20, 40], [40, 40]])
+    markers = Markers(origin, origin + np.array([1.0, 0.5]), np.zeros(4, np.uint8), np.full(4, 0.02))
+    field = FieldModel(origin, (60, 60))(markers)
+    assert field is not None
+    results = Results(PROCESSED, CONTACT, FLOW, markers, field=field)
+    assert "field" not in build_message(TICK, results, detail=True)
+    message = json.loads(encode_message(TICK, results, field=True))
+    VALIDATOR.validate(message)
+    rows, columns = field.grid.shape
+    assert np.array(message["field"]["displacement"]).shape == (rows, columns, 2)
+    assert np.array(message["field"]["stderr"]).shape == (rows, columns)
+    told = message["field"]
+    last = np.array(told["first"]) + told["spacing"] * np.array([columns - 1, rows - 1])
+    assert last == pytest.approx(field.grid.points[-1, -1])
+    empty = json.loads(encode_message(TICK, Results(PROCESSED), field=True))
+    VALIDATOR.validate(empty)
+    assert empty["field"] is None
 
 
 def test_separate_contacts_are_listed_and_nothing_is_an_empty_list() -> None:

@@ -18,6 +18,7 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from tactflow.engine.frame import Tick
 from tactflow.ports import Image
+from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.types import Contact, Depth, Evidence, Flow, Markers, MarkerStatus, Scale
 
 SCHEMA = "tactflow.frame/1"
@@ -47,6 +48,7 @@ class Results(NamedTuple):
     markers: Markers | None = None
     scale: Scale | None = None
     depth: Depth | None = None
+    field: DisplacementField | None = None
 
 
 class _Kept:
@@ -75,7 +77,7 @@ class _Kept:
         return text
 
 
-def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> bytes:
+def encode_message(tick: Tick, results: Results, *, detail: bool = False, field: bool = False) -> bytes:
     """The result message of one frame, as JSON in UTF-8 on a single line without a line end.
 
     Parameters
@@ -84,7 +86,9 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
     results : in pixels of the processed frame; None becomes null. Of the image only the size is told; without
         it, that of the raw frame.
     detail : also tell `contact.confidence`, `flow.stderr`, `flow.rotation`, `flow.divergence`,
-        `flow.residual`, `markers.stderr` and the standard errors of all that is in mm.
+        `flow.residual`, `flow.shear`, `markers.stderr`, and the standard errors of all these and of all that
+        is in mm.
+    field : also tell `field`.
 
     Raises
     ------
@@ -92,26 +96,26 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False) -> byt
         If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
     """
     frame = tick.frame
-    image, contact, flow, markers, scale, depth = results
+    image, contact, flow, markers, scale, depth, _ = results
     pixels = frame.image if image is None else image
     described = None if contact is None else _contact(contact, scale, detail)
     separate = () if contact is None else contact.separate
-    return orjson.dumps(
-        {
-            "schema": SCHEMA,
-            "sensor": frame.sensor,
-            "seq": frame.seq,
-            "t": _number(frame.t, "t"),
-            "size": [pixels.shape[1], pixels.shape[0]],
-            "contact": _with_depth(described, depth, detail),
-            "contacts": [_contact(part, scale, detail) for part in separate]
-            or [one for one in (described,) if one is not None],
-            "flow": None if flow is None else _flow(flow, scale, detail),
-            "markers": None if markers is None else _markers(markers, detail),
-            "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
-        },
-        option=_OPTIONS,
-    )
+    message: dict[str, Any] = {
+        "schema": SCHEMA,
+        "sensor": frame.sensor,
+        "seq": frame.seq,
+        "t": _number(frame.t, "t"),
+        "size": [pixels.shape[1], pixels.shape[0]],
+        "contact": _with_depth(described, depth, detail),
+        "contacts": [_contact(part, scale, detail) for part in separate]
+        or [one for one in (described,) if one is not None],
+        "flow": None if flow is None else _flow(flow, scale, detail),
+        "markers": None if markers is None else _markers(markers, detail),
+        "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
+    }
+    if field:
+        message["field"] = None if results.field is None else _field(results.field)
+    return orjson.dumps(message, option=_OPTIONS)
 
 
 def _contact(contact: Contact, scale: Scale | None, detail: bool) -> dict[str, Any]:
@@ -168,8 +172,19 @@ def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
         result["stderr"] = None if flow.stderr is None else _pair(flow.stderr, "flow.stderr")
         result["rotation"] = _optional(flow.rotation, "flow.rotation")
         result["divergence"] = _optional(flow.divergence, "flow.divergence")
-        result["residual"] = _optional(flow.residual, "flow.residual")
+        for key in ("residual", "rotation_stderr", "divergence_stderr", "shear_stderr"):
+            result[key] = _optional(getattr(flow, key), f"flow.{key}")
+        result["shear"] = None if flow.shear is None else _pair(flow.shear, "flow.shear")
     return result
+
+
+def _field(field: DisplacementField) -> dict[str, Any]:
+    return {
+        "first": list(field.grid.first),
+        "spacing": field.grid.spacing,
+        "displacement": _points(field.displacement, "field.displacement"),
+        "stderr": _points(field.stderr, "field.stderr"),
+    }
 
 
 def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
@@ -279,11 +294,11 @@ class _ContactModel(_Strict):
 
 
 class _FlowModel(_Strict):
-    """Mean displacement of the markers inside the contact."""
+    """How the gel inside the contact has moved."""
 
-    mean: _Point | None = Field(description="(dx, dy), px; null when count is 0")
+    mean: _Point | None = Field(description="mean displacement (dx, dy), px; null when not known")
     count: int = Field(ge=0, description="number of markers inside the contact")
-    mean_mm: _Point | None = Field(None, description="mean, mm; null when count is 0 (calibrated)")
+    mean_mm: _Point | None = Field(None, description="mean, mm; null when not known (calibrated)")
     mean_mm_stderr: _Point | None = Field(
         None, description="standard error of mean_mm, mm (calibrated, detail)"
     )
@@ -292,12 +307,19 @@ class _FlowModel(_Strict):
         None, description="twist, degrees, counter-clockwise as seen; null when unknown (detail)"
     )
     divergence: _Finite | None = Field(
-        None, description="relative growth in area of the marker pattern; null when unknown (detail)"
+        None, description="relative growth in area of the gel; null when unknown (detail)"
     )
     residual: _Finite | None = Field(
         None,
         description="RMS of what mean, rotation, divergence leave, px; null when unknown (detail)",
     )
+    shear: _Point | None = Field(
+        None,
+        description="(du/dx - dv/dy, du/dy + dv/dx) of the displacement (u, v); null when unknown (detail)",
+    )
+    rotation_stderr: _Positive | None = Field(None, description="degrees; null when unknown (detail)")
+    divergence_stderr: _Positive | None = Field(None, description="null when unknown (detail)")
+    shear_stderr: _Positive | None = Field(None, description="of each part; null when unknown (detail)")
 
 
 class _MarkersModel(_Strict):
@@ -308,6 +330,17 @@ class _MarkersModel(_Strict):
     status: list[Literal["tracked", "inferred", "lost"]] = Field(description="how each position is known")
     stderr: list[Annotated[float, Field(ge=0)] | None] = Field(
         default_factory=list, description="standard error of each position, px; null when unknown (detail)"
+    )
+
+
+class _FieldModel(_Strict):
+    """Displacement of the gel on a regular grid."""
+
+    first: _Point = Field(description="(x, y) of row 0, column 0, in the reference frame, px")
+    spacing: _Positive = Field(description="from one point to the next along both axes, px")
+    displacement: list[list[_Point]] = Field(description="rows of (dx, dy), px")
+    stderr: list[list[Annotated[float, Field(ge=0)]]] = Field(
+        description="standard error of each component, rows, px"
     )
 
 
@@ -329,6 +362,9 @@ class _Message(_Strict):
     )
     flow: _FlowModel | None = Field(description="null when there is no contact")
     markers: _MarkersModel | None = Field(description="null when markers were not computed")
+    field: _FieldModel | None = Field(
+        None, description="displacement field; null without contact (only where the sink's field is true)"
+    )
     skipped: dict[str, str] = Field(
         description="port -> why this frame did not need it; reference -> why this frame became a new one"
     )
@@ -342,6 +378,9 @@ class _NoDefaults(GenerateJsonSchema):
 
 
 def message_schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of the result message; what is (detail) or (calibrated) is optional."""
+    """JSON Schema (draft 2020-12) of the result message.
+
+    `field`, and what is marked (detail) or (calibrated), is optional.
+    """
     schema = _Message.model_json_schema(by_alias=True, schema_generator=_NoDefaults)
     return {"$schema": GenerateJsonSchema.schema_dialect, **schema}

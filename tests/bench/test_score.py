@@ -176,24 +176,23 @@ def test_a_gel_without_markers_gives_no_marker_errors() -> None:
 
 
 def test_flow_is_compared_where_both_know_it(truth: Truth) -> None:
-    assert truth.mean_flow is not None
-    x, y = truth.mean_flow
+    assert truth.contact_flow is not None
+    x, y = truth.contact_flow
     score = FlowScore()
     score.add(Flow((x + 0.3, y + 0.4), 5), truth)
     score.add(Flow(None, 0), truth)
     score.add(None, truth)
-    assert not truth.at_edge.any()
-    assert score.errors() == {"flow_error": pytest.approx(0.5), "flow_decided": pytest.approx(0.5)}
+    assert score.errors() == {"flow_error": pytest.approx(0.5), "flow_rms": pytest.approx(0.5)}
 
 
-def test_flow_beside_a_marker_at_the_edge_is_a_matter_of_chance(truth: Truth) -> None:
-    assert truth.mean_flow is not None
-    x, y = truth.mean_flow
-    at_edge = np.zeros_like(truth.at_edge)
-    at_edge[0] = True
+def test_errors_of_the_flow_are_held_against_its_own_standard_error(truth: Truth) -> None:
+    assert truth.contact_flow is not None
+    x, y = truth.contact_flow
     score = FlowScore()
-    score.add(Flow((x + 3, y), 5), replace(truth, at_edge=at_edge))
-    assert score.errors() == {"flow_error": pytest.approx(3)}
+    score.add(Flow((x + 0.3, y + 0.4), 5, stderr=(0.5, 0.3)), truth)
+    score.add(Flow((x + 0.1, y + 0.9), 5, stderr=(0.2, 0.4)), truth)
+    errors = score.errors()
+    assert (errors["flow_within_one"], errors["flow_within_two"]) == (50, 75)
 
 
 def test_detected_dots_are_compared_with_visible_ones(truth: Truth) -> None:

@@ -396,6 +396,12 @@ def test_a_failing_source_is_told_apart(toy_runner: MakeRunner, capture: dict[st
         assert [row[0] for row in rows(runner)] == list(range(5))
 
 
+def test_a_source_that_fails_at_once_takes_no_frame_from_a_slow_stage(toy_runner: MakeRunner) -> None:
+    runner = toy_runner({"capture": {"fail_at": 2}, "join": {"seconds": 0.3}})
+    assert runner.run().exit_code == 4
+    assert [row[0] for row in rows(runner)] == [0, 1]
+
+
 def test_an_error_while_closing_is_reported_and_the_others_are_closed(toy_runner: MakeRunner) -> None:
     runner = toy_runner(sinks={"bad": {"use": "BadClose"}, "out": {"use": "Collect"}})
     result = runner.run()

@@ -94,7 +94,8 @@ def report(looks: list[Look], frames: int, took: float) -> str:
         [
             f"{frames:,} frames of {SIZE[0]} x {SIZE[1]} px through all sinks (ZeroMQ with a subscriber, "
             f"a page, lines, a recording in files of 200 MB, a film, pictures) in {took / 60:.0f} minutes, "
-            f"{frames / took:.0f} a second; every frame has its line. Memory {verdict}: "
+            f"{frames / took:.0f} a second, the machine's load average {os.getloadavg()[1]:.1f} at the end; "
+            f"every frame has its line. Memory {verdict}: "
             f"{growth:+.1f} MB from the first tenth of the run to its end.",
             "",
             "| | after a tenth | least since | most since | at the end |",

@@ -123,13 +123,11 @@ def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
         assert np.isfinite(truth.origin).all()
         assert truth.depth > gel_model.TOUCH_DEPTH
         # The mask knows the contact at the pixels' centres; next to its outline a marker's centre decides.
-        height, width = truth.contact_mask.shape
         for i in np.flatnonzero(truth.visible):
             x, y = round(truth.position[i, 0]), round(truth.position[i, 1])
             around = truth.contact_mask[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
             if around.all() or not around.any():
                 assert truth.inside[i] == around.any()
-                assert not (truth.at_edge[i] and 1 < x < width - 2 and 1 < y < height - 2)
         assert not (truth.inside & ~truth.visible).any()
         if truth.mean_flow is None:
             assert not truth.inside.any()
@@ -154,7 +152,6 @@ def test_a_marker_at_the_outline_of_the_contact_is_told_apart_from_one_inside() 
     shown = np.ones(5, np.bool_)
     truth = measure(press, scene.camera, places, places, shown, scene.size, None, lambda: scene.clean(40))
     assert truth.inside.tolist() == [True, True, True, False, False]
-    assert truth.at_edge.tolist() == [False, False, True, True, False]
 
 
 def test_index_i_is_the_same_marker_in_every_frame() -> None:

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from tactflow.engine.ports import read_ports
 from tactflow.stages.flow_in_mask import FlowInMask
+from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Flow, Markers
 
 ORIGIN = np.array([[20.0, 20], [40, 20], [20, 40], [40, 40], [80, 50]])
@@ -24,7 +25,7 @@ def run(**params: Any) -> Flow:
 
 def test_it_takes_markers_and_a_contact_mask_and_gives_a_flow() -> None:
     ports = read_ports(FlowInMask, "process")
-    assert [port.name for port in ports.inputs] == ["markers", "contact_mask"]
+    assert [port.name for port in ports.inputs] == ["markers", "contact_mask", "field"]
     assert [(port.name, port.optional) for port in ports.outputs] == [("flow", False)]
 
 
@@ -35,6 +36,21 @@ def test_the_mean_is_over_the_markers_inside_the_dilated_contact() -> None:
     assert flow.rotation == pytest.approx(0, abs=1e-9)
     assert run(dilate=0).count == 2
     assert run(dilate=100).count == 5
+
+
+def test_with_a_field_the_mean_is_an_integral_unless_that_over_markers_is_asked_for() -> None:
+    position = ORIGIN + np.array([[2.0, 0], [0, 0], [0, 0], [0, 0], [0, 0]])
+    markers = Markers(ORIGIN, position, np.zeros(5, np.uint8), np.full(5, 0.02))
+    field = FieldModel(ORIGIN, (90, 60))(markers)
+    integral, plain = (
+        FlowInMask(FlowInMask.Params(method=method)).process(markers, MASK, field)
+        for method in ("field", "mean")
+    )
+    assert plain == FlowInMask(FlowInMask.Params()).process(markers, MASK)
+    assert plain.mean == (1.0, 0.0)  # of the two markers inside, one has moved by 2
+    assert integral.mean is not None
+    assert 0.1 < integral.mean[0] < 1.0
+    assert integral.count == plain.count == 2
 
 
 @pytest.mark.parametrize("params", [{"dilate": -1}, {"method": "median"}, {"dilation": 3}], ids=str)

@@ -96,6 +96,7 @@ class _Inputs:
     marker_mask: NDArray[np.uint8]
     unmarked: NDArray[np.uint8]
     markers: Any
+    field: Any
 
     @property
     def touching(self) -> bool:
@@ -145,7 +146,8 @@ def _chain(pipeline: Pipeline, rendered: Rendered) -> tuple[list[_Inputs], Pixel
         unmarked = run("inpaint", image=image, marker_mask=mask)
         markers = run("tracker", image=image, frame=frame)
         deep = rendered.deep(index)
-        collected.append(_Inputs(frame, truths[index], deep, image, mask, unmarked, markers))
+        field = run("field", image=image, markers=markers) if "field" in stage else Absent("no_field")
+        collected.append(_Inputs(frame, truths[index], deep, image, mask, unmarked, markers, field))
     return collected, mapping
 
 
@@ -193,6 +195,13 @@ def _see_flow(score: FlowScore, inputs: _Inputs, result: Any) -> None:
     score.add(None if isinstance(result, Absent) else result, inputs.truth)
 
 
+def _flow_inputs(inputs: _Inputs) -> dict[str, Any] | None:
+    if not inputs.touching:
+        return None
+    field = None if isinstance(inputs.field, Absent) else inputs.field.field
+    return {"markers": inputs.markers, "contact_mask": inputs.true_mask, "field": field}
+
+
 _GROUPS = (
     _Group("preprocess", lambda i: {"frame": i.frame}, DetectionScore, lambda *_: None),
     _Group("marker_mask", lambda i: {"image": i.image}, DetectionScore, _see_mask),
@@ -202,7 +211,7 @@ _GROUPS = (
     _Group("tracker", lambda i: {"image": i.image, "frame": i.frame}, MarkerScore, _see_markers),
     _Group(
         "flow_in_mask",
-        lambda i: {"markers": i.markers, "contact_mask": i.true_mask} if i.touching else None,
+        _flow_inputs,
         FlowScore,
         _see_flow,
     ),

@@ -245,27 +245,35 @@ class DetectionScore:
 
 @dataclass(slots=True)
 class FlowScore:
-    """Is the mean flow inside the contact right?
+    """Is the mean flow of the gel in contact right, and its standard error honest?
 
-    error : length of the error vector, px, one a frame; decided : only frames without a marker at the edge.
+    error : length of the error vector, px, one a frame. ratio : error of a component over its stated standard
+    error, two a frame that states one.
     """
 
     error: list[float] = field(default_factory=list[float])
-    decided: list[float] = field(default_factory=list[float])
+    ratio: list[float] = field(default_factory=list[float])
 
     def add(self, flow: Flow | None, truth: Truth) -> None:
         """Compare one frame, if both know a mean flow."""
-        if flow is None or flow.mean is None or truth.mean_flow is None:
+        if flow is None or flow.mean is None or truth.contact_flow is None:
             return
-        error = float(np.hypot(flow.mean[0] - truth.mean_flow[0], flow.mean[1] - truth.mean_flow[1]))
-        self.error.append(error)
-        if not truth.at_edge.any():
-            self.decided.append(error)
+        off = np.abs(np.subtract(flow.mean, truth.contact_flow))
+        self.error.append(float(np.hypot(*off)))
+        if flow.stderr is not None and min(flow.stderr) > 0:
+            self.ratio.extend((off / flow.stderr).tolist())
 
     def errors(self) -> dict[str, float]:
         """Quantity -> value."""
+        ratio = np.array(self.ratio)
+        within = [100.0 * float(np.mean(ratio < bound)) if len(ratio) else None for bound in (1, 2)]
         return _drop_unknown(
-            {"flow_error": metrics.mean(self.error), "flow_decided": metrics.mean(self.decided)}
+            {
+                "flow_error": metrics.mean(self.error),
+                "flow_rms": metrics.rms(self.error),
+                "flow_within_one": within[0],
+                "flow_within_two": within[1],
+            }
         )
 
 

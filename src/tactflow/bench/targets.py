@@ -70,12 +70,12 @@ def _marker_errors(simulated: Collection[Measurement], nominal: Collection[Measu
 def _contact_errors(simulated: Collection[Measurement], nominal: Collection[Measurement]) -> list[Target]:
     directed, tempting = _of(simulated, DIRECTED), _of(simulated, NOMINAL | ALWAYS)
     hull = [("hull_iou", 0.88), ("center_error", 1.0), ("area_error", 8.0)]
-    flow = [("flow_error", 0.15), ("flow_decided", 0.15)]
+    flow = [("flow_error", 0.15)]
     decisions = [("false_contacts", 0.0), ("missed_half_depth", 0.0)]
     return [
         _worst("contact: hull IoU; centre; area", nominal, hull),
         _worst("direction: mean; maximum", directed, [("angle_mean", 0.7), ("angle_max", 2.5)]),
-        _worst("mean flow in contact; without frames that chance decides", nominal, flow),
+        _worst("mean flow in contact", nominal, flow),
         _worst("idle frames called contact; half-depth contacts missed", tempting, decisions),
     ]
 

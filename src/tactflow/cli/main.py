@@ -14,6 +14,7 @@ from typing import NoReturn
 
 from tactflow import __version__
 from tactflow.__main__ import wanted
+from tactflow.cli.printable import printable
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.files import Unheard, lead_nowhere
 from tactflow.signals import ENDING
@@ -76,7 +77,7 @@ def main(argv: Sequence[str]) -> int:
         args = _parse(argv)
         return int(args.run(args))
     except TactflowError as error:
-        print(f"tactflow: {error}", file=sys.stderr)
+        print(printable(f"tactflow: {error}"), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         return 130

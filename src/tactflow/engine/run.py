@@ -303,7 +303,7 @@ class Runner:
 
     def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
         """Wait for the threads: as long as it takes until the source has ended, not for ever after a stop."""
-        headway, since = self._headway(), 0.0
+        headway, since = self._headway(), time.perf_counter()
         while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
             self._threads[alive[0]].join(interval_s)
             if on_progress is not None:

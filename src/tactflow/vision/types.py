@@ -111,15 +111,18 @@ class Markers:
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """Mean displacement of the markers inside the contact.
+    """How the gel inside the contact has moved.
 
-    mean : (dx, dy), px, over `count` markers; None when count is 0.
-    count : number of markers inside.
-    stderr : (dx, dy) standard error of the mean, px; None when unknown (fewer than 2 markers).
-    rotation : in-plane rotation of the markers (twist), degrees, counter-clockwise as seen on the screen;
-        None with fewer than 3 markers or where they do not span a plane.
-    divergence : relative areal growth of the marker pattern (press), 1; None where rotation is None.
+    mean : (dx, dy), px: the mean displacement; None where it is not known.
+    count : number of markers inside. A mean over markers is one of so many; that of the displacement field
+        also rests on markers around, and may be known where count is 0.
+    stderr : (dx, dy) standard error of the mean, px; None when unknown.
+    rotation : in-plane rotation (twist), degrees, counter-clockwise as seen on the screen; None with fewer
+        than 3 markers, where they do not span a plane, or for a contact too small to tell.
+    divergence : relative growth in area (press), 1; None where rotation is None.
     residual : RMS of what mean, rotation and divergence leave unexplained, px; None where rotation is None.
+    shear : (du/dx - dv/dy, du/dy + dv/dx) of the displacement (u, v), 1; None where no field is known.
+    rotation_stderr : degrees. divergence_stderr : 1. shear_stderr : of each part, 1. None where unknown.
 
     >>> Flow((1.2, -0.3), 9).mean
     (1.2, -0.3)
@@ -131,6 +134,10 @@ class Flow:
     rotation: float | None = None
     divergence: float | None = None
     residual: float | None = None
+    shear: tuple[float, float] | None = None
+    rotation_stderr: float | None = None
+    divergence_stderr: float | None = None
+    shear_stderr: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

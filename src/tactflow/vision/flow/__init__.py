@@ -1,7 +1,17 @@
-"""Flow of the markers: whether they move, and how those inside the contact do."""
+"""Flow of the gel and its markers: whether they move, how the gel moves between them and in the contact."""
 
-from tactflow.vision.flow.in_mask import HIDDEN, flow_in_mask
+from tactflow.vision.flow.displacement_field import DisplacementField, FieldModel
+from tactflow.vision.flow.in_mask import HIDDEN, flow_in_mask, flow_of_field
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
 
-__all__ = ["HIDDEN", "Motion", "MotionTest", "flow_in_mask", "inside_mask"]
+__all__ = [
+    "HIDDEN",
+    "DisplacementField",
+    "FieldModel",
+    "Motion",
+    "MotionTest",
+    "flow_in_mask",
+    "flow_of_field",
+    "inside_mask",
+]

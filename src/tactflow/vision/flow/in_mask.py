@@ -1,4 +1,4 @@
-"""Flow of the markers inside the contact: mean displacement, rotation, divergence."""
+"""Flow inside the contact, by its markers or by the field between them: mean, rotation, divergence."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.contact.inside import inside_outline
+from tactflow.vision.flow.displacement_field import DisplacementField, GelMotion
 from tactflow.vision.flow.inside import check_mask, inside_mask
 from tactflow.vision.flow.similarity import Similarity, fit_similarity
 from tactflow.vision.types import Flow, Markers, MarkerStatus
@@ -16,7 +17,11 @@ from tactflow.vision.types import Flow, Markers, MarkerStatus
 HIDDEN: Final = 2.5
 """Distance from a marker's border, px, up to which the marker bends the outline of the region: its mask is
 larger than the marker, and the outline is smoothed after that. Chosen by hand; with it, the bridged
-outline is off by 0.6 px at markers (docs/flow-limits.md)."""
+outline is off by 0.6 px at markers (`tactflow.vision.contact.inside`)."""
+UNKNOWN: Final = 0.1
+"""Share of what the mean flow could be that markers may leave open. Simulated contacts within the grid of
+markers leave less than 0.04; those beyond the last markers leave more, and there the mean is wrong by
+pixels."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
 _LOST: Final = int(MarkerStatus.LOST)
 
@@ -55,12 +60,7 @@ def flow_in_mask(markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0
     >>> flow.mean, flow.count
     ((1.5, -0.5), 3)
     """
-    check_mask(mask, dilate)
-    if markers.radius is None:
-        inside = inside_mask(markers.position, mask, dilate)
-    else:
-        inside = inside_outline(markers.position, mask, markers.radius + HIDDEN, dilate)
-    chosen = np.flatnonzero(inside & (markers.status != _LOST))
+    chosen = _inside(markers, mask, dilate)
     tracked = chosen[markers.status[chosen] == _TRACKED]
     if len(tracked) == 1:
         chosen = tracked
@@ -70,13 +70,85 @@ def flow_in_mask(markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0
     return _summary(fit_similarity(origin, position, chosen), len(chosen), len(tracked))
 
 
+def flow_of_field(
+    field: DisplacementField, markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0.0
+) -> Flow:
+    """Summarise the displacement of the gel inside the contact, between its markers.
+
+    field : of this frame. markers, mask, dilate : as `flow_in_mask` takes them; they tell `count`.
+
+    The mean is an integral over the contact, each bit of gel counted by its area at rest. A marker at the
+    outline in or out makes no jump: it counts as much as before. Rotation, divergence and shear are those of
+    the affine motion nearest to the field. Standard errors are those of the field between its markers; that
+    of the mean has the error of the contact's outline besides. The mean is None where markers are too far
+    away: where more than `UNKNOWN` of what it could be is open.
+
+    Raises ValueError if mask is not (H, W) uint8, or if dilate is negative or not finite.
+
+    >>> from tactflow.vision.flow.displacement_field import FieldModel
+    >>> x, y = np.meshgrid(np.arange(10.0, 100, 20), np.arange(10.0, 100, 20))
+    >>> origin = np.column_stack([x.ravel(), y.ravel()])
+    >>> markers = Markers(origin, origin + [1.5, -0.5], np.zeros(25, np.uint8), np.full(25, 0.02))
+    >>> mask = np.zeros((100, 100), np.uint8)
+    >>> mask[40:48, 40:48] = 255
+    >>> flow = flow_of_field(FieldModel(origin, (100, 100))(markers), markers, mask)
+    >>> [round(value, 1) for value in flow.mean], flow.count
+    ([1.5, -0.5], 0)
+    """
+    count = len(_inside(markers, mask, dilate))
+    motion = field.motion(mask)
+    if motion is None or motion.unknown > UNKNOWN:
+        return Flow(None, count)
+    return _field_summary(motion, count)
+
+
+def _inside(markers: Markers, mask: NDArray[np.uint8], dilate: float) -> NDArray[np.intp]:
+    """Which markers that are not lost lie inside the mask, or at most `dilate` px outside."""
+    check_mask(mask, dilate)
+    if markers.radius is None:
+        inside = inside_mask(markers.position, mask, dilate)
+    else:
+        inside = inside_outline(markers.position, mask, markers.radius + HIDDEN, dilate)
+    return np.flatnonzero(inside & (markers.status != _LOST))
+
+
+def _field_summary(motion: GelMotion, count: int) -> Flow:
+    x, y = (math.hypot(motion.stderr, error) for error in motion.outline_stderr)
+    gradient = motion.gradient
+    if gradient is None:
+        return Flow(motion.mean, count, (x, y))
+    spread, turn = gradient.growth
+    error = gradient.stderr
+    return Flow(
+        motion.mean,
+        count,
+        (x, y),
+        _rotation(spread, turn),
+        _divergence(spread, turn),
+        motion.residual,
+        gradient.shear,
+        math.degrees(error),
+        2 * error,
+        2 * error,
+    )
+
+
+def _rotation(spread: float, turn: float) -> float:
+    """Degrees, counter-clockwise on the screen: y points down, so that a positive turn is clockwise."""
+    return -math.degrees(math.atan2(turn, 1 + spread)) + 0.0
+
+
+def _divergence(spread: float, turn: float) -> float:
+    """Relative growth in area of a similarity, 1."""
+    return 2 * spread + spread * spread + turn * turn
+
+
 def _summary(fit: Similarity, count: int, tracked: int) -> Flow:
     """The flow of `count` markers, of which `tracked` were seen."""
     rotation = divergence = residual = None
     if fit.fitted:
-        # y points down: a positive turn is clockwise on the screen.
-        rotation = -math.degrees(math.atan2(fit.growth_y, 1 + fit.growth_x)) + 0.0
-        divergence = 2 * fit.growth_x + fit.growth_x * fit.growth_x + fit.growth_y * fit.growth_y
+        rotation = _rotation(fit.growth_x, fit.growth_y)
+        divergence = _divergence(fit.growth_x, fit.growth_y)
         residual = math.sqrt((fit.rest_x + fit.rest_y) / count)
     stderr = None
     if tracked >= 2:

@@ -1,0 +1,442 @@
+"""The displacement field of the gel between its markers, and how the gel inside a contact moves as a whole.
+
+Both displacement components are taken for independent Gaussian processes over the gel at rest (kriging), with
+a Matern kernel of order 5/2. Markers of one reference have one kernel matrix, so that it is inverted once; a
+frame then costs matrix products. Everything that is asked of the field is linear in the displacements of the
+markers, so that each answer has a standard error in closed form.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.flow.inside import check_mask
+from tactflow.vision.markers.family import pitch_of
+from tactflow.vision.types import Markers, MarkerStatus
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+LENGTH: Final = 1.5
+"""Correlation length of the field, pitches. Kernel and length are those that predict the markers of nine real
+recordings best, each marker from all others (leave-one-out likelihood); on four other recordings the best
+length is 1.4 (docs/field.md)."""
+NUGGET: Final = 1e-5
+"""Variance added to each marker's, relative to the field's: it keeps the matrix well conditioned. Markers
+known to 0.015 px in a field of 5 px have as much. Chosen by hand."""
+CELL: Final = 0.25
+"""Spacing of the grid, pitches. Chosen by hand."""
+MOST_CELLS: Final = 2500
+"""Cells of a grid at most; where a quarter of the pitch would make more, the spacing is larger. Chosen by
+hand."""
+SAMPLE: Final = 2.0
+"""Distance at which a cell asks the contact's mask whether it is inside, px: with 0.75 px the means of six
+simulated scenes differ by 0.001 px."""
+OUTLINE: Final = 4.0
+"""How uncertain a contact's outline is: the square of its error times the length over which it errs alike,
+px^3; 0.5 px over 16 px. Measured on 22 simulated recordings, by what it does to the mean."""
+FEWEST: Final = 3
+"""Markers that must be seen for a field. Chosen by hand."""
+OVERSHOOT: Final = 0.5
+"""How much farther gel may have moved than any marker that is seen, pitches. Chosen by hand."""
+POOR: Final = 3.0
+"""Times the median standard error from which on a marker's own error has its weight. Chosen by hand."""
+_TRACKED: Final = int(MarkerStatus.TRACKED)
+
+
+class Grid(NamedTuple):
+    """A regular grid over the frame: (rows, columns) of cells, the centre of the first, the spacing, px."""
+
+    shape: tuple[int, int]
+    first: tuple[float, float]
+    spacing: float
+
+    @property
+    def points(self) -> FloatArray:
+        """(rows, columns, 2) float64: x and y of every cell's centre, px."""
+        rows, columns = self.shape
+        x = self.first[0] + self.spacing * np.arange(columns)
+        y = self.first[1] + self.spacing * np.arange(rows)
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    def window(self, low: FloatArray, high: FloatArray) -> tuple[slice, slice]:
+        """Rows and columns of all cells whose centres lie between two corners (x, y), px."""
+        along = []
+        for axis, count in enumerate(self.shape[::-1]):
+            begin = math.floor((low[axis] - self.first[axis]) / self.spacing)
+            end = math.ceil((high[axis] - self.first[axis]) / self.spacing) + 1
+            along.append(slice(min(max(begin, 0), count), min(max(end, 0), count)))
+        return along[1], along[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Gradient:
+    """How a part of the gel is turned, pressed apart and sheared: its displacement gradient.
+
+    dx, dy : (du/dx, dv/dx) and (du/dy, dv/dy), 1: what x and y at rest change the displacement (u, v) by.
+    dx_stderr, dy_stderr : of each of their components, 1.
+    """
+
+    dx: tuple[float, float]
+    dy: tuple[float, float]
+    dx_stderr: float
+    dy_stderr: float
+
+    @property
+    def growth(self) -> tuple[float, float]:
+        """The nearest similarity as a complex number, less 1: (spread, turn from +x to +y)."""
+        return (self.dx[0] + self.dy[1]) / 2, (self.dx[1] - self.dy[0]) / 2
+
+    @property
+    def shear(self) -> tuple[float, float]:
+        """What no turn and no spread explains: (du/dx - dv/dy, du/dy + dv/dx), 1."""
+        return self.dx[0] - self.dy[1], self.dy[0] + self.dx[1]
+
+    @property
+    def stderr(self) -> float:
+        """Standard error of each part of `growth`, and half of that of each part of `shear`."""
+        return math.hypot(self.dx_stderr, self.dy_stderr) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class GelMotion:
+    """How a part of the gel has moved as a whole.
+
+    mean : (dx, dy), px: the integral of the displacement over the part, over its area at rest.
+    stderr : of each component of the mean, px, for a region whose outline is exact.
+    outline_stderr : what the outline of a contact adds to that, (dx, dy), px.
+    gradient : of the affine motion that is nearest to the displacement; None for a part too small to tell.
+    residual : RMS of what mean, turn and spread leave, px; None where gradient is None.
+    unknown : share of what the mean could be that the markers leave open, 0 to 1: how far they are away.
+    """
+
+    mean: tuple[float, float]
+    stderr: float
+    outline_stderr: tuple[float, float]
+    gradient: Gradient | None
+    residual: float | None
+    unknown: float
+
+
+class FieldModel:
+    """Displacement fields of one reference.
+
+    Parameters
+    ----------
+    origin : (N, 2) float64, markers in the reference, px.
+    size : (width, height) of the frame, px.
+
+    Raises
+    ------
+    ValueError : origin is not (N, 2) with N >= 3, or size is not positive.
+
+    Notes
+    -----
+    With K the kernel between markers, Q = (K + nugget)^-1 and z the displacements, the field at X is
+    k(X) Q z. A marker that is not seen is left out by Schur's complement instead of another inversion: Q is
+    replaced by Q - Q_S (Q_SS)^-1 Q_S', which is the same as putting the marker where the others expect it.
+    One that is seen poorly has its variance added in the same way (Woodbury).
+
+    The kernel says how the field varies from place to place relative to its own variance s^2. That is
+    estimated where it is asked for: markers near by are each predicted from all others, and s^2 makes the
+    errors of these predictions as large as they should be (Rasmussen and Williams, "Gaussian Processes for
+    Machine Learning", 2006, eq. 5.12: one inverse gives all leave-one-out errors).
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.arange(20.0, 300, 40), np.arange(20.0, 400, 40))
+    >>> origin = np.column_stack([x.ravel(), y.ravel()])
+    >>> status, stderr = np.zeros(len(origin), np.uint8), np.full(len(origin), 0.02)
+    >>> field = FieldModel(origin, (300, 400))(Markers(origin, origin + [2.0, -1.0], status, stderr))
+    >>> mask = np.zeros((400, 300), np.uint8)
+    >>> mask[150:220, 100:180] = 255
+    >>> [round(value, 2) for value in field.motion(mask).mean]
+    [2.0, -1.0]
+    """
+
+    def __init__(self, origin: FloatArray, size: tuple[int, int]) -> None:
+        if origin.ndim != 2 or origin.shape[1] != 2 or len(origin) < FEWEST:
+            raise ValueError(f"required an origin of shape (N, 2) with N >= {FEWEST}, got {origin.shape}")
+        if min(size) < 1:
+            raise ValueError(f"required a size of at least 1 x 1 px, got {size}")
+        self.origin = np.array(origin, np.float64)
+        self.pitch = max(pitch_of(self.origin), 1.0)
+        self.grid = _grid(size, self.pitch)
+        self.points = self.grid.points
+        self._length = LENGTH * self.pitch
+        kernel = self._kernel(self.origin)
+        self.inverse: FloatArray = np.asarray(
+            np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64
+        )
+        self.diagonal = np.diagonal(self.inverse).copy()
+        rows, columns = self.grid.shape
+        self.to_markers = self._kernel(self.points.reshape(-1, 2)).reshape(rows, columns, -1)
+        """(rows, columns, N), the kernel between cells and markers."""
+        down, across = np.mgrid[1 - rows : rows, 1 - columns : columns] * self.grid.spacing
+        self._between = matern(np.hypot(down, across) / self._length)
+
+    def _kernel(self, points: FloatArray) -> FloatArray:
+        """(M, N), the kernel between points (M, 2), px, and the markers."""
+        offset = points[:, None] - self.origin
+        return matern(np.sqrt(np.einsum("mnk,mnk->mn", offset, offset)) / self._length)
+
+    def covariance(self, functionals: FloatArray) -> FloatArray:
+        """(F,): variance of linear functionals of the field before any marker is known.
+
+        functionals : (rows, columns, F), weights of the cells of a window of the grid.
+        """
+        rows, columns, count = functionals.shape
+        middle, center = self.grid.shape[0] - 1, self.grid.shape[1] - 1
+        table = self._between[middle - rows + 1 : middle + rows, center - columns + 1 : center + columns]
+        spread = cv2.filter2D(functionals, cv2.CV_64F, table, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray((functionals * spread.reshape(rows, columns, count)).sum(axis=(0, 1)))
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """(cells, N): how much each marker counts in each cell where all are seen."""
+        return self.to_markers.reshape(-1, len(self.origin)) @ self.inverse
+
+    def __call__(self, markers: Markers) -> DisplacementField | None:
+        """The field of one frame; None where fewer than three markers are seen.
+
+        Raises ValueError if there are not as many markers as in the reference.
+        """
+        if markers.position.shape != self.origin.shape:
+            raise ValueError(f"required {len(self.origin)} markers, got {len(markers.position)}")
+        seen = markers.status == _TRACKED
+        if np.count_nonzero(seen) < FEWEST:
+            return None
+        return DisplacementField(self, markers, seen)
+
+
+class _Update:
+    """The inverse of a kernel matrix with more variance for some markers.
+
+    inverse : (N, N), of all markers. chosen : (S,), markers of which less is known. certainty : (S,), the
+    field's variance over the markers' own, 0 for those that are not seen at all.
+    """
+
+    def __init__(self, inverse: FloatArray, chosen: IntArray, certainty: FloatArray) -> None:
+        self._chosen = chosen
+        self._columns = inverse[:, chosen]
+        self._middle = np.linalg.inv(np.diag(certainty) + self._columns[chosen])
+
+    def apply(self, product: FloatArray) -> FloatArray:
+        """The new inverse times something, from the old inverse times the same, (N, m)."""
+        return np.asarray(product - self._columns @ (self._middle @ product[self._chosen]))
+
+    @property
+    def taken(self) -> FloatArray:
+        """(N,): what the diagonal of the inverse loses."""
+        return np.asarray(np.einsum("ns,st,nt->n", self._columns, self._middle, self._columns))
+
+
+class DisplacementField:
+    """The displacement of the gel everywhere, in one frame. What is not asked for is not computed.
+
+    Coordinates are those of the gel at rest: `displacement[row, column]` is how far the bit of gel has moved
+    that was at `grid.points[row, column]` in the reference frame.
+
+    model : of the reference. markers : of the frame. seen : (N,) bool, those that were seen, three or more.
+    """
+
+    def __init__(self, model: FieldModel, markers: Markers, seen: NDArray[np.bool_]) -> None:
+        self.grid = model.grid
+        self._model, self._seen = model, seen
+        # What is not seen counts as unmoved until it is left out below.
+        moved = np.where(seen[:, None], markers.position - model.origin, 0.0)
+        self._farthest = moved.min(axis=0), moved.max(axis=0)
+        known = seen & np.isfinite(markers.stderr)
+        ordered = np.sort(markers.stderr[known])
+        typical = ordered[len(ordered) // 2] if len(ordered) else 0.0
+        error = np.where(known, markers.stderr, typical)
+        self._variance = error * error
+        self._update: _Update | None = None
+        self._coefficients = model.inverse @ moved
+        poor = seen & (error > POOR * typical)
+        left_out = np.flatnonzero(~seen | poor)
+        if len(left_out):
+            self._leave_out(left_out, poor[left_out], moved)
+
+    def _leave_out(self, left_out: IntArray, poor: NDArray[np.bool_], moved: FloatArray) -> None:
+        """Take markers (S,) out of the field, those that are `poor` (S,) only as far as their errors ask."""
+        whole = self._coefficients
+        self._update = _Update(self._model.inverse, left_out, np.zeros(len(left_out)))
+        self._coefficients = self._update.apply(whole)
+        sure = len(moved) - len(left_out)
+        if poor.any() and sure:
+            scale = float((moved * self._coefficients).sum()) / (2 * sure)
+            certainty = np.where(poor, scale / self._variance[left_out], 0.0)
+            self._update = _Update(self._model.inverse, left_out, certainty)
+            self._coefficients = self._update.apply(whole)
+
+    @cached_property
+    def displacement(self) -> FloatArray:
+        """(rows, columns, 2) float64, px."""
+        return np.asarray(self._model.to_markers @ self._coefficients)
+
+    @cached_property
+    def stderr(self) -> FloatArray:
+        """(rows, columns) float64, standard error of each component of `displacement`, px."""
+        kernel = self._model.to_markers.reshape(-1, len(self._coefficients))
+        weights = self._model.weights
+        if self._update is not None:
+            weights = self._update.apply(weights.T).T
+        unknown = np.maximum(1 - np.einsum("gn,gn->g", weights, kernel), 0)
+        squares = self._scale(kernel) * unknown + (weights * weights) @ self._variance
+        return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
+
+    def motion(self, mask: NDArray[np.uint8]) -> GelMotion | None:
+        """How the gel inside a region has moved, each bit of it counted by its area at rest.
+
+        mask : (H, W) uint8, non-zero inside, in the current frame: what counts is where the gel is now.
+        Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
+        """
+        check_mask(mask, 0)
+        part = self.part(mask)
+        if part is None:
+            return None
+        functionals = _affine(part.share, part.points, self.grid.spacing)
+        weighted = functionals.reshape(-1, functionals.shape[2]).T
+        kernel = weighted @ part.kernel.reshape(weighted.shape[1], -1)
+        weights = (kernel @ self._model.inverse).T
+        if self._update is not None:
+            weights = self._update.apply(weights)
+        prior = self._model.covariance(functionals)
+        left = np.maximum(prior - (kernel * weights.T).sum(axis=1), 0)
+        # The markers near the region tell how rough the field is there, for the slopes as for the mean.
+        scale = float(self._scale(kernel[:1])[0])
+        stderr = np.sqrt(scale * left + (weights * weights).T @ self._variance).tolist()
+        (mean_x, mean_y), *slopes = (weighted @ part.moved.reshape(-1, 2)).tolist()
+        gradient = residual = None
+        if slopes:
+            gradient = Gradient(tuple(slopes[0]), tuple(slopes[1]), stderr[1], stderr[2])
+            residual = _residual(part, gradient.growth)
+        outline = _outline_errors(part, self.grid.spacing, int(np.count_nonzero(mask)))
+        return GelMotion((mean_x, mean_y), stderr[0], outline, gradient, residual, float(left[0] / prior[0]))
+
+    def part(self, mask: NDArray[np.uint8]) -> Part | None:
+        """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
+        left, top, width, height = cv2.boundingRect(mask)
+        if width == 0:
+            return None
+        model, grid = self._model, self.grid
+        least, most = self._farthest
+        margin = OVERSHOOT * model.pitch + grid.spacing
+        low = np.array([left, top]) - most - margin
+        high = np.array([left + width, top + height]) - least + margin
+        window = grid.window(low, high)
+        kernel = model.to_markers[window]
+        if kernel.size == 0:
+            return None
+        moved = np.asarray(kernel @ self._coefficients)
+        points = model.points[window]
+        region: NDArray[np.uint8] = mask[top : top + height, left : left + width]
+        share = _coverage(region, points + moved - [left, top], max(1, round(grid.spacing / SAMPLE)))
+        total = float(share.sum())
+        return Part(share / total, points, moved, kernel) if total > 0 else None
+
+    def _scale(self, kernel: FloatArray) -> FloatArray:
+        """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""
+        diagonal = self._model.diagonal
+        if self._update is not None:
+            diagonal = np.where(self._seen, np.maximum(diagonal - self._update.taken, NUGGET), 1.0)
+        squares = (self._coefficients * self._coefficients).sum(axis=1) / (2 * diagonal)
+        near = np.abs(kernel) * self._seen
+        return np.asarray(near @ squares / np.maximum(near.sum(axis=1), 1e-12))
+
+
+class Part(NamedTuple):
+    """A part of the gel, in a window of the grid.
+
+    share : (rows, columns), how much of the part each cell is, in sum 1. points : (rows, columns, 2), at
+    rest, px. moved : (rows, columns, 2), px. kernel : (rows, columns, N), between cells and markers.
+    """
+
+    share: FloatArray
+    points: FloatArray
+    moved: FloatArray
+    kernel: FloatArray
+
+
+def matern(distance: FloatArray) -> FloatArray:
+    """The Matern kernel of order 5/2 of distances in correlation lengths: 1 at 0.
+
+    >>> float(matern(np.array(0.0)))
+    1.0
+    """
+    scaled = math.sqrt(5) * distance
+    return np.asarray((1 + scaled + scaled * scaled / 3) * np.exp(-scaled))
+
+
+def _grid(size: tuple[int, int], pitch: float) -> Grid:
+    """A grid in the middle of a frame of (width, height), px."""
+    width, height = size
+    spacing = max(CELL * pitch, math.sqrt(width * height / MOST_CELLS))
+    columns, rows = math.ceil(width / spacing), math.ceil(height / spacing)
+    first = (width - 1 - spacing * (columns - 1)) / 2, (height - 1 - spacing * (rows - 1)) / 2
+    return Grid((rows, columns), first, spacing)
+
+
+def _coverage(mask: NDArray[np.uint8], places: FloatArray, parts: int) -> FloatArray:
+    """(rows, columns) share of each cell that is in a mask, by parts x parts samples.
+
+    mask : (H, W) uint8, non-zero inside. places : (rows, columns, 2), where the cells are, px.
+    """
+    rows, columns = places.shape[:2]
+    fine = cv2.resize(places.astype(np.float32) + 2, (columns * parts, rows * parts))
+    # Samples lie farther apart than pixels. The mean around each makes the sum follow the outline smoothly.
+    region = cv2.threshold(mask, 0, 255, cv2.THRESH_BINARY)[1]
+    region = cv2.blur(cv2.copyMakeBorder(region, 2, 2, 2, 2, cv2.BORDER_CONSTANT), (3, 3))
+    inside = cv2.remap(region, fine[..., 0], fine[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    share = cv2.resize(inside.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(share, np.float64).reshape(rows, columns) / 255
+
+
+def _affine(share: FloatArray, points: FloatArray, spacing: float) -> FloatArray:
+    """(rows, columns, 3) weights of the cells for mean, slope along x and slope along y; (.., 1) for a part
+    too small for slopes."""
+    arms = points - (share[..., None] * points).sum(axis=(0, 1))
+    weighted = share[..., None] * arms
+    (xx, xy), (_, yy) = weighted.reshape(-1, 2).T @ arms.reshape(-1, 2)
+    determinant = xx * yy - xy * xy
+    # A single cell has the second moment spacing^2 / 12 along each axis.
+    if determinant <= (xx + yy) * spacing * spacing / 12:
+        return share[..., None]
+    functionals = np.empty((*share.shape, 3))
+    functionals[..., 0] = share
+    functionals[..., 1] = (yy * weighted[..., 0] - xy * weighted[..., 1]) / determinant
+    functionals[..., 2] = (xx * weighted[..., 1] - xy * weighted[..., 0]) / determinant
+    return functionals
+
+
+def _outline_errors(part: Part, spacing: float, area: int) -> tuple[float, float]:
+    """Standard error of a part's mean displacement, (dx, dy), px, because its outline is not exact.
+
+    An outline that is d too far out at s adds (u(s) - mean) d ds / area. spacing : of the cells, px. area :
+    of the part, px^2.
+    """
+    share = part.share
+    along, across = np.gradient(share) if min(share.shape) > 1 else (share, share)
+    # The length of outline in each cell over the area of the part.
+    border = np.hypot(along, across) / spacing
+    away = part.moved - (share[..., None] * part.moved).sum(axis=(0, 1))
+    x, y = (OUTLINE / area * (border[..., None] * away * away).sum(axis=(0, 1))).tolist()
+    return math.sqrt(x), math.sqrt(y)
+
+
+def _residual(part: Part, growth: tuple[float, float]) -> float:
+    """RMS of what mean, turn and spread leave of a part's displacement, px."""
+    share = part.share.ravel()
+    points, moved = part.points.reshape(-1, 2), part.moved.reshape(-1, 2)
+    arms = points - share @ points
+    rest = moved - share @ moved - growth[0] * arms
+    rest += growth[1] * arms[:, ::-1] * [1.0, -1.0]
+    return math.sqrt(float(share @ (rest * rest).sum(axis=1)))

@@ -1,0 +1,43 @@
+"""Stage `field`: how the gel has moved between its markers."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.frame import Absent
+from tactflow.ports import Image
+from tactflow.vision.flow.displacement_field import FEWEST, DisplacementField, FieldModel
+from tactflow.vision.types import Markers
+
+
+class FieldPorts(NamedTuple):
+    """field : the displacement of the gel on a regular grid."""
+
+    field: DisplacementField | None
+
+
+class Field(Stage):
+    """Displacement field of the gel from the displacements of its markers, with standard errors."""
+
+    memory = "pure"
+
+    def __init__(self, params: StageParams) -> None:
+        super().__init__(params)
+        self._model: FieldModel | None = None
+        self._size = (0, 0)
+
+    def process(self, markers: Markers, image: Image) -> FieldPorts | Absent:
+        """The field of this frame; absent where fewer than three markers are seen."""
+        size = image.shape[1], image.shape[0]
+        if len(markers.origin) < FEWEST:
+            return Absent("no_markers")
+        # What the reference alone tells is kept; it is known again by its markers.
+        model = self._model
+        if model is None or self._size != size or not np.array_equal(model.origin, markers.origin):
+            model = FieldModel(markers.origin, size)
+            self._model, self._size = model, size
+        field = model(markers)
+        return Absent("no_markers") if field is None else FieldPorts(field)
