@@ -3,6 +3,7 @@
 # make soak         what takes longer: faults in running processes, a million frames (two hours)
 # make load         results, drops, latency and memory against the load (ten minutes)
 # make fuzz         damaged input to every parser, SECONDS for each
+# make reliability  lets every fault happen, and writes that into docs/reliability.md
 # make audit        known weaknesses of the packages that are used, where the list can be reached
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
 # make kernels      measures what compiling gains, and writes docs/kernels.md
@@ -16,7 +17,7 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak load fuzz audit lock lint types kernels system-deps clean
+.PHONY: run test soak load fuzz reliability audit lock lint types kernels system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -44,6 +45,9 @@ types: $(VENV)/.installed-test
 	$(PY) -m mypy
 	$(PY) -m mypy --platform darwin
 	$(PY) -m mypy --platform win32
+
+reliability: $(VENV)/.installed-test
+	$(PY) -m tests.faults
 
 kernels: $(VENV)/.installed-test
 	$(PY) -m tests.oracles

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import logging
 import platform
-import re
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +28,7 @@ from tactflow.files import expanded, next_name
 from tactflow.message import Results, encode_message
 from tactflow.ports import Image
 from tactflow.recording import missing_packages
+from tactflow.redaction import without_secrets
 from tactflow.vision import compiled
 
 if TYPE_CHECKING:
@@ -347,6 +347,7 @@ class Record(Recorder):
             self._write_entry(self._file, entry)
 
     def _write_entry(self, file: RecordingWriter, entry: Entry) -> None:
+        self._refuse_interference(file)
         if file.frames == 0:
             self._file_begins, self._in_force = entry.time, []
         try:
@@ -356,7 +357,6 @@ class Record(Recorder):
             file.write(entry)
         except OSError as error:
             self._give_up(file, error)
-        self._refuse_interference(file)
         new = [*self._late, *([entry] if entry.reference else [])]
         if new:
             self._in_force = [reference for reference in self._in_force if reference.epoch == new[-1].epoch]
@@ -436,16 +436,6 @@ class Record(Recorder):
             except (OSError, UnicodeDecodeError) as error:
                 log.debug("%s: not recorded: %s", pipeline.file, error)
         return About(self._sensor, facts, texts)
-
-
-def without_secrets(text: str) -> str:
-    """The text of a pipeline without passwords in addresses and without tokens: a recording is handed on.
-
-    >>> print(without_secrets("{source: rtsp://me:pass@camera/1, token: abc, host: null}"))
-    {source: rtsp://camera/1, token: removed, host: null}
-    """
-    text = re.sub(r"(?<=//)[^/@\s]*@", "", text)
-    return re.sub(r"\b((?:token|password)['\"]?\s*[:=]\s*)(?!null\b)[^,}\s]+", r"\1removed", text)
 
 
 def _refuses(params: Record.Params) -> bool:

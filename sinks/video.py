@@ -164,8 +164,8 @@ class Video(Sink):
             if self._claim is not None:
                 os.close(self._claim)
                 self._claim = None
-        if self._frames:
-            self._check_file()
+        if self._ours is not None:
+            self._check_file(self._ours)
 
     def _refuse_what_is_there(self) -> None:
         # FFmpeg would wait for the reader of a pipe for ever.
@@ -175,15 +175,20 @@ class Video(Sink):
             raise StageError(f"{self._path}: this file exists; set overwrite: true or give another path")
 
     def _refuse_full_disk(self) -> None:
-        if shutil.disk_usage(self._path.parent).free < MIN_FREE_BYTES:
-            raise StageError(
-                f"{self._path}: the disk is full; the {self._frames} frames written before can be played"
-            )
+        """End the film while its end still fits."""
+        if shutil.disk_usage(self._path.parent).free >= MIN_FREE_BYTES:
+            return
+        writer, self._writer, self._ours = self._writer, None, None
+        problem = None
+        if writer is not None:
+            writer.release()
+            problem = film_problem(self._path, self._frames)
+        kept = problem or f"the {self._frames} frames written before can be played"
+        raise StageError(f"{self._path}: the disk is full; {kept}")
 
-    def _check_file(self) -> None:
+    def _check_file(self, ours: os.stat_result) -> None:
         """The encoder tells nobody that a write failed: look at the file."""
-        assert self._ours is not None
-        what = taken_away(self._path, self._ours)
+        what = taken_away(self._path, ours)
         if what is not None:
             raise StageError(
                 f"{self._path}: was {what} by another program while the run wrote to it; its {self._frames} "
@@ -191,10 +196,7 @@ class Video(Sink):
             )
         problem = film_problem(self._path, self._frames)
         if problem is not None:
-            raise StageError(
-                f"{self._path}: {problem}: its end could not be written; is the disk full, or the size of "
-                "files limited?"
-            )
+            raise StageError(f"{self._path}: {problem}; is the disk full, or the size of files limited?")
 
     def _start(self) -> None:
         assert self._size is not None
@@ -232,11 +234,13 @@ def film_problem(path: Path, frames: int) -> str | None:
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
-            return "it cannot be played"
+            return "it cannot be played, as its end could not be written"
         claimed = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         capture.set(cv2.CAP_PROP_POS_FRAMES, frames - 1)
         there = capture.get(cv2.CAP_PROP_POS_FRAMES) == frames - 1 and capture.grab()
-        return None if claimed == frames and there else f"it ends before its {frames} frames"
+        if claimed == frames and there:
+            return None
+        return f"it ends before its {frames} frames, as its end could not be written"
     finally:
         capture.release()
 

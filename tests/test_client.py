@@ -354,3 +354,11 @@ def test_whoever_sends_messages_as_long_as_no_result_is_heard_no_more() -> None:
             assert publisher.recv() == b"\x01tactflow."
             publisher.send(b"tactflow.main {" + bytes(LONGEST_MESSAGE))
             assert publisher.recv() == b"\x00tactflow."
+
+
+def test_what_a_publisher_sends_commands_no_terminal() -> None:
+    message = json.loads(encode_message(Tick(Frame("main", 3, 0.1, IMAGE)), Results()))
+    message |= {"sensor": "\x1b[2Jmain", "skipped": {"contact": "\x9b2J"}}
+    shown = listen.describe(message)
+    assert "?[2Jmain 3" in shown
+    assert "(?2J)" in shown

@@ -36,9 +36,9 @@ SETTLE = 4.0
 """Time that a run is given after its first results, s. Chosen by hand."""
 MEASURED = 15.0
 """Time that each load is measured for, s. Chosen by hand."""
-SENSORS = (1, 2, 4, 6, 8, 12, 16)
-SUBSCRIBERS = (1, 4, 16, 64, 128)
-PAGES = (1, 2, 4, 8, 16)
+SENSORS = (1, 2, 4, 8, 12, 16, 24)
+SUBSCRIBERS = (1, 16, 64, 128, 256)
+PAGES = (1, 4, 8, 16)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +54,15 @@ class Load:
 class Seen:
     """What one load gave.
 
-    results : that arrived at the first subscriber, 0..1; the others are missing from `seq`. p50, p99 : age of
-    a result at the subscribers, ms. oldest : of the last second, ms. memory, growth : of all processes, MB,
-    and by how much it grew while it was measured. busy : what the machine's processors did, 0..1.
+    results : that arrived at the first subscriber, 0..1; the others are missing from `seq`. shown : pictures
+    a second that each page got. p50, p99 : age of a result at the subscribers, ms. oldest : of the last
+    second, ms. memory, growth : of all processes, MB, and by how much it grew while it was measured. busy :
+    what the machine's processors did, 0..1.
     """
 
     load: Load
     results: float
+    shown: float
     p50: float
     p99: float
     oldest: float
@@ -90,10 +92,11 @@ def measure(load: Load, port: int, folder: Path) -> Seen:
             if process.poll() is not None:
                 raise SystemExit((folder / "messages.txt").read_text(encoding="utf-8"))
             time.sleep(0.1)
-        stack.enter_context(pages([port + 1], load.pages))
+        pictures = stack.enter_context(pages([port + 1], load.pages))
         time.sleep(SETTLE)
         subscribers.ages.clear()
         subscribers.seqs.clear()
+        shown = sum(pictures)
         before, idle = _memory(process.pid), _idle()
         began = time.monotonic()
         time.sleep(MEASURED)
@@ -102,9 +105,11 @@ def measure(load: Load, port: int, folder: Path) -> Seen:
         got = [len(seqs) / (seqs[-1] - seqs[0] + 1) for seqs in subscribers.seqs.values()]
         busy = 1 - (_idle() - idle) / (seconds * (os.cpu_count() or 1))
         after = _memory(process.pid)
+        shown = sum(pictures) - shown
     last = ages[-max(1, round(RATE * load.sensors * load.subscribers)) :]
     p50, p99 = (float(np.percentile(ages, part)) for part in (50, 99))
-    return Seen(load, float(np.mean(got)), p50, p99, float(last.max()), after, after - before, busy)
+    per_page = shown / seconds / max(1, load.pages)
+    return Seen(load, float(np.mean(got)), per_page, p50, p99, float(last.max()), after, after - before, busy)
 
 
 def _memory(pid: int) -> float:
@@ -126,6 +131,7 @@ def report(found: list[Seen], others: float) -> str:
     """
     rows = [
         f"| {seen.load.sensors} | {seen.load.subscribers} | {seen.load.pages} | {100 * seen.results:.0f} % | "
+        f"{seen.shown:.0f} | "
         f"{seen.p50:.1f} | {seen.p99:.0f} | {seen.oldest:.0f} | {seen.memory:.0f} | {seen.growth:+.1f} | "
         f"{100 * seen.busy:.0f} % |"
         for seen in found
@@ -138,9 +144,9 @@ def report(found: list[Seen], others: float) -> str:
             f"before: {others:.1f}). Results that are not there were dropped: a gap in `seq`, counted in the "
             "statistics. Ages from the moment a frame was due to its result at the subscriber.",
             "",
-            "| sensors | subscribers | pages | results | age, ms: p50 | p99 | oldest at the end | memory, MB "
-            "| growth | processors busy |",
-            "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+            "| sensors | subscribers | pages | results | pictures a second and page | age, ms: p50 | p99 | "
+            "oldest at the end | memory, MB | growth | processors busy |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
             *rows,
             "",
             "`make load` measures it again.",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import threading
@@ -158,7 +159,7 @@ class Subscribers:
 
 @contextmanager
 def pages(ports: Sequence[int], count: int) -> Iterator[list[int]]:
-    """So many pages on each of some ports that take all they are sent; gives how many messages each got."""
+    """So many pages on each of some ports that show all they are sent; gives how many pictures each got."""
     got = [0] * (count * len(ports))
     sockets = []
 
@@ -167,8 +168,13 @@ def pages(ports: Sequence[int], count: int) -> Iterator[list[int]]:
             address = f"127.0.0.1:{port}"
             with connect(f"ws://{address}/live", compression=None, origin=f"http://{address}") as socket:  # type: ignore[arg-type]
                 sockets.append(socket)
-                for _ in socket:
-                    got[index] += 1
+                for message in socket:
+                    if isinstance(message, bytes):
+                        got[index] += 1
+                        # The next picture comes when this one is said to have been shown.
+                        (length,) = struct.unpack_from("<I", message)
+                        header = json.loads(message[4 : 4 + length])
+                        socket.send(json.dumps({"ack": header["number"]}))
 
     threads = [
         threading.Thread(target=drain, args=(index, port), daemon=True)

@@ -147,7 +147,7 @@ def test_a_film_that_did_not_fit_on_the_disk_is_an_error(
     try:
         for index, picture in enumerate(pictures(60)):
             sink.write(Tick(Frame("main", index, index * 0.1, picture)), picture)
-        with pytest.raises(StageError, match=f"{words}: its end could not be written; is the disk full"):
+        with pytest.raises(StageError, match=f"{words}, as its end could not be written; is the disk full"):
             sink.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -579,6 +579,33 @@ def test_connections_that_ask_for_nothing_keep_nobody_out(
     assert get(sink).status == 200
 
 
+def test_a_connection_that_begins_a_second_request_and_waits_is_closed(
+    view: Callable[..., View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "SILENT_SECONDS", 0.2)
+    where = urlsplit(str(view().description))
+    request = b"HEAD / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with socket.create_connection((str(where.hostname), where.port or 0), PATIENCE) as connection:
+        connection.sendall(request)
+        assert connection.recv(65536).startswith(b"HTTP/1.1")
+        connection.sendall(request[:10])
+        with suppress(ConnectionError):
+            assert connection.recv(65536) == b""
+
+
+def test_a_request_whose_body_is_none_is_refused_without_a_traceback(
+    view: Callable[..., View], caplog: pytest.LogCaptureFixture
+) -> None:
+    where = urlsplit(str(view().description))
+    with socket.create_connection((str(where.hostname), where.port or 0), PATIENCE) as connection:
+        connection.sendall(
+            b"HEAD / HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello, you\r\n"
+        )
+        while connection.recv(65536):
+            pass
+    assert "Traceback" not in caplog.text
+
+
 def test_another_address_needs_a_token() -> None:
     with pytest.raises(ValidationError, match="a token is required"):
         View.Params(host="0.0.0.0")

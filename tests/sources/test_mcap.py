@@ -341,9 +341,9 @@ def test_a_time_that_is_none_is_an_error_of_the_recording(tmp_path: Path, t: flo
     assert whole.count(stored) == 1
     path.write_bytes(whole.replace(stored, encode([(4, t)])))
     # Without the checksum of its chunk, which is zero where a writer made none.
-    unchecked = records.breakup_chunk
+    unchecked = records.get_chunk_data_stream
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(records, "breakup_chunk", lambda chunk, validate_crc: unchecked(chunk))  # noqa: ARG005
+        patch.setattr(records, "get_chunk_data_stream", lambda chunk, **_: unchecked(chunk))
         source = open_source(str(path))
         assert [source.read() is None for _ in range(3)] == [False] * 3
         with pytest.raises(SourceError, match=r"a\.mcap, 0\.3 s: required a frame's time within"):

@@ -366,6 +366,8 @@ BAD = {
         ["cut off"],
     ),
     "empty image": (_bytes("a.png", b""), ["empty"]),
+    "list of videos": (_bytes("a.avi", b"ffconcat version 1.0\nfile b.avi\n"), ["list of other files"]),
+    "playlist": (_bytes("a.m3u8", b"\xef\xbb\xbf#EXTM3U\n/b.ts\n"), ["list of other files"]),
     "text as video": (_bytes("a.avi", b"hello"), ["neither a video"]),
     "empty video": (_bytes("a.mp4", b""), ["empty"]),
     "no kind at all": (_bytes("a.xyz", b"hello"), ["neither a video"]),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import orjson
 
+from tactflow.cli.printable import printable
 from tactflow.sources.cameras import CameraInfo, list_cameras
 
 NONE = """no camera is plugged in ({folder}/video* is empty)
@@ -36,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     if not cameras:
         print(NONE.format(folder=args.dev), file=sys.stderr)
     for camera in cameras:
-        print(orjson.dumps(asdict(camera)).decode() if args.json else "\n".join(describe(camera)))
+        print(orjson.dumps(asdict(camera)).decode() if args.json else printable("\n".join(describe(camera))))
     return 0
 
 

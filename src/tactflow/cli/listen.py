@@ -9,6 +9,7 @@ import time
 from collections import deque
 from typing import Any
 
+from tactflow.cli.printable import printable
 from tactflow.client import DEFAULT_ENDPOINT, Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 
@@ -84,7 +85,7 @@ def describe(message: Message) -> str:
     if markers is not None:
         status = markers["status"]
         parts.append(f"markers {status.count('tracked')}/{len(status)}")
-    return "  ".join(parts)
+    return printable("  ".join(parts))
 
 
 def _missing(port: str, message: Message, usual: str) -> str:
@@ -113,20 +114,22 @@ def _lines(subscriber: Subscriber, count: float) -> None:
 def _json_lines(subscriber: Subscriber, count: float) -> None:
     out = sys.stdout.buffer
     while subscriber.received < count:
-        out.write(subscriber.receive_json() + b"\n")
+        body = subscriber.receive_json()
+        out.write((printable(body.decode(errors="replace")).encode() if out.isatty() else body) + b"\n")
         out.flush()
 
 
 def _table(subscriber: Subscriber, count: float) -> None:
     from rich.live import Live
     from rich.table import Table
+    from rich.text import Text
 
     rows: dict[str, tuple[Message, deque[float]]] = {}
 
     def table() -> Table:
         result = Table("sensor", "seq", "contact", "area, px^2", "angle, deg", "flow, px", "markers", "Hz")
         for sensor, (message, arrivals) in sorted(rows.items()):
-            result.add_row(sensor, *_cells(message), _rate(arrivals))
+            result.add_row(Text(printable(sensor)), *_cells(message), _rate(arrivals))
         result.caption = f"{subscriber.received} received, {subscriber.lost} lost"
         return result
 

@@ -14,6 +14,7 @@ from typing import NoReturn
 
 from tactflow import __version__
 from tactflow.__main__ import wanted
+from tactflow.cli.printable import printable
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.files import Unheard, lead_nowhere
 from tactflow.signals import ENDING
@@ -31,6 +32,7 @@ COMMANDS = {
     "warmup": "compile what `run` would compile on its first use",
     "record": "run a pipeline and record its frames and results",
     "repair": "give a recording that was cut off its index",
+    "calibrate": "make the calibration file of a sensor, or see whether it still fits",
     "detect": "find the marks of a gel and show what was found and why, in one picture",
     "cameras": "list the cameras that are plugged in, with names that stay the same",
     "sim": "write a simulated recording and its ground truth",
@@ -75,7 +77,7 @@ def main(argv: Sequence[str]) -> int:
         args = _parse(argv)
         return int(args.run(args))
     except TactflowError as error:
-        print(f"tactflow: {error}", file=sys.stderr)
+        print(printable(f"tactflow: {error}"), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         return 130

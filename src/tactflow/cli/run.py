@@ -21,6 +21,7 @@ from rich.logging import RichHandler
 from tactflow.api import make_runner
 from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline
+from tactflow.cli.printable import printable
 from tactflow.cli.progress import progress_display, summary, with_statistics
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import find_pipeline
@@ -89,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=HANG_AFTER,
         metavar="SECONDS",
         help="of several sensors, kill and start again one that has given no sign of life for so long "
-        "(%(default)g); more than the slowest stage may take for a frame",
+        "(%(default)g, and to start it has no less); more than the slowest stage may take for a frame",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
     parser.add_argument(
@@ -201,14 +202,14 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
         code = 0 if result.exit_code == INTERRUPTED and len(caught) == 1 else result.exit_code
         written = _report(args, result, trace)
         if not args.quiet:
-            console.print(summary(result, runner), markup=False)
+            console.print(printable(summary(result, runner)), markup=False)
         return code or (0 if written else StageError.exit_code)
 
 
 def _report(args: argparse.Namespace, result: RunResult, trace: Trace | None) -> bool:
     """Say why a run failed, and write what was asked for about it; whether that could be written."""
     if result.error is not None:
-        print(f"tactflow: {result.error}", file=sys.stderr)
+        print(printable(f"tactflow: {result.error}"), file=sys.stderr)
     written = [
         trace is None or _write_report("--trace", args.trace, trace.lines()),
         args.stats is None or _write_report("--stats", args.stats, [json.dumps(result.stats, indent=1)]),
@@ -275,6 +276,12 @@ def _refuse_unwritable(option: str, path: str | None, begins: str) -> None:
         raise ConfigError(f"{option} {path}: holds something else; choose another file, or delete it")
 
 
+def _without_control_characters(record: logging.LogRecord) -> bool:
+    """Lets every note pass, made safe for a terminal."""
+    record.msg, record.args = printable(record.getMessage()), ()
+    return True
+
+
 @contextmanager
 def _logging_to(console: Console) -> Iterator[None]:
     """Show the program's notes and warnings on standard error while the run lasts."""
@@ -285,6 +292,7 @@ def _logging_to(console: Console) -> Iterator[None]:
     else:
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(logging.Formatter("tactflow: %(levelname)s: %(message)s"))
+    handler.addFilter(_without_control_characters)
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:

@@ -24,7 +24,7 @@ from mcap.records import (
     Metadata,
     Schema,
 )
-from mcap.stream_reader import breakup_chunk
+from mcap.stream_reader import get_chunk_data_stream
 
 from tactflow.recording.packing import unpacked
 
@@ -107,12 +107,12 @@ def intact_records(file: BinaryIO, since: int | None = None) -> Iterator[McapRec
             at = after
             continue
         try:
-            found = _read(file, at, since)
+            for record in _read(file, at, since):
+                yield record
+                if isinstance(record, Footer):
+                    return
         except DAMAGE:
-            found = [Damage(at, end)]
-        yield from found
-        if any(isinstance(record, Footer) for record in found):
-            return
+            yield Damage(at, end)
         at = end
 
 
@@ -166,23 +166,35 @@ def _next_chunk(file: BinaryIO, at: int, size: int) -> int:
     return size
 
 
-def _read(file: BinaryIO, at: int, since: int | None) -> list[McapRecord | Damage]:
+def _read(file: BinaryIO, at: int, since: int | None) -> Iterator[McapRecord]:
     """The record at a place, those in it if it is a chunk; none if it belongs to the index."""
     file.seek(at)
     kind, length = _PREFIX.unpack(file.read(_PREFIX.size))
     if kind == Opcode.CHUNK:
         last = _CHUNK.unpack(file.read(_CHUNK.size))[1]
         if since is not None and last < since:
-            return []
+            return
         file.seek(at + _PREFIX.size)
         chunk = Chunk.read(ReadDataStream(file))
         data = unpacked(chunk.data, chunk.compression, _bounded(chunk.uncompressed_size))
-        return [*breakup_chunk(replace(chunk, data=data, compression=""), validate_crc=True)]
-    if kind == Opcode.MESSAGE:
-        return [Message.read(ReadDataStream(file), _bounded(length))]
-    if kind in _READERS:
-        return [_READERS[kind](ReadDataStream(io.BytesIO(file.read(_bounded(length)))))]
-    return []
+        yield from _records_of(replace(chunk, data=data, compression=""))
+    elif kind == Opcode.MESSAGE:
+        yield Message.read(ReadDataStream(file), _bounded(length))
+    elif kind in _READERS:
+        yield _READERS[kind](ReadDataStream(io.BytesIO(file.read(_bounded(length)))))
+
+
+def _records_of(chunk: Chunk) -> Iterator[McapRecord]:
+    """The records of an unpacked chunk, one by one: as objects, small ones take ten times their bytes."""
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    while stream.count < size:
+        kind, length = stream.read1(), stream.read8()
+        if kind == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        elif kind in (Opcode.CHANNEL, Opcode.SCHEMA):
+            yield _READERS[kind](stream)
+        else:
+            stream.read(length)
 
 
 def _bounded(size: int) -> int:

@@ -181,7 +181,10 @@ class _WholeRecords(io.BufferedIOBase):
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         super().__init__()
-        self._file = path.open("r+b" if overwrite and path.exists() else "xb", buffering=0)
+        create = 0 if overwrite and path.exists() else os.O_CREAT | os.O_EXCL
+        # At the end whatever happens: a file that another program has cut then stays too short.
+        flags = os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0) | create
+        self._file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
         claim(self._file)
         self._file.truncate()
         self._kept = 0

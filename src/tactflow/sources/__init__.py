@@ -12,8 +12,9 @@ from functools import partial
 from pathlib import Path
 
 from tactflow.engine.errors import SourceError
+from tactflow.redaction import public_address
 from tactflow.sources.base import FrameReader, StampedReader
-from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream, public_address
+from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream
 from tactflow.sources.files import open_recording
 from tactflow.sources.health import Watch
 from tactflow.sources.watch import Arrival, LiveReader, Watched
@@ -104,7 +105,9 @@ def _open_stream(spec: str, scheme: str, watch: Watch | None) -> FrameReader:
     if scheme.lower() in _STREAMS:
         return _live(partial(Stream, spec, ArrivalClock()), watch, public_address(spec))
     hint = f"; for a file, leave out {scheme}://" if scheme.lower() == "file" else ""
-    raise SourceError(f"{spec}: unknown kind of source {scheme}://{hint}; required one of: {KINDS}")
+    raise SourceError(
+        f"{public_address(spec)}: unknown kind of source {scheme}://{hint}; required one of: {KINDS}"
+    )
 
 
 def _live(opener: Callable[[], FrameReader], watch: Watch | None, name: str) -> FrameReader:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import os
-import re
 import sys
 from dataclasses import dataclass
 from urllib.parse import urlsplit
@@ -13,6 +12,7 @@ import cv2
 
 from tactflow.clock import SYSTEM, Clock
 from tactflow.engine.errors import SourceError
+from tactflow.redaction import public_address
 from tactflow.sources.base import BgrImage, Normaliser, frame_size, log, quiet_opencv
 
 
@@ -223,11 +223,6 @@ class Stream:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
-
-
-def public_address(url: str) -> str:
-    """The address without user and password, which must not end up in logs and error messages."""
-    return re.sub(r"(?<=//)[^/@]*@", "", url)
 
 
 def _stream_hint(url: str) -> str:

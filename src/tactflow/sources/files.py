@@ -37,6 +37,8 @@ LARGEST_FPS = 1e4
 ARCHIVE = r"got b'PK\x03\x04"
 """What numpy says about a .npz file, which begins as every ZIP file does."""
 
+PLAYLISTS = (b"#EXTM3U", b"ffconcat")
+"""How lists of other files begin that FFmpeg would open in place of a video."""
 PNG = b"\x89PNG\r\n\x1a\n"
 """How a PNG file begins."""
 CHUNK_FRAME = 12
@@ -325,6 +327,19 @@ def _map_array(path: Path) -> np.memmap[Any, Any]:
     return array
 
 
+def _look_at_beginning(path: Path) -> None:
+    """Refuse an empty file, and a list of other files: what is handed on as a video shall not open others."""
+    try:
+        with path.open("rb") as file:
+            begins = file.read(64)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not begins:
+        raise SourceError(f"{path}: the file is empty")
+    if begins.lstrip(b"\xef\xbb\xbf \r\n").startswith(PLAYLISTS):
+        raise SourceError(f"{path}: a list of other files, not a video; name one of them")
+
+
 class VideoFile:
     """A video file, read by OpenCV's FFmpeg.
 
@@ -340,8 +355,7 @@ class VideoFile:
     live = False
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        if path.stat().st_size == 0:
-            raise SourceError(f"{path}: the file is empty")
+        _look_at_beginning(path)
         with quiet_opencv():
             self._capture: cv2.VideoCapture | None = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():

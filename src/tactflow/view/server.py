@@ -18,6 +18,7 @@ from importlib import resources
 from urllib.parse import parse_qs, urlsplit
 
 import uvicorn
+from h11 import LocalProtocolError
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
 from starlette.requests import Request
@@ -41,7 +42,7 @@ CLOSE_SECONDS = 3.0
 MAX_CONNECTIONS = 128
 """Connections at a time: each page opens up to seven. Each takes a file, of which a process may have 1024."""
 SILENT_SECONDS = 10.0
-"""Time within which a connection must have asked for something, s. Chosen by hand."""
+"""Time within which a connection must have asked for something, again and again, s. Chosen by hand."""
 
 WRONG_TOKEN = 4401
 TOO_MANY = 4429
@@ -64,12 +65,24 @@ class _BoundedConnection(H11Protocol):
         if len(self.connections) > MAX_CONNECTIONS:
             transport.abort()
         else:
-            self.loop.call_later(SILENT_SECONDS, self._close_if_silent)
+            self.loop.call_later(SILENT_SECONDS, self._close_if_silent, None)
 
-    def _close_if_silent(self) -> None:
+    def send_400_response(self, msg: str) -> None:
+        """Say that the request is none, and hang up."""
+        # To HEAD there is no answer with words in it, and h11 refuses to send them.
+        with contextlib.suppress(LocalProtocolError):
+            super().send_400_response(msg)
+        self.transport.close()
+
+    def _close_if_silent(self, last: object) -> None:
+        """Close it unless it has asked for something since `last`, the request that was its last one then."""
         # One that became a page's WebSocket has another protocol now.
-        if self.cycle is None and self.transport.get_protocol() is self:
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:
+            return
+        if self.cycle is last:
             self.transport.abort()
+        else:
+            self.loop.call_later(SILENT_SECONDS, self._close_if_silent, self.cycle)
 
 
 class Server:

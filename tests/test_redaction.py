@@ -1,0 +1,34 @@
+"""Passwords and tokens are left out, however they are written."""
+
+from __future__ import annotations
+
+import pytest
+
+from tactflow.redaction import public_address, without_secrets
+
+SECRET = "a-secret-of-some-length"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"sinks: {{view: {{token: {SECRET}}}}}",
+        f"sinks:\n  view:\n    token: >-\n      {SECRET}\n",
+        f"mine: &t {SECRET}\nsinks: {{view: {{token: *t}}}}",
+        f"sinks: {{view: {{token: &t '{SECRET}'}}}}",
+        f"sensors: {{left: {{sinks.view.token: {SECRET}}}}}",
+        f"stages: {{capture: {{source: 'rtsp://me:{SECRET}@camera/1'}}}}",
+        f"stages: {{capture: {{source: 'rtsp://me:p@{SECRET}@camera/1'}}}}",
+        f"stages: {{capture: {{source: 'http://camera/video?channel=1&PWD={SECRET}'}}}}",
+    ],
+)
+def test_a_pipeline_is_handed_on_without_its_secrets(text: str) -> None:
+    public = without_secrets(text)
+    assert SECRET not in public
+    assert public.partition(":")[0] == text.partition(":")[0]
+
+
+def test_what_is_no_secret_stays() -> None:
+    text = "stages: {capture: {source: 'http://camera:81/video?channel=2'}}\nsinks: {view: {token: null}}\n"
+    assert without_secrets(text) == text
+    assert public_address("/data/press@2x.avi") == "/data/press@2x.avi"
