@@ -46,7 +46,9 @@ def _ended(number: int, folder: Path, moment: float, *, starting: bool) -> Seen:
     sinks = {id_: settings for kind in WRITES for id_, settings in _settings(kind, folder).items()}
     with start(folder, sinks) as process:
         if not starting:
-            until(lambda: (folder / "out.jsonl").exists() and (folder / "out.jsonl").stat().st_size)
+            # The film is the last that anything reaches.
+            film = folder / KINDS["video .avi"].output
+            until(lambda: film.exists() and film.stat().st_size)
         time.sleep(moment)
         process.send_signal(number)
         _, said = process.communicate(timeout=PATIENCE)
@@ -63,7 +65,7 @@ def _ended_once(number: int) -> tuple[Seen, Mapping[str, str]]:
     """One run, ended up to 1 s after its first result, and what each sink left behind."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        seen = _ended(number, folder, random.Random(number).uniform(0.5, 1.5), starting=False)
+        seen = _ended(number, folder, random.Random(number).uniform(0, 1), starting=False)
         return seen, {kind: KINDS[kind].look(folder / KINDS[kind].output) for kind in WRITES}
 
 

@@ -40,7 +40,6 @@ class Process:
     def __init__(
         self, clock: Clock, lasts: float, code: int, alive: Path, silent_after: float = math.inf
     ) -> None:
-        alive.touch()
         self._alive, self._silent_at = alive, clock.now + silent_after
         self.stdin, self.stdout, self.stderr = io.BytesIO(), io.BytesIO(), io.BytesIO()
         self._clock, self._ends, self._code = clock, clock.now + lasts, code
@@ -49,6 +48,7 @@ class Process:
     def poll(self) -> int | None:
         if self._clock.now < self._silent_at:
             now = round(self._clock.now * 1e9)
+            self._alive.touch()
             os.utime(self._alive, ns=(now, now))
         return self._code if self._clock.now >= self._ends else None
 
@@ -85,7 +85,7 @@ class Machine:
 
     def run(self) -> int:
         members = [Member(sensor, [sensor], SignOfLife(self.folder / sensor)) for sensor in self._plans]
-        supervisor = Supervisor(HANG_AFTER, self.start, self.clock, self.clock.pause)
+        supervisor = Supervisor(self.start, self.clock, self.clock.pause)
         with ending_handled(supervisor.count_signal):
             return supervisor.run(members)
 
@@ -150,7 +150,18 @@ def test_a_process_that_gives_no_sign_of_life_is_killed_and_started_again(
 def test_what_the_supervisor_has_slept_through_is_no_silence(tmp_path: Path) -> None:
     sign = SignOfLife(tmp_path / "alive")
     sign.start(0.0)
-    assert sign.look(1000.0) == LONGEST_LOOK
+    sign.look(1000.0)
+    assert sign.silent == LONGEST_LOOK
+
+
+def test_to_start_a_sensor_has_time_whatever_it_may_take_for_a_frame(tmp_path: Path) -> None:
+    sign = SignOfLife(tmp_path / "alive", limit=2.0)
+    sign.start(0.0)
+    assert sum(not sign.look(float(second)) for second in range(100)) == HANG_AFTER + 1
+    sign.start(100.0)
+    sign.path.touch()
+    assert not sign.look(101.0)
+    assert [sign.look(101.0 + second) for second in (1.0, 2.0, 3.0)] == [False, False, True]
 
 
 def test_there_is_headway_when_every_thread_is_in_another_call_or_waits() -> None:

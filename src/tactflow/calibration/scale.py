@@ -12,6 +12,8 @@ from tactflow.vision.types import Scale
 
 FEWEST_LINKS: Final = 8
 """Distances between neighbouring dots in each direction at least, for a pitch and its error. By hand."""
+POINTED: Final = 0.5
+"""Standard error of a point that somebody has pointed at in a picture, px. Chosen by hand."""
 LONGER: Final = 1.35
 """How much longer than the typical one a distance between neighbours may be: less than the diagonal of a
 square, 1.41."""
@@ -89,7 +91,7 @@ def scale_from_corners(pixels: ArrayLike, millimetres: ArrayLike, size: tuple[in
     Returns
     -------
     The scale by least squares, mm = offset + scale px along each axis, with standard errors from what is
-    left; 0 where there are only two points.
+    left, but at least those of points that are known to half a pixel.
 
     Raises
     ------
@@ -117,9 +119,9 @@ def scale_from_corners(pixels: ArrayLike, millimetres: ArrayLike, size: tuple[in
             )
         rest = real[:, axis] - real[:, axis].mean() - slope * away
         left = len(known) - 2
-        variance = float((rest**2).sum() / left / (away**2).sum()) if left else 0.0
+        variance = max(float((rest**2).sum()) / left if left else 0.0, (POINTED * slope) ** 2)
         values.append(slope)
-        errors.append(float(np.sqrt(variance)))
+        errors.append(float(np.sqrt(variance / (away**2).sum())))
     return Scale(values[0], values[1], (errors[0], errors[1]), centre(size))
 
 

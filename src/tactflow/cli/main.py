@@ -32,6 +32,7 @@ COMMANDS = {
     "warmup": "compile what `run` would compile on its first use",
     "record": "run a pipeline and record its frames and results",
     "repair": "give a recording that was cut off its index",
+    "calibrate": "make the calibration file of a sensor, or see whether it still fits",
     "detect": "find the marks of a gel and show what was found and why, in one picture",
     "cameras": "list the cameras that are plugged in, with names that stay the same",
     "sim": "write a simulated recording and its ground truth",

@@ -90,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=HANG_AFTER,
         metavar="SECONDS",
         help="of several sensors, kill and start again one that has given no sign of life for so long "
-        "(%(default)g); more than the slowest stage may take for a frame",
+        "(%(default)g, and to start it has no less); more than the slowest stage may take for a frame",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
     parser.add_argument(

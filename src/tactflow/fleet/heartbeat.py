@@ -17,8 +17,8 @@ from tactflow.files import status
 BEAT_EVERY = 1.0
 """Time between two signs of life, s. Chosen by hand."""
 HANG_AFTER = 60.0
-"""A process without a sign of life for so long, s, hangs. Chosen by hand: to start takes a few seconds, one
-frame in a slow stage a second."""
+"""A process without a sign of life for so long, s, hangs. Chosen by hand: to start takes a few seconds, ten
+on a machine with other work; one frame in a slow stage takes a second."""
 LONGEST_LOOK = 1.0
 """Time between two looks counts as no longer than this, s: while the supervisor itself was stopped, it has
 missed signs of life. Chosen by hand."""
@@ -67,12 +67,15 @@ def _beat(path: Path, headway: Callable[[], bool]) -> None:
 class SignOfLife:
     """How long a process has been silent, as its supervisor sees it.
 
-    path : the file that it touches. silent : s.
+    path : the file that it touches. limit : how long it may be silent, s; while it starts, no less than
+    `HANG_AFTER`. silent : how long it has been, s.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, limit: float = HANG_AFTER) -> None:
         self.path = path
         self.silent = 0.0
+        self._limit = limit
+        self._heard = False
         self._looked = 0.0
         self._touched: int | None = None
 
@@ -80,16 +83,22 @@ class SignOfLife:
         """A new process has just been started, at a time in seconds."""
         self.silent = 0.0
         self._looked = now
+        self._heard = False
 
-    def look(self, now: float) -> float:
-        """Look whether there was a sign since the last look; `silent`, s."""
+    @property
+    def limit(self) -> float:
+        """How long the process may be silent now, s."""
+        return self._limit if self._heard else max(self._limit, HANG_AFTER)
+
+    def look(self, now: float) -> bool:
+        """Look whether there was a sign since the last look; whether the silence is too long."""
         there = status(str(self.path))
         touched = None if there is None else there.st_mtime_ns
         self.silent += min(now - self._looked, LONGEST_LOOK)
         self._looked = now
         if touched != self._touched:
-            self._touched, self.silent = touched, 0.0
-        return self.silent
+            self._touched, self.silent, self._heard = touched, 0.0, True
+        return self.silent > self.limit
 
     def excuse(self, now: float) -> None:
         """The time since the last look does not count."""

@@ -66,7 +66,7 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
     if problems:
         raise ConfigError("\n".join(problems))
     shared = shared_addresses(pipelines)
-    supervisor = Supervisor(request.hang_after)
+    supervisor = Supervisor()
     with ending_handled(supervisor.count_signal), ExitStack() as stack:
         scratch = Path(stack.enter_context(_scratch_folder(pipelines)))
         for one in shared:
@@ -74,7 +74,7 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
             stack.enter_context(relay(one.address, upstream, one.backlog, one.keys))
         members = []
         for sensor, pipeline in pipelines.items():
-            sign = SignOfLife(scratch / f"{sensor}.alive")
+            sign = SignOfLife(scratch / f"{sensor}.alive", request.hang_after)
             command = _command(request, sensor, pipeline, _side_by_side(sensor, pipeline, shared, scratch))
             command += ["--sign-of-life", str(sign.path)]
             members.append(Member(sensor, command, sign, [WatchedSink(node) for node in pipeline.sinks]))

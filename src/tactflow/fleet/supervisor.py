@@ -15,7 +15,7 @@ from typing import IO, TextIO
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.run import INTERRUPTED
 from tactflow.files import lead_nowhere
-from tactflow.fleet.heartbeat import HANG_AFTER, SignOfLife
+from tactflow.fleet.heartbeat import SignOfLife
 from tactflow.fleet.sinks import WatchedSink
 
 FIRST_PAUSE = 1.0
@@ -82,18 +82,15 @@ class Member:
 class Supervisor:
     """Keeps the processes of several sensors running until each has ended for good.
 
-    hang_after : time without a sign of life, s, after which a process is killed and started again. start :
-    starts a command. clock : seconds. pause : waits so many seconds.
+    start : starts a command. clock : seconds. pause : waits so many seconds.
     """
 
     def __init__(
         self,
-        hang_after: float = HANG_AFTER,
         start: Callable[[Sequence[str]], Process] = start_process,
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._hang_after = hang_after
         self._start_process = start
         self._clock = clock
         self._pause = pause
@@ -164,8 +161,8 @@ class Supervisor:
         if self._results.locked() or self._messages.locked():
             # It may wait for us, who wait for somebody that reads what we write.
             member.sign.excuse(self._clock())
-        elif member.sign.look(self._clock()) > self._hang_after:
-            self._say(member, f"has given no sign of life for {self._hang_after:g} s; it is killed")
+        elif member.sign.look(self._clock()):
+            self._say(member, f"has given no sign of life for {member.sign.limit:g} s; it is killed")
             member.told = KILL_AT
             process.kill()
 

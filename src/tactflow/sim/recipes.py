@@ -23,6 +23,10 @@ def _sphere(_bend: float) -> tuple[shapes.Shape, ...]:
     return (shapes.sphere(),)
 
 
+def _ball(_bend: float) -> tuple[shapes.Shape, ...]:
+    return (shapes.ball(),)
+
+
 def _cable(bend: float) -> tuple[shapes.Shape, ...]:
     return (shapes.cable(bend=bend),)
 
@@ -44,6 +48,13 @@ _CABLE = motion.Programme(_cable, wander=(60.0, 60.0), angles=(-75.0, 75.0), dil
 """Programmes that several scenes share; lengths in px of the raw frame, angles in degrees."""
 SCENES: dict[str, Recipe] = {
     "press": Recipe("a ball is pressed in several places, at several depths", _PRESS),
+    "ball": Recipe(
+        "a ball of radius 2.375 mm is pressed all over the gel, for a calibration: 0.025 mm a raw pixel",
+        motion.Programme(
+            _ball, wander=(300.0, 210.0), period=20, rise=4, hold=10, depths=(1.0, 0.8, 0.9, 0.6)
+        ),
+        {"shear": 0.0},
+    ),
     "cable": Recipe("a straight cable is pressed at several angles", _CABLE),
     "bent_cable": Recipe("a cable that bends by 70 degrees", _CABLE, {"bend": 70.0}),
     "slide": Recipe(
@@ -52,6 +63,13 @@ SCENES: dict[str, Recipe] = {
             _sphere, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)
         ),
         {"shear": 0.9},
+    ),
+    "stick_slip": Recipe(
+        "a ball is dragged until the gel slips, at the edge of the contact first",
+        motion.Programme(
+            _sphere, wander=(100.0, 60.0), travel=260.0, hold=80, period=120, depths=(1.0, 0.8), partial=True
+        ),
+        {"shear": 0.5},
     ),
     "roll": Recipe(
         "a ball rolls over the gel without dragging it",

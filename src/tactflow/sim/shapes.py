@@ -71,6 +71,18 @@ def sphere(radius: float = 95.0, depth: float = 26.0) -> Shape:
     return Shape("sphere", gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
 
 
+def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
+    """A ball of `radius` px, as it is: what a calibration is made with."""
+
+    def gap(x: Array, y: Array) -> Array:
+        squared = np.minimum(x * x + y * y, np.float32((0.99 * radius) ** 2))
+        round_part = np.float32(radius) - np.sqrt(np.float32(radius**2) - squared)
+        return np.asarray(round_part + np.hypot(x, y) - np.sqrt(squared), dtype=np.float32)
+
+    contact = float(np.sqrt(radius * depth))
+    return Shape("ball", gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
+
+
 def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0, bend: float = 0.0) -> Shape:
     """A cylinder of `radius` px along x with rounded ends.
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim.camera import Camera
-from tactflow.sim.gel import Press, displacement, in_contact
+from tactflow.sim.gel import Press, displacement, in_contact, reached, surface
 
 FLOW_POINTS = 1500
 """Points of the gel around a contact at which its displacement is computed; in between it is interpolated.
@@ -37,6 +37,8 @@ class Truth:
         without a contact.
     area : of that hull, px^2.
     depth : of the deepest indenter, raw px, 0 without a contact: how faint the contact is.
+    stick_ratio : share of the contact's area on which the gel sticks to the indenter, the least of several;
+        None without a contact. slipping : whether one slides over the gel.
     origin : (N, 2) float64, markers on the untouched gel. position : (N, 2) float64, now. Markers that were
         never printed are not listed.
     visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, lit, not vanished.
@@ -56,7 +58,10 @@ class Truth:
     inside: NDArray[np.bool_]
     mean_flow: tuple[float, float] | None
     depth: float
+    stick_ratio: float | None
+    slipping: bool
     _render: Callable[[], NDArray[np.uint8]] = field(repr=False)
+    _lower: Callable[[], NDArray[np.float32]] = field(repr=False)
     _move: Callable[[NDArray[np.float64]], NDArray[np.float64]] = field(repr=False)
     _touched: Callable[[NDArray[np.float64]], NDArray[np.bool_]] = field(repr=False)
 
@@ -94,6 +99,11 @@ class Truth:
     def unmarked(self) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 BGR: the frame without markers, dirt and noise. Rendered when first asked for."""
         return self._render()
+
+    @cached_property
+    def sunk(self) -> NDArray[np.float32]:
+        """(H, W) float32, raw px: how far the gel's surface has sunk. Computed when first asked for."""
+        return self._lower()
 
 
 def pixel_mapping(mapping: Any) -> Any:
@@ -209,7 +219,10 @@ def measure(
         inside=inside,
         mean_flow=mean_flow,
         depth=max((press.depth for press in pressed), default=0.0) if touching else 0.0,
+        stick_ratio=min((press.stick_ratio for press in pressed), default=None) if touching else None,
+        slipping=touching and any(press.sliding for press in pressed),
         _render=partial(_processed, clean, mapping),
+        _lower=partial(_sunk, pressed, camera, size, to),
         _move=partial(_moved, pressed, camera, to),
         _touched=partial(_touched, pressed, camera, to, size),
     )
@@ -233,6 +246,16 @@ def _touched(
     gel = camera.to_gel(raw).astype(np.float32).reshape(points.shape)
     seen = np.all((raw >= -0.5) & (raw <= np.array(size) - 0.5), axis=1) & _lit(camera, raw)
     return np.asarray(seen.reshape(points.shape[:2]) & in_contact(pressed, gel[..., 0], gel[..., 1]))
+
+
+def _sunk(pressed: Sequence[Press], camera: Camera, size: tuple[int, int], to: Any) -> NDArray[np.float32]:
+    """How far the surface has sunk at each pixel's centre, (H, W) raw px: the deepest of all presses."""
+    gel_x, gel_y, seen = _pixel_centres(camera, size, to)
+    lowest = np.zeros(gel_x.shape, np.float32)
+    for press in pressed:
+        if press.touching:
+            np.maximum(lowest, surface(press, reached(press, gel_x, gel_y)), out=lowest)
+    return np.where(seen, lowest, np.float32(0))
 
 
 def _contact(

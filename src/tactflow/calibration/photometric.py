@@ -1,0 +1,372 @@
+"""Which colour of the gel is which slope, learned from presses of a ball.
+
+Where the ball touches, the surface is the ball: at a distance d from the middle of a ball of radius R the
+horizontal part of the unit normal is d / R, towards the middle. Where exactly the middle is, is not known to
+a pixel from the outline, so fit and centres take turns: with a model, each pixel of a press says where the
+middle would be, and the median of them is the press's new centre. What they lie off in common shows as a
+slope of the unchanged colour, which has none.
+
+Around the ball nothing is known of the slope but that it is the same all around and points to the middle: a
+gel that is pressed by a ball is as round as the ball. Colours that a shadow or a reflection gives one side
+alone would break this, and with it the heights, which are integrals of the slopes: so it is part of the fit.
+On wedge_ball it halves the RMS distance of the heights from the ball.
+
+All of it is linear in the coefficients, so a ridge regression with a few hundred unknowns; numpy solves it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.calibration.file import PhotometricEntry
+from tactflow.calibration.presses import Press, Session
+from tactflow.engine.errors import ConfigError
+from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel, colour_terms, place_terms
+from tactflow.vision.depth.surface import FADE, Rest, Surface, Window, colour_change, contact_window
+from tactflow.vision.types import Scale
+
+Double = NDArray[np.float64]
+
+FEWEST_PRESSES: Final = 8
+"""Presses that a fit needs at least; 20 or more are advised. Chosen by hand."""
+SPREAD: Final = 0.15
+"""Part of the picture's width and height that the presses must span at least. Chosen by hand."""
+INNER: Final = 0.85
+"""Part of a contact's radius inside which the surface is the ball for sure, and part of the ball's radius up
+to which its colours tell slopes apart. Chosen on wedge_ball."""
+TOO_LARGE: Final = 1.25
+"""Radius of a contact over that of the ball that no ball can make; what outlines add to it is less."""
+ROUND: Final = 0.05
+"""Weight of a pixel around the contact, where the surface is round, to one inside of it. Chosen on
+wedge_ball: 0.03 leaves 0.033 mm RMS and 0.1 flattens the ball."""
+RIDGE: Final = 1e-6
+"""Part of a coefficient's own weight by which it is drawn to 0. Chosen by hand."""
+TURNS: Final = 3
+"""How often fit and centres take turns; later ones move centres by less than 0.05 px on wedge_ball."""
+STRANGE: Final = 4.0
+"""Standard deviations above the median, by median deviation, from which the misfit of a press has it
+rejected. Chosen by hand."""
+MAD_TO_SIGMA: Final = 1.4826
+"""Standard deviation of a normal variable in units of its median absolute deviation."""
+FEWEST_PIXELS: Final = 12
+"""Pixels at half resolution inside a contact that a sphere can be fitted to. Chosen by hand."""
+EDGE: Final = 0.1
+"""Half the width of the ring that counts as the rim of a contact, relative to its radius. Chosen by hand."""
+EVERY: Final = 9
+"""Of the pixels around the contact every ninth will do: the others cost time and tell the same."""
+
+
+class _Sample(NamedTuple):
+    """A press, prepared: pixels (m) in its window at half resolution, in mm.
+
+    x, y : (m,), places, mm. terms : (m, 114) float32. hidden : (m,) bool. inner : (m,) bool, not too near the
+    border of the window. start : (x, y) of the outline, mm. reach : radius inside which it is the ball, mm.
+    """
+
+    x: Double
+    y: Double
+    terms: NDArray[np.float32]
+    hidden: NDArray[np.bool_]
+    inner: NDArray[np.bool_]
+    start: Double
+    reach: float
+    window: Window
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Photometry:
+    """What was learned. model : of the slopes. found : numbers for the calibration file. centers : (n, 2)
+    float64, px, of the presses. kept : (n,) bool, which presses were not rejected. misfit : (n,) float64,
+    mean angle between the normals of each press and its ball, degrees."""
+
+    model: SlopeModel
+    found: PhotometricEntry
+    centers: Double
+    kept: NDArray[np.bool_]
+    misfit: Double
+
+
+def fit_photometry(session: Session, scale: Scale, ball_radius: float) -> Photometry:
+    """Learn slopes from presses of a ball.
+
+    Presses that fit badly are rejected. The errors come from two fits to one half of the presses each, tried
+    on the other half.
+
+    Parameters
+    ----------
+    session : what `find_presses` found. scale : mm per px. ball_radius : mm.
+
+    Raises
+    ------
+    ConfigError : too few presses, all in one place, or contacts larger than the ball.
+    """
+    check_presses(session, scale, ball_radius)
+    rest = Rest(session.untouched)
+    samples = [_prepare(press, rest, scale, ball_radius) for press in session.presses]
+    everyone = np.arange(len(samples))
+    weights, centers = _fit(samples, everyone, ball_radius)
+    misfit = np.array([_misfit(s, c, weights, ball_radius) for s, c in zip(samples, centers, strict=True)])
+    spread = MAD_TO_SIGMA * np.median(np.abs(misfit - np.median(misfit)))
+    kept = misfit <= np.median(misfit) + STRANGE * max(float(spread), 0.1)
+    good = np.flatnonzero(kept)
+    if len(good) < len(samples):
+        weights, refitted = _fit(samples, good, ball_radius)
+        centers[good] = refitted[good]
+    errors = _held_out(session, samples, good, rest, scale, ball_radius)
+    found = PhotometricEntry(
+        ball_radius=ball_radius, presses=len(good), rejected=len(samples) - len(good), **errors
+    )
+    pixels = centers / (scale.x, scale.y) + scale.origin
+    return Photometry(SlopeModel(_shaped(weights)), found, pixels, kept, misfit)
+
+
+def check_presses(session: Session, scale: Scale, ball_radius: float) -> None:
+    """Raise ConfigError if the presses cannot give a calibration, with what was found and what to do."""
+    presses = session.presses
+    if not (np.isfinite(ball_radius) and ball_radius > 0):
+        raise ConfigError(f"calibrate: required a ball radius > 0 mm, got {ball_radius:g}")
+    if not presses:
+        raise ConfigError(
+            f"calibrate: nothing touched the gel in {session.frames} frames; the first frame must show it "
+            "untouched, the others presses of the ball"
+        )
+    if len(presses) < FEWEST_PRESSES:
+        raise ConfigError(
+            f"calibrate: required {FEWEST_PRESSES} presses of the ball or more (20 are better), found "
+            f"{len(presses)} in {session.frames} frames; lift the ball between two presses"
+        )
+    span = np.ptp([press.center for press in presses], axis=0) / session.mapping.size
+    if span.min() < SPREAD:
+        raise ConfigError(
+            f"calibrate: the presses span {100 * span[0]:.0f} % of the picture's width and "
+            f"{100 * span[1]:.0f} % of its height, required {100 * SPREAD:.0f} %; press all over the gel"
+        )
+    radius = float(np.median([press.radius for press in presses])) * (scale.x * scale.y) ** 0.5
+    if radius > TOO_LARGE * ball_radius:
+        raise ConfigError(
+            f"calibrate: the contacts have a radius of {radius:.2f} mm in the median, which a ball of radius "
+            f"{ball_radius:g} mm cannot make; give its radius, not its diameter, in mm, and look at the scale"
+        )
+
+
+def _prepare(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> _Sample:
+    window = contact_window(press.mask, rest.window)
+    change = colour_change(press.image, rest, window)
+    place = place_terms((rest.window.right, rest.window.bottom))[(slice(None), *window.part)]
+    colours = colour_terms(change).reshape(COLOUR_TERMS, -1)
+    terms = (place.reshape(PLACE_TERMS, 1, -1) * colours).reshape(PLACE_TERMS * COLOUR_TERMS, -1)
+    rows, columns = np.mgrid[window.part]
+    # The centre of a pixel at half resolution lies between two of the processed frame.
+    x = (2.0 * columns + 0.5 - scale.origin[0]) * scale.x
+    y = (2.0 * rows + 0.5 - scale.origin[1]) * scale.y
+    hidden = _halved(press.hidden, window)
+    inner = np.zeros(change.shape[:2], np.bool_)
+    inner[FADE:-FADE, FADE:-FADE] = True
+    reach = min(INNER * press.radius * (scale.x * scale.y) ** 0.5, INNER * ball_radius)
+    start = np.array(scale.point(press.center))
+    return _Sample(
+        x.ravel(),
+        y.ravel(),
+        np.ascontiguousarray(terms.T),
+        hidden.ravel(),
+        inner.ravel(),
+        start,
+        reach,
+        window,
+    )
+
+
+def _halved(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
+    """(h, w) bool: whether any of the 2 x 2 pixels of a mask is set."""
+    part = mask[window.whole]
+    return part[::2, ::2] | part[1::2, ::2] | part[::2, 1::2] | part[1::2, 1::2]
+
+
+def _fit(samples: list[_Sample], chosen: NDArray[np.intp], ball_radius: float) -> tuple[Double, Double]:
+    """Coefficients (2, 114), and the centres (n, 2), mm, of all samples, from the chosen ones."""
+    centers = np.array([sample.start for sample in samples])
+    for turn in range(TURNS):
+        weights, offset = _solve([(samples[i], centers[i]) for i in chosen], ball_radius)
+        if turn < TURNS - 1:
+            centers += offset
+            centers[chosen] = [_center(samples[i], centers[i], weights, ball_radius) for i in chosen]
+    return weights, centers
+
+
+def _solve(presses: list[tuple[_Sample, Double]], ball_radius: float) -> tuple[Double, Double]:
+    """Coefficients (2, 114) for given centres, and how far all of these lie off in common, (2,) mm.
+
+    The second is what a constant beside the terms says: where no change of colour would have a slope.
+    """
+    count = PLACE_TERMS * COLOUR_TERMS
+    inside = np.zeros((count + 1, count + 1))
+    aim = np.zeros((2, count + 1))
+    around = np.zeros((2 * count, 2 * count))
+    for sample, center in presses:
+        dx, dy = sample.x - center[0], sample.y - center[1]
+        distance = np.hypot(dx, dy)
+        seen = ~sample.hidden
+        ball = seen & (distance < sample.reach)
+        terms = np.column_stack([sample.terms[ball], np.ones(np.count_nonzero(ball), np.float32)])
+        inside += terms.T @ terms
+        aim += np.stack([dx[ball], dy[ball]]) / ball_radius @ terms
+        outer = np.flatnonzero(seen & ~ball & sample.inner)[::EVERY]
+        around += EVERY * _roundness(sample.terms[outer], dx[outer], dy[outer], distance[outer])
+    matrix = np.kron(np.eye(2), inside)
+    free = np.flatnonzero(np.arange(2 * count + 2) % (count + 1) < count)
+    matrix[np.ix_(free, free)] += ROUND * around
+    matrix += np.diag(RIDGE * np.diag(matrix) + 1e-9 * np.trace(matrix) / len(matrix))
+    solved = np.linalg.solve(matrix, aim.ravel()).reshape(2, count + 1)
+    return solved[:, :count], ball_radius * solved[:, count]
+
+
+def _roundness(terms: NDArray[np.float32], dx: Double, dy: Double, distance: Double) -> Double:
+    """(228, 228): quadratic form that is 0 for normals which point to the middle, the same all around."""
+    ux, uy = ((part / distance).astype(np.float32)[:, None] for part in (dx, dy))
+    across = np.concatenate([-uy * terms, ux * terms], axis=1)
+    along = np.concatenate([ux * terms, uy * terms], axis=1)
+    # Rings as wide as two pixels at half resolution.
+    width = 2 * float(np.abs(np.diff(np.unique(np.round(dx, 6)))).min()) if len(dx) > 1 else 1.0
+    ring = (distance / width).astype(np.int64)
+    order = np.argsort(ring, kind="stable")
+    ring, along = ring[order], along[order]
+    first = np.flatnonzero(np.diff(ring, prepend=-1))
+    members = np.diff(first, append=len(ring))
+    means = np.add.reduceat(along, first, axis=0) / members[:, None].astype(np.float32)
+    along -= np.repeat(means, members, axis=0)
+    return np.asarray(across.T @ across + along.T @ along, np.float64)
+
+
+def _normals(sample: _Sample, weights: Double, chosen: NDArray[np.bool_]) -> Double:
+    """(m, 2): horizontal part of the normals at some pixels, as the fit has it."""
+    return np.asarray(sample.terms[chosen] @ weights.T.astype(np.float32), np.float64)
+
+
+def _center(sample: _Sample, center: Double, weights: Double, ball_radius: float) -> Double:
+    """(2,), mm: where most pixels of a press say that the middle of the ball is."""
+    for _ in range(TURNS):
+        ball = ~sample.hidden & (np.hypot(sample.x - center[0], sample.y - center[1]) < sample.reach)
+        if not ball.any():
+            return center
+        places = np.stack([sample.x[ball], sample.y[ball]], axis=1)
+        center = np.median(places - ball_radius * _normals(sample, weights, ball), axis=0)
+    return center
+
+
+def _misfit(sample: _Sample, center: Double, weights: Double, ball_radius: float) -> float:
+    """Mean angle between the normals of a press and those of the ball, degrees; 180 if it has none."""
+    dx, dy = sample.x - center[0], sample.y - center[1]
+    ball = ~sample.hidden & (np.hypot(dx, dy) < sample.reach)
+    if not ball.any():
+        return 180.0
+    true = _upright(np.stack([dx[ball], dy[ball]], axis=1) / ball_radius)
+    cosine = np.sum(_upright(_normals(sample, weights, ball)) * true, axis=1)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+
+
+def _upright(flat: Double) -> Double:
+    """(m, 3): unit normals from their horizontal parts (m, 2); longer ones than 1 lie flat."""
+    length = np.maximum(np.hypot(flat[:, 0], flat[:, 1]), 1)[:, None]
+    flat = flat / length
+    return np.concatenate([flat, np.sqrt(np.maximum(1 - (flat**2).sum(axis=1, keepdims=True), 0))], axis=1)
+
+
+def _held_out(
+    session: Session,
+    samples: list[_Sample],
+    good: NDArray[np.intp],
+    rest: Rest,
+    scale: Scale,
+    ball_radius: float,
+) -> dict[str, float]:
+    """Errors of presses that the fit has not seen, for `PhotometricEntry`."""
+    tried = []
+    for learned, others in ((good[::2], good[1::2]), (good[1::2], good[::2])):
+        weights, _ = _fit(samples, learned, ball_radius)
+        surface = Surface(SlopeModel(_shaped(weights)), scale)
+        for i in others:
+            image = session.presses[i].image
+            tried.append(
+                _errors(samples[i], weights, surface.heights(image, rest, samples[i].window), ball_radius)
+            )
+    return _summary(np.array(tried))
+
+
+def try_photometry(session: Session, model: SlopeModel, scale: Scale, ball_radius: float) -> dict[str, float]:
+    """How well a model fits presses of a ball: the errors of `PhotometricEntry`.
+
+    session : what `find_presses` found, at least one press. ball_radius : mm.
+    """
+    rest = Rest(session.untouched)
+    weights = model.coefficients.transpose(2, 0, 1).reshape(2, -1).astype(np.float64)
+    surface = Surface(model, scale)
+    tried = []
+    for press in session.presses:
+        sample = _prepare(press, rest, scale, ball_radius)
+        heights = surface.heights(press.image, rest, sample.window)
+        tried.append(_errors(sample, weights, heights, ball_radius))
+    return _summary(np.array(tried))
+
+
+def _errors(
+    sample: _Sample, weights: Double, heights: NDArray[np.float32], ball_radius: float
+) -> list[float]:
+    """Of one press: mean angle, relative error of the radius, RMS from the sphere, of depth, of volume.
+
+    The depth is judged by how far the surface falls from the middle of the ball to the rim of the contact,
+    and the volume by the mean of that: the gel around the ball is not known.
+    """
+    center = _center(sample, sample.start, weights, ball_radius)
+    angle = _misfit(sample, center, weights, ball_radius)
+    found = heights.ravel().astype(np.float64)
+    dx, dy = sample.x - center[0], sample.y - center[1]
+    distance = np.hypot(dx, dy)
+    ball = distance < sample.reach
+    edge = np.abs(distance - sample.reach) < EDGE * sample.reach
+    if np.count_nonzero(ball) < FEWEST_PIXELS or not edge.any():
+        return [angle, np.nan, np.nan, np.nan, np.nan]
+    radius, rms = fit_sphere(np.stack([dx[ball], dy[ball], found[ball]], axis=1))
+    cap = np.sqrt(ball_radius**2 - distance[ball] ** 2)
+    rise = cap - cap.mean()
+    fall = np.sqrt(ball_radius**2 - distance[edge] ** 2).mean()
+    depth = float(rise @ found[ball] / (rise @ rise)) - 1
+    volume = float((found[ball].mean() - found[edge].mean()) / (cap.mean() - fall)) - 1
+    return [angle, radius / ball_radius - 1, rms, depth, volume]
+
+
+def _summary(tried: Double) -> dict[str, float]:
+    """Numbers of `PhotometricEntry` from what `_errors` says of each press, (n, 5)."""
+    angle, radius, rms, depth, volume = tried.T
+    return {
+        "normal_error": float(np.mean(angle)),
+        "radius_error": float(np.nanmedian(radius)),
+        "sphere_rms": float(np.nanmean(rms)),
+        "depth_stderr": float(np.sqrt(np.nanmean(depth**2))),
+        "volume_stderr": float(np.sqrt(np.nanmean(volume**2))),
+    }
+
+
+def fit_sphere(points: Double) -> tuple[float, float]:
+    """Radius of the sphere through points (n, 3), by linear least squares, and their RMS distance from it.
+
+    >>> angle = np.linspace(0, 6, 40)
+    >>> flat = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.linspace(0.1, 1.2, 40)[:, None]
+    >>> points = np.column_stack([flat, np.sqrt(4 - (flat**2).sum(axis=1))])
+    >>> [round(value, 6) for value in fit_sphere(points)]
+    [2.0, 0.0]
+    """
+    matrix = np.column_stack([points, np.ones(len(points))])
+    solved = np.linalg.lstsq(matrix, (points**2).sum(axis=1), rcond=None)[0]
+    center = solved[:3] / 2
+    radius = float(np.sqrt(max(solved[3] + center @ center, 0.0)))
+    distance = np.linalg.norm(points - center, axis=1) - radius
+    return radius, float(np.sqrt(np.mean(distance**2)))
+
+
+def _shaped(weights: Double) -> Double:
+    """(6, 19, 2) coefficients, as `SlopeModel` takes them, from (2, 114)."""
+    return weights.reshape(2, PLACE_TERMS, COLOUR_TERMS).transpose(1, 2, 0)

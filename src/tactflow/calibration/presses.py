@@ -1,0 +1,170 @@
+"""Presses of a ball in a recording: found by the pipeline's own contact detector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.api import make_runner
+from tactflow.engine.conformance import component
+from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.control import Control
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.frame import Tick
+from tactflow.engine.graph import Mark, Node, Pipeline
+from tactflow.ports import ContactMask, MarkerMask, Unmarked
+from tactflow.signals import ending_handled
+from tactflow.vision.geometry import PixelMapping
+from tactflow.vision.types import Contact, Markers
+
+MOVED_ON: Final = 0.5
+"""How far a contact lies from the one before, in its own radii, to be another press. Chosen by hand."""
+
+_COLLECT: Final = "tactflow.calibrate"
+"""Id of the sink that collects; no id of a file has a point in it."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Press:
+    """One press of the ball, at the moment when its contact was largest.
+
+    seq : of the frame. image : (H, W, 3) uint8, without markers. mask : (H, W) uint8, 255 in contact.
+    hidden : (H, W) bool, where a marker was. center : (x, y) of the contact, px. radius : of a disc of its
+    area, px.
+    """
+
+    seq: int
+    image: NDArray[np.uint8]
+    mask: NDArray[np.uint8]
+    hidden: NDArray[np.bool_]
+    center: tuple[float, float]
+    radius: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Session:
+    """What a recording shows that a calibration needs.
+
+    untouched : (H, W, 3) uint8, mean of the reference frames without markers. mapping : of the pixels.
+    presses : in order. dots : (N, 2) float64, markers of the untouched gel, px; empty without markers.
+    frames : how many there were.
+    """
+
+    untouched: NDArray[np.uint8]
+    mapping: PixelMapping
+    presses: list[Press]
+    dots: NDArray[np.float64]
+    frames: int
+
+
+Report = Callable[[int, Sequence["Press"], bool], bool]
+"""Called with each frame: how many there were, the presses so far, and whether the last one still lasts.
+Returns whether that is enough for a live source; of a recording all is read."""
+
+
+def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, _lasts: False) -> Session:
+    """Run a pipeline on its source and collect the presses in it.
+
+    A press lasts as long as something touches at about one place; of each, the frame with the largest
+    contact is kept. Pictures of separate presses one after the other will do. A signal such as Ctrl-C ends
+    it; what was found until then counts.
+
+    Parameters
+    ----------
+    pipeline : with stages that give `unmarked` and `contact`. report : see `Report`.
+
+    Raises
+    ------
+    ConfigError : the pipeline lacks one of the stages, or its source has no frames.
+    TactflowError : a stage or the source failed.
+    """
+    values: dict[str, Any] = {"report": staticmethod(report), "__annotations__": {}}
+    sink = component(type("Collect", (_Collect,), values), _COLLECT, "tactflow calibrate", ())
+    inputs = {port.name: pipeline.last_output(port.name) for port in sink.ports.inputs}
+    # Of a gel without markers the picture itself is without them.
+    inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
+    for port, stage in (("unmarked", "preprocess"), ("contact", "hull")):
+        if inputs[port] is None:
+            raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
+    kept = {id_: node for id_, node in pipeline.nodes.items() if node.component.kind != "sink"}
+    kept[_COLLECT] = Node(_COLLECT, sink, StageParams(), inputs, Mark(_COLLECT, 0, 0))
+    runner = make_runner(replace(pipeline, nodes=kept, skipping=False, calibration=None))
+    with ending_handled(lambda _number, _frame: runner.stop()):
+        failure = runner.run().failure
+    if failure is not None:
+        raise failure
+    collected: Any = runner.nodes[_COLLECT].instance
+    return _session(collected)
+
+
+class _Collect(Sink):
+    """Keeps the largest contact of each press."""
+
+    report: Report
+
+    def __init__(self, params: StageParams, control: Control) -> None:
+        super().__init__(params)
+        self._control = control
+        self.rest: list[NDArray[np.uint8]] = []
+        self.presses: list[Press] = []
+        self.mapping: PixelMapping | None = None
+        self.dots = np.zeros((0, 2))
+        self.frames = 0
+        self._open = False
+
+    def write(
+        self,
+        tick: Tick,
+        unmarked: Unmarked,
+        contact: Contact | None,
+        contact_mask: ContactMask | None,
+        marker_mask: MarkerMask | None,
+        markers: Markers | None,
+        mapping: PixelMapping | None,
+    ) -> None:
+        """Look at one frame."""
+        self.frames += 1
+        if not self.rest or tick.frame.reference:
+            self.rest.append(unmarked.copy())
+            self.mapping = mapping
+        if markers is not None:
+            self.dots = markers.origin
+        if contact is None or contact_mask is None or tick.frame.reference:
+            self._open = False
+        else:
+            radius = float(np.sqrt(np.count_nonzero(contact_mask) / np.pi))
+            hidden = np.zeros(unmarked.shape[:2], np.bool_) if marker_mask is None else marker_mask > 0
+            self._add(Press(tick.frame.seq, unmarked, contact_mask, hidden, contact.center, radius))
+        enough = self.report(self.frames, self.presses, self._open)
+        if enough and self._control.source is not None and self._control.source.live:
+            self._control.stop()
+
+    def _add(self, press: Press) -> None:
+        """A press of its own, or another moment of the last one."""
+        if self._open:
+            last = self.presses[-1]
+            away = np.hypot(press.center[0] - last.center[0], press.center[1] - last.center[1])
+            if away < MOVED_ON * last.radius:
+                if press.radius > last.radius:
+                    self.presses[-1] = press
+                return
+        self._open = True
+        self.presses.append(press)
+
+
+def _session(collected: _Collect) -> Session:
+    if not collected.rest:
+        raise ConfigError("calibrate: the source has no frames")
+    untouched = np.rint(np.mean(collected.rest, axis=0)).astype(np.uint8)
+    size = (untouched.shape[1], untouched.shape[0])
+    return Session(
+        untouched,
+        collected.mapping or PixelMapping.identity(size),
+        collected.presses,
+        collected.dots,
+        collected.frames,
+    )

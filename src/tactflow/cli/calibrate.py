@@ -1,0 +1,205 @@
+"""`tactflow calibrate`: make the calibration file of a sensor, and see whether it still fits."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from tactflow.api import load
+from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_picture
+from tactflow.calibration.photometric import fit_photometry, try_photometry
+from tactflow.calibration.presses import Press, Report, Session, find_presses
+from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Pipeline
+from tactflow.vision.types import Scale
+
+LIGHT: Final = 0.3
+"""Radius of a contact over that of the ball, below which a press is called light. Chosen by hand."""
+WORSE: Final = 1.5
+"""Error on new presses over that in the file, from which on a calibration is called drifted. By hand."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `calibrate`."""
+    parser.add_argument(
+        "what",
+        nargs="*",
+        metavar="PIPELINE | check FILE [PIPELINE]",
+        help="a pipeline with the sensor's preprocess, to make a calibration (default: ./pipeline.yaml, else "
+        "the packaged one); or check, and a calibration file, to see how well it fits today",
+    )
+    parser.add_argument(
+        "--source",
+        "--from",
+        dest="source",
+        metavar="SRC",
+        help="as in 'tactflow run': a camera, a recording or a folder of pictures. First the untouched gel, "
+        "then presses of the ball",
+    )
+    parser.add_argument("--sensor", metavar="NAME", help="which one of a file with sensors")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="calibration/SENSOR.yaml unless given")
+    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
+    parser.add_argument("--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel")
+    parser.add_argument(
+        "--area",
+        type=float,
+        nargs=2,
+        metavar=("WIDTH", "HEIGHT"),
+        help="what the whole processed picture shows, mm, where the gel has no dots of known pitch",
+    )
+    parser.add_argument("--ball-radius", type=float, metavar="MM", help="of the ball; without it, scale only")
+    parser.add_argument(
+        "--presses", type=int, default=30, metavar="N", help="of a live source: enough presses (30)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make or check a calibration; returns the exit code: of a check 3 where it does not fit.
+
+    Raises
+    ------
+    TactflowError
+        If options are wrong, or what was recorded gives no calibration.
+    """
+    words = list(args.what)
+    if words[:1] == ["check"]:
+        if len(words) not in (2, 3):
+            raise ConfigError("calibrate check: required a calibration file, and a pipeline if wanted")
+        return _check(args, Path(words[1]), words[2] if len(words) == 3 else None)
+    if len(words) > 1:
+        raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
+    return _make(args, words[0] if words else None)
+
+
+def _make(args: argparse.Namespace, pipeline: str | None) -> int:
+    if (args.pitch is None) == (args.area is None):
+        raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
+    loaded = _load(args, pipeline)
+    out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
+    if out.suffix != ".yaml":
+        raise ConfigError(f"--out: required a file whose name ends in .yaml, got {out}")
+    if out.exists() and not args.overwrite:
+        raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
+    if args.ball_radius is not None:
+        _say(
+            "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
+            f"all over the gel and to several depths. {args.presses} presses will do; Ctrl-C ends earlier."
+        )
+    session = find_presses(loaded, _guide(args))
+    scale = _scale(args, session)
+    _say(f"scale: {_scale_words(scale)}")
+    found = None
+    if args.ball_radius is not None:
+        _say(f"{len(session.presses)} presses; learning from them ...")
+        found = fit_photometry(session, scale, args.ball_radius)
+        for press, kept, misfit in zip(session.presses, found.kept, found.misfit, strict=True):
+            if not kept:
+                _say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
+        _say(_photometric_words(found.found.model_dump()))
+    Calibration(
+        sensor=loaded.sensor,
+        made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
+        raw_size=session.mapping.raw_size,
+        size=session.mapping.size,
+        corners=raw_corners(session.mapping),
+        look=small_picture(session.untouched),
+        scale=scale,
+        scale_by=f"pitch of {args.pitch:g} mm"
+        if args.pitch
+        else f"area of {args.area[0]:g} x {args.area[1]:g} mm",
+        slopes=None if found is None else found.model,
+        photometric=None if found is None else found.found,
+    ).save(out)
+    _say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
+    return 0
+
+
+def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
+    calibration = Calibration.load(path)
+    session = find_presses(_load(args, pipeline), _guide(args))
+    misfit = calibration.misfit(session.mapping)
+    if misfit is not None:
+        print(f"does not fit: {misfit}")
+        return 3
+    unlike = calibration.unlikeness(session.untouched)
+    fits = unlike <= UNLIKE
+    print(
+        f"untouched gel: differs by {100 * unlike:.1f} % of its brightness; up to {100 * UNLIKE:.0f} % fits"
+    )
+    if calibration.slopes is not None and calibration.photometric is not None and session.presses:
+        then = calibration.photometric
+        now = try_photometry(session, calibration.slopes, calibration.scale, then.ball_radius)
+        print(f"{len(session.presses)} presses today: {_photometric_words(now)}")
+        print(f"when it was made: {_photometric_words(then.model_dump())}")
+        fits = fits and now["normal_error"] <= WORSE * then.normal_error
+    print("it still fits" if fits else "it has drifted; calibrate anew")
+    return 0 if fits else 3
+
+
+def _load(args: argparse.Namespace, pipeline: str | None) -> Pipeline:
+    return load(pipeline, source=args.source, sensor=args.sensor, settings={"calibration": None})
+
+
+def _scale(args: argparse.Namespace, session: Session) -> Scale:
+    width, height = session.mapping.size
+    try:
+        if args.pitch is not None:
+            return scale_from_pitch(session.dots, args.pitch, (width, height))
+        # The picture reaches half a pixel beyond the centres of its outermost pixels.
+        return scale_from_corners(
+            [[-0.5, -0.5], [width - 0.5, height - 0.5]], [[0, 0], args.area], (width, height)
+        )
+    except ValueError as problem:
+        raise ConfigError(f"calibrate: {problem}") from None
+
+
+def _given(args: argparse.Namespace) -> str:
+    if args.pitch is not None:
+        return f"dots with a pitch of {args.pitch:g} mm"
+    return f"a picture of {args.area[0]:g} x {args.area[1]:g} mm"
+
+
+def _guide(args: argparse.Namespace) -> Report:
+    """Tell of each press when it is over, and when there are enough."""
+    told = 0
+
+    def report(_frames: int, presses: Sequence[Press], lasts: bool) -> bool:
+        nonlocal told
+        over = len(presses) - lasts
+        for number in range(told, over):
+            press = presses[number]
+            size = f"radius {press.radius:.0f} px at ({press.center[0]:.0f}, {press.center[1]:.0f})"
+            _say(f"press {number + 1}: {size}{_advice(presses[:over], number)}")
+        told = max(told, over)
+        return over >= int(args.presses)
+
+    return report
+
+
+def _advice(presses: Sequence[Press], number: int) -> str:
+    usual = float(np.median([press.radius for press in presses]))
+    return "; light, press harder" if presses[number].radius < LIGHT * usual else ""
+
+
+def _scale_words(scale: Scale) -> str:
+    return (
+        f"{scale.x:.5f} +- {scale.stderr[0]:.5f} mm per px in x, {scale.y:.5f} +- {scale.stderr[1]:.5f} in y"
+    )
+
+
+def _photometric_words(errors: dict[str, float]) -> str:
+    return (
+        f"normals {errors['normal_error']:.1f} degrees off in the mean, radius of the ball "
+        f"{100 * errors['radius_error']:+.1f} %, heights {errors['sphere_rms']:.3f} mm RMS from it, standard "
+        f"error of the depth {100 * errors['depth_stderr']:.0f} %"
+    )
+
+
+def _say(words: str) -> None:
+    print(words, file=sys.stderr)

@@ -1,0 +1,133 @@
+"""Which colour is which slope: learned from presses of a ball, tried on other contacts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tactflow.calibration.photometric import Photometry, fit_photometry, try_photometry
+from tactflow.calibration.presses import Press, Session
+from tactflow.calibration.scale import centre
+from tactflow.engine.errors import ConfigError
+from tactflow.sim import Scene, open_scene
+from tactflow.vision.depth.surface import Rest, Surface
+from tactflow.vision.geometry import Preprocessor
+from tactflow.vision.types import Scale
+
+RAW_MM = 0.025
+BALL = 95 * RAW_MM
+PREPROCESS = Preprocessor((800, 600), rotate=90, downsample=2)
+SIZE = PREPROCESS.mapping.size
+SCALE = Scale(2 * RAW_MM, 2 * RAW_MM, (0.0, 0.0), centre(SIZE))
+
+
+def press_at(scene: Scene, index: int) -> Press:
+    """The press that a frame shows, with an outline that lies a pixel or two to the side."""
+    truth = scene.truth(index, PREPROCESS)
+    mask = np.roll(np.where(truth.contact_mask, 255, 0).astype(np.uint8), 2, axis=1)
+    assert truth.center is not None
+    x, y = truth.center
+    radius = float(np.sqrt(np.count_nonzero(mask) / np.pi))
+    noise = np.random.default_rng(index).normal(0, 0.7, truth.unmarked.shape)
+    image = np.clip(truth.unmarked + noise, 0, 255).astype(np.uint8)
+    return Press(index, image, mask, np.zeros(mask.shape, np.bool_), (x + 2, y), radius)
+
+
+def session_of(scene: Scene) -> Session:
+    """Every press of a recording, at its deepest."""
+    depths = [max((press.depth for press in scene.presses(i)), default=0.0) for i in range(len(scene))]
+    deepest = [i for i in range(1, len(scene) - 1) if depths[i - 1] < depths[i] >= depths[i + 1]]
+    presses = [press_at(scene, i) for i in deepest]
+    return Session(
+        scene.truth(0, PREPROCESS).unmarked, PREPROCESS.mapping, presses, np.zeros((0, 2)), len(scene)
+    )
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    """Presses of a ball, as a calibration has them."""
+    return session_of(open_scene("ball?frames=500"))
+
+
+@pytest.fixture(scope="module")
+def learned(session: Session) -> Photometry:
+    """What is learned from them."""
+    return fit_photometry(session, SCALE, BALL)
+
+
+def test_the_middles_of_the_presses_are_found_to_a_fraction_of_a_pixel(
+    session: Session, learned: Photometry
+) -> None:
+    scene = open_scene("ball?frames=500")
+    raw = np.array([(scene.presses(p.seq)[0].x, scene.presses(p.seq)[0].y) for p in session.presses])
+    off = learned.centers - PREPROCESS.mapping.to_processed(raw)
+    assert np.sqrt((off**2).mean()) < 0.3
+    assert learned.kept.all()
+
+
+def test_errors_on_presses_that_were_not_learned_from_are_part_of_the_result(learned: Photometry) -> None:
+    found = learned.found
+    assert 0 < found.normal_error < 2
+    assert abs(found.radius_error) < 0.03
+    assert found.sphere_rms < 0.01
+    assert 0 < found.depth_stderr < 0.1
+
+
+@pytest.mark.parametrize(("scene", "worst"), [("press?seed=11", 0.03), ("cable?seed=11", 0.04)])
+def test_heights_of_other_contacts_are_right_to_a_few_hundredths_of_the_depth(
+    learned: Photometry, scene: str, worst: float
+) -> None:
+    shown = open_scene(scene)
+    rest = Rest(shown.truth(0, PREPROCESS).unmarked)
+    surface = Surface(learned.model, SCALE, learned.found.depth_stderr, learned.found.volume_stderr)
+    for index in (60, 120):
+        truth = shown.truth(index, PREPROCESS)
+        sunk = truth.sunk * RAW_MM
+        mask = np.where(truth.contact_mask, 255, 0).astype(np.uint8)
+        found = surface.depth(truth.unmarked, rest, mask)
+        around = sunk > 0.02 * sunk.max()
+        assert np.sqrt(np.mean((found.heights - sunk)[around] ** 2)) < worst * sunk.max()
+        assert found.volume == pytest.approx(sunk.sum() * SCALE.area(1.0), rel=0.15)
+        assert found.greatest_stderr == pytest.approx(found.greatest * learned.found.depth_stderr)
+
+
+def test_a_press_that_is_no_ball_is_rejected(session: Session) -> None:
+    odd = session.presses[5]
+    turned = replace(session, presses=[*session.presses])
+    turned.presses[5] = replace(odd, image=np.ascontiguousarray(odd.image[..., ::-1]))
+    found = fit_photometry(turned, SCALE, BALL)
+    assert np.flatnonzero(~found.kept).tolist() == [5]
+    assert found.found.rejected == 1
+
+
+def test_a_light_that_has_changed_shows_as_a_larger_error(session: Session, learned: Photometry) -> None:
+    def redder(image: np.ndarray) -> np.ndarray:
+        return np.clip(image * (1.0, 1.0, 1.0) + (image - 110.0) * (0, 0, 0.5), 0, 255).astype(np.uint8)
+
+    same = try_photometry(session, learned.model, SCALE, BALL)
+    presses = [replace(press, image=redder(press.image)) for press in session.presses]
+    changed = replace(session, untouched=redder(session.untouched), presses=presses)
+    assert try_photometry(changed, learned.model, SCALE, BALL)["normal_error"] > 2 * same["normal_error"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "radius", "words"),
+    [
+        (slice(0, 0), BALL, "nothing touched the gel in 500 frames"),
+        (slice(0, 4), BALL, "required 8 presses of the ball or more .* found 4 in 500 frames"),
+        (slice(None), 0.6, "cannot make; give its radius, not its diameter"),
+        (slice(None), -1.0, "required a ball radius > 0 mm"),
+    ],
+)
+def test_presses_that_give_no_calibration_are_refused_with_what_to_do(
+    session: Session, chosen: slice, radius: float, words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words):
+        fit_photometry(replace(session, presses=session.presses[chosen]), SCALE, radius)
+
+
+def test_presses_all_in_one_place_are_refused(session: Session) -> None:
+    with pytest.raises(ConfigError, match="press all over the gel"):
+        fit_photometry(replace(session, presses=[session.presses[0]] * 10), SCALE, BALL)
