@@ -19,7 +19,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from tactflow.engine.frame import Tick
 from tactflow.ports import Image
 from tactflow.vision.flow.displacement_field import DisplacementField
-from tactflow.vision.types import Contact, Depth, Evidence, Flow, Markers, MarkerStatus, Scale
+from tactflow.vision.types import Contact, Depth, Evidence, Flow, Markers, MarkerStatus, Scale, Slip
 
 SCHEMA = "tactflow.frame/1"
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
@@ -35,8 +35,8 @@ _OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 class Results(NamedTuple):
     """What the pipeline found in one frame, for sinks: `def write(self, tick: Tick, results: Results)`.
 
-    image : the processed frame. scale, depth : only with a calibration. Each is None where it was not
-    computed or nothing was found.
+    image : the processed frame. scale, depth : only with a calibration. field, slip : only where a stage of
+    that name stands in the pipeline. Each is None where it was not computed or nothing was found.
 
     >>> Results().contact is None
     True
@@ -49,6 +49,7 @@ class Results(NamedTuple):
     scale: Scale | None = None
     depth: Depth | None = None
     field: DisplacementField | None = None
+    slip: Slip | None = None
 
 
 class _Kept:
@@ -96,7 +97,7 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False, field:
         If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
     """
     frame = tick.frame
-    image, contact, flow, markers, scale, depth, _ = results
+    image, contact, flow, markers, scale, depth, _, slip = results
     pixels = frame.image if image is None else image
     described = None if contact is None else _contact(contact, scale, detail)
     separate = () if contact is None else contact.separate
@@ -113,6 +114,9 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False, field:
         "markers": None if markers is None else _markers(markers, detail),
         "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
     }
+    if slip is not None:
+        ratio = _number(slip.stick_ratio, "slip.stick_ratio")
+        message["slip"] = {"slipping": bool(slip.slipping), "stick_ratio": ratio}
     if field:
         message["field"] = None if results.field is None else _field(results.field)
     return orjson.dumps(message, option=_OPTIONS)
@@ -333,6 +337,15 @@ class _MarkersModel(_Strict):
     )
 
 
+class _SlipModel(_Strict):
+    """Whether what touches the gel slips."""
+
+    slipping: bool = Field(description="whether it slides over the gel")
+    stick_ratio: float = Field(
+        ge=0, le=1, description="share of the contact on which the gel moves with it; 0 while it slides"
+    )
+
+
 class _FieldModel(_Strict):
     """Displacement of the gel on a regular grid."""
 
@@ -364,6 +377,9 @@ class _Message(_Strict):
     markers: _MarkersModel | None = Field(description="null when markers were not computed")
     field: _FieldModel | None = Field(
         None, description="displacement field; null without contact (only where the sink's field is true)"
+    )
+    slip: _SlipModel | None = Field(
+        None, description="of the contact (only where the pipeline has the stage slip)"
     )
     skipped: dict[str, str] = Field(
         description="port -> why this frame did not need it; reference -> why this frame became a new one"

@@ -37,6 +37,9 @@ Picture = Annotated[NDArray[np.uint8], ArrayPort("annotated", ("H", "W", 3), "ui
 Touching = Annotated[bool, SignalPort("touching", closed="no_contact")]
 """True while something touches the gel."""
 
+Slipping = Annotated[bool, SignalPort("slipping", closed="no_slip")]
+"""True while what touches the gel slides over it."""
+
 Changed = Annotated[bool, SignalPort("changed", closed="unchanged", otherwise="repeat")]
 """True when the frame differs from the last one that was worked on by more than the sensor's noise."""
 

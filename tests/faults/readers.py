@@ -19,12 +19,12 @@ import zmq
 
 from tactflow import lines
 from tactflow.engine.run import Runner
-from tests.clock import PATIENCE
+from tests.clock import PATIENCE, until
 from tests.faults.rig import FRAMES, Seen, array, run
 
 SMALLEST_PIPE = 4096
 """Bytes that a pipe holds at least (Linux)."""
-FAST = 500.0
+FAST = 100.0
 """Rate of a recording that is played as if it were live, Hz."""
 
 
@@ -44,7 +44,11 @@ def pipe(reader_does: str, folder: Path, *, live: bool) -> Seen:
 
     def signal(runner: Runner) -> None:
         if "signal" in reader_does:
-            time.sleep(0.3)
+            if "hangs" in reader_does:
+                # More than the pipe takes.
+                until(lambda: runner.progress().frames >= 20)
+            else:
+                time.sleep(0.3)
             runner.stop("signal")
 
     with pytest.MonkeyPatch.context() as patch:

@@ -46,7 +46,9 @@ def _ended(number: int, folder: Path, moment: float, *, starting: bool) -> Seen:
     sinks = {id_: settings for kind in WRITES for id_, settings in _settings(kind, folder).items()}
     with start(folder, sinks) as process:
         if not starting:
-            until(lambda: (folder / "out.jsonl").exists() and (folder / "out.jsonl").stat().st_size)
+            # The film is the last that anything reaches.
+            film = folder / KINDS["video .avi"].output
+            until(lambda: film.exists() and film.stat().st_size)
         time.sleep(moment)
         process.send_signal(number)
         _, said = process.communicate(timeout=PATIENCE)
@@ -63,7 +65,7 @@ def _ended_once(number: int) -> tuple[Seen, Mapping[str, str]]:
     """One run, ended up to 1 s after its first result, and what each sink left behind."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        seen = _ended(number, folder, random.Random(number).uniform(0.5, 1.5), starting=False)
+        seen = _ended(number, folder, random.Random(number).uniform(0, 1), starting=False)
         return seen, {kind: KINDS[kind].look(folder / KINDS[kind].output) for kind in WRITES}
 
 
@@ -84,7 +86,9 @@ def ended_often(number: int, times: int, folder: Path) -> Seen:
         place.mkdir()
         seen = _ended(number, place, moments.uniform(0, 2 * STARTING), starting=True)
         said |= set(filter(None, [seen.said]))
-        if seen.exit != 0:
+        if number == signal.SIGKILL:
+            assert seen.exit == -number
+        elif seen.exit != 0:
             # While Python itself starts, the signal ends it.
             early += 1
             assert seen.exit in (-number, INTERRUPTED), seen
@@ -93,7 +97,10 @@ def ended_often(number: int, times: int, folder: Path) -> Seen:
             output = place / KINDS[kind].output
             if output.exists() and kind != "video .avi" and not _is_empty(output):
                 KINDS[kind].look(output)
-    return Seen(0, "\n".join(said), f"{times} runs left nothing damaged; {early} ended before they had begun")
+    kept = f"{times} runs left nothing damaged"
+    if number == signal.SIGKILL:
+        return Seen(-number, "\n".join(said), kept)
+    return Seen(0, "\n".join(said), f"{kept}; {early} ended before they had begun")
 
 
 def _is_empty(output: Path) -> bool:

@@ -90,29 +90,27 @@ def settings_of(kind: str, output: Path) -> dict[str, Any]:
 
 
 def _remove(output: Path) -> None:
-    shutil.rmtree(output) if output.is_dir() else output.unlink()
+    output.rename(output.with_name("moved-away"))
 
 
 def _replace(output: Path) -> None:
-    output.rename(output.with_name("moved-away"))
-    output.write_text(THEIRS)
+    other = output.with_name("other")
+    other.write_text(THEIRS)
+    other.replace(output)
 
 
 def _turn_into_pipe(output: Path) -> None:
-    _remove(output)
-    os.mkfifo(output)
-
-
-def _move_folder(output: Path) -> None:
-    output.rename(output.with_name("moved-away"))
-    output.mkdir()
+    pipe = output.with_name("pipe")
+    os.mkfifo(pipe)
+    if output.is_dir():
+        _remove(output)
+    pipe.replace(output)
 
 
 IN_MID_RUN: dict[str, Callable[[Path], None]] = {
     "disk full": lambda output: fill(output.parent),
     "removed": _remove,
     "replaced": _replace,
-    "replaced by another folder": _move_folder,
     "turned into a pipe": _turn_into_pipe,
     "cut to nothing": lambda output: os.truncate(output, 0),
 }
@@ -135,9 +133,6 @@ def in_mid_run(kind: str, fault: str, folder: Path) -> Seen:
             kept = "the other's file" if output.read_text() == THEIRS else "the other's file was written to"
         elif fault == "turned into a pipe":
             kept = "the pipe" if output.is_fifo() else "a file"
-        elif fault == "replaced by another folder":
-            look = KINDS[kind].look
-            kept = f"{look(output.with_name('moved-away'))}, then {look(output)}"
         else:
             kept = _as_said(seen, KINDS[kind].look(output))
     return Seen(seen.exit, seen.said, kept)

@@ -28,6 +28,10 @@ RIM = 0.6
 Chosen by hand."""
 TOUCH_DEPTH = 0.25
 """Depth below which an indenter does not count as touching, px. Chosen by hand."""
+_MOST_STICK = 0.999
+"""Part of a contact's radius that sticks at most: where all sticks, the edge has a traction without bound."""
+_BISECTIONS = 20
+"""Steps in which the radius of a contact is found: to a millionth of an indenter's reach."""
 SHEAR_SPREAD = 110.0
 """How far around a contact the gel follows its shear and twist, px (standard deviation of a Gaussian).
 Chosen by hand: four to five pitches of the markers."""
@@ -42,6 +46,9 @@ class Press:
     shear : (sx, sy) by which the gel under it has been dragged, px. twist : the same for rotation, radians.
     dilation : largest displacement by which the press pushes the gel apart, px.
     sink, rim : the gel's `SINK_IN` and `RIM`.
+    stick : for a ball, radius of the part of the contact that still follows the shear over that of the whole
+        contact, 0 to 1: around it the gel slips (Mindlin). None: all of the contact follows.
+    sliding : whether the indenter moves on while the gel under it stays behind.
     """
 
     shape: Shape
@@ -54,6 +61,25 @@ class Press:
     dilation: float = 0.0
     sink: float = SINK_IN
     rim: float = RIM
+    stick: float | None = None
+    sliding: bool = False
+
+    @property
+    def radius(self) -> float:
+        """Distance from the origin along x up to which the gel is in contact, px: the radius of a ball's."""
+        near, far = 0.0, self.shape.reach
+        for _ in range(_BISECTIONS):
+            middle = np.array([(near + far) / 2], np.float32)
+            touched = self.depth - float(self.shape.gap(middle, middle * 0)[0]) > self.sink * self.depth
+            near, far = ((near + far) / 2, far) if touched else (near, (near + far) / 2)
+        return near
+
+    @property
+    def stick_ratio(self) -> float:
+        """Share of the contact's area on which the gel sticks to the indenter."""
+        if self.sliding:
+            return 0.0
+        return 1.0 if self.stick is None else self.stick**2
 
     @property
     def touching(self) -> bool:
@@ -115,9 +141,40 @@ def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray
             beyond = np.maximum(distance - press.shape.spread, 0.0)
             spread = max(SHEAR_SPREAD, 1.2 * float(np.hypot(*shear)))
             weight = np.exp(-(beyond**2) / (2.0 * spread**2))
+            if press.stick is not None:
+                weight = partial_slip(distance / max(press.radius, 1e-6), press.stick)
             turn = weight * press.twist * grip
             # A turn by an angle that varies with the distance keeps areas; a faded displacement would not.
             moved[:, 0] += offset[:, 0] * (np.cos(turn) - 1.0) - offset[:, 1] * np.sin(turn)
             moved[:, 1] += offset[:, 0] * np.sin(turn) + offset[:, 1] * (np.cos(turn) - 1.0)
             moved += weight[:, None] * shear
     return moved
+
+
+def partial_slip(distance: NDArray[np.float64], stick: float) -> NDArray[np.float64]:
+    """How far the gel follows a ball that is dragged along, 0 to 1, where only the middle still sticks.
+
+    distance : (N,), from the middle, in radii of the contact. stick : radius of the part that sticks, in
+    radii of the contact, 0 to 1. There the result is 1; around it the gel follows less and less.
+
+    References
+    ----------
+    R. D. Mindlin, "Compliance of elastic bodies in contact", J. Appl. Mech. 16 (1949); K. L. Johnson, Contact
+    Mechanics (1985), ch. 7.2: the traction of full slip on the contact less one of the same form on the part
+    that sticks, each with the displacement that a Hertz pressure has (eq. 3.41, 3.42).
+
+    >>> partial_slip(np.array([0.0, 0.5, 1.0]), 0.0).tolist()
+    [1.0, 0.875, 0.5]
+    """
+    stick = min(stick, _MOST_STICK)
+    return np.asarray((_hertz(distance, 1.0) - _hertz(distance, stick)) / (2 * (1 - stick * stick)))
+
+
+def _hertz(distance: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    """Form of the displacement, 1, at distances from the middle of a Hertz traction on a disc."""
+    if radius <= 0:
+        return np.zeros_like(distance)
+    away = np.maximum(distance, radius)
+    outside = (2 * radius**2 - away**2) * np.arcsin(radius / away)
+    outside += radius * np.sqrt(away**2 - radius**2)
+    return np.where(distance <= radius, 2 * radius**2 - distance**2, 2 / np.pi * outside)

@@ -25,6 +25,9 @@ _LONGEST_REST = 120
 _LAST_REST = 30
 """One frame of so many is left untouched at the end of a recording; chosen by hand."""
 
+_FULL_LOAD = 0.75
+"""Part of a hold after which a ball that slips at the edge first slips altogether. Chosen by hand."""
+
 _LARGEST_CREEP = 60.0
 """Farthest that a creeping gel is dragged before it turns back, px; chosen by hand."""
 
@@ -43,6 +46,7 @@ class Programme:
     travel : px by which the indenter slides during a hold. jumps : if true, the gel is dragged to a new place
     every third frame. creep : px per frame by which the gel is dragged. dilation : pitches by which a press
     pushes the gel apart. contacts : so many that share the length of the recording; 0: as many as fit.
+    partial : whether the gel begins to slip at the edge of the contact before all of it does; for balls.
     """
 
     build: Callable[[float], tuple[Shape, ...]]
@@ -59,6 +63,7 @@ class Programme:
     creep: float = 0.0
     dilation: float = 0.3
     contacts: int = 0
+    partial: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +158,33 @@ def _creep(programme: Programme, timing: _Timing) -> float:
     return _LARGEST_CREEP - abs(way - _LARGEST_CREEP)
 
 
+def _dragged(
+    programme: Programme, timing: _Timing, plan: _Plan, seed: int, pitch: float, shear: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float | None, bool]:
+    """How far the gel is dragged and the indenter has travelled, (2,) px; `stick`, `sliding` of `Press`."""
+    ahead = plan.ahead
+    farthest = shear * pitch
+    if programme.jumps:
+        drag = _jump(timing, seed, pitch)
+        return drag, drag, None, False
+    if programme.creep:
+        drag = _creep(programme, timing) * ahead
+        return drag, drag, None, False
+    if programme.partial:
+        load = timing.progress / _FULL_LOAD
+        stick = max(1.0 - load, 0.0) ** (1 / 3)
+        drag = farthest * (1 - stick**2) * ahead
+        beyond = programme.travel * max(timing.progress - _FULL_LOAD, 0.0)
+        return drag, drag + beyond * ahead, stick, load > 1 and timing.progress < 1
+    if programme.travel:
+        # Stick until the gel has been dragged as far as friction holds it, then slip.
+        way = programme.travel * timing.progress
+        return min(way, farthest) * ahead, way * ahead, None, 0 < farthest < way and timing.progress < 1
+    swing = float(np.sin(np.pi * _smooth(timing.progress)))
+    drag = farthest * swing * ahead if shear else np.zeros(2)
+    return drag, drag, None, False
+
+
 def presses(
     programme: Programme,
     shapes: tuple[Shape, ...],
@@ -179,18 +211,7 @@ def presses(
         return (), -1
     plan = _plan(programme, seed, timing.cycle, size)
     swing = float(np.sin(np.pi * _smooth(timing.progress)))
-    if programme.jumps:
-        drag = travelled = _jump(timing, seed, pitch)
-    elif programme.creep:
-        drag = travelled = _creep(programme, timing) * plan.ahead
-    elif programme.travel:
-        # Stick until the gel has been dragged as far as friction holds it, then slip.
-        way = programme.travel * timing.progress
-        drag, travelled = min(way, shear * pitch) * plan.ahead, way * plan.ahead
-    elif shear:
-        drag = travelled = shear * pitch * swing * plan.ahead
-    else:
-        drag = travelled = np.zeros(2)
+    drag, travelled, stick, sliding = _dragged(programme, timing, plan, seed, pitch, shear)
     turn = np.radians(twist) * plan.sign * swing
     made = [
         Press(
@@ -204,6 +225,8 @@ def presses(
             programme.dilation * pitch,
             sink,
             rim,
+            stick,
+            sliding,
         )
         for shape, (offset_x, offset_y) in zip(shapes, programme.offsets, strict=True)
     ]

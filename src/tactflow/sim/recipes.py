@@ -64,6 +64,13 @@ SCENES: dict[str, Recipe] = {
         ),
         {"shear": 0.9},
     ),
+    "stick_slip": Recipe(
+        "a ball is dragged until the gel slips, at the edge of the contact first",
+        motion.Programme(
+            _sphere, wander=(100.0, 60.0), travel=260.0, hold=80, period=120, depths=(1.0, 0.8), partial=True
+        ),
+        {"shear": 0.5},
+    ),
     "roll": Recipe(
         "a ball rolls over the gel without dragging it",
         motion.Programme(

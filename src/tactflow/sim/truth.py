@@ -37,6 +37,8 @@ class Truth:
         without a contact.
     area : of that hull, px^2.
     depth : of the deepest indenter, raw px, 0 without a contact: how faint the contact is.
+    stick_ratio : share of the contact's area on which the gel sticks to the indenter, the least of several;
+        None without a contact. slipping : whether one slides over the gel.
     origin : (N, 2) float64, markers on the untouched gel. position : (N, 2) float64, now. Markers that were
         never printed are not listed.
     visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, lit, not vanished.
@@ -56,6 +58,8 @@ class Truth:
     inside: NDArray[np.bool_]
     mean_flow: tuple[float, float] | None
     depth: float
+    stick_ratio: float | None
+    slipping: bool
     _render: Callable[[], NDArray[np.uint8]] = field(repr=False)
     _lower: Callable[[], NDArray[np.float32]] = field(repr=False)
     _move: Callable[[NDArray[np.float64]], NDArray[np.float64]] = field(repr=False)
@@ -215,6 +219,8 @@ def measure(
         inside=inside,
         mean_flow=mean_flow,
         depth=max((press.depth for press in pressed), default=0.0) if touching else 0.0,
+        stick_ratio=min((press.stick_ratio for press in pressed), default=None) if touching else None,
+        slipping=touching and any(press.sliding for press in pressed),
         _render=partial(_processed, clean, mapping),
         _lower=partial(_sunk, pressed, camera, size, to),
         _move=partial(_moved, pressed, camera, to),

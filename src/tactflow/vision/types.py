@@ -141,6 +141,21 @@ class Flow:
 
 
 @dataclass(frozen=True, slots=True)
+class Slip:
+    """Whether what touches the gel slips.
+
+    slipping : whether it slides over the gel.
+    stick_ratio : share of the contact on which the gel still moves with it, 0 to 1; 0 while it slides.
+
+    >>> Slip(False, 0.7).stick_ratio
+    0.7
+    """
+
+    slipping: bool
+    stick_ratio: float
+
+
+@dataclass(frozen=True, slots=True)
 class Scale:
     """Millimetres of the gel's surface per pixel of the processed frame.
 

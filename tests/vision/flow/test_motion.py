@@ -39,7 +39,7 @@ def test_markers_at_rest_do_not_move() -> None:
     test = MotionTest(ORIGIN)
     seen = [test(moved(noise=0.14, seed=seed)) for seed in range(2000)]
     assert not any(motion.moving for motion in seen)
-    assert np.mean([motion.still.mean() for motion in seen]) > 0.8
+    assert np.mean([motion.still().mean() for motion in seen]) > 0.8
 
 
 def test_false_alarms_come_at_most_at_the_stated_rate() -> None:
@@ -57,7 +57,7 @@ def test_a_press_moves_them(depth: float) -> None:
     motion = MotionTest(ORIGIN)(moved(press(depth), noise=0.1))
     assert motion.moving
     assert motion.largest == pytest.approx(depth, abs=0.4)
-    assert not motion.still[PRESSED].any()
+    assert not motion.still()[PRESSED].any()
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_markers_that_are_not_seen_have_no_vote(status: MarkerStatus) -> None:
     markers.stderr[PRESSED] = np.nan
     motion = MotionTest(ORIGIN)(markers)
     assert not motion.moving
-    assert not motion.still[PRESSED].any()
+    assert not motion.still()[PRESSED].any()
 
 
 def test_what_a_released_gel_still_shows_is_no_motion() -> None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.components import STRAY
-from tactflow.vision.contact.filling import close_gaps, fill, fill_pockets, is_solid, outlined
+from tactflow.vision.contact.filling import SQUARE, close_gaps, fill, fill_pockets, is_solid, outlined
 
 Float = NDArray[np.float32]
 Double = NDArray[np.float64]
@@ -100,9 +100,6 @@ Chosen by hand."""
 _NOTHING: Final = np.zeros((0, 0), np.uint8)
 """An empty mask."""
 
-_SQUARE: Final = np.ones((3, 3), np.uint8)
-"""A pixel and its neighbours."""
-
 
 @dataclass(frozen=True, slots=True)
 class WindowChange:
@@ -155,7 +152,7 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
 def _level(change: WindowChange, bridge: float, hidden: Mask | None) -> tuple[Float, Float | None]:
     """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0."""
     cap = GLOSS * _typical(
-        change.strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, _SQUARE), np.uint8)
+        change.strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
     )
     strength = np.minimum(change.strength, np.float32(cap))
     # A fifth of the time of `np.clip`.
@@ -187,7 +184,7 @@ def _largest_nearby(values: Float) -> Float:
     coarse = (-(-wide // COARSE), -(-high // COARSE))
     largest = cv2.resize(smooth, coarse, interpolation=cv2.INTER_AREA)
     largest = cv2.copyMakeBorder(largest, *(reach,) * 4, cv2.BORDER_CONSTANT, value=(0.0,))
-    largest = cv2.blur(cv2.dilate(largest, _SQUARE, iterations=reach), (side, side))
+    largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
     largest = largest[reach:, reach:][: coarse[1], : coarse[0]]
     largest = cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR)
     return np.maximum(largest, np.float32(FAINT * peak))
@@ -205,7 +202,7 @@ def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
     level = (brightness - half_way) / nearby
     if hidden is not None:
         # The change is smooth here: what is painted next to what is seen is nearly right.
-        hidden = np.asarray(cv2.erode(hidden, _SQUARE), np.uint8)
+        hidden = np.asarray(cv2.erode(hidden, SQUARE), np.uint8)
     inside = fill_pockets(*outlined((level > 0).view(np.uint8), hidden)).view(np.bool_)
     # What is filled in is as deep inside as the middle of a plateau, what is left out as far outside.
     np.clip(level, -0.5, 0.5, out=level)
@@ -275,9 +272,10 @@ def _first_peak(profile: list[float]) -> float:
     """The largest value before the profile falls clearly for the first time."""
     peak = profile[0]
     for value in profile:
-        if value < FALLEN * peak:
+        if value > peak:
+            peak = value
+        elif value < FALLEN * peak:
             break
-        peak = max(peak, value)
     return peak
 
 

@@ -21,6 +21,9 @@ POCKET: Final = 0.8
 """Part of an area between a region and the frame's border that the region's hull covers if it belongs to the
 region. Chosen by hand."""
 
+SQUARE: Final = np.ones((3, 3), np.uint8)
+"""A pixel and its neighbours."""
+
 
 def fill(mask: Mask) -> Mask:
     """Fill what a region encloses, alone or together with the border of the frame.
@@ -46,7 +49,7 @@ def outlined(mask: Mask, hidden: Mask | None) -> tuple[Mask, Outlines]:
     outlines = [np.asarray(outline[:, 0], np.int32) for outline in found]
     if hidden is not None:
         # Smoothing has carried what was painted one pixel further.
-        grown = np.asarray(cv2.dilate(hidden, np.ones((3, 3), np.uint8)), np.uint8)
+        grown = np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
         outlines = [line for line in (continued(outline, grown) for outline in outlines) if line is not None]
     filled = np.zeros_like(mask)
     if outlines:

@@ -99,7 +99,7 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     """Whether many markers lie below a change of the light, and all of them are at rest."""
     seen = markers.status == _TRACKED
     below = inside_mask(markers.position[seen], light)
-    resting = motion.still[seen][below]
+    resting = motion.still()[seen][below]
     return len(resting) >= UNMOVED and bool(resting.all())
 
 
@@ -112,7 +112,7 @@ def _without_reflections(light: Mask, markers: Markers, motion: Motion, reach: f
     if len(outlines) < 2:
         return light
     seen = markers.status == _TRACKED
-    places, unmoved = markers.position[seen], (motion.still | (motion.left <= DRAGGED * motion.largest))[seen]
+    places, unmoved = markers.position[seen], motion.still(DRAGGED)[seen]
     boxes = np.array([cv2.boundingRect(outline) for outline in outlines], np.float64)[:, None]
     low, high = boxes[..., :2] - reach, boxes[..., :2] + boxes[..., 2:] + reach
     beside = ((low <= places) & (places <= high)).all(axis=2)

@@ -4,6 +4,7 @@ from tactflow.vision.flow.displacement_field import DisplacementField, FieldMode
 from tactflow.vision.flow.in_mask import HIDDEN, flow_in_mask, flow_of_field
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
+from tactflow.vision.flow.slip import SlipTest
 
 __all__ = [
     "HIDDEN",
@@ -11,6 +12,7 @@ __all__ = [
     "FieldModel",
     "Motion",
     "MotionTest",
+    "SlipTest",
     "flow_in_mask",
     "flow_of_field",
     "inside_mask",

@@ -245,6 +245,8 @@ class DisplacementField:
     that was at `grid.points[row, column]` in the reference frame.
 
     model : of the reference. markers : of the frame. seen : (N,) bool, those that were seen, three or more.
+
+    grid : where the field is told. noise : median standard error of a marker, px; 0 where none is known.
     """
 
     def __init__(self, model: FieldModel, markers: Markers, seen: NDArray[np.bool_]) -> None:
@@ -256,6 +258,7 @@ class DisplacementField:
         known = seen & np.isfinite(markers.stderr)
         ordered = np.sort(markers.stderr[known])
         typical = ordered[len(ordered) // 2] if len(ordered) else 0.0
+        self.noise = float(typical)
         error = np.where(known, markers.stderr, typical)
         self._variance = error * error
         self._update: _Update | None = None
@@ -299,7 +302,6 @@ class DisplacementField:
         mask : (H, W) uint8, non-zero inside, in the current frame: what counts is where the gel is now.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
-        check_mask(mask, 0)
         part = self.part(mask)
         if part is None:
             return None
@@ -324,6 +326,7 @@ class DisplacementField:
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
         """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
+        check_mask(mask, 0)
         left, top, width, height = cv2.boundingRect(mask)
         if width == 0:
             return None
@@ -341,7 +344,7 @@ class DisplacementField:
         region: NDArray[np.uint8] = mask[top : top + height, left : left + width]
         share = _coverage(region, points + moved - [left, top], max(1, round(grid.spacing / SAMPLE)))
         total = float(share.sum())
-        return Part(share / total, points, moved, kernel) if total > 0 else None
+        return Part(share / total, total, window, points, moved, kernel) if total > 0 else None
 
     def _scale(self, kernel: FloatArray) -> FloatArray:
         """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""
@@ -356,11 +359,14 @@ class DisplacementField:
 class Part(NamedTuple):
     """A part of the gel, in a window of the grid.
 
-    share : (rows, columns), how much of the part each cell is, in sum 1. points : (rows, columns, 2), at
+    share : (rows, columns), how much of the part each cell is, in sum 1. cells : how many cells that makes.
+    window : rows and columns of the grid. points : (rows, columns, 2), at
     rest, px. moved : (rows, columns, 2), px. kernel : (rows, columns, N), between cells and markers.
     """
 
     share: FloatArray
+    cells: float
+    window: tuple[slice, slice]
     points: FloatArray
     moved: FloatArray
     kernel: FloatArray

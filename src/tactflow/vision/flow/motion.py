@@ -43,15 +43,23 @@ class Motion:
     moving : whether neighbouring markers have moved in a way that no motion of the whole gel explains.
     clearly : whether they have moved so far that it is a contact whatever else is seen.
     largest : the third largest of their motions, px; 0 with fewer than three tracked markers.
-    still : (N,) bool, tracked markers that are at rest: not even half of what `moving` asks for. left : (N,)
-    float64, the motion of each tracked marker that no motion of the whole gel explains, px; 0 of others.
+    left : (N,) float64, the motion of each tracked marker that no motion of the whole gel explains, px; 0 of
+    others. bound : (N,) float64, what it takes to be one, px.
     """
 
     moving: bool
     clearly: bool
     largest: float
-    still: NDArray[np.bool_]
     left: FloatArray
+    bound: FloatArray
+
+    def still(self, dragged: float = 0.0) -> NDArray[np.bool_]:
+        """Tracked markers (N,) bool that are at rest: not even half of what `moving` asks for.
+
+        dragged : part of the largest motion up to which a marker rests as well. One whose standard error is
+        unknown does not rest.
+        """
+        return np.asarray(self.left <= np.maximum(STILL * self.bound, dragged * self.largest))
 
 
 class MotionTest:
@@ -131,14 +139,14 @@ class MotionTest:
         if markers.position.T.shape != self._origin.shape:
             raise ValueError(f"required {self._origin.shape[1]} markers, got {len(markers.position)}")
         tracked = markers.status == _TRACKED
-        left = np.zeros(len(tracked))
         number = np.count_nonzero(tracked)
-        if number >= TOGETHER:
-            moved = np.ascontiguousarray(markers.position.T) - self._origin
-            if number == len(left):
-                left = _unexplained(moved, self._arms)
-            else:
-                left[tracked] = _unexplained(moved[:, tracked], self._arms[:, tracked])
+        if number == len(tracked) >= TOGETHER:
+            left = _unexplained(np.ascontiguousarray(markers.position.T) - self._origin, self._arms)
+        else:
+            left = np.zeros(len(tracked))
+            if number >= TOGETHER:
+                moved = markers.position[tracked].T - self._origin[:, tracked]
+                left[tracked] = _unexplained(moved, self._arms[:, tracked])
         remembered = self._relaxation * self._strongest
         bound = self._limit * np.sqrt(markers.stderr * markers.stderr + self._variance)
         far = np.maximum(ALONE * (STAY if self._clearly else 1.0) * bound, remembered)
@@ -149,7 +157,7 @@ class MotionTest:
         self._moving = self._clearly or self._together(left > near)
         largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
-        return Motion(self._moving, self._clearly, largest, tracked & (left <= STILL * bound), left)
+        return Motion(self._moving, self._clearly, largest, left, bound)
 
     def stretched(self, markers: Markers) -> FloatArray:
         """Positions (K, 2), px, of the markers at the most strained links between tracked ones.

@@ -1,0 +1,48 @@
+"""Stage `slip`: whether what touches the gel slips."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from tactflow.engine.contract import Stage, StageParams
+from tactflow.ports import ContactMask, Slipping, Touching
+from tactflow.vision.flow import DisplacementField, SlipTest
+from tactflow.vision.types import Flow, Slip
+
+
+class SlipPorts(NamedTuple):
+    """slipping : whether the contact slides over the gel. slip : the same, and how much of it sticks."""
+
+    slipping: Slipping
+    slip: Slip | None
+
+
+class SlipStage(Stage):
+    """Gross slip from the gel that a contact leaves behind, incipient slip from how the gel moves below it.
+
+    `when: slipping` gates other stages. This one needs no gate: without a contact it only forgets the last.
+    """
+
+    memory = "stateful"
+
+    def __init__(self, params: StageParams) -> None:
+        super().__init__(params)
+        self._test = SlipTest()
+
+    def reset(self) -> None:
+        """A new reference follows: displacements are measured anew."""
+        self._test.reset()
+
+    def process(
+        self,
+        touching: Touching,
+        contact_mask: ContactMask,
+        field: DisplacementField | None = None,
+        flow: Flow | None = None,
+    ) -> SlipPorts:
+        """Slip of this frame's contact; `slip` is absent without one, or where no marker is near."""
+        if not touching or field is None:
+            self._test.reset()
+            return SlipPorts(False, None)
+        slip = self._test(field, contact_mask, flow)
+        return SlipPorts(slip is not None and slip.slipping, slip)

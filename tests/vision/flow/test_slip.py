@@ -1,0 +1,93 @@
+"""Gross and incipient slip."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from tactflow.sim import open_scene
+from tactflow.vision.flow import FieldModel, SlipTest, flow_of_field
+from tactflow.vision.flow.slip import stick_ratio
+from tactflow.vision.geometry.preprocess import Preprocessor
+from tactflow.vision.types import Markers, MarkerStatus, Slip
+
+MAPPING = Preprocessor((800, 600), rotate=90, downsample=2).mapping
+NOISE = 0.015
+
+
+def judged(spec: str, frames: range) -> Iterator[tuple[int, bool, float, Slip]]:
+    """Frame, whether it truly slips, its true stick ratio, and what the test says, from true outlines."""
+    scene, test, rng = open_scene(spec), SlipTest(), np.random.default_rng(3)
+    model = FieldModel(scene.truth(0, MAPPING).origin, MAPPING.size)
+    for index in frames:
+        truth = scene.truth(index, MAPPING)
+        if not truth.touching or truth.stick_ratio is None:
+            test.reset()
+            continue
+        seen = np.where(truth.visible, MarkerStatus.TRACKED, MarkerStatus.LOST).astype(np.uint8)
+        position = truth.position + rng.normal(0, NOISE, truth.position.shape)
+        markers = Markers(truth.origin, position, seen, np.full(len(seen), NOISE))
+        field = model(markers)
+        assert field is not None
+        mask = np.uint8(255) * truth.contact_mask
+        slip = test(field, mask, flow_of_field(field, markers, mask))
+        if slip is not None:
+            yield index, truth.slipping, truth.stick_ratio, slip
+
+
+@pytest.mark.parametrize("spec", ["slide?frames=140", "stick_slip?frames=150"])
+def test_a_contact_that_slides_is_noticed_within_three_frames_and_not_before(spec: str) -> None:
+    told = [(index, true, slip.slipping) for index, true, _, slip in judged(spec, range(14, 110))]
+    first = next(index for index, true, _ in told if true)
+    found = next(index for index, _, slipping in told if slipping)
+    assert first <= found <= first + 3
+    # From then on without a gap, for as long as it slides.
+    assert all(slipping for index, true, slipping in told if true and index >= found)
+
+
+@pytest.mark.parametrize("spec", ["press?frames=150", "twist?frames=140", "roll?frames=140"])
+def test_what_presses_or_turns_and_sticks_or_rolls_does_not_slip(spec: str) -> None:
+    told = [slip.slipping for *_, slip in judged(spec, range(14, 110))]
+    assert len(told) > 40
+    assert not any(told)
+
+
+def test_the_stick_ratio_falls_from_the_edge_of_the_contact_inwards() -> None:
+    told = [
+        (true, slip.stick_ratio)
+        for _, _, true, slip in judged("stick_slip?frames=150&markers=16x12", range(14, 86))
+    ]
+    whole = [ratio for true, ratio in told if true > 0.95]
+    half = [ratio for true, ratio in told if 0.4 < true < 0.6]
+    last = [ratio for true, ratio in told if true < 0.2]
+    assert np.mean(whole) > np.mean(half) + 0.15 > np.mean(last) + 0.25
+    assert np.sqrt(np.mean([(true - ratio) ** 2 for true, ratio in told])) < 0.3
+
+
+def test_gel_that_stays_behind_does_not_stick() -> None:
+    points = np.stack(np.meshgrid(np.arange(0.0, 90, 10), np.arange(0.0, 90, 10)), axis=-1)
+    share = (np.hypot(*(points - 40).transpose(2, 0, 1)) < 35).astype(float)
+    # A turn and a shift of everything, but for one side.
+    moved = np.stack([4 - 0.02 * (points[..., 1] - 40), 0.02 * (points[..., 0] - 40)], axis=-1)
+    left = points[..., 0] < 15
+    moved[left] *= 0.3
+    expected = 1 - share[left].sum() / share.sum()
+    assert stick_ratio(share, share, points, moved, NOISE) == pytest.approx(expected)
+    assert stick_ratio(share, share, points, 0 * moved, NOISE) == 1
+    assert stick_ratio(share, 0 * share, points, moved, NOISE) == 0
+
+
+def test_another_contact_starts_anew_and_what_moves_against_the_drag_is_no_slip() -> None:
+    test = SlipTest()
+    x, y = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
+    origin = np.column_stack([x.ravel(), y.ravel()])
+    markers = Markers(origin, origin + np.array([3.0, 0]), np.zeros(100, np.uint8), np.full(100, NOISE))
+    field = FieldModel(origin, (200, 200))(markers)
+    assert field is not None
+    here, there = np.zeros((2, 200, 200), np.uint8)
+    here[60:120, 40:100] = there[60:120, 80:140] = 255
+    for mask, expected in ((here, False), (np.zeros_like(here), None), (there, False), (here, False)):
+        slip = test(field, mask, flow_of_field(field, markers, mask))
+        assert (None if slip is None else slip.slipping) == expected
