@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from tactflow import publisher as publisher_module
 from tactflow.cli.main import main
 from tactflow.client import Subscriber
 from tactflow.config.load import load_pipeline
@@ -20,7 +21,7 @@ from tactflow.fleet.sinks import clash_problems
 from tactflow.keys import WrongKeysError, make_keys
 from tactflow.publisher import Publisher
 from tactflow.sinks.zmq import Zmq
-from tests.clock import PATIENCE
+from tests.clock import PATIENCE, until
 from tests.conftest import REPOSITORY
 
 MESSAGE = (
@@ -171,3 +172,25 @@ def test_the_command_keeps_keys_that_are_there(tmp_path: Path, capsys: pytest.Ca
     assert main(["keys", "new", "laptop", "--folder", str(folder)]) == 2
     assert main(["keys", "new", "../x", "--folder", str(folder)]) == 2
     assert sorted(path.name for path in folder.iterdir()) == ["laptop", "phone", "publisher"]
+
+
+def test_the_relay_ends_a_flood_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = Publisher("tcp://127.0.0.1:*", 10, 32768)
+    finder = Publisher("tcp://127.0.0.1:*", 10, 32768)
+    finder.close(0)
+    try:
+        with (
+            relay(finder.endpoint, [sensor.endpoint], 10),
+            Subscriber(finder.endpoint, timeout=PATIENCE) as messages,
+        ):
+            assert sensor.socket.recv() == b"\x01tactflow."
+            left = [0]
+            monkeypatch.setattr(publisher_module, "files_left", lambda: left.pop() if left else 1000)
+            # It lets go of the sensors as well, and comes again with those who come again.
+            assert sensor.socket.recv() == b"\x00tactflow."
+            until(lambda: messages._socket.poll(1) or sensor.socket.poll(1))
+            assert sensor.socket.recv() == b"\x01tactflow."
+            sensor.socket.send(MESSAGE)
+            assert messages.receive()["seq"] == 1
+    finally:
+        sensor.close(0)

@@ -5,21 +5,39 @@ from __future__ import annotations
 import errno
 import socket as system_socket
 import sys
+import time
 from pathlib import Path
 
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
 from tactflow.engine.errors import StageError
-from tactflow.files import expanded
+from tactflow.files import expanded, files_left
 from tactflow.keys import DOMAIN, WrongKeysError, secure_publisher, subscribers_folder
 from tactflow.view.address import is_loopback
 
 LONGEST_SUBSCRIPTION = 4096
 """Bytes of a subscription: topics have some twenty. ZeroMQ keeps subscriptions in a tree and takes a step on
 the stack for each of their bytes: one of a megabyte ends the process."""
+MOST_SUBSCRIBED = 1 << 18
+"""Bytes that all different subscriptions may have together, thousands of topics. ZeroMQ takes some 50 times
+as much memory for them (600 MB for 12 MB, measured)."""
+WAITING_SUBSCRIPTIONS = 100
+"""Subscriptions of one subscriber that may wait until they are read. Chosen by hand."""
+HANDSHAKE_MS = 5000
+"""A connection that has not said by then that it is a subscriber ends, ms. Chosen by hand."""
+KEEPALIVE_S = 10
+"""After so much silence the system asks whether a subscriber's machine is still there, s. Chosen by hand."""
+FEWEST_FILES = 64
+"""Files that a run must still be able to open; each connection takes one. Chosen by hand."""
+FILES_EVERY = 0.2
+"""Time between two looks at how many there are, s. Chosen by hand."""
 LOOPBACK_INTERFACES = frozenset({"lo", "lo0"})
 """What Linux and macOS call the network that ends in this machine; an address may name it."""
+
+
+class FloodError(Exception):
+    """Subscribers have taken more than they may; says what."""
 
 
 class Publisher:
@@ -46,23 +64,35 @@ class Publisher:
 
     def __init__(self, endpoint: str, backlog: int, send_buffer: int, keys: str | None = None) -> None:
         _refuse_taken_path(endpoint)
+        self._backlog = backlog
+        self._send_buffer = send_buffer
+        self._keys = keys
+        self._open(endpoint)
+        self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def _open(self, endpoint: str) -> None:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
-        self.socket = self._context.socket(zmq.XPUB)
-        self.socket.sndhwm = backlog
-        self.socket.setsockopt(zmq.SNDBUF, send_buffer)
-        self.socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_SUBSCRIPTION)
+        self._subscribed = 0
+        self._look_at_files = 0.0
+        self.socket = socket = self._context.socket(zmq.XPUB)
+        socket.sndhwm = self._backlog
+        socket.rcvhwm = WAITING_SUBSCRIPTIONS
+        socket.setsockopt(zmq.SNDBUF, self._send_buffer)
+        socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_SUBSCRIPTION)
+        socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, KEEPALIVE_S)
         try:
-            if keys is not None:
-                self._ask_for_keys(expanded(keys))
-            self.socket.bind(endpoint)
+            if self._keys is not None:
+                self._ask_for_keys(expanded(self._keys))
+            socket.bind(endpoint)
         except WrongKeysError as error:
             self.close(0)
             raise StageError(f"keys: {error}") from error
         except zmq.ZMQError as error:
             self.close(0)
             raise StageError(_bind_problem(endpoint, error)) from error
-        self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def _ask_for_keys(self, folder: Path) -> None:
         secure_publisher(self.socket, folder)
@@ -71,10 +101,45 @@ class Publisher:
         self._authenticator.start()
         self._authenticator.configure_curve(domain=DOMAIN, location=allowed)
 
+    def next_event(self) -> bytes | None:
+        """The next subscription, 1 and the beginning of what is wanted, or its end, 0 and the same; or None.
+
+        Never waits.
+
+        Raises
+        ------
+        FloodError
+            If all subscriptions together are too long, or connections take too many files: `renew` ends it.
+        """
+        now = time.monotonic()
+        if now > self._look_at_files:
+            self._look_at_files = now + FILES_EVERY
+            if files_left() < FEWEST_FILES:
+                raise FloodError("too many connections")
+        if not int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            return None
+        event = self.socket.recv(zmq.NOBLOCK)
+        self._subscribed += (len(event) - 1) * (1 if event[:1] == b"\x01" else -1)
+        if self._subscribed > MOST_SUBSCRIBED:
+            raise FloodError("too many subscriptions")
+        return event
+
+    def renew(self) -> None:
+        """Disconnect everybody, who may come again, and give back what they took.
+
+        Raises
+        ------
+        StageError
+            If another program has taken the address in this moment.
+        """
+        self.close(0)
+        self._open(self.endpoint)
+
     def close(self, linger: float) -> None:
-        """Deliver what is under way, for at most `linger` seconds, and free the address."""
+        """Deliver what is under way, for at most `linger` seconds, and free the address. May come twice."""
         if self._authenticator is not None:
             self._authenticator.stop()
+            self._authenticator = None
         self.socket.close(linger=int(linger * 1000))
         self._context.term()
 

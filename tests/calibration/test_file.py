@@ -130,6 +130,12 @@ def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path
     path.with_suffix(".npz").write_bytes(b"PK\x03\x04 broken")
     with pytest.raises(ConfigError, match="make it anew"):
         Calibration.load(path)
+    np.savez_compressed(path.with_suffix(".npz"), look=np.zeros(2 << 20, np.uint8))
+    with pytest.raises(ConfigError, match="unpack to more than 1 MiB"):
+        Calibration.load(path)
     path.with_suffix(".npz").unlink()
     with pytest.raises(ConfigError, match=r"left\.npz"):
+        Calibration.load(path)
+    path.write_text("[" * 5000)
+    with pytest.raises(ConfigError, match="make it anew"):
         Calibration.load(path)

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def program(*args: str, **options: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tactflow.cli.main", *args]
+    command = [sys.executable, "-m", "tactflow", *args]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)  # type: ignore[call-overload, no-any-return]
 
 
@@ -98,7 +98,7 @@ def test_a_reader_that_leaves_early_causes_no_complaint() -> None:
     os.close(read)
     with os.fdopen(write, "wb") as out:
         done = subprocess.run(
-            [sys.executable, "-m", "tactflow.cli.main", "schema", "pipeline"],
+            [sys.executable, "-m", "tactflow", "schema", "pipeline"],
             stdout=out,
             stderr=subprocess.PIPE,
             text=True,
@@ -159,7 +159,7 @@ def test_a_program_without_standard_output_does_its_work() -> None:
 def test_a_full_disk_behind_standard_output_is_an_error_and_no_traceback(words: tuple[str, ...]) -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "tactflow.cli.main", *words],
+            [sys.executable, "-m", "tactflow", *words],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,

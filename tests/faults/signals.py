@@ -86,7 +86,9 @@ def ended_often(number: int, times: int, folder: Path) -> Seen:
         place.mkdir()
         seen = _ended(number, place, moments.uniform(0, 2 * STARTING), starting=True)
         said |= set(filter(None, [seen.said]))
-        if seen.exit != 0:
+        if number == signal.SIGKILL:
+            assert seen.exit == -number
+        elif seen.exit != 0:
             # While Python itself starts, the signal ends it.
             early += 1
             assert seen.exit in (-number, INTERRUPTED), seen
@@ -95,7 +97,10 @@ def ended_often(number: int, times: int, folder: Path) -> Seen:
             output = place / KINDS[kind].output
             if output.exists() and kind != "video .avi" and not _is_empty(output):
                 KINDS[kind].look(output)
-    return Seen(0, "\n".join(said), f"{times} runs left nothing damaged; {early} ended before they had begun")
+    kept = f"{times} runs left nothing damaged"
+    if number == signal.SIGKILL:
+        return Seen(-number, "\n".join(said), kept)
+    return Seen(0, "\n".join(said), f"{kept}; {early} ended before they had begun")
 
 
 def _is_empty(output: Path) -> bool:

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from tactflow.calibration.file import Calibration
 from tactflow.cli import explain, listen
 from tactflow.cli.statistics import read_statistics
 from tactflow.client import _parsed
@@ -36,7 +37,7 @@ from tactflow.sources.mcap import Recording
 from tactflow.view.address import bind
 from tactflow.view.hub import Hub, Wire
 from tactflow.view.server import Server
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.vision.types import Contact, Flow, Markers, Scale
 from tests.conftest import REPOSITORY
 
 IMAGE = np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8)
@@ -201,6 +202,24 @@ def videos(folder: Path) -> Iterator[Parser]:
         _read_all(VideoFile(path))
 
     yield Parser([sample for sample in samples if sample], feed)
+
+
+@contextmanager
+def calibrations(folder: Path) -> Iterator[Parser]:
+    """A calibration: its YAML, or the arrays beside it."""
+    path = folder / "left.yaml"
+    look = np.zeros((12, 16, 3), np.float32)
+    scale = Scale(0.05, 0.05, (0.001, 0.001), (0.0, 0.0))
+    known = Calibration("left", "sim:press", (16, 12), (16, 12), np.zeros((4, 2)), look, scale, "pitch")
+    known.save(path)
+    text, arrays = path.read_bytes(), path.with_suffix(".npz").read_bytes()
+
+    def feed(data: bytes) -> None:
+        path.write_bytes(text if data[:1] == b"Z" else data)
+        path.with_suffix(".npz").write_bytes(data[1:] if data[:1] == b"Z" else arrays)
+        Calibration.load(path)
+
+    yield Parser([text, b"Z" + arrays], feed)
 
 
 @contextmanager
@@ -419,7 +438,7 @@ def commands(folder: Path) -> Iterator[Parser]:
 TARGETS: dict[str, Callable[[Path], AbstractContextManager[Parser]]] = {
     function.__name__: cast(Any, function)
     for function in (
-        *(pipelines, overrides, recordings, arrays, pictures, videos, statistics, messages),
+        *(pipelines, overrides, recordings, arrays, pictures, videos, calibrations, statistics, messages),
         *(subscriptions, requests, websockets, commands),
     )
 }

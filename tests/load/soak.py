@@ -124,11 +124,11 @@ def picture(looks: list[Look], frames: int) -> str:
         top = 14 + row * (height + gap)
         most = 1.25 * max(values)
         points = " ".join(
-            f"{left + (width - left - 20) * look.frames / frames:.1f},{top + height * (1 - value / most):.1f}"
+            f"{left + (width - left - 40) * look.frames / frames:.1f},{top + height * (1 - value / most):.1f}"
             for look, value in zip(looks, values, strict=True)
         )
         parts.append(
-            f'<rect x="{left}" y="{top}" width="{width - left - 20}" height="{height}" fill="none" '
+            f'<rect x="{left}" y="{top}" width="{width - left - 40}" height="{height}" fill="none" '
             f'stroke="#aaa"/><text x="{left - 8}" y="{top + 10}" text-anchor="end">{most:.0f}</text>'
             f'<text x="{left - 8}" y="{top + height}" text-anchor="end">0</text>'
             f'<text x="{left + 8}" y="{top + 16}">{what}</text>'
@@ -136,7 +136,7 @@ def picture(looks: list[Look], frames: int) -> str:
         )
     bottom = 14 + 3 * (height + gap)
     parts += [
-        f'<text x="{left + (width - left - 20) * tenth / 10:.0f}" y="{bottom - gap + 16}" '
+        f'<text x="{left + (width - left - 40) * tenth / 10:.0f}" y="{bottom - gap + 16}" '
         f'text-anchor="middle">{frames * tenth // 10:,}</text>'
         for tenth in range(0, 11, 2)
     ]

@@ -16,6 +16,7 @@ import pytest
 import zmq
 from pydantic import ValidationError
 
+from tactflow import publisher
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
@@ -409,4 +410,33 @@ def test_a_subscriber_to_statistics_asks_for_no_frames(subscribe: Subscribing) -
     sink = with_statistics(run)
     receive(subscribe(sink.endpoint, b"tactflow.stats"))
     assert not sink.wants()
+    sink.close()
+
+
+def test_a_flood_of_subscriptions_is_ended_and_who_was_there_before_comes_again(
+    subscribe: Subscribing, caplog: pytest.LogCaptureFixture
+) -> None:
+    sink = opened()
+    listener = subscribe(sink.endpoint)
+    wait_until_wanted(sink)
+    hostile = subscribe(sink.endpoint, b"tactflow.main ")
+    for number in range(400):
+        hostile.subscribe(b"tactflow.main " + str(number).encode() * 300)
+    until(lambda: sink.wants() is None or "too many subscriptions" in caplog.text)
+    hostile.close()
+    # To subscribe again is done by whoever listens, while it listens.
+    until(lambda: listener.poll(1) or (sink.wants() and write(sink, range(1))))
+    sink.close()
+
+
+def test_connections_that_leave_no_files_are_ended(
+    subscribe: Subscribing, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    sink = opened()
+    listener = subscribe(sink.endpoint)
+    wait_until_wanted(sink)
+    left = [0]
+    monkeypatch.setattr(publisher, "files_left", lambda: left.pop() if left else 1000)
+    until(lambda: sink.wants() is None or "too many connections" in caplog.text)
+    until(lambda: listener.poll(1) or (sink.wants() and write(sink, range(1))))
     sink.close()

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -33,6 +34,10 @@ what rounding in a pipeline file does is less."""
 UNLIKE: Final = 0.1
 """Difference of the untouched gel, relative to its brightness and after its light was scaled channel by
 channel, from which on it is said to look unlike. Chosen by hand: presses of one session differ by 0.01."""
+
+
+LARGEST: Final = 1 << 20
+"""Bytes of either file at most, and of the arrays when they are unpacked; ours have some thousands."""
 
 
 class _Strict(BaseModel):
@@ -145,18 +150,18 @@ class Calibration:
         Raises ConfigError if it or its arrays are not there, or are no calibration.
         """
         try:
-            said = _File.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-            # Opened here, since numpy leaves a file open that is no archive.
-            with path.with_suffix(".npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                look = np.asarray(arrays["look"], np.float32)
-                slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
+            said = _File.model_validate(yaml.safe_load(_bounded(path).decode("utf-8")))
+            arrays = _arrays(_bounded(path.with_suffix(".npz")))
+            look = np.asarray(arrays["look"], np.float32)
+            slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
         except OSError as error:
             raise ConfigError(f"calibration {path}: {error.filename}: {error.strerror}") from None
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"])) or "the file"
             raise ConfigError(f"calibration {path}: {where}: {first['msg']}; {_REMEDY}") from None
-        except (yaml.YAMLError, UnicodeDecodeError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except Exception as error:
+            # What YAML, ZIP and numpy raise about damaged data is many things.
             raise ConfigError(f"calibration {path}: cannot be read: {error}; {_REMEDY}") from None
         if look.shape != (LOOK[1], LOOK[0], 3) or not np.isfinite(look).all():
             raise ConfigError(f"calibration {path}: its .npz is of another file; {_REMEDY}")
@@ -225,6 +230,24 @@ def raw_corners(mapping: PixelMapping) -> NDArray[np.float64]:
     width, height = mapping.size
     right, low = width - 1, height - 1
     return np.asarray(mapping.to_raw([[0, 0], [right, 0], [0, low], [right, low]]), np.float64)
+
+
+def _bounded(path: Path) -> bytes:
+    """The bytes of a file, unless they are more than any calibration has: a device has no end."""
+    with path.open("rb") as file:
+        data = file.read(LARGEST + 1)
+    if len(data) > LARGEST:
+        raise ValueError(f"{path} is larger than {LARGEST >> 20} MiB")
+    return data
+
+
+def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of a `.npz` file, unless they unpack to more than they may."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(member.file_size for member in archive.infolist()) > LARGEST:
+            raise ValueError(f"its arrays unpack to more than {LARGEST >> 20} MiB")
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return dict(arrays)
 
 
 def _pair(values: list[Any]) -> Any:

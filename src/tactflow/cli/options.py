@@ -18,7 +18,10 @@ from tactflow.engine.plan import Plan, make_plan
 def add_pipeline(parser: argparse.ArgumentParser) -> None:
     """Declare PIPELINE and `--set`."""
     parser.add_argument(
-        "pipeline", nargs="?", metavar="PIPELINE", help="default: ./pipeline.yaml, else the packaged one"
+        "pipeline",
+        nargs="?",
+        metavar="PIPELINE",
+        help="default: ./pipeline.yaml, else the packaged one; Python code that it names is run",
     )
     parser.add_argument(
         "--set",

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "name",
         nargs="?",
         metavar="NAME",
-        help="explain one: a built-in, a plug-in, module:Class or ./file.py:Class",
+        help="explain one: a built-in, a plug-in, module:Class or ./file.py:Class, which is run",
     )
 
 

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 
 import zmq
 
-from tactflow.publisher import Publisher
+from tactflow.engine.errors import StageError
+from tactflow.publisher import FloodError, Publisher
 
 SEND_BUFFER = 32_768
 """Kernel send buffer per subscriber, bytes, the ZeroMQ sink's default. Large ones hold seconds of messages.
@@ -32,17 +33,9 @@ def relay(address: str, upstream: Sequence[str], backlog: int, keys: str | None 
     StageError : the address cannot be bound, or the keys are wrong.
     """
     publisher = Publisher(address, backlog, SEND_BUFFER, keys)
-    front = publisher.socket
-    # A context of its own: nobody asks the sensors of this run for keys.
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    back = context.socket(zmq.XSUB)
-    back.linger = 0
-    # As in the sink: a slow reader shall not be seconds behind.
-    back.rcvhwm = backlog
-    for source in upstream:
-        back.connect(source)
     stop = threading.Event()
-    thread = threading.Thread(target=_pass_on, args=(front, back, stop), name="tactflow-relay", daemon=True)
+    work = _Relay(publisher, upstream, backlog, stop)
+    thread = threading.Thread(target=work.run, name="tactflow-relay", daemon=True)
     thread.start()
 
     print(f"tactflow: publishing {len(upstream)} sensors on {address}", file=sys.stderr)
@@ -52,20 +45,54 @@ def relay(address: str, upstream: Sequence[str], backlog: int, keys: str | None 
         stop.set()
         thread.join(5)
         publisher.close(LINGER)
-        back.close()
-        context.term()
 
 
-def _pass_on(front: zmq.Socket[bytes], back: zmq.Socket[bytes], stop: threading.Event) -> None:
-    """Body of the relay's thread: messages to the front, subscriptions to the back, until told to stop."""
-    poller = zmq.Poller()
-    poller.register(front, zmq.POLLIN)
-    poller.register(back, zmq.POLLIN)
-    while True:
-        events = dict(poller.poll(POLL_MS))
-        if front in events:
-            back.send(front.recv())
-        if back in events:
-            front.send(back.recv())
-        elif stop.is_set():
-            return
+class _Relay:
+    """Messages to the front, subscriptions to the back, until told to stop; all of it in one thread."""
+
+    def __init__(
+        self, publisher: Publisher, upstream: Sequence[str], backlog: int, stop: threading.Event
+    ) -> None:
+        self._publisher = publisher
+        self._upstream = upstream
+        self._backlog = backlog
+        self._stop = stop
+
+    def run(self) -> None:
+        """Body of the thread."""
+        # A context of its own: nobody asks the sensors of this run for keys.
+        with zmq.Context() as context:
+            flooded = True
+            while flooded:
+                with context.socket(zmq.XSUB) as back:
+                    back.linger = 0
+                    # As in the sink: a slow reader shall not be seconds behind.
+                    back.rcvhwm = self._backlog
+                    for source in self._upstream:
+                        back.connect(source)
+                    flooded = self._pass_on(back)
+
+    def _pass_on(self, back: zmq.Socket[bytes]) -> bool:
+        """Until told to stop; True: until subscribers took too much and were disconnected."""
+        front = self._publisher.socket
+        poller = zmq.Poller()
+        poller.register(front, zmq.POLLIN)
+        poller.register(back, zmq.POLLIN)
+        while True:
+            events = dict(poller.poll(POLL_MS))
+            try:
+                event = self._publisher.next_event()
+            except FloodError as error:
+                print(f"tactflow: {error}; all subscribers are disconnected", file=sys.stderr)
+                try:
+                    self._publisher.renew()
+                except StageError as failure:
+                    print(f"tactflow: nothing is published any more: {failure}", file=sys.stderr)
+                    return False
+                return True
+            if event is not None:
+                back.send(event)
+            if back in events:
+                front.send(back.recv())
+            elif self._stop.is_set():
+                return False
