@@ -7,48 +7,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactflow.bench.depth import BALL, RAW_MM, scale, session_of
 from tactflow.calibration.photometric import Photometry, fit_photometry, try_photometry
-from tactflow.calibration.presses import Press, Session
-from tactflow.calibration.scale import centre
+from tactflow.calibration.presses import Session
 from tactflow.engine.errors import ConfigError
-from tactflow.sim import Scene, open_scene
+from tactflow.sim import open_scene
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.types import Scale
 
-RAW_MM = 0.025
-BALL = 95 * RAW_MM
 PREPROCESS = Preprocessor((800, 600), rotate=90, downsample=2)
-SIZE = PREPROCESS.mapping.size
-SCALE = Scale(2 * RAW_MM, 2 * RAW_MM, (0.0, 0.0), centre(SIZE))
-
-
-def press_at(scene: Scene, index: int) -> Press:
-    """The press that a frame shows, with an outline that lies a pixel or two to the side."""
-    truth = scene.truth(index, PREPROCESS)
-    mask = np.roll(np.where(truth.contact_mask, 255, 0).astype(np.uint8), 2, axis=1)
-    assert truth.center is not None
-    x, y = truth.center
-    radius = float(np.sqrt(np.count_nonzero(mask) / np.pi))
-    noise = np.random.default_rng(index).normal(0, 0.7, truth.unmarked.shape)
-    image = np.clip(truth.unmarked + noise, 0, 255).astype(np.uint8)
-    return Press(index, image, mask, np.zeros(mask.shape, np.bool_), (x + 2, y), radius)
-
-
-def session_of(scene: Scene) -> Session:
-    """Every press of a recording, at its deepest."""
-    depths = [max((press.depth for press in scene.presses(i)), default=0.0) for i in range(len(scene))]
-    deepest = [i for i in range(1, len(scene) - 1) if depths[i - 1] < depths[i] >= depths[i + 1]]
-    presses = [press_at(scene, i) for i in deepest]
-    return Session(
-        scene.truth(0, PREPROCESS).unmarked, PREPROCESS.mapping, presses, np.zeros((0, 2)), len(scene)
-    )
+SCALE = scale()
+ASIDE = 2
+"""How far to the side outlines are drawn, px: those of a real gel lie towards its lights."""
 
 
 @pytest.fixture(scope="module")
 def session() -> Session:
     """Presses of a ball, as a calibration has them."""
-    return session_of(open_scene("ball?frames=500"))
+    right = session_of(open_scene("ball?frames=500"))
+    presses = [
+        replace(p, mask=np.roll(p.mask, ASIDE, axis=1), center=(p.center[0] + ASIDE, p.center[1]))
+        for p in right.presses
+    ]
+    return replace(right, presses=presses)
 
 
 @pytest.fixture(scope="module")

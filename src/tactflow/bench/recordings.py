@@ -110,7 +110,7 @@ def without_markers(pipeline: Pipeline) -> Pipeline:
     return replace(pipeline, nodes={i: node for i, node in pipeline.nodes.items() if i not in gone})
 
 
-def _stack(files: list[Path], scratch: Path) -> Path:
+def stack(files: list[Path], scratch: Path) -> Path:
     """Images as one `.npy` recording, so that decoding is not part of the time."""
     path = scratch / "recording.npy"
     images = [cv2.imread(str(file), cv2.IMREAD_COLOR) for file in files]
@@ -149,7 +149,7 @@ def _ball(
     with (folder / "labels.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     labels = np.array([(float(row["x"]), float(row["y"])) for row in rows])
-    recording = _stack([folder / "reference.jpg", *(folder / row["file"] for row in rows)], scratch)
+    recording = stack([folder / "reference.jpg", *(folder / row["file"] for row in rows)], scratch)
     centers: dict[str, NDArray[np.float64]] = {name: np.full((len(rows), 2), np.nan) for name in pipelines}
 
     def see(name: str, outcome: Outcome) -> str:
@@ -192,7 +192,7 @@ def _roll(
     pipelines: Mapping[str, Pipeline], folder: Path, scratch: Path, unit: CopyUnit, step: Step
 ) -> list[Measurement]:
     files = sorted(folder.glob("*.jpg"))
-    recording = _stack(files, scratch)
+    recording = stack(files, scratch)
     tallies = {name: IdentityTally() for name in pipelines}
 
     def see(name: str, outcome: Outcome) -> str:

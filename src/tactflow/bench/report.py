@@ -25,6 +25,7 @@ TITLES = {
     "hull": "Contact geometry",
     "tracker": "Marker tracking",
     "flow_in_mask": "Flow inside the contact",
+    "depth": "Heights in mm, by light",
 }
 """Group -> heading."""
 
@@ -36,6 +37,7 @@ PRIMARY = {
     "hull": ("angle_mean", "center_error"),
     "tracker": ("displacement_rms", "displacement_p99", "wrong_percent"),
     "flow_in_mask": ("flow_error",),
+    "depth": ("depth_rms", "volume_error"),
 }
 """Group -> quantities that are plotted; the first one decides the answer."""
 

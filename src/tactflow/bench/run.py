@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tactflow.bench import gels, recordings
+from tactflow.bench import depth, gels, recordings
 from tactflow.bench.methods import CLASSIC, measure_methods
 from tactflow.bench.pictures import draw
 from tactflow.bench.pipelines import (
@@ -212,6 +212,9 @@ class _Run:
         for rendered in render_all(self.alone, scratch):
             self.doing = f"methods on {rendered.case.label}"
             found += measure_methods(self.general, rendered, self.unit, self.step)
+        if not self.plan.quick and self.plan.scenes is None:
+            self.doing = "depth"
+            found += depth.measure_simulated(self.unit)
 
     def growth(self, scratch: Path) -> float | None:
         """What `pipelines.growth` says of the default pipeline; None in a run that leaves it out."""
@@ -249,6 +252,10 @@ class _Run:
         )
         for measurements in measured:
             self.result.measurements += measurements
+        ball = self.plan.data / "wedge_ball"
+        if WEDGE in self.loaded and (ball / "labels.csv").exists():
+            self.doing = "depth"
+            self.result.measurements.append(depth.measure_ball(self.loaded[WEDGE], ball, scratch))
         self.result.measurements += gels.measure_gels(
             (DEFAULT, self.loaded[DEFAULT]),
             (MARKERLESS, self.bare[MARKERLESS]),
