@@ -22,8 +22,6 @@ the stack for each of their bytes: one of a megabyte ends the process."""
 MOST_SUBSCRIBED = 1 << 18
 """Bytes that all different subscriptions may have together, thousands of topics. ZeroMQ takes some 50 times
 as much memory for them (600 MB for 12 MB, measured)."""
-WAITING_SUBSCRIPTIONS = 100
-"""Subscriptions of one subscriber that may wait until they are read. Chosen by hand."""
 HANDSHAKE_MS = 5000
 """A connection that has not said by then that it is a subscriber ends, ms. Chosen by hand."""
 KEEPALIVE_S = 10
@@ -77,7 +75,6 @@ class Publisher:
         self._look_at_files = 0.0
         self.socket = socket = self._context.socket(zmq.XPUB)
         socket.sndhwm = self._backlog
-        socket.rcvhwm = WAITING_SUBSCRIPTIONS
         socket.setsockopt(zmq.SNDBUF, self._send_buffer)
         socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_SUBSCRIPTION)
         socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
