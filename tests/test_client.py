@@ -362,3 +362,12 @@ def test_what_a_publisher_sends_commands_no_terminal() -> None:
     shown = listen.describe(message)
     assert "?[2Jmain 3" in shown
     assert "(?2J)" in shown
+
+
+def test_invented_sensors_take_no_memory() -> None:
+    with Subscriber() as results:
+        for number in range(2 * client.MOST_SENSORS):
+            results._count(f"sensor{number}", 0)
+        results._count("sensor0", 3)
+        assert len(results._last_seq) == client.MOST_SENSORS
+        assert results.lost == 2

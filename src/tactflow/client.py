@@ -40,6 +40,9 @@ LONGEST_MESSAGE = 16 << 20
 """Bytes of a message at most; one with 140 dots has about 14,000. Whoever sends longer ones is no tactflow,
 and is heard no more, before memory is taken for it. Chosen by hand."""
 
+MOST_SENSORS = 1000
+"""Sensors whose gaps are counted, so that invented names take no memory. Chosen by hand."""
+
 REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
 """After these, ZeroMQ does not try again."""
 
@@ -193,7 +196,8 @@ class Subscriber:
         # A smaller number than before means that tactflow was started again.
         if last is not None and seq > last + 1:
             self.lost += seq - last - 1
-        self._last_seq[sensor] = seq
+        if last is not None or len(self._last_seq) < MOST_SENSORS:
+            self._last_seq[sensor] = seq
 
     def close(self) -> None:
         """Disconnect. May be called twice."""

@@ -36,9 +36,6 @@ CELL: Final = 0.25
 MOST_CELLS: Final = 2500
 """Cells of a grid at most; where a quarter of the pitch would make more, the spacing is larger. Chosen by
 hand."""
-SAMPLE: Final = 2.0
-"""Distance at which a cell asks the contact's mask whether it is inside, px: with 0.75 px the means of six
-simulated scenes differ by 0.001 px."""
 OUTLINE: Final = 4.0
 """How uncertain a contact's outline is: the square of its error times the length over which it errs alike,
 px^3; 0.5 px over 16 px. Measured on 22 simulated recordings, by what it does to the mean."""
@@ -66,7 +63,7 @@ class Grid(NamedTuple):
         y = self.first[1] + self.spacing * np.arange(rows)
         return np.stack(np.meshgrid(x, y), axis=-1)
 
-    def window(self, low: FloatArray, high: FloatArray) -> tuple[slice, slice]:
+    def window(self, low: tuple[float, float], high: tuple[float, float]) -> tuple[slice, slice]:
         """Rows and columns of all cells whose centres lie between two corners (x, y), px."""
         along = []
         for axis, count in enumerate(self.shape[::-1]):
@@ -187,16 +184,18 @@ class FieldModel:
         offset = points[:, None] - self.origin
         return matern(np.sqrt(np.einsum("mnk,mnk->mn", offset, offset)) / self._length)
 
-    def covariance(self, functionals: FloatArray) -> FloatArray:
+    def covariance(self, functionals: FloatArray, shape: tuple[int, int]) -> FloatArray:
         """(F,): variance of linear functionals of the field before any marker is known.
 
-        functionals : (rows, columns, F), weights of the cells of a window of the grid.
+        functionals : (F, rows * columns), weights of the cells of a window of the grid. shape : its rows and
+            columns.
         """
-        rows, columns, count = functionals.shape
+        rows, columns = shape
+        weights = np.ascontiguousarray(functionals.T).reshape(rows, columns, -1)
         middle, center = self.grid.shape[0] - 1, self.grid.shape[1] - 1
         table = self._between[middle - rows + 1 : middle + rows, center - columns + 1 : center + columns]
-        spread = cv2.filter2D(functionals, cv2.CV_64F, table, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray((functionals * spread.reshape(rows, columns, count)).sum(axis=(0, 1)))
+        spread = cv2.filter2D(weights, cv2.CV_64F, table, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray((weights * spread.reshape(weights.shape)).sum(axis=(0, 1)))
 
     @cached_property
     def weights(self) -> FloatArray:
@@ -254,7 +253,7 @@ class DisplacementField:
         self._model, self._seen = model, seen
         # What is not seen counts as unmoved until it is left out below.
         moved = np.where(seen[:, None], markers.position - model.origin, 0.0)
-        self._farthest = moved.min(axis=0), moved.max(axis=0)
+        self._farthest = moved.min(axis=0).tolist(), moved.max(axis=0).tolist()
         known = seen & np.isfinite(markers.stderr)
         ordered = np.sort(markers.stderr[known])
         typical = ordered[len(ordered) // 2] if len(ordered) else 0.0
@@ -299,30 +298,37 @@ class DisplacementField:
     def motion(self, mask: NDArray[np.uint8]) -> GelMotion | None:
         """How the gel inside a region has moved, each bit of it counted by its area at rest.
 
-        mask : (H, W) uint8, non-zero inside, in the current frame: what counts is where the gel is now.
+        mask : (H, W) uint8, 0 or 255 inside, in the current frame: what counts is where the gel is now.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
         part = self.part(mask)
         if part is None:
             return None
-        functionals = _affine(part.share, part.points, self.grid.spacing)
-        weighted = functionals.reshape(-1, functionals.shape[2]).T
-        kernel = weighted @ part.kernel.reshape(weighted.shape[1], -1)
-        weights = (kernel @ self._model.inverse).T
+        model, spacing = self._model, self.grid.spacing
+        share = part.inside.ravel() / part.cells
+        points, moved = part.points.reshape(-1, 2), part.moved.reshape(-1, 2)
+        arms = points - share @ points
+        functionals = _affine(share, arms, spacing)
+        kernel = functionals @ part.kernel.reshape(len(share), -1)
+        weights = kernel @ model.inverse
         if self._update is not None:
-            weights = self._update.apply(weights)
-        prior = self._model.covariance(functionals)
-        left = np.maximum(prior - (kernel * weights.T).sum(axis=1), 0)
+            weights = self._update.apply(weights.T).T
+        prior = model.covariance(functionals, part.inside.shape)
+        left = np.maximum(prior - (kernel * weights).sum(axis=1), 0)
         # The markers near the region tell how rough the field is there, for the slopes as for the mean.
         scale = float(self._scale(kernel[:1])[0])
-        stderr = np.sqrt(scale * left + (weights * weights).T @ self._variance).tolist()
-        (mean_x, mean_y), *slopes = (weighted @ part.moved.reshape(-1, 2)).tolist()
+        stderr = np.sqrt(scale * left + (weights * weights) @ self._variance).tolist()
+        mean, *slopes = (functionals @ moved).tolist()
+        rest = moved - mean
+        squares = rest * rest
+        outline = _outline_errors(part, squares, spacing)
         gradient = residual = None
         if slopes:
             gradient = Gradient(tuple(slopes[0]), tuple(slopes[1]), stderr[1], stderr[2])
-            residual = _residual(part, gradient.growth)
-        outline = _outline_errors(part, self.grid.spacing, int(np.count_nonzero(mask)))
-        return GelMotion((mean_x, mean_y), stderr[0], outline, gradient, residual, float(left[0] / prior[0]))
+            spread, turn = gradient.growth
+            rest = rest - arms @ np.array([[spread, turn], [-turn, spread]])
+            residual = math.sqrt(float(share @ (rest * rest).sum(axis=1)))
+        return GelMotion(tuple(mean), stderr[0], outline, gradient, residual, float(left[0] / prior[0]))
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
         """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
@@ -333,18 +339,23 @@ class DisplacementField:
         model, grid = self._model, self.grid
         least, most = self._farthest
         margin = OVERSHOOT * model.pitch + grid.spacing
-        low = np.array([left, top]) - most - margin
-        high = np.array([left + width, top + height]) - least + margin
+        low = (left - most[0] - margin, top - most[1] - margin)
+        high = (left + width - least[0] + margin, top + height - least[1] + margin)
         window = grid.window(low, high)
-        kernel = model.to_markers[window]
-        if kernel.size == 0:
+        points, kernel = model.points[window], model.to_markers[window]
+        rows, columns = points.shape[:2]
+        if rows == 0 or columns == 0:
             return None
-        moved = np.asarray(kernel @ self._coefficients)
-        points = model.points[window]
-        region: NDArray[np.uint8] = mask[top : top + height, left : left + width]
-        share = _coverage(region, points + moved - [left, top], max(1, round(grid.spacing / SAMPLE)))
-        total = float(share.sum())
-        return Part(share / total, total, window, points, moved, kernel) if total > 0 else None
+        moved = (kernel.reshape(rows * columns, -1) @ self._coefficients).reshape(rows, columns, 2)
+        inside = _coverage(mask, (left, top, width, height), points + moved, grid.spacing)
+        left, top, width, height = cv2.boundingRect(inside)
+        if width == 0:
+            return None
+        cells = slice(top, top + height), slice(left, left + width)
+        begin = window[0].start + top, window[1].start + left
+        covered = inside[cells] / 255.0
+        total = float(covered.sum())
+        return Part(covered, total, begin, points[cells], moved[cells], kernel[cells])
 
     def _scale(self, kernel: FloatArray) -> FloatArray:
         """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""
@@ -357,16 +368,16 @@ class DisplacementField:
 
 
 class Part(NamedTuple):
-    """A part of the gel, in a window of the grid.
+    """A part of the gel: the cells of a window of the grid, so many rows and columns of them.
 
-    share : (rows, columns), how much of the part each cell is, in sum 1. cells : how many cells that makes.
-    window : rows and columns of the grid. points : (rows, columns, 2), at
-    rest, px. moved : (rows, columns, 2), px. kernel : (rows, columns, N), between cells and markers.
+    inside : (rows, columns), how much of each cell belongs to the part, 0 to 1. cells : their sum.
+    begin : row and column of the grid where the window begins. points : (rows, columns, 2), at rest, px.
+    moved : (rows, columns, 2), px. kernel : (rows, columns, N), between cells and markers.
     """
 
-    share: FloatArray
+    inside: FloatArray
     cells: float
-    window: tuple[slice, slice]
+    begin: tuple[int, int]
     points: FloatArray
     moved: FloatArray
     kernel: FloatArray
@@ -391,58 +402,50 @@ def _grid(size: tuple[int, int], pitch: float) -> Grid:
     return Grid((rows, columns), first, spacing)
 
 
-def _coverage(mask: NDArray[np.uint8], places: FloatArray, parts: int) -> FloatArray:
-    """(rows, columns) share of each cell that is in a mask, by parts x parts samples.
+def _coverage(
+    mask: NDArray[np.uint8], box: tuple[int, int, int, int], places: FloatArray, spacing: float
+) -> NDArray[np.uint8]:
+    """(rows, columns) uint8: how much of the surroundings of each cell is in a mask, of 255.
 
-    mask : (H, W) uint8, non-zero inside. places : (rows, columns, 2), where the cells are, px.
+    mask : (H, W) uint8. box : (left, top, width, height) of what is not 0 in it. places : (rows, columns, 2),
+    where the cells are, px. spacing : of the cells, px: as wide is the square around each that counts.
     """
-    rows, columns = places.shape[:2]
-    fine = cv2.resize(places.astype(np.float32) + 2, (columns * parts, rows * parts))
-    # Samples lie farther apart than pixels. The mean around each makes the sum follow the outline smoothly.
-    region = cv2.threshold(mask, 0, 255, cv2.THRESH_BINARY)[1]
-    region = cv2.blur(cv2.copyMakeBorder(region, 2, 2, 2, 2, cv2.BORDER_CONSTANT), (3, 3))
-    inside = cv2.remap(region, fine[..., 0], fine[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    share = cv2.resize(inside.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
-    return np.asarray(share, np.float64).reshape(rows, columns) / 255
+    side = 2 * round((spacing - 1) / 2) + 1
+    left, top, width, height = box
+    # Whatever is around the mask counts as outside, also beyond the border of the frame.
+    region = cv2.copyMakeBorder(
+        mask[top : top + height, left : left + width], side, side, side, side, cv2.BORDER_CONSTANT
+    )
+    shares = cv2.blur(region, (side, side))
+    at = (places - (left - side, top - side)).astype(np.float32)
+    inside = cv2.remap(shares, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(inside, np.uint8)
 
 
-def _affine(share: FloatArray, points: FloatArray, spacing: float) -> FloatArray:
-    """(rows, columns, 3) weights of the cells for mean, slope along x and slope along y; (.., 1) for a part
-    too small for slopes."""
-    arms = points - (share[..., None] * points).sum(axis=(0, 1))
-    weighted = share[..., None] * arms
-    (xx, xy), (_, yy) = weighted.reshape(-1, 2).T @ arms.reshape(-1, 2)
+def _affine(share: FloatArray, arms: FloatArray, spacing: float) -> FloatArray:
+    """(3, n) weights of the cells for mean, slope along x and slope along y; (1, n) for a part too small.
+
+    share : (n,), in sum 1. arms : (n, 2), from the part's middle, px.
+    """
+    weighted = (share[:, None] * arms).T
+    (xx, xy), (_, yy) = (weighted @ arms).tolist()
     determinant = xx * yy - xy * xy
     # A single cell has the second moment spacing^2 / 12 along each axis.
     if determinant <= (xx + yy) * spacing * spacing / 12:
-        return share[..., None]
-    functionals = np.empty((*share.shape, 3))
-    functionals[..., 0] = share
-    functionals[..., 1] = (yy * weighted[..., 0] - xy * weighted[..., 1]) / determinant
-    functionals[..., 2] = (xx * weighted[..., 1] - xy * weighted[..., 0]) / determinant
-    return functionals
+        return share[None]
+    slopes = np.array([[yy, -xy], [-xy, xx]]) / determinant @ weighted
+    return np.vstack([share, slopes])
 
 
-def _outline_errors(part: Part, spacing: float, area: int) -> tuple[float, float]:
+def _outline_errors(part: Part, squares: FloatArray, spacing: float) -> tuple[float, float]:
     """Standard error of a part's mean displacement, (dx, dy), px, because its outline is not exact.
 
-    An outline that is d too far out at s adds (u(s) - mean) d ds / area. spacing : of the cells, px. area :
-    of the part, px^2.
+    An outline that is d too far out at s adds (u(s) - mean) d ds / area. squares : (n, 2), of the cells'
+    u - mean, px^2. spacing : of the cells, px.
     """
-    share = part.share
-    along, across = np.gradient(share) if min(share.shape) > 1 else (share, share)
-    # The length of outline in each cell over the area of the part.
-    border = np.hypot(along, across) / spacing
-    away = part.moved - (share[..., None] * part.moved).sum(axis=(0, 1))
-    x, y = (OUTLINE / area * (border[..., None] * away * away).sum(axis=(0, 1))).tolist()
+    # Across an outline, the share of a cell falls from 1 to 0 within its width: share (1 - share) tells how
+    # much outline there is, 1 / 6 for a whole side.
+    length = 6 * spacing * (part.inside * (1 - part.inside)).ravel()
+    area = part.cells * spacing * spacing
+    x, y = (OUTLINE / (area * area) * (length @ squares)).tolist()
     return math.sqrt(x), math.sqrt(y)
-
-
-def _residual(part: Part, growth: tuple[float, float]) -> float:
-    """RMS of what mean, turn and spread leave of a part's displacement, px."""
-    share = part.share.ravel()
-    points, moved = part.points.reshape(-1, 2), part.moved.reshape(-1, 2)
-    arms = points - share @ points
-    rest = moved - share @ moved - growth[0] * arms
-    rest += growth[1] * arms[:, ::-1] * [1.0, -1.0]
-    return math.sqrt(float(share @ (rest * rest).sum(axis=1)))

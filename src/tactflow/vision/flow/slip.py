@@ -123,7 +123,8 @@ def _touched(field: DisplacementField, mask: NDArray[np.uint8]) -> _Touched | No
     if part is None:
         return None
     share = np.zeros(field.grid.shape)
-    share[part.window] = part.share * part.cells
+    (top, left), (rows, columns) = part.begin, part.inside.shape
+    share[top : top + rows, left : left + columns] = part.inside
     return _Touched(share, field.displacement, part.cells)
 
 
