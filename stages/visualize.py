@@ -9,6 +9,7 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Image, Picture, Valid
 from tactflow.vision.draw import Annotator
+from tactflow.vision.flow import DisplacementField
 from tactflow.vision.types import Contact, Flow, Markers
 
 
@@ -27,12 +28,14 @@ class Visualize(Stage):
             "frame", description="contact: only the contact and the arrows inside it, the rest black"
         )
         ellipse: bool = Field(False, description="whether the fitted ellipse is drawn")
+        field: bool = Field(False, description="whether the displacement between the markers is drawn")
         text: bool = Field(True, description="whether numbers are written")
         dilate: float = Field(
             8.0, ge=0, le=1000, description="view contact: how far outside the contact is shown, px"
         )
 
     def __init__(self, params: Params) -> None:
+        self._field = params.field
         self._annotator = Annotator(
             arrow_scale=params.arrow_scale,
             view=params.view,
@@ -49,8 +52,15 @@ class Visualize(Stage):
         markers: Markers | None,
         contact_mask: ContactMask | None,
         valid: Valid | None = None,
+        field: DisplacementField | None = None,
     ) -> Picture:
         """A new picture; what is absent is not drawn."""
         return self._annotator(
-            image, contact=contact, flow=flow, markers=markers, contact_mask=contact_mask, valid=valid
+            image,
+            contact=contact,
+            flow=flow,
+            markers=markers,
+            contact_mask=contact_mask,
+            valid=valid,
+            field=field if self._field else None,
         )

@@ -81,6 +81,12 @@ def test_a_calibration_that_is_not_there_is_a_mistake_with_its_place(pipeline: P
     assert "tactflow calibrate" in mistake
 
 
+def test_a_calibration_that_no_stage_uses_is_warned_of(pipeline: Path) -> None:
+    assert not any("no stage uses it" in warning for warning in tactflow.load(pipeline).warnings)
+    loaded = tactflow.load(pipeline, settings={"stages.scale": None})
+    assert any("calibration: no stage uses it" in warning for warning in loaded.warnings)
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

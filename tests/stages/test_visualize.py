@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from tactflow.engine.ports import read_ports
 from tactflow.stages.visualize import Visualize
+from tactflow.vision.flow import FieldModel
 from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.types import Flow, Markers
 
@@ -36,6 +37,7 @@ def test_everything_but_the_image_may_be_absent() -> None:
         "markers": True,
         "contact_mask": True,
         "valid": True,
+        "field": True,
     }
     assert [port.name for port in ports.outputs] == ["annotated"]
     picture = Visualize(Visualize.Params(text=False)).process(IMAGE, None, None, None, None)
@@ -68,3 +70,16 @@ def test_dilate_widens_the_contact_view() -> None:
 def test_wrong_parameters_are_refused(params: Any) -> None:
     with pytest.raises(ValidationError):
         Visualize.Params(**params)
+
+
+def test_the_field_between_the_markers_is_drawn_where_it_is_asked_for() -> None:
+    known = Markers(ORIGIN, ORIGIN + np.array([3.0, -2.0]), np.zeros(3, np.uint8), np.full(3, 0.1))
+    field = FieldModel(ORIGIN, (160, 120))(known)
+    plain, asked = (
+        Visualize(Visualize.Params(text=False, field=wanted)).process(
+            IMAGE, None, None, None, None, field=field
+        )
+        for wanted in (False, True)
+    )
+    np.testing.assert_array_equal(plain, IMAGE)
+    assert (asked[30:70, 55:75] != IMAGE[30:70, 55:75]).any()  # no marker there

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 from collections.abc import Collection, Mapping, Sequence
@@ -350,7 +351,18 @@ def _settings(root: Item, sensor: str, drafts: Sequence[Draft]) -> dict[str, Any
 
 
 def _warnings(root: Item, drafts: Sequence[Draft]) -> list[str]:
-    if any(draft.section == "sinks" for draft in drafts):
-        return []
-    entry = root.entries.get("sinks")
-    return [f"{entry.mark if entry else root.mark}  there are no sinks, so nothing will be computed"]
+    warnings = []
+    if not any(draft.section == "sinks" for draft in drafts):
+        entry = root.entries.get("sinks")
+        mark = entry.mark if entry else root.mark
+        warnings.append(f"{mark}  there are no sinks, so nothing will be computed")
+    calibration = root.entries.get("calibration")
+    users = (draft.component.cls for draft in drafts if draft.component)
+    if calibration and calibration.item.content and not any(map(_takes_calibration, users)):
+        warnings.append(f"{calibration.mark}  calibration: no stage uses it; add untouched, scale and depth")
+    return warnings
+
+
+def _takes_calibration(cls: type) -> bool:
+    """Whether the constructor of a stage asks for the calibration."""
+    return "calibration" in inspect.signature(cls).parameters

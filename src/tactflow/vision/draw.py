@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.flow import inside_mask
+from tactflow.vision.flow import DisplacementField, inside_mask
 from tactflow.vision.lettering import Lettering
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
 
@@ -57,6 +57,8 @@ _TEXT: Final = 11
 """Size of the text, px."""
 _LINE_SPACING: Final = 14
 """Distance of two lines of text, px."""
+_BETWEEN: Final = 12.0
+"""Distance of the arrows of a field, px, at least."""
 _STATUS_COLOURS: Final = (
     (MarkerStatus.LOST, GRAY),
     (MarkerStatus.INFERRED, WHITE),
@@ -133,6 +135,7 @@ class Annotator:
         markers: Markers | None = None,
         contact_mask: NDArray[np.uint8] | None = None,
         valid: NDArray[np.uint8] | None = None,
+        field: DisplacementField | None = None,
     ) -> NDArray[np.uint8]:
         """A new picture of the size of `image`, with whatever is given drawn on it.
 
@@ -153,6 +156,11 @@ class Annotator:
             draw_polygon(picture, contact.hull, GREEN, unit)
             if self._ellipse and contact.ellipse is not None:
                 draw_ellipse(picture, contact.ellipse, MAGENTA, unit)
+        if field is not None:
+            between = field_arrows(field, _BETWEEN * unit)
+            if self._view == "contact":
+                between = self._inside(between, contact_mask)
+            draw_arrows(picture, between, self._arrow_scale, unit)
         if markers is not None:
             draw_arrows(picture, markers, self._arrow_scale, unit)
         if contact is not None:
@@ -250,6 +258,25 @@ class Annotator:
         shade: NDArray[Any] = picture[max(0, y - tall - 1) : y + 3, max(0, x - 2) : x + wide + 3]
         shade[...] = shade // 3
         self._letters.write(picture, text, (x, y), colour, size)
+
+
+def field_arrows(field: DisplacementField, distance: float) -> Markers:
+    """Points of a displacement field for `draw_arrows`, inferred as markers are from their neighbours.
+
+    distance : of two points at least, px. Returns as many rows and columns of the grid as fit.
+
+    >>> from tactflow.vision.flow import FieldModel
+    >>> origin = np.array([[20.0, 20], [60, 20], [20, 60], [60, 60]])
+    >>> markers = Markers(origin, origin + 1, np.zeros(4, np.uint8), np.full(4, 0.02))
+    >>> len(field_arrows(FieldModel(origin, (80, 80))(markers), 20.0).origin)
+    16
+    """
+    step = max(1, math.ceil(distance / field.grid.spacing))
+    chosen = (slice(step // 2, None, step),) * 2
+    origin = field.grid.points[chosen].reshape(-1, 2)
+    moved = field.displacement[chosen].reshape(-1, 2)
+    status = np.full(len(origin), MarkerStatus.INFERRED, np.uint8)
+    return Markers(origin, origin + moved, status, np.full(len(origin), np.nan))
 
 
 def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0, unit: float = 1.0) -> None:

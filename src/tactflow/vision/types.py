@@ -113,9 +113,9 @@ class Markers:
 class Flow:
     """How the gel inside the contact has moved.
 
-    mean : (dx, dy), px: the mean displacement; None where it is not known.
+    mean : (dx, dy), px: the mean displacement; None where it is not known, as where count is 0.
     count : number of markers inside. A mean over markers is one of so many; that of the displacement field
-        also rests on markers around, and may be known where count is 0.
+        also rests on markers around.
     stderr : (dx, dy) standard error of the mean, px; None when unknown.
     rotation : in-plane rotation (twist), degrees, counter-clockwise as seen on the screen; None with fewer
         than 3 markers, where they do not span a plane, or for a contact too small to tell.

@@ -80,8 +80,8 @@ def flow_of_field(
     The mean is an integral over the contact, each bit of gel counted by its area at rest. A marker at the
     outline in or out makes no jump: it counts as much as before. Rotation, divergence and shear are those of
     the affine motion nearest to the field. Standard errors are those of the field between its markers; that
-    of the mean has the error of the contact's outline besides. The mean is None where markers are too far
-    away: where more than `UNKNOWN` of what it could be is open.
+    of the mean has the error of the contact's outline besides. The mean is None where no marker is inside, and
+    where markers are too far away: where more than `UNKNOWN` of what it could be is open.
 
     Raises ValueError if mask is not (H, W) uint8, or if dilate is negative or not finite.
 
@@ -90,13 +90,13 @@ def flow_of_field(
     >>> origin = np.column_stack([x.ravel(), y.ravel()])
     >>> markers = Markers(origin, origin + [1.5, -0.5], np.zeros(25, np.uint8), np.full(25, 0.02))
     >>> mask = np.zeros((100, 100), np.uint8)
-    >>> mask[40:48, 40:48] = 255
+    >>> mask[40:60, 40:60] = 255
     >>> flow = flow_of_field(FieldModel(origin, (100, 100))(markers), markers, mask)
     >>> [round(value, 1) for value in flow.mean], flow.count
-    ([1.5, -0.5], 0)
+    ([1.5, -0.5], 1)
     """
     count = len(_inside(markers, mask, dilate))
-    motion = field.motion(mask)
+    motion = field.motion(mask) if count else None
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)
     return _field_summary(motion, count)
