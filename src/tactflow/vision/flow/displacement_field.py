@@ -9,6 +9,7 @@ markers, so that each answer has a standard error in closed form.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
@@ -27,7 +28,7 @@ IntArray = NDArray[np.intp]
 LENGTH: Final = 1.5
 """Correlation length of the field, pitches. Kernel and length are those that predict the markers of nine real
 recordings best, each marker from all others (leave-one-out likelihood); on four other recordings the best
-length is 1.4 (docs/field.md)."""
+length is 1.4 (docs/flow.md)."""
 NUGGET: Final = 1e-5
 """Variance added to each marker's, relative to the field's: it keeps the matrix well conditioned. Markers
 known to 0.015 px in a field of 5 px have as much. Chosen by hand."""
@@ -36,6 +37,9 @@ CELL: Final = 0.25
 MOST_CELLS: Final = 2500
 """Cells of a grid at most; where a quarter of the pitch would make more, the spacing is larger. Chosen by
 hand."""
+MANY: Final = 400
+"""Cells of a region from which on every other one, along each axis, stands for its neighbours: such a region
+is five pitches wide or more, and the field varies over one and a half. Chosen by hand."""
 OUTLINE: Final = 4.0
 """How uncertain a contact's outline is: the square of its error times the length over which it errs alike,
 px^3; 0.5 px over 16 px. Measured on 22 simulated recordings, by what it does to the mean."""
@@ -184,16 +188,19 @@ class FieldModel:
         offset = points[:, None] - self.origin
         return matern(np.sqrt(np.einsum("mnk,mnk->mn", offset, offset)) / self._length)
 
-    def covariance(self, functionals: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    def covariance(self, functionals: FloatArray, shape: tuple[int, int], step: int = 1) -> FloatArray:
         """(F,): variance of linear functionals of the field before any marker is known.
 
         functionals : (F, rows * columns), weights of the cells of a window of the grid. shape : its rows and
-            columns.
+            columns. step : every so many cells of the grid count, along each axis.
         """
         rows, columns = shape
         weights = np.ascontiguousarray(functionals.T).reshape(rows, columns, -1)
         middle, center = self.grid.shape[0] - 1, self.grid.shape[1] - 1
-        table = self._between[middle - rows + 1 : middle + rows, center - columns + 1 : center + columns]
+        down, across = step * (rows - 1), step * (columns - 1)
+        table = self._between[
+            middle - down : middle + down + 1 : step, center - across : center + across + 1 : step
+        ]
         spread = cv2.filter2D(weights, cv2.CV_64F, table, borderType=cv2.BORDER_CONSTANT)
         return np.asarray((weights * spread.reshape(weights.shape)).sum(axis=(0, 1)))
 
@@ -301,10 +308,13 @@ class DisplacementField:
         mask : (H, W) uint8, 0 or 255 inside, in the current frame: what counts is where the gel is now.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
-        part = self.part(mask)
+        check_mask(mask, 0)
+        box = cv2.boundingRect(mask)
+        step = 1 if box[2] * box[3] < MANY * self.grid.spacing**2 else 2
+        part = self._part(mask, box, step)
         if part is None:
             return None
-        model, spacing = self._model, self.grid.spacing
+        model, spacing = self._model, step * self.grid.spacing
         share = part.inside.ravel() / part.cells
         points, moved = part.points.reshape(-1, 2), part.moved.reshape(-1, 2)
         arms = points - share @ points
@@ -313,7 +323,7 @@ class DisplacementField:
         weights = kernel @ model.inverse
         if self._update is not None:
             weights = self._update.apply(weights.T).T
-        prior = model.covariance(functionals, part.inside.shape)
+        prior = model.covariance(functionals, part.inside.shape, step)
         left = np.maximum(prior - (kernel * weights).sum(axis=1), 0)
         # The markers near the region tell how rough the field is there, for the slopes as for the mean.
         scale = float(self._scale(kernel[:1])[0])
@@ -333,7 +343,11 @@ class DisplacementField:
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
         """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
         check_mask(mask, 0)
-        left, top, width, height = cv2.boundingRect(mask)
+        return self._part(mask, cv2.boundingRect(mask), step=1)
+
+    def _part(self, mask: NDArray[np.uint8], box: Sequence[int], step: int) -> Part | None:
+        """Of every so many cells, those in a region. box : (left, top, width, height) of the region."""
+        left, top, width, height = box
         if width == 0:
             return None
         model, grid = self._model, self.grid
@@ -342,17 +356,18 @@ class DisplacementField:
         low = (left - most[0] - margin, top - most[1] - margin)
         high = (left + width - least[0] + margin, top + height - least[1] + margin)
         window = grid.window(low, high)
-        points, kernel = model.points[window], model.to_markers[window]
+        every = slice(None, None, step)
+        points, kernel = model.points[window][every, every], model.to_markers[window][every, every]
         rows, columns = points.shape[:2]
         if rows == 0 or columns == 0:
             return None
         moved = (kernel.reshape(rows * columns, -1) @ self._coefficients).reshape(rows, columns, 2)
-        inside = _coverage(mask, (left, top, width, height), points + moved, grid.spacing)
+        inside = _coverage(mask, box, points + moved, step * grid.spacing)
         left, top, width, height = cv2.boundingRect(inside)
         if width == 0:
             return None
         cells = slice(top, top + height), slice(left, left + width)
-        begin = window[0].start + top, window[1].start + left
+        begin = window[0].start + step * top, window[1].start + step * left
         covered = inside[cells] / 255.0
         total = float(covered.sum())
         return Part(covered, total, begin, points[cells], moved[cells], kernel[cells])
@@ -403,7 +418,7 @@ def _grid(size: tuple[int, int], pitch: float) -> Grid:
 
 
 def _coverage(
-    mask: NDArray[np.uint8], box: tuple[int, int, int, int], places: FloatArray, spacing: float
+    mask: NDArray[np.uint8], box: Sequence[int], places: FloatArray, spacing: float
 ) -> NDArray[np.uint8]:
     """(rows, columns) uint8: how much of the surroundings of each cell is in a mask, of 255.
 

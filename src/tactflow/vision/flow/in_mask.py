@@ -75,13 +75,14 @@ def flow_of_field(
 ) -> Flow:
     """Summarise the displacement of the gel inside the contact, between its markers.
 
-    field : of this frame. markers, mask, dilate : as `flow_in_mask` takes them; they tell `count`.
+    field : of this frame. markers, mask : as `flow_in_mask` takes them. dilate : px; markers whose pixel is
+        at most this far outside the region count as inside, which matters for `count` and nothing else.
 
     The mean is an integral over the contact, each bit of gel counted by its area at rest. A marker at the
     outline in or out makes no jump: it counts as much as before. Rotation, divergence and shear are those of
     the affine motion nearest to the field. Standard errors are those of the field between its markers; that
-    of the mean has the error of the contact's outline besides. The mean is None where no marker is inside, and
-    where markers are too far away: where more than `UNKNOWN` of what it could be is open.
+    of the mean has the error of the contact's outline besides. The mean is None where no marker is inside,
+    and where markers are too far away: where more than `UNKNOWN` of what it could be is open.
 
     Raises ValueError if mask is not (H, W) uint8, or if dilate is negative or not finite.
 
@@ -95,7 +96,8 @@ def flow_of_field(
     >>> [round(value, 1) for value in flow.mean], flow.count
     ([1.5, -0.5], 1)
     """
-    count = len(_inside(markers, mask, dilate))
+    near = inside_mask(markers.position, mask, dilate)
+    count = int(np.count_nonzero(near & (markers.status != _LOST)))
     motion = field.motion(mask) if count else None
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)
