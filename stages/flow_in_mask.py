@@ -8,9 +8,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
-from tactflow.vision import compiled
-from tactflow.vision.contact import inside
-from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field, similarity
+from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field
 from tactflow.vision.types import Flow, Markers
 
 
@@ -38,7 +36,6 @@ class FlowInMask(Stage):
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(similarity, inside)
 
     def process(
         self, markers: Markers, contact_mask: ContactMask, field: DisplacementField | None = None

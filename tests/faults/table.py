@@ -79,7 +79,7 @@ FAULTS_OF_OUTPUTS: tuple[tuple[str, str, str, int, str, str], ...] = (
     ("video .avi", "cut to nothing", NOT_WHOLE, 3, "it ends before its 120 frames", "can be played"),
     ("video .mkv", "disk full", WRITING_STOPS + FILM_ENDS, 3, "the disk is full; ", "can be played"),
     ("video .mkv", "cut to nothing", NOT_WHOLE, 3, "it ends before its 120 frames", "can be played"),
-    ("video .mp4", "disk full", WRITING_STOPS + FILM_ENDS, 3, "full; it cannot be played", "no frame"),
+    ("video .mp4", "disk full", WRITING_STOPS + FILM_ENDS, 3, "the disk is full; ", "can be played"),
     ("video .mp4", "cut to nothing", NOT_WHOLE, 3, "it ends before its 120 frames", "can be played"),
     (
         "record",

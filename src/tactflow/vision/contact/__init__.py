@@ -1,6 +1,5 @@
 """Where something touches the gel: background model, illumination, contact detection and its outline."""
 
 from tactflow.vision.contact.detector import ContactDetector, ContactResult, chi_square_threshold
-from tactflow.vision.contact.inside import inside_outline, outline_depth
 
-__all__ = ["ContactDetector", "ContactResult", "chi_square_threshold", "inside_outline", "outline_depth"]
+__all__ = ["ContactDetector", "ContactResult", "chi_square_threshold"]

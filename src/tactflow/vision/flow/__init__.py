@@ -1,13 +1,12 @@
 """Flow of the gel and its markers: whether they move, how the gel moves between them and in the contact."""
 
 from tactflow.vision.flow.displacement_field import DisplacementField, FieldModel
-from tactflow.vision.flow.in_mask import HIDDEN, flow_in_mask, flow_of_field
+from tactflow.vision.flow.in_mask import flow_in_mask, flow_of_field
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
 from tactflow.vision.flow.slip import SlipTest
 
 __all__ = [
-    "HIDDEN",
     "DisplacementField",
     "FieldModel",
     "Motion",

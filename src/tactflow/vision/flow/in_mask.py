@@ -8,16 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.inside import inside_outline
 from tactflow.vision.flow.displacement_field import DisplacementField, GelMotion
-from tactflow.vision.flow.inside import check_mask, inside_mask
+from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.similarity import Similarity, fit_similarity
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
-HIDDEN: Final = 2.5
-"""Distance from a marker's border, px, up to which the marker bends the outline of the region: its mask is
-larger than the marker, and the outline is smoothed after that. Chosen by hand; with it, the bridged
-outline is off by 0.6 px at markers (`tactflow.vision.contact.inside`)."""
 UNKNOWN: Final = 0.1
 """Share of what the mean flow could be that markers may leave open. Simulated contacts within the grid of
 markers leave less than 0.04; those beyond the last markers leave more, and there the mean is wrong by
@@ -33,9 +28,7 @@ def flow_in_mask(markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0
     mask : (H, W) uint8, non-zero inside the contact.
     dilate : px; a marker is inside if its *current* centre lies at most this far outside of the region. More
         takes in more markers (a steadier mean), also such as move less because they lie outside the contact.
-        Where the markers' radius is known, the region's outline is bridged below each of them
-        (`tactflow.vision.contact.inside`) and the distance counts to a fraction of a pixel; otherwise it is
-        that between the pixel that a centre falls on and the nearest pixel of the mask.
+        The distance is that between the pixel that a centre falls on and the nearest pixel of the mask.
 
     Tracked and inferred markers have equal weight, since the mean is one over the contact's area and not over
     how well each marker is seen; but a single tracked marker stands alone, since an inferred one has its
@@ -75,8 +68,7 @@ def flow_of_field(
 ) -> Flow:
     """Summarise the displacement of the gel inside the contact, between its markers.
 
-    field : of this frame. markers, mask : as `flow_in_mask` takes them. dilate : px; markers whose pixel is
-        at most this far outside the region count as inside, which matters for `count` and nothing else.
+    field : of this frame. markers, mask, dilate : as `flow_in_mask` takes them; they tell `count`.
 
     The mean is an integral over the contact, each bit of gel counted by its area at rest. A marker at the
     outline in or out makes no jump: it counts as much as before. Rotation, divergence and shear are those of
@@ -96,8 +88,7 @@ def flow_of_field(
     >>> [round(value, 1) for value in flow.mean], flow.count
     ([1.5, -0.5], 1)
     """
-    near = inside_mask(markers.position, mask, dilate)
-    count = int(np.count_nonzero(near & (markers.status != _LOST)))
+    count = len(_inside(markers, mask, dilate))
     motion = field.motion(mask) if count else None
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)
@@ -106,12 +97,7 @@ def flow_of_field(
 
 def _inside(markers: Markers, mask: NDArray[np.uint8], dilate: float) -> NDArray[np.intp]:
     """Which markers that are not lost lie inside the mask, or at most `dilate` px outside."""
-    check_mask(mask, dilate)
-    if markers.radius is None:
-        inside = inside_mask(markers.position, mask, dilate)
-    else:
-        inside = inside_outline(markers.position, mask, markers.radius + HIDDEN, dilate)
-    return np.flatnonzero(inside & (markers.status != _LOST))
+    return np.flatnonzero(inside_mask(markers.position, mask, dilate) & (markers.status != _LOST))
 
 
 def _field_summary(motion: GelMotion, count: int) -> Flow:

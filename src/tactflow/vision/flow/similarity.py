@@ -7,8 +7,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
-
 FloatArray = NDArray[np.float64]
 
 _FLAT: Final = 1e-3
@@ -44,38 +42,20 @@ def fit_similarity(origin: FloatArray, position: FloatArray, chosen: NDArray[np.
     >>> fit_similarity(origin, 1.1 * origin, np.arange(3)).growth_x.__round__(6)
     0.1
     """
-    sums = np.empty(7)
-    sum_similarity(np.ascontiguousarray(origin), np.ascontiguousarray(position), chosen, sums)
-    mean_x, mean_y, fitted, growth_x, growth_y, rest_x, rest_y = sums.tolist()
-    return Similarity(mean_x, mean_y, bool(fitted), growth_x, growth_y, rest_x, rest_y)
-
-
-@kernel("void(float64[:, ::1], float64[:, ::1], int64[::1], float64[::1])")
-def sum_similarity(
-    origin: FloatArray, position: FloatArray, chosen: NDArray[np.intp], sums: FloatArray
-) -> None:
-    """Set `sums` (7,) to the fields of `Similarity`, in their order."""
-    count = chosen.size
-    at_x = at_y = mean_x = mean_y = 0.0
-    for index in chosen:
-        at_x, at_y = at_x + origin[index, 0], at_y + origin[index, 1]
-        mean_x += position[index, 0] - origin[index, 0]
-        mean_y += position[index, 1] - origin[index, 1]
-    at_x, at_y, mean_x, mean_y = at_x / count, at_y / count, mean_x / count, mean_y / count
-    xx = xy = yy = along = across = 0.0
-    for index in chosen:
-        x, y = origin[index, 0] - at_x, origin[index, 1] - at_y
-        u = position[index, 0] - origin[index, 0] - mean_x
-        v = position[index, 1] - origin[index, 1] - mean_y
-        xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
-        along, across = along + x * u + y * v, across + x * v - y * u
-    fitted = count >= 3 and xx * yy - xy * xy > _FLAT * _FLAT * (xx + yy) * (xx + yy)
-    growth_x, growth_y = (along / (xx + yy), across / (xx + yy)) if fitted else (0.0, 0.0)
-    rest_x = rest_y = 0.0
-    for index in chosen:
-        x, y = origin[index, 0] - at_x, origin[index, 1] - at_y
-        u = position[index, 0] - origin[index, 0] - mean_x - (growth_x * x - growth_y * y)
-        v = position[index, 1] - origin[index, 1] - mean_y - (growth_y * x + growth_x * y)
-        rest_x, rest_y = rest_x + u * u, rest_y + v * v
-    sums[0], sums[1], sums[2], sums[3], sums[4] = mean_x, mean_y, fitted, growth_x, growth_y
-    sums[5], sums[6] = rest_x, rest_y
+    at = origin[chosen]
+    rest = position[chosen] - at
+    mean = rest.mean(axis=0)
+    rest -= mean
+    at -= at.mean(axis=0)
+    x, y = at.T
+    xx, yy = float(x @ x), float(y @ y)
+    scatter = xx + yy
+    # Product over squared sum of the principal scatters; about their ratio where one is small.
+    fitted = len(at) >= 3 and xx * yy - float(x @ y) ** 2 > (_FLAT * scatter) ** 2
+    growth_x = growth_y = 0.0
+    if fitted:
+        u, v = rest.T
+        growth_x, growth_y = float(x @ u + y @ v) / scatter, float(x @ v - y @ u) / scatter
+        rest -= np.column_stack([growth_x * x - growth_y * y, growth_y * x + growth_x * y])
+    rest_x, rest_y = (rest * rest).sum(axis=0).tolist()
+    return Similarity(float(mean[0]), float(mean[1]), fitted, growth_x, growth_y, rest_x, rest_y)
