@@ -27,11 +27,11 @@ class FlowInMask(Stage):
         )
 
         dilate: float = Field(
-            0.3,
+            0.0,
             ge=0,
             le=1000,
-            description="markers whose centre is up to this far outside the contact's outline count too, px; "
-            "more markers make a mean over markers steadier and mix in gel that moves less",
+            description="markers whose pixel is up to this far outside the contact count too, px, in whole "
+            "pixels; more markers make a mean over markers steadier and mix in gel that moves less",
         )
 
     def __init__(self, params: Params) -> None:
