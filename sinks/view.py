@@ -53,10 +53,10 @@ class View(Sink):
             "127.0.0.1",
             min_length=1,
             description="address of this machine to serve on; any but loopback needs a token, and sends it "
-            "unencrypted (from afar, ssh -L 8765:localhost:8765 is safer)",
+            "unencrypted (from afar, ssh -L 8780:localhost:8780 is safer)",
         )
         port: int = Field(
-            8765, ge=0, le=65535, description="port; the next free one where it is taken; 0 picks any"
+            8780, ge=0, le=65535, description="port; the next free one where it is taken; 0 picks any"
         )
         token: str | None = Field(
             None,

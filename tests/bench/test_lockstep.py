@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tactflow.bench.lockstep import LockstepPipeline, Outcome
 from tactflow.bench.pipelines import on_recording, take_turns
@@ -13,6 +15,7 @@ from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
+from tactflow.sources.files import ArrayFile
 
 STAGES = '''
 import numpy as np
@@ -152,6 +155,25 @@ class Sleeps(Stage):
     assert outcomes[1].wall >= 0.06
     assert outcomes[3].wall >= 0.03
     assert all(outcome.cpu < outcome.wall for outcome in outcomes[1::2])
+
+
+def test_what_it_takes_to_read_a_recording_is_no_part_of_a_frames_time(
+    pipeline: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = ArrayFile.read
+
+    def slow(self: ArrayFile) -> tuple[NDArray[np.uint8], float] | None:
+        time.sleep(0.05)
+        return read(self)
+
+    monkeypatch.setattr(ArrayFile, "read", slow)
+    lockstep = LockstepPipeline(on_recording(pipeline, recording(tmp_path, 0, 10, 20), settle=0), None)
+    began = time.perf_counter()
+    outcomes = lockstep.block(3)
+    took = time.perf_counter() - began
+    lockstep.close()
+    # Reading all of it is in what the turn took, and in no frame's time.
+    assert took - sum(outcome.wall for outcome in outcomes) >= 4 * 0.05
 
 
 def test_every_node_runs_in_one_thread(pipeline: Pipeline, tmp_path: Path) -> None:

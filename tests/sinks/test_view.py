@@ -662,7 +662,7 @@ def test_only_loopback_is_loopback(host: str, expected: bool) -> None:
 
 
 def test_addresses_are_written_as_a_browser_takes_them() -> None:
-    assert address("127.0.0.1", 8765) == "http://127.0.0.1:8765/"
+    assert address("127.0.0.1", 8780) == "http://127.0.0.1:8780/"
     assert address("::1", 80) == "http://[::1]:80/"
     assert address("0.0.0.0", 80) == f"http://{socket.gethostname()}:80/"
 
