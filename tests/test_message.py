@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import STATUS_NAMES, Results, encode_message, message_schema
 from tactflow.vision.flow import FieldModel
-from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
+from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, MarkerStatus, Scale
 from tests.messages import build_message
 
 VALIDATOR = jsonschema.Draft202012Validator(message_schema())
@@ -130,6 +130,17 @@ def test_the_field_is_told_where_it_is_asked_for() -> None:
     empty = json.loads(encode_message(TICK, Results(PROCESSED), field=True))
     VALIDATOR.validate(empty)
     assert empty["field"] is None
+
+
+def test_a_force_is_told_with_its_errors_and_null_where_a_component_is_unknown() -> None:
+    force = Force((None, None, 2.5), (None, None, 0.2), True)
+    message = build_message(TICK, Results(PROCESSED, CONTACT, force=force))
+    VALIDATOR.validate(message)
+    assert message["force"] == {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": True}
+    assert "force" not in build_message(TICK, Results(PROCESSED, CONTACT))
+    endless = replace(force, value=(0.0, math.inf, 1.0))
+    with pytest.raises(ValueError, match=r"force\.value"):
+        build_message(TICK, Results(PROCESSED, CONTACT, force=endless))
 
 
 def test_separate_contacts_are_listed_and_nothing_is_an_empty_list() -> None:

@@ -19,7 +19,17 @@ from pydantic.json_schema import GenerateJsonSchema
 from tactflow.engine.frame import Tick
 from tactflow.ports import Image
 from tactflow.vision.flow.displacement_field import DisplacementField
-from tactflow.vision.types import Contact, Depth, Evidence, Flow, Markers, MarkerStatus, Scale, Slip
+from tactflow.vision.types import (
+    Contact,
+    Depth,
+    Evidence,
+    Flow,
+    Force,
+    Markers,
+    MarkerStatus,
+    Scale,
+    Slip,
+)
 
 SCHEMA = "tactflow.frame/1"
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
@@ -35,8 +45,8 @@ _OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 class Results(NamedTuple):
     """What the pipeline found in one frame, for sinks: `def write(self, tick: Tick, results: Results)`.
 
-    image : the processed frame. scale, depth : only with a calibration. field, slip : only where a stage of
-    that name stands in the pipeline. Each is None where it was not computed or nothing was found.
+    image : the processed frame. scale, depth, force : only with a calibration. field, slip : only where a
+    stage of that name stands in the pipeline. Each is None where it was not computed or nothing was found.
 
     >>> Results().contact is None
     True
@@ -50,6 +60,7 @@ class Results(NamedTuple):
     depth: Depth | None = None
     field: DisplacementField | None = None
     slip: Slip | None = None
+    force: Force | None = None
 
 
 class _Kept:
@@ -97,7 +108,7 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False, field:
         If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
     """
     frame = tick.frame
-    image, contact, flow, markers, scale, depth, _, slip = results
+    image, contact, flow, markers, scale, depth, _, slip, force = results
     pixels = frame.image if image is None else image
     described = None if contact is None else _contact(contact, scale, detail)
     separate = () if contact is None else contact.separate
@@ -117,6 +128,8 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False, field:
     if slip is not None:
         ratio = _number(slip.stick_ratio, "slip.stick_ratio")
         message["slip"] = {"slipping": bool(slip.slipping), "stick_ratio": ratio}
+    if force is not None:
+        message["force"] = _force(force)
     if field:
         message["field"] = None if results.field is None else _field(results.field)
     return orjson.dumps(message, option=_OPTIONS)
@@ -182,6 +195,14 @@ def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
     return result
 
 
+def _force(force: Force) -> dict[str, Any]:
+    return {
+        "value": [_optional(part, "force.value") for part in force.value],
+        "stderr": [_optional(part, "force.stderr") for part in force.stderr],
+        "in_range": bool(force.in_range),
+    }
+
+
 def _field(field: DisplacementField) -> dict[str, Any]:
     return {
         "first": list(field.grid.first),
@@ -242,6 +263,7 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Point = tuple[_Finite, _Finite]
 _Angle = Annotated[float, Field(gt=-90, le=90, allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class _Strict(BaseModel):
@@ -346,6 +368,21 @@ class _SlipModel(_Strict):
     )
 
 
+class _ForceModel(_Strict):
+    """The force on the gel."""
+
+    value: tuple[_Finite | None, _Finite | None, _NotNegative] = Field(
+        description="(x, y, z), N: z presses on the gel, x and y drag it along the axes of the picture; null "
+        "when not known"
+    )
+    stderr: tuple[_NotNegative | None, _NotNegative | None, _NotNegative] = Field(
+        description="standard errors, N; null where value is"
+    )
+    in_range: bool = Field(
+        description="whether the calibration was fitted to such contacts; stderr only holds there"
+    )
+
+
 class _FieldModel(_Strict):
     """Displacement of the gel on a regular grid."""
 
@@ -380,6 +417,9 @@ class _Message(_Strict):
     )
     slip: _SlipModel | None = Field(
         None, description="of the contact (only where the pipeline has the stage slip)"
+    )
+    force: _ForceModel | None = Field(
+        None, description="on the gel; only where something touches (calibrated)"
     )
     skipped: dict[str, str] = Field(
         description="port -> why this frame did not need it; reference -> why this frame became a new one"

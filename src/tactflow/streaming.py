@@ -20,7 +20,7 @@ from tactflow.engine.graph import Mark, Node, Pipeline
 from tactflow.engine.link import Link
 from tactflow.engine.run import Runner
 from tactflow.ports import ContactMask, Image
-from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
+from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Scale, Slip
 
 _SINK = "tactflow.stream"
 """Id of the sink that hands results over; no id of a file has a point in it."""
@@ -35,7 +35,9 @@ class Result:
     contact, flow, markers : None where there is none, or no stage of the pipeline makes it.
     contact_mask : (H, W) uint8, 255 in contact; None without a contact.
     skipped : port -> why it was not computed in this frame: `unchanged` repeats the last value.
-    scale, depth : millimetres per pixel, and how far the gel is pushed in; None without a calibration.
+    scale, depth, force : millimetres per pixel, how far the gel is pushed in, and by which force; None
+        without a calibration that knows it.
+    slip : whether the contact slips; None unless a stage `slip` stands in the pipeline.
     image : (H, W, 3) uint8 BGR, the processed frame. frame : the raw one. Both None unless asked for, because
         a list of results would hold them all in memory.
 
@@ -56,6 +58,8 @@ class Result:
     skipped: Mapping[str, str]
     scale: Scale | None = None
     depth: Depth | None = None
+    force: Force | None = None
+    slip: Slip | None = None
     image: NDArray[np.uint8] | None = None
     frame: NDArray[np.uint8] | None = None
 
@@ -142,6 +146,8 @@ class _Inputs(NamedTuple):
     contact_mask: ContactMask | None
     scale: Scale | None
     depth: Depth | None
+    force: Force | None
+    slip: Slip | None
 
 
 class _Hand(Sink):
@@ -175,6 +181,8 @@ class _Hand(Sink):
                 skipped=dict(tick.skipped),
                 scale=inputs.scale,
                 depth=_locked(inputs.depth),
+                force=inputs.force,
+                slip=inputs.slip,
                 image=_locked(inputs.image) if self.images else None,
                 frame=frame.image if self.images else None,
             )

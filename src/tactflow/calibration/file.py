@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tactflow import __version__
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.depth.slopes import SlopeModel
+from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, ForceModel, LinearForce
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
 
@@ -71,6 +72,59 @@ class PhotometricEntry(_Strict):
     volume_stderr: float
 
 
+class LinearForceEntry(_Strict):
+    """A force that is linear in features, and how right it is on what it was not fitted to.
+
+    stiffness, greatest, error : see `LinearForce`. range : least and largest force of the fit, N.
+    rmse : RMS error, N. r2 : share of the variance that is explained. hysteresis : mean distance between the
+    force while it grows and while it falls at the same prediction, relative to the largest; None where no
+    press shows both.
+    """
+
+    stiffness: dict[str, float]
+    greatest: dict[str, float]
+    error: list[float] = Field(min_length=2, max_length=2)
+    range: list[float] = Field(min_length=2, max_length=2)
+    rmse: float
+    r2: float
+    hysteresis: float | None = None
+
+    def model(self) -> LinearForce:
+        """What the stage `force` computes with."""
+        return LinearForce(self.stiffness, self.greatest, (self.error[0], self.error[1]))
+
+
+class ForceEntry(_Strict):
+    """`force` of the file.
+
+    press : of z. drag : of x and y; None where the reference had no such columns. change_at_rest : see
+    `ForceModel`. recordings : source -> by how much its frames' time is ahead of that of its CSV, s.
+    presses : in all of them. left_out : whether `rmse` is of whole recordings or of single presses that the
+    fit has not seen.
+    """
+
+    press: LinearForceEntry
+    drag: LinearForceEntry | None = None
+    change_at_rest: float
+    recordings: dict[str, float]
+    presses: int
+    left_out: Literal["recording", "press"]
+
+    @model_validator(mode="after")
+    def _known_features(self) -> ForceEntry:
+        for part, known in ((self.press, {*BY_DEPTH, *BY_CHANGE}), (self.drag, {*BY_SHEAR})):
+            if part is not None and not (part.stiffness.keys() == part.greatest.keys() <= known):
+                raise ValueError(
+                    f"required features from {sorted(known)}, each with its stiffness and greatest"
+                )
+        return self
+
+    def model(self) -> ForceModel:
+        """What the stage `force` computes with."""
+        drag = None if self.drag is None else self.drag.model()
+        return ForceModel(self.press.model(), drag, self.change_at_rest)
+
+
 class _File(_Strict):
     format: Literal["tactflow.calibration/1"]
     sensor: str
@@ -82,6 +136,7 @@ class _File(_Strict):
     corners: list[list[float]] = Field(min_length=4, max_length=4)
     scale: ScaleEntry
     photometric: PhotometricEntry | None = None
+    force: ForceEntry | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +148,8 @@ class Calibration:
     corners : (4, 2) float64, where the corner pixels of the processed frame lie in the raw one, px.
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
     scale, scale_by : millimetres per pixel, and how they were found. version : of tactflow.
-    slopes, photometric : which slope has which colour, and how well; None where only the scale is known.
+    slopes, photometric : which slope has which colour, and how well; None where that is not known.
+    force : how the force follows from a contact; None where that is not known.
     """
 
     sensor: str
@@ -106,6 +162,7 @@ class Calibration:
     scale_by: str
     slopes: SlopeModel | None = None
     photometric: PhotometricEntry | None = None
+    force: ForceEntry | None = None
     made: str = ""
     version: str = __version__
 
@@ -132,6 +189,7 @@ class Calibration:
                 found_by=self.scale_by,
             ),
             photometric=self.photometric,
+            force=self.force,
         ).model_dump()
         arrays: dict[str, Any] = {"look": self.look}
         if self.slopes is not None:
@@ -183,6 +241,7 @@ class Calibration:
             scale_by=said.scale.found_by,
             slopes=slopes,
             photometric=said.photometric,
+            force=said.force,
         )
 
     def misfit(self, mapping: PixelMapping) -> str | None:

@@ -224,3 +224,21 @@ class Depth:
     greatest_stderr: float | None
     volume: float
     volume_stderr: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Force:
+    """The force on the gel.
+
+    value : (x, y, z), N, along the axes of `Scale`: z is how hard the object presses, >= 0; x and y are how
+        it drags the gel. None for a component that the calibration does not know.
+    stderr : standard error of each component, N; None where `value` is.
+    in_range : whether the contact is like those the calibration was fitted to; `stderr` only holds there.
+
+    >>> Force((None, None, 2.5), (None, None, 0.2), True).value[2]
+    2.5
+    """
+
+    value: tuple[float | None, float | None, float]
+    stderr: tuple[float | None, float | None, float]
+    in_range: bool

@@ -1,0 +1,63 @@
+"""Stage `force`: how hard the object presses on the gel, and how it drags it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from tactflow.calibration.file import Calibration
+from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.frame import Absent
+from tactflow.ports import Unmarked, Untouched
+from tactflow.vision.force import seen, total_change
+from tactflow.vision.types import Contact, Depth, Flow, Scale
+from tactflow.vision.types import Force as ForceOnGel
+
+logger = logging.getLogger("tactflow")
+
+
+class Force(Stage):
+    """Force in N, by the force part of the sensor's calibration; nothing without it.
+
+    A contact larger than those that the calibration was fitted to is warned of, once.
+    """
+
+    memory = "pure"
+
+    def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
+        """Prepare. calibration : the file."""
+        super().__init__(params)
+        known = None if calibration is None else Calibration.load(calibration).force
+        self._known = known
+        self._model = None if known is None else known.model()
+        self._warned = False
+
+    def process(
+        self,
+        contact: Contact,
+        scale: Scale,
+        unmarked: Unmarked,
+        untouched: Untouched,
+        depth: Depth | None = None,
+        flow: Flow | None = None,
+    ) -> ForceOnGel | Absent:
+        """The force of this frame's contact."""
+        model, known = self._model, self._known
+        if model is None or known is None:
+            return Absent("no_calibration")
+        change = 0.0
+        if model.needs_depth:
+            if depth is None:
+                return Absent("no_depth")
+        else:
+            change = total_change(unmarked, untouched) - model.change_at_rest
+        force = model.force(seen(contact, scale, depth, change, flow))
+        if not force.in_range and not self._warned:
+            self._warned = True
+            logger.warning(
+                "force: %.2f N is of a larger contact than those the calibration was fitted to (%.2f to "
+                "%.2f N); its standard error does not hold (said once)",
+                force.value[2],
+                *known.press.range,
+            )
+        return force
