@@ -30,6 +30,7 @@ COMMANDS = {
     "keys": "make keys, so that only who has one can read results over a network",
     "bench": "measure run time against error, per method and for whole pipelines",
     "warmup": "compile what `run` would compile on its first use",
+    "batch": "run a pipeline over many recordings; a second call does what is missing",
     "record": "run a pipeline and record its frames and results",
     "repair": "give a recording that was cut off its index",
     "calibrate": "make the calibration file of a sensor, or see whether it still fits",
