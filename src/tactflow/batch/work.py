@@ -58,7 +58,7 @@ def work(task: Task, report: Report = lambda _done, _total: None) -> Outcome:
         versions=versions(),
     )
     try:
-        with _attempt(task) as attempts:
+        with attempt(task) as attempts:
             blank = replace(blank, attempts=attempts)
             if attempts > DEADLY:
                 what = f"it killed its worker {DEADLY} times. Is memory short, or the file harmful?"
@@ -75,7 +75,7 @@ def work(task: Task, report: Report = lambda _done, _total: None) -> Outcome:
 
 
 @contextmanager
-def _attempt(task: Task) -> Iterator[int]:
+def attempt(task: Task) -> Iterator[int]:
     """Count that a worker begins a recording; the count is forgotten when the worker is through with it."""
     name = hashlib.sha256(task.recording.source.encode()).hexdigest()[:16]
     marks = Path(task.scratch, f"{name}.attempts")
