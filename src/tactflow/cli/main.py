@@ -27,6 +27,7 @@ COMMANDS = {
     "pipelines": "list the pipelines that come with tactflow, one for each kind of sensor",
     "stages": "list the stages and sinks that can be used, their ports and parameters",
     "listen": "print what a running tactflow publishes",
+    "control": "tell a running tactflow to pause, to take a reference, to record",
     "keys": "make keys, so that only who has one can read results over a network",
     "bench": "measure run time against error, per method and for whole pipelines",
     "warmup": "compile what `run` would compile on its first use",
