@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol
 
 import orjson
 
-from tactflow.engine.contract import Source
+from tactflow.commands import Commands, RefusedError
 from tactflow.engine.control import Control
 from tactflow.engine.stats import Durations
 
@@ -63,10 +63,6 @@ class Packet(NamedTuple):
     data: bytes
     captured: float
     published: float
-
-
-class BadCommandError(Exception):
-    """A page asked for something that does not exist, or that is not possible now; says why."""
 
 
 class Page:
@@ -120,6 +116,7 @@ class Hub:
         neighbours: Callable[[], Mapping[str, int]] = dict,
     ) -> None:
         self.control = control
+        self._run = Commands(control)
         self.sensor = sensor
         self.neighbours = neighbours
         self.run_id = secrets.token_hex(8)
@@ -136,11 +133,11 @@ class Hub:
         self._screen = Durations()
         self._end: str | None = None
         self._commands: Mapping[str, Callable[[Any], Any]] = {
-            "pause": self._pause,
-            "step": self._step,
-            "reference": self._reference,
-            "record": self._record,
-            "stop": self._stop,
+            "pause": lambda value: self._run.pause(value is True),
+            "step": lambda _: self._step(),
+            "reference": lambda _: self._run.take_reference(),
+            "record": lambda value: self._run.record(value is True),
+            "stop": lambda _: self._run.stop(),
         }
 
     # -- from other threads -------------------------------------------------------------------------------
@@ -212,7 +209,7 @@ class Hub:
 
     def end(self) -> None:
         """The run is over: tell every page how it ended and let it go."""
-        snapshot = self._snapshot()
+        snapshot = self._run.snapshot()
         self._end = str(snapshot.get("end", "eos"))
         for page in self.pages:
             page.post("stats", _text(type="stats", sensor=self.sensor, screen_ms=None, run=snapshot))
@@ -230,7 +227,7 @@ class Hub:
         listeners = [page for page in self.pages if not page.stuck]
         if not listeners:
             return
-        snapshot = self._snapshot()
+        snapshot = self._run.snapshot()
         state = self.state()
         for page in listeners:
             delays = sorted(page.screen_s)
@@ -243,14 +240,13 @@ class Hub:
         """The message that says what the run is doing, and which buttons work (null) or why not."""
         control = self.control
         source = None if control is None else control.source
-        paused = bool(control and control.paused)
-        condition = None if source is None else source.state
-        recorder = None if control is None else control.recorder()
+        now = self._run.state()
+        paused, condition = now["paused"], now["source"]
         return _text(
             type="state",
             sensor=self.sensor,
             paused=paused,
-            recording=bool(recorder is not None and recorder.recording),
+            recording=now["recording"],
             end=self._end,
             neighbours=self.neighbours(),
             source={
@@ -336,68 +332,25 @@ class Hub:
         name = message.get("do")
         try:
             if not isinstance(name, str) or name not in self._commands:
-                raise BadCommandError(f"there is no command {name!r}")
+                raise RefusedError(f"there is no command {name!r}")
             refusal = self._refusal(name)
             if refusal is not None:
-                raise BadCommandError(refusal)
+                raise RefusedError(refusal)
             # Starting or ending a recording may touch the disk; the other commands return at once.
             await asyncio.to_thread(self._commands[name], message.get("value"))
         except Exception as error:
-            if not isinstance(error, BadCommandError):
+            if not isinstance(error, RefusedError):
                 log.warning("view: %s failed: %s: %s", name, type(error).__name__, error)
             page.post("note", _text(type="note", text=str(error) or type(error).__name__))
         self.tell_state()
 
     def _refusal(self, name: str) -> str | None:
         """Why a command is not possible now, or None."""
-        control = self.control
-        if control is None or self._end is not None:
-            return "the run cannot be controlled" if control is None else "the run has ended"
-        source = control.source
-        if name == "step":
-            if source is not None and source.live:
-                return "a live source cannot be stepped"
-            return None if control.paused else "pause first"
-        if name == "reference" and (source is None or type(source).retake is Source.retake):
-            return "this source cannot take a new reference"
-        if name == "record" and control.recorder() is None:
-            return "no record sink in this pipeline"
-        return None
+        return "the run has ended" if self._end is not None else self._run.refusal(name)
 
-    def _pause(self, value: Any) -> None:
-        assert self.control is not None
-        self.control.pause(value is True)
-
-    def _step(self, _: Any) -> None:
-        assert self.control is not None
+    def _step(self) -> None:
         self.owed = True
-        self.control.step()
-
-    def _reference(self, _: Any) -> None:
-        assert self.control is not None
-        self.control.retake_reference()
-
-    def _record(self, value: Any) -> None:
-        assert self.control is not None
-        recorder = self.control.recorder()
-        if recorder is not None:
-            if value is True:
-                recorder.start_recording()
-            else:
-                recorder.stop_recording()
-
-    def _stop(self, _: Any) -> None:
-        assert self.control is not None
-        self.control.stop()
-
-    def _snapshot(self) -> dict[str, Any]:
-        if self.control is None:
-            return {}
-        try:
-            return dict(self.control.snapshot())
-        except RuntimeError:
-            # The run is still opening its sinks: its tables grew while they were read. The next one is whole.
-            return {}
+        self._run.step()
 
 
 def _text(**fields: Any) -> str:
