@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import platform
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -14,11 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import cv2
-import numpy as np
-import yaml
 from pydantic import Field, model_validator
 
-from tactflow import __version__
 from tactflow.engine.contract import Output, Recorder, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
@@ -27,9 +23,8 @@ from tactflow.engine.rate import SLACK, RateLimit
 from tactflow.files import expanded, next_name
 from tactflow.message import Results, encode_message
 from tactflow.ports import Image
+from tactflow.provenance import facts, texts
 from tactflow.recording import missing_packages
-from tactflow.redaction import without_secrets
-from tactflow.vision import compiled
 
 if TYPE_CHECKING:
     from tactflow.recording.frames import FrameCoder
@@ -415,27 +410,7 @@ class Record(Recorder):
     def _about(self) -> About:
         from tactflow.recording.writer import About
 
-        facts = {
-            "tactflow": __version__,
-            "numpy": np.__version__,
-            "numba": compiled.numba_version(),
-            "opencv": cv2.__version__,
-            "python": platform.python_version(),
-            "machine": f"{platform.system()} {platform.machine()}",
-            "sensor": self._sensor,
-        }
-        texts: dict[str, str] = {}
-        if self._control is not None:
-            pipeline = self._control.pipeline
-            facts["source"] = str((self._control.source and self._control.source.description) or "")
-            texts["pipeline.yaml"] = without_secrets(yaml.safe_dump(dict(pipeline.settings), sort_keys=False))
-            try:
-                texts["pipeline.original.yaml"] = without_secrets(
-                    Path(pipeline.file).read_text(encoding="utf-8")
-                )
-            except (OSError, UnicodeDecodeError) as error:
-                log.debug("%s: not recorded: %s", pipeline.file, error)
-        return About(self._sensor, facts, texts)
+        return About(self._sensor, facts(self._sensor, self._control), texts(self._control))
 
 
 def _refuses(params: Record.Params) -> bool:

@@ -11,6 +11,8 @@ import orjson
 import zmq
 from pydantic import Field, field_validator, model_validator
 
+from tactflow.commands import Commands
+from tactflow.control_socket import ControlSocket
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
@@ -38,13 +40,15 @@ class Zmq(Sink):
     Whoever subscribes to `tactflow.stats` by that name gets the statistics of the run every `stats_every`
     seconds: `tactflow.stats`, a space, the JSON of the statistics file with the sensor's name. A shorter
     prefix, such as `tactflow.`, does not ask for them, but receives them while somebody else does.
+
+    With `control`, other programs may pause the run, take a new reference, start and end recordings.
     """
 
     threaded = True
     when_live = "latest"
 
     class Params(StageParams):
-        """Where to publish, and how much may wait for a slow subscriber."""
+        """Where to publish, how much may wait for a slow subscriber, and who may send commands."""
 
         endpoint: str = Field(
             "tcp://127.0.0.1:5556",
@@ -92,11 +96,21 @@ class Zmq(Sink):
             description="time between two messages of statistics (topic tactflow.stats), s; 0: none",
         )
 
-        @field_validator("endpoint")
+        control: str | None = Field(
+            None,
+            min_length=1,
+            description="address at which commands are taken (tactflow control), such as "
+            "tcp://127.0.0.1:5557; one that other machines can reach takes keys; null: none are",
+        )
+        control_keys: str | None = Field(
+            None, min_length=1, description="folder of keys for commands; null: that of keys"
+        )
+
+        @field_validator("endpoint", "control")
         @classmethod
-        def _port_is_one(cls, endpoint: str) -> str:
+        def _port_is_one(cls, endpoint: str | None) -> str | None:
             # ZeroMQ takes a larger number and binds another port.
-            port = re.fullmatch(r"tcp://.*:(\d+)", endpoint)
+            port = re.fullmatch(r"tcp://.*:(\d+)", endpoint or "")
             if port is not None and int(port[1]) > HIGHEST_PORT:
                 raise ValueError(f"required a port up to {HIGHEST_PORT}, got {port[1]}")
             return endpoint
@@ -109,7 +123,18 @@ class Zmq(Sink):
                     "with tactflow keys new and set keys to the publisher's folder, or endpoint to "
                     "tcp://127.0.0.1:5556; open_to_all: true lets everybody read who reaches it"
                 )
+            if self.control is not None and self.commanders is None and is_reachable(self.control):
+                raise ValueError(
+                    f"{self.control} can be reached from other machines, so commands require keys: make some "
+                    "with tactflow keys new and set keys or control_keys to the publisher's folder, or "
+                    "control to tcp://127.0.0.1:5557"
+                )
             return self
+
+        @property
+        def commanders(self) -> str | None:
+            """The folder that says who may send commands; None: who can reach the address."""
+            return self.control_keys or self.keys
 
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is bound yet.
@@ -117,7 +142,7 @@ class Zmq(Sink):
         Parameters
         ----------
         sensor : names the topic.
-        control : the run, asked for its statistics; None: there are none to publish.
+        control : the run, asked for its statistics and told what to do; None: there is nothing to ask.
         """
         super().__init__(params)
         self.endpoint = params.endpoint
@@ -136,6 +161,7 @@ class Zmq(Sink):
         self._stats_wanted = False
         self._closing = threading.Event()
         self._stats_thread: threading.Thread | None = None
+        self._commands: ControlSocket | None = None
 
     @classmethod
     def publishes(cls, params: Zmq.Params) -> Publication:
@@ -145,15 +171,21 @@ class Zmq(Sink):
     @classmethod
     def publish_at(cls, params: Zmq.Params, address: str) -> Zmq.Params:
         """With another endpoint, of this machine alone: it is the relay that asks for keys."""
-        return params.changed(endpoint=address, keys=None)
+        kept = params.commanders if params.control is not None else params.control_keys
+        return params.changed(endpoint=address, keys=None, control_keys=kept)
+
+    @property
+    def control_endpoint(self) -> str | None:
+        """The real address at which commands are taken; None while none are."""
+        return None if self._commands is None else self._commands.endpoint
 
     def open(self) -> None:
-        """Bind the socket; afterwards `endpoint` is the real address.
+        """Bind the sockets; afterwards `endpoint` and `control_endpoint` are the real addresses.
 
         Raises
         ------
         StageError
-            If the address is taken or cannot be bound, or the keys are wrong.
+            If an address is taken or cannot be bound, or the keys are wrong.
         """
         p = self.params
         self._publisher = Publisher(p.endpoint, p.backlog, p.send_buffer, p.keys)
@@ -161,6 +193,10 @@ class Zmq(Sink):
         self.endpoint = self._publisher.endpoint
         self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
         log.info("publishing %s", self.description)
+        if p.control is not None:
+            commands = Commands(self._control)
+            self._commands = ControlSocket(p.control, p.commanders, self._sensor, commands)
+            log.info("taking commands on %s", self.control_endpoint)
         self._wait_for_subscriber(p.wait_for_subscriber)
         if self._control is not None and p.stats_every:
             # Not in the run's threads: statistics shall also come while no frame does.
@@ -213,7 +249,10 @@ class Zmq(Sink):
                     self._socket.send(STATS_TOPIC + body, zmq.NOBLOCK)
 
     def close(self) -> None:
-        """Deliver what is under way, for at most `linger` seconds, and free the address."""
+        """Deliver what is under way, for at most `linger` seconds, and free the addresses."""
+        if self._commands is not None:
+            self._commands.close()
+            self._commands = None
         self._closing.set()
         if self._stats_thread is not None:
             self._stats_thread.join()

@@ -21,6 +21,7 @@ ROOMS = {
     "src/tactflow/vision": ("zmq", "tactflow.engine", "tactflow.config", "tactflow.stages"),
     "src/tactflow/calibration": ("zmq", "tactflow.stages", "tactflow.sinks", "tactflow.cli"),
     "src/tactflow/fleet": ("tactflow.cli", "tactflow.stages", "tactflow.sinks"),
+    "src/tactflow/batch": ("tactflow.cli", "tactflow.bench"),
     "src/tactflow/classic": ("tactflow.stages", "tactflow.cli"),
     "stages": ("tactflow.stages", "tactflow.config", "tactflow.cli"),
     "sinks": ("tactflow.stages", "tactflow.config", "tactflow.cli"),

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from tactflow.engine.frame import Frame as Frame
     from tactflow.engine.frame import Tick as Tick
     from tactflow.message import Results as Results
+    from tactflow.remote import RemoteControl as RemoteControl
     from tactflow.sim.scenes import open_scene as open_scene
     from tactflow.streaming import Result as Result
     from tactflow.streaming import stream as stream
@@ -51,6 +52,7 @@ _HOMES = {
     "tactflow.api": ("load", "check", "run", "stage"),
     "tactflow.streaming": ("stream", "Result"),
     "tactflow.client": ("Subscriber",),
+    "tactflow.remote": ("RemoteControl",),
     "tactflow.sim.scenes": ("open_scene",),
     "tactflow.vision.types": ("Contact", "Flow", "Markers", "MarkerStatus"),
     "tactflow.engine.contract": ("Stage", "Sink", "Source", "StageParams"),
@@ -70,6 +72,7 @@ __all__ = [
     "Frame",
     "MarkerStatus",
     "Markers",
+    "RemoteControl",
     "Result",
     "Results",
     "Sink",

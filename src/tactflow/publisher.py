@@ -1,4 +1,5 @@
-"""The socket of whoever publishes over ZeroMQ: the sink `zmq`, and the relay of several sensors."""
+"""Sockets that others connect to over ZeroMQ: of whoever publishes (the sink `zmq`, the relay of several
+sensors), and of whoever takes commands."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import errno
 import socket as system_socket
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import zmq
@@ -16,9 +18,9 @@ from tactflow.files import expanded, files_left
 from tactflow.keys import DOMAIN, WrongKeysError, secure_publisher, subscribers_folder
 from tactflow.view.address import is_loopback
 
-LONGEST_SUBSCRIPTION = 4096
-"""Bytes of a subscription: topics have some twenty. ZeroMQ keeps subscriptions in a tree and takes a step on
-the stack for each of their bytes: one of a megabyte ends the process."""
+LONGEST_REQUEST = 4096
+"""Bytes of a subscription or a command, which have some twenty. ZeroMQ keeps subscriptions in a tree and
+takes a step on the stack for each of their bytes: one of a megabyte ends the process."""
 MOST_SUBSCRIBED = 1 << 18
 """Bytes that all different subscriptions may have together, thousands of topics. ZeroMQ takes some 50 times
 as much memory for them (600 MB for 12 MB, measured)."""
@@ -35,17 +37,16 @@ LOOPBACK_INTERFACES = frozenset({"lo", "lo0"})
 
 
 class FloodError(Exception):
-    """Subscribers have taken more than they may; says what."""
+    """Those who connect have taken more than they may; says what."""
 
 
-class Publisher:
-    """An XPUB socket that is bound, and all that belongs to it.
+class BoundSocket:
+    """A socket that is bound, with a context and an authenticator of its own.
 
     Parameters
     ----------
-    endpoint : address to bind.
-    backlog : messages that may wait for each subscriber.
-    send_buffer : of the kernel for each, bytes.
+    kind : of the socket, as ZeroMQ counts them. endpoint : address to bind.
+    options : ZeroMQ's number of an option -> its value.
     keys : the publisher's folder as `tactflow keys new` makes it: only who has a key there is admitted, and
         all is encrypted. None admits everybody who can reach the address.
 
@@ -60,10 +61,13 @@ class Publisher:
     endpoint : the real address, where a port was to be chosen.
     """
 
-    def __init__(self, endpoint: str, backlog: int, send_buffer: int, keys: str | None = None) -> None:
-        _refuse_taken_path(endpoint)
-        self._backlog = backlog
-        self._send_buffer = send_buffer
+    hint = ""
+    """What to try where the address is taken."""
+
+    def __init__(self, kind: int, endpoint: str, options: Mapping[int, int], keys: str | None = None) -> None:
+        _refuse_taken_path(endpoint, self.hint)
+        self._kind = kind
+        self._options = dict(options)
         self._keys = keys
         self._open(endpoint)
         self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -71,15 +75,14 @@ class Publisher:
     def _open(self, endpoint: str) -> None:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
-        self._subscribed = 0
         self._look_at_files = 0.0
-        self.socket = socket = self._context.socket(zmq.XPUB)
-        socket.sndhwm = self._backlog
-        socket.setsockopt(zmq.SNDBUF, self._send_buffer)
-        socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_SUBSCRIPTION)
+        self.socket = socket = self._context.socket(self._kind)
+        socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_REQUEST)
         socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
         socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, KEEPALIVE_S)
+        for option, value in self._options.items():
+            socket.setsockopt(option, value)
         try:
             if self._keys is not None:
                 self._ask_for_keys(expanded(self._keys))
@@ -89,7 +92,7 @@ class Publisher:
             raise StageError(f"keys: {error}") from error
         except zmq.ZMQError as error:
             self.close(0)
-            raise StageError(_bind_problem(endpoint, error)) from error
+            raise StageError(_bind_problem(endpoint, error, self.hint)) from error
 
     def _ask_for_keys(self, folder: Path) -> None:
         secure_publisher(self.socket, folder)
@@ -98,28 +101,19 @@ class Publisher:
         self._authenticator.start()
         self._authenticator.configure_curve(domain=DOMAIN, location=allowed)
 
-    def next_event(self) -> bytes | None:
-        """The next subscription, 1 and the beginning of what is wanted, or its end, 0 and the same; or None.
-
-        Never waits.
+    def refuse_crowd(self) -> None:
+        """Look, not too often, whether connections leave enough files to the run.
 
         Raises
         ------
         FloodError
-            If all subscriptions together are too long, or connections take too many files: `renew` ends it.
+            If they do not: `renew` ends it.
         """
         now = time.monotonic()
         if now > self._look_at_files:
             self._look_at_files = now + FILES_EVERY
             if files_left() < FEWEST_FILES:
                 raise FloodError("too many connections")
-        if not int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            return None
-        event = self.socket.recv(zmq.NOBLOCK)
-        self._subscribed += (len(event) - 1) * (1 if event[:1] == b"\x01" else -1)
-        if self._subscribed > MOST_SUBSCRIBED:
-            raise FloodError("too many subscriptions")
-        return event
 
     def renew(self) -> None:
         """Disconnect everybody, who may come again, and give back what they took.
@@ -141,6 +135,47 @@ class Publisher:
         self._context.term()
 
 
+class Publisher(BoundSocket):
+    """An XPUB socket that is bound.
+
+    endpoint, keys : as of `BoundSocket`. backlog : messages that may wait for each subscriber.
+    send_buffer : of the kernel for each, bytes.
+    """
+
+    hint = (
+        "another tactflow run, or another program, publishes there. End it, choose another address "
+        "(--set sinks.zmq.endpoint=tcp://127.0.0.1:5557) or publish nothing (--set sinks.zmq=null)"
+    )
+
+    def __init__(self, endpoint: str, backlog: int, send_buffer: int, keys: str | None = None) -> None:
+        self._subscribed = 0
+        super().__init__(zmq.XPUB, endpoint, {zmq.SNDHWM: backlog, zmq.SNDBUF: send_buffer}, keys)
+
+    def next_event(self) -> bytes | None:
+        """The next subscription, 1 and the beginning of what is wanted, or its end, 0 and the same; or None.
+
+        Never waits.
+
+        Raises
+        ------
+        FloodError
+            If all subscriptions together are too long, or connections take too many files: `renew` ends it.
+        """
+        self.refuse_crowd()
+        if not int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            return None
+        event = self.socket.recv(zmq.NOBLOCK)
+        self._subscribed += (len(event) - 1) * (1 if event[:1] == b"\x01" else -1)
+        if self._subscribed > MOST_SUBSCRIBED:
+            raise FloodError("too many subscriptions")
+        return event
+
+    def renew(self) -> None:
+        """As of `BoundSocket`; nobody has subscribed then."""
+        self._subscribed = 0
+        super().renew()
+
+
 def is_reachable(endpoint: str) -> bool:
     """Whether other machines can reach an address.
 
@@ -154,7 +189,7 @@ def is_reachable(endpoint: str) -> bool:
     return not (scheme == "tcp" and (is_loopback(host) or host in LOOPBACK_INTERFACES))
 
 
-def _refuse_taken_path(endpoint: str) -> None:
+def _refuse_taken_path(endpoint: str, hint: str) -> None:
     """ZeroMQ deletes whatever stands at the path of an ipc address, even one that somebody listens at."""
     path = Path(endpoint.removeprefix("ipc://"))
     if sys.platform == "win32" or not endpoint.startswith("ipc://") or not path.exists():
@@ -167,16 +202,12 @@ def _refuse_taken_path(endpoint: str) -> None:
         except OSError:
             # Left behind by a run that was killed.
             return
-    raise StageError(_bind_problem(endpoint, zmq.ZMQError(errno.EADDRINUSE)))
+    raise StageError(_bind_problem(endpoint, zmq.ZMQError(errno.EADDRINUSE), hint))
 
 
-def _bind_problem(endpoint: str, error: zmq.ZMQError) -> str:
+def _bind_problem(endpoint: str, error: zmq.ZMQError, hint: str) -> str:
     if error.errno == errno.EADDRINUSE:
-        return (
-            f"{endpoint} is in use: another tactflow run, or another program, publishes there. End it, "
-            "choose another address (--set sinks.zmq.endpoint=tcp://127.0.0.1:5557) or publish nothing "
-            "(--set sinks.zmq=null)"
-        )
+        return f"{endpoint} is in use: {hint}"
     return (
         f"{endpoint} cannot be bound: {error.strerror}; required an address of this machine such as "
         "tcp://127.0.0.1:5556, tcp://*:5556 or ipc:///tmp/tactflow"

@@ -41,12 +41,16 @@ def files_read(params: BaseModel, directory: Path) -> set[FileId]:
     ...     found == {file_id(file.name)}
     True
     """
-    found = set()
+    found = {file_id(path) for path in files_named(params, directory)}
+    return {identity for identity in found if identity is not None}
+
+
+def files_named(params: BaseModel, directory: Path) -> Iterator[Path]:
+    """Every path that parameters may mean: each text in them, as `files_read` takes it."""
     for text in _texts(params.model_dump()):
         for name in {text, text.partition("?")[0]} - {""}:
             path = expanded(_folder_of_pattern(name))
-            found |= {file_id(path), file_id(directory / path)}
-    return {identity for identity in found if identity is not None}
+            yield from (path, directory / path)
 
 
 def _texts(value: Any) -> Iterator[str]:

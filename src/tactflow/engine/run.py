@@ -157,6 +157,7 @@ class Runner:
     def fail(self, error: TactflowError, cause: BaseException | None = None) -> None:
         """Record the error that ends the run (the first one counts) and stop capturing."""
         if cause is not None:
+            error.__cause__ = cause
             logger.debug("%s", "".join(traceback.format_exception(cause)))
         with self._lock:
             if self._error is None:

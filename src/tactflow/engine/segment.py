@@ -227,7 +227,7 @@ class Segment:
                 failure = StageError(
                     f"{failure}\n  (the budget of {policy.budget} skipped frames is used up)"
                 )
-            self.run.fail(failure)
+            self.run.fail(failure, error)
             raise NodeFailedError
 
     def forward(self, tick: TickState) -> None:

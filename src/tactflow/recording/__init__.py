@@ -17,14 +17,11 @@ adds it for programs that insist on one.
 
 from __future__ import annotations
 
-import importlib.util
+from tactflow.extras import missing
 
 NEEDED = ("mcap", "zstandard")
 
 
 def missing_packages() -> str | None:
     """Why recordings can be neither written nor read here and what to do about it, or None."""
-    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-    if not missing:
-        return None
-    return f"recordings need {' and '.join(missing)}: pip install 'tactflow[record]'"
+    return missing("recordings", "record", NEEDED)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol
 
 import orjson
 
-from tactflow.engine.contract import Source
+from tactflow.commands import Commands, RefusedError
 from tactflow.engine.control import Control
 from tactflow.engine.stats import Durations
 
@@ -33,6 +33,9 @@ Chosen by hand."""
 
 REST_MS = 250
 """A page whose machine is full may ask for at most this long until its next frame. Chosen by hand."""
+
+SHOWN_IF_ASKED = frozenset({"field", "surface"})
+"""What is sent only while a page shows it."""
 
 MAX_PAGES = 16
 """More pages than this at a time are turned away. Chosen by hand."""
@@ -65,21 +68,19 @@ class Packet(NamedTuple):
     published: float
 
 
-class BadCommandError(Exception):
-    """A page asked for something that does not exist, or that is not possible now; says why."""
-
-
 class Page:
     """One open page.
 
-    credit : it has asked for the next frame. sent, answered : numbers of the last frame it was sent, and of
-    the last it has shown. captured, sent_at : `time.perf_counter` of the one sent, s. screen_s : times from
-    capture to screen of the last frames, s. wake : there is something to send. ended : it is gone.
+    credit : it has asked for the next frame. shows : those of `SHOWN_IF_ASKED` that it shows. sent,
+    answered : numbers of the last frame it was sent, and of the last it has shown. captured, sent_at :
+    `time.perf_counter` of the one sent, s. screen_s : times from capture to screen of the last frames, s.
+    wake : there is something to send. ended : it is gone.
     """
 
     def __init__(self, wire: Wire) -> None:
         self.wire = wire
         self.credit = True
+        self.shows: frozenset[str] = frozenset()
         self.sent = 0
         self.answered = 0
         self.captured = 0.0
@@ -104,13 +105,15 @@ class Page:
 class Hub:
     """The pages that are open now.
 
-    `publish`, `wanted`, `owed` and `counters` may be used from any thread, the rest in the server's loop.
+    `publish`, `wanted`, `owed`, `shown` and `counters` may be used from any thread, the rest in the server's
+    loop.
 
     Parameters
     ----------
     control : handle on the run; None shows frames without any control over it.
     sensor : name of the sensor this run serves.
     neighbours : tells the ports of other sensors' pages by their names.
+    again : publishes the last frame once more. Called in a thread of its own.
     """
 
     def __init__(
@@ -118,15 +121,20 @@ class Hub:
         control: Control | None,
         sensor: str,
         neighbours: Callable[[], Mapping[str, int]] = dict,
+        again: Callable[[], None] = lambda: None,
     ) -> None:
         self.control = control
+        self._run = Commands(control)
         self.sensor = sensor
         self.neighbours = neighbours
+        self._again = again
         self.run_id = secrets.token_hex(8)
         self.wanted = False
         """Whether a page has credit."""
         self.owed = False
         """Whether somebody asked for one single frame: it is shown however soon it comes."""
+        self.shown: frozenset[str] = frozenset()
+        """Those of `SHOWN_IF_ASKED` that some page shows."""
         self.pages: set[Page] = set()
         self._someone = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -136,11 +144,11 @@ class Hub:
         self._screen = Durations()
         self._end: str | None = None
         self._commands: Mapping[str, Callable[[Any], Any]] = {
-            "pause": self._pause,
-            "step": self._step,
-            "reference": self._reference,
-            "record": self._record,
-            "stop": self._stop,
+            "pause": lambda value: self._run.pause(value is True),
+            "step": lambda _: self._step(),
+            "reference": lambda _: self._run.take_reference(),
+            "record": lambda value: self._run.record(value is True),
+            "stop": lambda _: self._run.stop(),
         }
 
     # -- from other threads -------------------------------------------------------------------------------
@@ -149,20 +157,20 @@ class Hub:
         """Tell which loop serves the pages."""
         self._loop = loop
 
-    def publish(self, header: bytes, jpeg: bytes, captured: float) -> None:
+    def publish(self, header: bytes, pixels: bytes, captured: float) -> None:
         """Offer a frame to every page. From one thread, any; never waits.
 
         Parameters
         ----------
         header : JSON object that describes the frame, without its last brace.
-        jpeg : the picture.
+        pixels : heights of a surface, if the header describes one, then the picture as JPEG.
         captured : `time.perf_counter` at its capture, s.
         """
         self.owed = False
         self._number += 1
         header = header + b',"number":%d}' % self._number
-        # A little-endian length, the JSON header, the picture.
-        data = struct.pack("<I", len(header)) + header + jpeg
+        # A little-endian length, the JSON header, the heights and the picture.
+        data = struct.pack("<I", len(header)) + header + pixels
         packet = Packet(self._number, data, captured, time.perf_counter())
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._take, packet)
@@ -212,7 +220,7 @@ class Hub:
 
     def end(self) -> None:
         """The run is over: tell every page how it ended and let it go."""
-        snapshot = self._snapshot()
+        snapshot = self._run.snapshot()
         self._end = str(snapshot.get("end", "eos"))
         for page in self.pages:
             page.post("stats", _text(type="stats", sensor=self.sensor, screen_ms=None, run=snapshot))
@@ -230,7 +238,7 @@ class Hub:
         listeners = [page for page in self.pages if not page.stuck]
         if not listeners:
             return
-        snapshot = self._snapshot()
+        snapshot = self._run.snapshot()
         state = self.state()
         for page in listeners:
             delays = sorted(page.screen_s)
@@ -243,14 +251,13 @@ class Hub:
         """The message that says what the run is doing, and which buttons work (null) or why not."""
         control = self.control
         source = None if control is None else control.source
-        paused = bool(control and control.paused)
-        condition = None if source is None else source.state
-        recorder = None if control is None else control.recorder()
+        now = self._run.state()
+        paused, condition = now["paused"], now["source"]
         return _text(
             type="state",
             sensor=self.sensor,
             paused=paused,
-            recording=bool(recorder is not None and recorder.recording),
+            recording=now["recording"],
             end=self._end,
             neighbours=self.neighbours(),
             source={
@@ -276,6 +283,7 @@ class Hub:
 
     def _recount(self) -> None:
         self.wanted = any(page.credit for page in self.pages)
+        self.shown = frozenset().union(*(page.shows for page in self.pages))
 
     async def _send(self, page: Page) -> None:
         while True:
@@ -308,8 +316,18 @@ class Hub:
                 return
             if "ack" in message:
                 self._acknowledged(page, message)
+            elif "show" in message:
+                await self._show(page, message["show"])
             else:
                 await self._command(page, message)
+
+    async def _show(self, page: Page, asked: Any) -> None:
+        page.shows = SHOWN_IF_ASKED.intersection(map(str, asked if isinstance(asked, list) else ()))
+        before = self.shown
+        self._recount()
+        # No further frame comes that would have it.
+        if self.shown - before and self.control is not None and self.control.paused:
+            await asyncio.to_thread(self._again)
 
     def _acknowledged(self, page: Page, message: Mapping[str, Any]) -> None:
         if message["ack"] != page.sent or page.sent == page.answered:
@@ -336,68 +354,25 @@ class Hub:
         name = message.get("do")
         try:
             if not isinstance(name, str) or name not in self._commands:
-                raise BadCommandError(f"there is no command {name!r}")
+                raise RefusedError(f"there is no command {name!r}")
             refusal = self._refusal(name)
             if refusal is not None:
-                raise BadCommandError(refusal)
+                raise RefusedError(refusal)
             # Starting or ending a recording may touch the disk; the other commands return at once.
             await asyncio.to_thread(self._commands[name], message.get("value"))
         except Exception as error:
-            if not isinstance(error, BadCommandError):
+            if not isinstance(error, RefusedError):
                 log.warning("view: %s failed: %s: %s", name, type(error).__name__, error)
             page.post("note", _text(type="note", text=str(error) or type(error).__name__))
         self.tell_state()
 
     def _refusal(self, name: str) -> str | None:
         """Why a command is not possible now, or None."""
-        control = self.control
-        if control is None or self._end is not None:
-            return "the run cannot be controlled" if control is None else "the run has ended"
-        source = control.source
-        if name == "step":
-            if source is not None and source.live:
-                return "a live source cannot be stepped"
-            return None if control.paused else "pause first"
-        if name == "reference" and (source is None or type(source).retake is Source.retake):
-            return "this source cannot take a new reference"
-        if name == "record" and control.recorder() is None:
-            return "no record sink in this pipeline"
-        return None
+        return "the run has ended" if self._end is not None else self._run.refusal(name)
 
-    def _pause(self, value: Any) -> None:
-        assert self.control is not None
-        self.control.pause(value is True)
-
-    def _step(self, _: Any) -> None:
-        assert self.control is not None
+    def _step(self) -> None:
         self.owed = True
-        self.control.step()
-
-    def _reference(self, _: Any) -> None:
-        assert self.control is not None
-        self.control.retake_reference()
-
-    def _record(self, value: Any) -> None:
-        assert self.control is not None
-        recorder = self.control.recorder()
-        if recorder is not None:
-            if value is True:
-                recorder.start_recording()
-            else:
-                recorder.stop_recording()
-
-    def _stop(self, _: Any) -> None:
-        assert self.control is not None
-        self.control.stop()
-
-    def _snapshot(self) -> dict[str, Any]:
-        if self.control is None:
-            return {}
-        try:
-            return dict(self.control.snapshot())
-        except RuntimeError:
-            # The run is still opening its sinks: its tables grew while they were read. The next one is whole.
-            return {}
+        self._run.step()
 
 
 def _text(**fields: Any) -> str:

@@ -4,8 +4,8 @@ An elastic gel answers to a press in one of two ways. A layer that is thin compa
 of springs: the force is proportional to the volume that is indented in the contact (Winkler). In a deep one
 it is proportional to depth times width, for a ball (Hertz) as for a flat punch. A real gel lies between the
 two, and so do linear combinations of both. The area is there for objects that are softer than the gel, which
-spread instead of sinking in. Where heights are not known, the change of the light stands for them: under a ball the integral of
-the slopes is proportional to Hertz's force.
+spread instead of sinking in. Where heights are not known, the change of the light stands for them: under a
+ball the integral of the slopes is proportional to Hertz's force.
 
 Sideways it is the same: a thin layer answers with the integral of the shear over the contact, a deep one with
 shear times width (Mindlin).

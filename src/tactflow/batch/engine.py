@@ -1,0 +1,69 @@
+"""The seam between a batch and what it runs on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from tactflow.batch.task import Outcome, Task
+
+
+@dataclass(frozen=True, slots=True)
+class Headway:
+    """How far a worker is. task : None while it has none. total : frames, None if unknown."""
+
+    worker: str
+    task: Task | None
+    frames: int = 0
+    total: int | None = None
+
+
+class Engine(Protocol):
+    """Works on tasks, several at a time. Every task that is submitted comes back as one outcome.
+
+    description : for people. window : tasks that keep it busy.
+    """
+
+    description: str
+
+    @property
+    def window(self) -> int: ...
+
+    def submit(self, task: Task) -> None:
+        """Begin a task as soon as a worker is free.
+
+        Raises
+        ------
+        StageError : the engine is gone.
+        """
+        ...
+
+    def finished(self, timeout: float) -> Sequence[Outcome]:
+        """What has ended since the last call; waits up to `timeout` seconds for something.
+
+        Raises
+        ------
+        StageError : the engine is gone; what it had is lost, and may be done again.
+        """
+        ...
+
+    def headway(self) -> Sequence[Headway]:
+        """What each worker is doing, as far as it is known."""
+        ...
+
+    def close(self, *, kill: bool) -> None:
+        """End the workers. kill : at once, whatever they are doing."""
+        ...
+
+
+def died(task: Task, how: str) -> Outcome:
+    """The outcome of a task whose worker died, where nobody tries it again."""
+    return Outcome(task.recording.source, task.recording.name, "failed", error=how)
+
+
+ThreadLimits = Mapping[str, str]
+ONE_THREAD: ThreadLimits = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+"""Environment of a worker: as many workers as processors, so one thread for each library."""

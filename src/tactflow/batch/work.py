@@ -1,0 +1,250 @@
+"""Works on one recording, in whatever process an engine has chosen for it."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import hashlib
+import logging
+import math
+import os
+import socket
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import orjson
+
+from tactflow.api import make_runner
+from tactflow.batch.folder import Folder, remove
+from tactflow.batch.keys import (
+    digest_of,
+    fingerprint,
+    input_digest,
+    pipeline_digest,
+    result_key,
+    versions,
+)
+from tactflow.batch.summary import Summary, with_summary
+from tactflow.batch.task import Format, Outcome, PipelineRequest, Report, Task, result_name
+from tactflow.config.load import load_pipeline
+from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
+from tactflow.engine.graph import Pipeline
+from tactflow.engine.run import Progress
+
+DEADLY = 2
+"""Workers that a recording may kill before it is set aside."""
+_MOST_NOTES = 5
+"""Warnings that are kept of one recording. Chosen by hand."""
+
+
+def work(task: Task, report: Report = lambda _done, _total: None) -> Outcome:
+    """Run the pipeline over one recording, unless its result is there.
+
+    report : told how far it is. Never raises a TactflowError: what is wrong is in the outcome.
+    """
+    began = time.time()
+    blank = Outcome(
+        task.recording.source,
+        task.recording.name,
+        "failed",
+        pipeline=task.pipeline.digest,
+        started=began,
+        worker=f"{socket.gethostname()}:{os.getpid()}",
+        versions=versions(),
+    )
+    try:
+        with attempt(task) as attempts:
+            blank = replace(blank, attempts=attempts)
+            if attempts > DEADLY:
+                what = f"it killed its worker {DEADLY} times. Is memory short, or the file harmful?"
+                outcome = replace(blank, status="set aside", error=what, attempts=DEADLY)
+            else:
+                outcome = _result(task, blank, report)
+    except TactflowError as error:
+        outcome = replace(blank, error=str(error), disk_full=_is_disk_full(error))
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        what = f"{type(error).__name__}: {error} ({place.filename}:{place.lineno})"
+        outcome = replace(blank, error=what, disk_full=_is_disk_full(error))
+    return replace(outcome, seconds=0.0 if outcome.reused else time.time() - began)
+
+
+@contextmanager
+def attempt(task: Task) -> Iterator[int]:
+    """Count that a worker begins a recording; the count is forgotten when the worker is through with it."""
+    name = hashlib.sha256(task.recording.source.encode()).hexdigest()[:16]
+    marks = Path(task.scratch, f"{name}.attempts")
+    with marks.open("ab") as file:
+        file.write(b"x")
+    attempts = marks.stat().st_size
+    try:
+        yield attempts
+    finally:
+        with suppress(OSError):
+            marks.unlink()
+
+
+def _result(task: Task, blank: Outcome, report: Report) -> Outcome:
+    """The outcome of a recording: that of an earlier call if its result is there, else of a run."""
+    path = task.recording.path
+    try:
+        before = None if path is None else fingerprint(path)
+        read = input_digest(task.recording)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+    key = result_key(read, task.pipeline.digest)
+    folder = Folder(Path(task.folder))
+    there = folder.outcome_of(key)
+    if there is not None and folder.is_whole(there, verify=task.verify):
+        return replace(there.of(task.recording), input=before, reused=True, started=blank.started)
+    found = replace(blank, key=key, input=before, input_digest=read)
+    found, summary = _run(task, found, report)
+    if path is not None and fingerprint(path) != before:
+        raise SourceError(f"{path}: was changed while it was read; call again")
+    _commit(task, folder, found, summary)
+    return found
+
+
+def _run(task: Task, blank: Outcome, report: Report) -> tuple[Outcome, Summary]:
+    """Run the pipeline into a file of the scratch folder, and move that into its place."""
+    name = result_name(task.recording, blank.key, task.format)
+    unfinished = Path(task.scratch, f"{os.getpid()}-{name}")
+    summary = Summary()
+    pipeline = _for_recording(task, unfinished)
+    runner = make_runner(with_summary(pipeline, summary))
+
+    def progress(now: Progress) -> None:
+        report(now.frames, None if runner.source is None else runner.source.total)
+
+    try:
+        with _notes() as notes:
+            result = runner.run(progress, interval_s=0.25)
+        if result.failure is not None:
+            raise result.failure
+        written, digest = fingerprint(unfinished), digest_of(unfinished)
+        place = Path(task.folder, "results", name)
+        if place.is_dir():
+            # Of a call that ended before it could say that this is complete; no folder replaces another.
+            remove(place)
+        unfinished.replace(place)
+    finally:
+        with suppress(OSError):
+            remove(unfinished)
+    outcome = replace(
+        blank,
+        status="done",
+        result=name,
+        result_file=written,
+        result_digest=digest,
+        frames=result.stats["frames"],
+        dropped=result.stats["dropped"],
+        duration=summary.duration,
+        contacts=summary.contacts,
+        touching=summary.touching,
+        largest=summary.largest,
+        notes=tuple(notes),
+    )
+    return outcome, summary
+
+
+def _commit(task: Task, folder: Folder, outcome: Outcome, summary: Summary) -> None:
+    """Store what is told of a result: only what has this is complete."""
+    record = {"outcome": asdict(outcome), **summary.finished()}
+    unfinished = Path(task.scratch, f"{os.getpid()}-{outcome.key}.json")
+    try:
+        unfinished.write_bytes(orjson.dumps(record))
+        unfinished.replace(folder.records / f"{outcome.key}.json")
+    finally:
+        with suppress(OSError):
+            unfinished.unlink()
+
+
+@functools.lru_cache(maxsize=4)
+def pipeline_for(request: PipelineRequest, format_: Format) -> tuple[Pipeline, str]:
+    """The pipeline with one sink, that of the results, and its digest.
+
+    A sink of that kind in the file is used as it stands there, but for where it writes.
+
+    Raises
+    ------
+    ConfigError : the file is wrong, or its source is no stage that takes a `source`.
+    """
+    loaded = load_pipeline(Path(request.file), request.overrides, sensor=request.sensor)
+    if not any(node.component.name == format_ for node in loaded.sinks):
+        extra = {f"--{format_}": {"path": os.devnull}}
+        loaded = load_pipeline(Path(request.file), request.overrides, extra, sensor=request.sensor)
+    sink = next(node.id for node in loaded.sinks if node.component.name == format_)
+    kept = {id_: n for id_, n in loaded.nodes.items() if n.component.kind != "sink" or id_ == sink}
+    pipeline = replace(loaded, nodes=kept, opencv_threads=1)
+    if "source" not in pipeline.source.component.params.model_fields:
+        raise ConfigError(f"{pipeline.source.mark}: a batch needs a source with the parameter source")
+    return pipeline, pipeline_digest(pipeline)
+
+
+def _for_recording(task: Task, path: Path) -> Pipeline:
+    """The pipeline that reads this recording and writes to this path."""
+    pipeline, digest = pipeline_for(replace(task.pipeline, digest="", versions=()), task.format)
+    if digest != task.pipeline.digest:
+        here, there = versions(), dict(task.pipeline.versions)
+        other = [
+            f"{name} {here.get(name)} instead of {there[name]}"
+            for name in there
+            if here.get(name) != there[name]
+        ]
+        raise StageError(
+            f"the worker {socket.gethostname()} would compute something else: "
+            + (", ".join(other) or f"{task.pipeline.file}, or a file that it names, has changed; call again")
+        )
+    nodes = dict(pipeline.nodes)
+    source, (sink,) = pipeline.source, pipeline.sinks
+    wanted = {"source": task.recording.source, "realtime": False}
+    read = source.params.changed(**{k: v for k, v in wanted.items() if k in type(source.params).model_fields})
+    nodes[source.id] = replace(source, params=read)
+    # Not in parts of so many seconds each: the same recording shall give the same files.
+    flush = {"flush": math.inf} if task.format == "parquet" else {}
+    nodes[sink.id] = replace(sink, params=sink.params.changed(path=str(path), overwrite=True, **flush))
+    return replace(pipeline, nodes=nodes, settings=_as_run(pipeline, wanted, sink.component.name))
+
+
+def _as_run(pipeline: Pipeline, source: Mapping[str, Any], sink: str) -> Mapping[str, Any]:
+    """The settings, for who finds them in a result: of what was run."""
+    stages = dict(pipeline.settings["stages"])
+    stages[pipeline.source.id] = {**(stages[pipeline.source.id] or {}), **source}
+    return {**pipeline.settings, "stages": stages, "sinks": {sink: {}}}
+
+
+def _is_disk_full(error: BaseException | None) -> bool:
+    """Whether that is why, however deep it lies."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+class _Notes(logging.Handler):
+    """Keeps the first warnings."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if len(self.texts) < _MOST_NOTES:
+            self.texts.append(record.getMessage())
+
+
+@contextmanager
+def _notes() -> Iterator[list[str]]:
+    """What the run warns of."""
+    logger, handler = logging.getLogger("tactflow"), _Notes()
+    logger.addHandler(handler)
+    try:
+        yield handler.texts
+    finally:
+        logger.removeHandler(handler)

@@ -1,0 +1,59 @@
+"""How results came about, for files that outlive the run: versions, source, pipeline, calibration."""
+
+from __future__ import annotations
+
+import logging
+import platform
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from tactflow import __version__
+from tactflow.engine.control import Control
+from tactflow.redaction import without_secrets
+from tactflow.vision import compiled
+
+log = logging.getLogger("tactflow")
+
+
+def facts(sensor: str, control: Control | None) -> dict[str, str]:
+    """Versions, machine, sensor and, of a run, the source: name -> text.
+
+    >>> facts("main", None)["sensor"]
+    'main'
+    """
+    told = {
+        "tactflow": __version__,
+        "numpy": np.__version__,
+        "numba": compiled.numba_version(),
+        "opencv": cv2.__version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "sensor": sensor,
+    }
+    if control is not None:
+        told["source"] = str((control.source and control.source.description) or "")
+    return told
+
+
+def texts(control: Control | None) -> dict[str, str]:
+    """The files of a run, without passwords: name -> text.
+
+    `pipeline.yaml` has every override, `pipeline.original.yaml` is the file as it was written,
+    `calibration.yaml` the sensor's calibration, where it has one.
+    """
+    if control is None:
+        return {}
+    pipeline = control.pipeline
+    found = {"pipeline.yaml": without_secrets(yaml.safe_dump(dict(pipeline.settings), sort_keys=False))}
+    files = {"pipeline.original.yaml": Path(pipeline.file)}
+    if pipeline.calibration is not None:
+        files["calibration.yaml"] = pipeline.calibration
+    for name, file in files.items():
+        try:
+            found[name] = without_secrets(file.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            log.debug("%s: not kept: %s", file, error)
+    return found

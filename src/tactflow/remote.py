@@ -1,0 +1,160 @@
+"""Control of a run in another process, where its ZeroMQ sink takes commands (`sinks.zmq.control`).
+
+Nothing here needs OpenCV or the rest of tactflow: over plain ZeroMQ, a REQ socket sends one JSON object,
+`{"do": "pause"}`, and receives one.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import orjson
+import zmq
+
+from tactflow.client import REFUSALS
+from tactflow.files import expanded
+from tactflow.keys import WrongKeysError, secure_subscriber
+
+DEFAULT_ENDPOINT = "tcp://127.0.0.1:5557"
+"""Where `tactflow control` looks for a run that takes commands."""
+LONGEST_ANSWER = 1 << 20
+"""Bytes of an answer at most; statistics have some ten thousand. Chosen by hand."""
+
+Answer = dict[str, Any]
+
+
+class RemoteControl:
+    """Controls a run in another process; a context manager. Belongs to one thread at a time.
+
+    Each method waits for the answer of the run and returns it: `message`, what was done, in words; `state`
+    with `sensor`, `paused`, `recording`, `source`; `path` for recordings; `stats` for statistics.
+
+    Parameters
+    ----------
+    endpoint : address that the run takes commands at. timeout : how long to wait for an answer, s.
+    keys : the subscriber's folder that `tactflow keys new` makes, where the run asks for keys.
+
+    Raises
+    ------
+    ValueError
+        From the constructor: the endpoint is no address, the folder has no keys, the timeout is not positive.
+    TimeoutError
+        From every method: no answer came. It is not known whether the command was carried out.
+    PermissionError
+        From every method: the run does not admit us: it asks for keys, or for others.
+    RuntimeError
+        From every method: the run says that it is not possible, and why.
+
+    Examples
+    --------
+    >>> with RemoteControl("tcp://127.0.0.1:5557", timeout=0.1) as run:
+    ...     try:
+    ...         print(run.take_reference()["message"])
+    ...     except TimeoutError as error:
+    ...         print(error)
+    no answer from tcp://127.0.0.1:5557 within 0.1 s; is tactflow running with sinks.zmq.control set to it?
+    """
+
+    def __init__(
+        self, endpoint: str = DEFAULT_ENDPOINT, timeout: float = 5.0, keys: str | Path | None = None
+    ) -> None:
+        if not 0 < timeout < math.inf:
+            raise ValueError(f"timeout: required a number of seconds above 0, got {timeout}")
+        self.endpoint = endpoint
+        self.timeout = timeout
+        self._has_keys = keys is not None
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.REQ)
+        self._socket.linger = 0
+        # After a timeout another command may be sent, and a late answer is not taken for its.
+        self._socket.setsockopt(zmq.REQ_RELAXED, 1)
+        self._socket.setsockopt(zmq.REQ_CORRELATE, 1)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_ANSWER)
+        self._refused = self._socket.get_monitor_socket(REFUSALS)
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self._refused, zmq.POLLIN)
+        try:
+            if keys is not None:
+                secure_subscriber(self._socket, expanded(str(keys)))
+            self._socket.connect(endpoint)
+        except WrongKeysError:
+            self.close()
+            raise
+        except zmq.ZMQError as error:
+            self.close()
+            raise ValueError(
+                f"required an address such as {DEFAULT_ENDPOINT}, got {endpoint!r}: {error.strerror}"
+            ) from None
+
+    def ping(self) -> Answer:
+        """Whether the run is there."""
+        return self.ask("ping")
+
+    def stats(self) -> Answer:
+        """Its statistics so far, under `stats`, as in the statistics file."""
+        return self.ask("stats")
+
+    def take_reference(self) -> Answer:
+        """Have the next frame taken as the reference: how the gel looks untouched."""
+        return self.ask("take_reference")
+
+    def pause(self) -> Answer:
+        """Hold capturing: a recording waits, a live source's frames are let go."""
+        return self.ask("pause")
+
+    def resume(self) -> Answer:
+        """Go on."""
+        return self.ask("resume")
+
+    def record_start(self) -> Answer:
+        """Begin a recording; `path` is its file. The pipeline must have a sink `record`."""
+        return self.ask("record_start")
+
+    def record_stop(self) -> Answer:
+        """Finish the recording; nothing if there is none."""
+        return self.ask("record_stop")
+
+    def ask(self, command: str) -> Answer:
+        """Send a command by its name, and wait for the answer."""
+        self._socket.send(orjson.dumps({"do": command}), zmq.NOBLOCK)
+        ready = dict(self._poller.poll(math.ceil(self.timeout * 1000)))
+        if self._refused in ready:
+            what = "does not admit these keys" if self._has_keys else "asks for keys, or is no tactflow"
+            raise PermissionError(f"{self.endpoint} {what}")
+        if not ready:
+            known = ", and are these keys for it" if self._has_keys else ""
+            raise TimeoutError(
+                f"no answer from {self.endpoint} within {self.timeout:g} s; is tactflow running with "
+                f"sinks.zmq.control set to it{known}?"
+            )
+        try:
+            answer: Answer = orjson.loads(self._socket.recv())
+            done, message = answer["ok"], answer["message"]
+        except (ValueError, TypeError, KeyError):
+            raise RuntimeError(f"{self.endpoint} does not answer as tactflow does") from None
+        if not done:
+            raise RuntimeError(str(message))
+        return answer
+
+    def close(self) -> None:
+        """Disconnect. May be called twice."""
+        if not self._socket.closed:
+            self._socket.disable_monitor()
+        self._refused.close(0)
+        self._socket.close()
+        self._context.term()
+
+    def __enter__(self) -> RemoteControl:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

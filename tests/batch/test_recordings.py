@@ -1,0 +1,72 @@
+"""Words of a command line become recordings, or a mistake that says what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tactflow.batch.recordings import find_recordings
+from tactflow.engine.errors import ConfigError
+
+
+@pytest.fixture
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in ("b/press-10.npy", "b/press-2.npy", "a/press-2.npy", "a/notes.md", "pictures/1.png", "x.dat"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def names(*words: str) -> list[str]:
+    return [one.name for one in find_recordings(words)]
+
+
+def test_a_folder_is_searched_and_one_of_pictures_is_a_recording(data: Path) -> None:
+    found = find_recordings([str(data)])
+    assert [one.name for one in found] == ["a/press-2.npy", "b/press-2.npy", "press-10.npy", "pictures"]
+    assert all(Path(one.source).is_absolute() for one in found)
+
+
+def test_each_recording_comes_once_however_it_is_named(data: Path) -> None:
+    assert names("b/press-2.npy", str(data / "b" / "press-2.npy"), "b") == ["press-2.npy", "press-10.npy"]
+
+
+def test_a_pattern_stands_for_what_matches_and_pictures_are_one_recording(data: Path) -> None:
+    assert names("*/press-2.npy") == ["a/press-2.npy", "b/press-2.npy"]
+    (one,) = find_recordings(["pictures/*.png"])
+    assert one.source.endswith("pictures/*.png")
+    assert one.path == data / "pictures"
+
+
+def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (data / "b" / "list.txt").write_text("# today\npress-2.npy  # the first\n\nsim:press?seed=3\n../x.dat\n")
+    monkeypatch.chdir("/")
+    assert names(str(data / "b" / "list.txt")) == ["press-2.npy", "sim:press?seed=3", "x.dat"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["b/press-3.npy"], "did you mean b/press-2.npy"),
+        (["nothing/*.mp4"], "no file matches"),
+        (["a/empty"], "no recording in this folder"),
+        (["0"], "is live"),
+        (["rtsp://camera/1"], "is live"),
+        (["pictures/1.png"], "name its folder"),
+        (["list.txt"], "there are no recordings"),
+    ],
+)
+def test_what_names_no_recording_is_said(data: Path, words: list[str], told: str) -> None:
+    (data / "a" / "empty").mkdir()
+    (data / "list.txt").write_text("# nothing\n")
+    with pytest.raises(ConfigError, match=told):
+        find_recordings(words)
+
+
+def test_all_mistakes_are_told_at_once(data: Path) -> None:
+    (data / "empty").mkdir()
+    with pytest.raises(ConfigError) as raised:
+        find_recordings(["no.npy", "none.npy", "empty"])
+    assert len(raised.value.mistakes) == 3

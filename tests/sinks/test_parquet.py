@@ -1,0 +1,248 @@
+"""The Parquet sink: the same numbers as the JSON lines, complete parts, clear errors."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame, Tick
+from tactflow.message import Results, message_schema
+from tactflow.sinks import parquet as parquet_module
+from tactflow.sinks.parquet import TABLES, Parquet
+from tactflow.vision.types import Depth, Scale, Slip
+from tests.clock import PATIENCE, until
+from tests.messages import build_message
+from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
+
+pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+
+import pyarrow.parquet as pq
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SCALE = Scale(0.05, 0.06, (0.0005, 0.0005), (150.0, 200.0))
+DEPTH = Depth(np.zeros((4, 3), np.float32), 0.4, 0.1, 3.2, None)
+SECOND = replace(CONTACT, area=12.0, angle=None, ellipse=None, hull=CONTACT.hull + 100)
+TWO = replace(CONTACT, separate=(CONTACT, SECOND))
+SLIP = Slip(slipping=True, stick_ratio=0.25)
+FOUND = [
+    Results(PROCESSED),
+    Results(PROCESSED, CONTACT, FLOW, MARKERS),
+    Results(PROCESSED, TWO, FLOW, MARKERS, SCALE, DEPTH, None, SLIP),
+    Results(PROCESSED, SECOND, replace(FLOW, mean=None), replace(MARKERS, stderr=np.zeros(3))),
+]
+"""What the columns hold: nothing, a contact, all there is, and some of it."""
+
+
+def tick(seq: int) -> Tick:
+    skipped = {"contact": "no_contact"} if seq % len(FOUND) == 0 else {}
+    return Tick(Frame("main", seq, seq / 30, PROCESSED), skipped)
+
+
+def opened(folder: Path, **params: Any) -> Parquet:
+    sink = Parquet(Parquet.Params(path=str(folder), **params))
+    sink.open()
+    return sink
+
+
+def write(sink: Parquet, seqs: range) -> list[dict[str, Any]]:
+    """Write frames; the messages about them."""
+    for seq in seqs:
+        sink.write(tick(seq), FOUND[seq % len(FOUND)])
+    return [build_message(tick(seq), FOUND[seq % len(FOUND)], detail=True) for seq in seqs]
+
+
+def rows(folder: Path, table: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(folder / table).to_pylist()
+    return found
+
+
+NAMES = {"size": ["width", "height"], "axes": ["major", "minor"], "shear": ["1", "2"]}
+
+
+def leaves(value: Any, *names: str) -> Iterator[tuple[str, Any]]:
+    """Every value of a part of a message that is there, with the name that its column must have."""
+    if isinstance(value, dict) and names[-1:] != ("skipped",):
+        for key, inner in value.items():
+            yield from leaves(inner, *names, key)
+    elif isinstance(value, list) and not isinstance(value[0], list):
+        for suffix, number in zip(NAMES.get(names[-1], ["x", "y"]), value, strict=True):
+            yield "_".join([*names, suffix]), number
+    elif value is not None:
+        yield "_".join(names), list(value.items()) if isinstance(value, dict) else value
+
+
+def test_the_tables_hold_what_the_messages_say_and_nothing_else(tmp_path: Path) -> None:
+    sink = opened(tmp_path)
+    messages = write(sink, range(8))
+    sink.close()
+    assert sink.counters() == {"frames": 8, "parts": 1}
+    frames = rows(tmp_path, "frames")
+    parts = ("schema", "contacts", "markers")
+    for row, message in zip(frames, messages, strict=True):
+        kept = {key: value for key, value in message.items() if key not in parts}
+        assert {name: value for name, value in row.items() if value is not None} == dict(leaves(kept))
+    contacts = rows(tmp_path, "contacts")
+    expected = [
+        {"seq": message["seq"], "contact": index} | dict(leaves(contact))
+        for message in messages
+        for index, contact in enumerate(message["contacts"])
+    ]
+    assert [{name: one for name, one in row.items() if one is not None} for row in contacts] == expected
+    expected = [
+        (message["seq"], index, *now, *(np.array(now) - origin), *origin, status, stderr)
+        for message in messages
+        for index, (origin, now, status, stderr) in enumerate(
+            zip(*(message["markers"] or {}).values(), strict=True)
+        )
+    ]
+    assert [tuple(row.values()) for row in rows(tmp_path, "markers")] == expected
+
+
+def test_every_value_of_the_message_has_a_column_with_its_description(tmp_path: Path) -> None:
+    sink = opened(tmp_path)
+    write(sink, range(1))
+    sink.close()
+    schema = pq.read_schema(tmp_path / "frames" / "part-00000.parquet")
+    described = message_schema()["$defs"]["_ContactModel"]["properties"]["depth_mm"]["description"]
+    assert schema.field("contact_depth_mm").metadata[b"description"].decode() == described
+    assert schema.metadata[b"schema"] == b"tactflow.frame/1"
+    assert {b"tactflow", b"numpy", b"opencv", b"sensor"} <= set(schema.metadata)
+
+
+def test_pandas_reads_the_same_numbers(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
+    sink = opened(tmp_path)
+    messages = write(sink, range(8))
+    sink.close()
+    frames = pandas.read_parquet(tmp_path / "frames").set_index("seq")
+    dots = pandas.read_parquet(tmp_path / "markers")
+    for message in messages:
+        row, contact = frames.loc[message["seq"]], message["contact"]
+        assert pandas.isna(row.contact_area) if contact is None else row.contact_area == contact["area"]
+        if contact is not None:
+            assert np.vstack(row.contact_hull).tolist() == contact["hull"]
+            position = dots[dots.seq == message["seq"]][["x", "y"]].to_numpy().tolist()
+            assert position == message["markers"]["position"]
+
+
+def test_a_part_is_written_at_the_interval_and_can_be_read_while_the_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 50.0
+    monkeypatch.setattr(parquet_module.time, "monotonic", lambda: now)
+    sink = opened(tmp_path, flush=10)
+    write(sink, range(3))
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    now = 60.0
+    write(sink, range(3, 4))
+    write(sink, range(4, 6))
+    assert [row["seq"] for row in rows(tmp_path, "frames")] == [0, 1, 2, 3]
+    sink.close()
+    assert [row["seq"] for row in rows(tmp_path, "frames")] == list(range(6))
+    assert sink.counters() == {"frames": 6, "parts": 2}
+
+
+def test_tables_are_refused_replaced_or_added_to(tmp_path: Path) -> None:
+    for settings, expected in (({}, [0, 1]), ({"append": True}, [0, 1, 0, 1]), ({"overwrite": True}, [0, 1])):
+        sink = opened(tmp_path, **settings)
+        write(sink, range(2))
+        sink.close()
+        assert [row["seq"] for row in rows(tmp_path, "frames")] == expected
+    with pytest.raises(StageError, match="holds tables already; set overwrite: true to replace them, append"):
+        opened(tmp_path)
+
+
+def test_without_pyarrow_the_error_has_the_command_that_installs_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(StageError, match=r"need pyarrow: pip install 'tactflow\[parquet\]'"):
+        opened(tmp_path)
+
+
+def test_the_example_of_the_page_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pandas", reason="pandas is not installed")
+    sink = opened(tmp_path / "out" / "press")
+    write(sink, range(8))
+    sink.close()
+    monkeypatch.chdir(tmp_path)
+    page = (REPOSITORY / "docs" / "tables.md").read_text()
+    exec(page.partition("```python\n")[2].partition("```")[0], {})
+    assert "contact_center_x" in capsys.readouterr().out
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+import pyarrow.parquet
+from tests.sinks.test_parquet import *
+
+def endless(folder):
+    sink = opened(folder, flush=0.005)
+    for seq in range(1_000_000):
+        sink.write(tick(seq), FOUND[seq % len(FOUND)])
+        Path(folder, "told").write_text(str(sink.counters()["frames"]))
+
+for line in sys.stdin:
+    child = os.fork()
+    if child == 0:
+        endless(Path(line.strip()))
+    print(child, flush=True)
+    os.waitpid(child, 0)
+    print("ended", flush=True)
+"""
+"""Writes until it is killed, into one folder for each line of standard input."""
+
+
+@pytest.mark.slow
+def test_what_was_written_can_be_read_after_kill_9_at_twenty_random_moments(tmp_path: Path) -> None:
+    moments = random.Random(16)
+    command = [sys.executable, "-c", KILLED]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        for turn in range(20):
+            folder = tmp_path / str(turn)
+            process.stdin.write(f"{folder}\n")
+            process.stdin.flush()
+            child = int(process.stdout.readline())
+            until(lambda folder=folder: any(folder.glob("frames/part-*")))
+            time.sleep(moments.uniform(0, 0.2))
+            told = int((folder / "told").read_text() or 0)
+            os.kill(child, signal.SIGKILL)
+            assert process.stdout.readline() == "ended\n"
+            frames = rows(folder, "frames")
+            assert [row["seq"] for row in frames] == list(range(len(frames)))
+            assert len(frames) >= max(told, 1)
+            with_dots = [row["seq"] for row in frames if row["seq"] % len(FOUND)]
+            dots = sorted({row["seq"] for row in rows(folder, "markers")})
+            assert dots[: len(with_dots)] == with_dots
+        process.stdin.close()
+        process.wait(PATIENCE)
+
+
+def test_a_run_puts_the_pipeline_into_every_table(tmp_path: Path) -> None:
+    from tests.faults.rig import array, run
+
+    folder = tmp_path / "out"
+    _, seen = run(tmp_path, {"parquet": {"path": str(folder)}}, source=str(array(tmp_path, 12)))
+    assert seen.exit == 0
+    for name in TABLES:
+        facts = pq.read_schema(folder / name / "part-00000.parquet").metadata
+        assert b"noise.npy" in facts[b"source"]
+        assert b"preprocess" in facts[b"pipeline.yaml"]
+    assert len(rows(folder, "frames")) == 12

@@ -1,0 +1,243 @@
+"""Control from outside: what is answered, whatever is asked, and that the run goes on."""
+
+from __future__ import annotations
+
+import json
+import socket as system_socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import zmq
+from pydantic import ValidationError
+
+from tactflow import control_socket, publisher
+from tactflow.cli.main import main
+from tactflow.commands import Commands
+from tactflow.config.load import load_pipeline
+from tactflow.control_socket import ControlSocket
+from tactflow.engine.control import Control
+from tactflow.engine.errors import StageError
+from tactflow.engine.run import Runner
+from tactflow.keys import make_keys
+from tactflow.remote import RemoteControl
+from tactflow.sinks.zmq import Zmq
+from tactflow.sources import open_source
+from tactflow.sources.mcap import Recording
+from tests.clock import PATIENCE, until
+from tests.conftest import REPOSITORY
+
+ANY_PORT = "tcp://127.0.0.1:*"
+PIPELINE = """
+stages:
+  capture: {source: "sim:press?frames=100000", realtime: true}
+sinks:
+  record: {path: touch.mcap, trigger: button}
+  zmq: {endpoint: "tcp://127.0.0.1:*", control: "tcp://127.0.0.1:*"}
+"""
+
+
+PAGE = (REPOSITORY / "docs" / "control.md").read_text().split("```python\n")[1].split("```")[0]
+
+
+@pytest.fixture
+def bare() -> Iterator[ControlSocket]:
+    """The socket of a run that can do nothing."""
+    socket = ControlSocket(ANY_PORT, None, "main", Commands(None))
+    yield socket
+    socket.close()
+
+
+def remote(endpoint: str, **options: Any) -> RemoteControl:
+    return RemoteControl(endpoint, **{"timeout": PATIENCE, **options})
+
+
+def test_a_run_does_what_it_is_told_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "pipeline.yaml").write_text(PIPELINE)
+    monkeypatch.chdir(tmp_path)
+    runner = Runner(load_pipeline(tmp_path / "pipeline.yaml"))
+    thread = threading.Thread(target=runner.run)
+    thread.start()
+    try:
+        until(lambda: "zmq" in runner.nodes and cast(Zmq, runner.nodes["zmq"].sink).control_endpoint)
+        with remote(cast(Zmq, runner.nodes["zmq"].sink).control_endpoint or "") as run:
+            assert run.ping()["state"]["sensor"] == "main"
+            assert run.record_start()["message"] == "recording to touch-001.mcap"
+            assert run.record_start()["message"] == "is recording already to touch-001.mcap"
+            until(lambda: run.stats()["stats"]["sinks"]["record"]["counters"]["frames"] > 3)
+            assert "reference" in run.take_reference()["message"]
+            before = run.stats()["stats"]["sinks"]["record"]["counters"]["frames"]
+            until(lambda: run.stats()["stats"]["sinks"]["record"]["counters"]["frames"] > before + 5)
+            assert run.pause()["state"] == {
+                "sensor": "main",
+                "paused": True,
+                "recording": True,
+                "source": "running",
+            }
+            assert run.record_stop() | {"state": None} == {
+                "ok": True,
+                "message": "recorded to touch-001.mcap",
+                "path": "touch-001.mcap",
+                "state": None,
+            }
+            assert run.record_stop()["message"] == "nothing was being recorded"
+            assert run.resume()["message"] == "running"
+            exec(PAGE.replace("tcp://127.0.0.1:5557", run.endpoint), {})
+            assert " frames\n" in capsys.readouterr().out
+    finally:
+        runner.stop()
+        thread.join()
+    recording = open_source("touch-001.mcap")
+    assert isinstance(recording, Recording)
+    epochs = [stamp.epoch for _, _, stamp in iter(recording.read_stamped, None)]
+    recording.close()
+    assert epochs[0] == 0
+    assert epochs[-1] == 1
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        (b"", "required one JSON object"),
+        (b"pause", "required one JSON object"),
+        (b"[]", "required one JSON object"),
+        (b'{"do": ["pause"]}', "there is no command"),
+        (b'{"do": "stop"}', "there is no command 'stop'; there are ping, stats"),
+        (b'{"do": "pause"}', "the run cannot be controlled"),
+        (b'{"do": "record_start"}', "the run cannot be controlled"),
+        (b"[" * 4000, "required one JSON object"),
+    ],
+)
+def test_what_cannot_be_done_is_answered_with_a_reason(
+    bare: ControlSocket, request_: bytes, words: str
+) -> None:
+    with zmq.Context() as context, context.socket(zmq.REQ) as socket:
+        socket.connect(bare.endpoint)
+        socket.send(request_)
+        answer = json.loads(socket.recv())
+    assert not answer["ok"]
+    assert words in answer["message"]
+
+
+def test_a_command_that_fails_is_answered_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    class Broken:
+        source = None
+        paused = False
+
+        def recorder(self) -> None: ...
+
+        def pause(self, paused: bool) -> None:
+            raise OSError(f"no space left, {paused}")
+
+    socket = ControlSocket(ANY_PORT, None, "main", Commands(cast(Control, Broken())))
+    try:
+        with remote(socket.endpoint) as run:
+            with pytest.raises(RuntimeError, match="no space left"):
+                run.pause()
+            with pytest.raises(RuntimeError, match=r"no record sink .* adds one"):
+                run.record_start()
+            assert run.ping()["message"] == "here"
+    finally:
+        socket.close()
+    assert "no space left" in caplog.text
+
+
+def test_what_is_too_long_or_no_request_is_dropped(bare: ControlSocket) -> None:
+    host, _, port = bare.endpoint.removeprefix("tcp://").rpartition(":")
+    with system_socket.create_connection((host, int(port))) as raw:
+        raw.sendall(b"GET / HTTP/1.1\r\n\r\n" * 100)
+    with zmq.Context() as context, context.socket(zmq.DEALER) as junk:
+        junk.linger = 0
+        junk.connect(bare.endpoint)
+        for parts in ([b""], [b"", b"{}", b"{}"], [b"no delimiter"], [b"", b"x" * 100_000]):
+            junk.send_multipart(parts)
+        with remote(bare.endpoint) as run:
+            assert run.ping()["ok"]
+
+
+def test_a_flood_that_reads_no_answer_keeps_nobody_else_from_one(
+    bare: ControlSocket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_socket, "REST", 0.0)
+    for _ in range(3):
+        with zmq.Context() as context, context.socket(zmq.DEALER) as flood:
+            flood.linger = 0
+            flood.connect(bare.endpoint)
+            for _ in range(1000):
+                flood.send_multipart([b"", b'{"do": "stats"}'])
+            with remote(bare.endpoint) as run:
+                assert run.ping()["ok"]
+
+
+def test_too_many_connections_are_ended_and_commands_are_taken_again(
+    bare: ControlSocket, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    looks = iter([0])
+    with remote(bare.endpoint) as run:
+        assert run.ping()["ok"]
+        monkeypatch.setattr(publisher, "files_left", lambda: next(looks, 10_000))
+        until(lambda: "too many connections" in caplog.text)
+        until(lambda: bare._thread.is_alive())
+    with remote(bare.endpoint) as run:
+        assert run.ping()["ok"]
+
+
+def test_only_who_has_a_key_is_obeyed(tmp_path: Path) -> None:
+    own, laptop = make_keys(tmp_path / "keys", "laptop")
+    _, stranger = make_keys(tmp_path / "other", "laptop")
+    (stranger / "publisher.key").write_bytes((laptop / "publisher.key").read_bytes())
+    sink = Zmq(Zmq.Params(endpoint=ANY_PORT, control=ANY_PORT, keys=str(own)))
+    sink.open()
+    assert sink.control_endpoint is not None
+    try:
+        for keys, reason in ((stranger, "does not admit these keys"), (None, "asks for keys")):
+            with (
+                remote(sink.control_endpoint, keys=keys) as run,
+                pytest.raises(PermissionError, match=reason),
+            ):
+                run.ping()
+        with remote(sink.control_endpoint, keys=laptop) as run:
+            assert run.ping()["ok"]
+    finally:
+        sink.close()
+
+
+def test_an_address_that_others_reach_takes_keys_also_where_everybody_may_read() -> None:
+    with pytest.raises(ValidationError, match="commands require keys"):
+        Zmq.Params(control="tcp://*:5557", open_to_all=True)
+    with pytest.raises(ValidationError, match="required a port up to 65535"):
+        Zmq.Params(control="tcp://127.0.0.1:99999")
+    assert Zmq.Params(control="tcp://*:5557", control_keys="keys").commanders == "keys"
+
+
+def test_among_several_sensors_commands_still_ask_for_the_keys_of_all() -> None:
+    alone = Zmq.Params(control="tcp://*:5557", keys="mine")
+    among = Zmq.publish_at(alone, "ipc:///tmp/left")
+    assert (among.keys, among.commanders) == (None, "mine")
+
+
+def test_an_address_that_is_taken_is_named_with_what_to_do(bare: ControlSocket) -> None:
+    sink = Zmq(Zmq.Params(endpoint=ANY_PORT, control=bare.endpoint))
+    with pytest.raises(StageError, match=r"is in use: another run takes commands there.*tactflow-{sensor}"):
+        sink.open()
+    sink.close()
+
+
+def test_the_command_says_what_happened_and_what_did_not(
+    bare: ControlSocket, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["control", "ping", bare.endpoint]) == 0
+    assert capsys.readouterr().out == "main: here\n"
+    assert main(["control", "stats", bare.endpoint]) == 0
+    assert json.loads(capsys.readouterr().out) == {}
+    assert main(["control", "take-reference", bare.endpoint]) == 3
+    assert "the run cannot be controlled" in capsys.readouterr().err
+    assert main(["control", "pause", f"ipc://{tmp_path}/nobody", "--timeout", "0.05"]) == 4
+    assert "sinks.zmq.control" in capsys.readouterr().err
+    assert main(["control", "explode", bare.endpoint]) == 2
+    assert main(["control", "ping", "nowhere"]) == 2
+    assert main(["control", "ping", "--keys", str(tmp_path)]) == 2
