@@ -283,7 +283,7 @@ def _error(left: Double, force: Double) -> tuple[float, float]:
     (True, 0.1)
     """
     best, least = (0.0, 0.0), math.inf
-    for ratio in RATIOS:
+    for ratio in RATIOS.tolist():
         form = 1 + (ratio * force) ** 2
         variance = float(np.mean(left**2 / form))
         surprise = len(left) * math.log(max(variance, 1e-30)) + float(np.log(form).sum())
