@@ -230,21 +230,22 @@ class Record(Recorder):
 
     def _entry(self, tick: Tick, results: Results) -> Entry:
         from tactflow.recording.frames import nanoseconds
-        from tactflow.recording.schemas import encode_picture
+        from tactflow.recording.schemas import encode_annotations, encode_picture
         from tactflow.recording.writer import Entry
 
         assert self._coder is not None
         frame = tick.frame
         time = nanoseconds(frame.t)
-        message = picture = None
+        message = picture = annotations = None
         # A reference image that is not part of the source has no results of its own.
         if frame.seq >= 0:
             message = encode_message(tick, results, detail=True)
             if self._previews is not None and self._previews.due(frame.t):
                 jpeg = self._jpeg(frame.image if results.image is None else results.image)
                 picture = encode_picture(jpeg, self._sensor, time)
+                annotations = encode_annotations(results, time)
         pixels = self._coder.encode(frame)
-        return Entry(time, frame.seq, frame.reference, frame.epoch, pixels, message, picture)
+        return Entry(time, frame.seq, frame.reference, frame.epoch, pixels, message, picture, annotations)
 
     def _jpeg(self, image: Image) -> bytes:
         done, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, self.params.quality))
@@ -348,7 +349,7 @@ class Record(Recorder):
         try:
             # The references of before stand where the file's time line begins, without results of that time.
             for reference in self._late:
-                file.write(replace(reference, message=None, picture=None), entry.time)
+                file.write(replace(reference, message=None, picture=None, annotations=None), entry.time)
             file.write(entry)
         except OSError as error:
             self._give_up(file, error)

@@ -12,18 +12,16 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import orjson
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
-from tactflow.message import STATUS_NAMES, Results, encode_message
+from tactflow.message import Results, encode_message
 from tactflow.ports import Image, Valid
 from tactflow.view.address import Neighbours, address, bind, is_loopback
-from tactflow.vision.draw import dimmed
-from tactflow.vision.types import Markers
+from tactflow.view.compact import compact_markers, compact_surface
+from tactflow.vision.draw import dimmed, field_arrows
 
 if TYPE_CHECKING:
     from tactflow.view.hub import Hub
@@ -31,8 +29,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("tactflow")
 
-STATUS_LETTERS = np.array([ord(name[0]) for name in STATUS_NAMES], np.uint8)
-"""The first letter of the word for each value of `MarkerStatus`."""
+FIELD_ARROWS = 14.0
+"""Distance of the arrows of a displacement field in a picture of 400 px, px. Chosen by hand."""
 
 
 class View(Sink):
@@ -106,6 +104,8 @@ class View(Sink):
         self._interval = 1.0 / params.max_fps
         self._due = float("-inf")
         self._encoded = 0
+        self._sending = threading.Lock()
+        self._last: tuple[Tick, Results, Valid | None, float] | None = None
 
     @classmethod
     def among(cls, params: View.Params, folder: Path) -> View.Params:
@@ -128,7 +128,7 @@ class View(Sink):
         port = listener.getsockname()[1]
         if p.port not in (0, port) and self._neighbours is None:
             log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
-        self._hub = Hub(self._control, self._sensor, self._neighbours or dict)
+        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send)
         self._server = Server(self._hub, listener, p.host, p.token)
         self._server.start()
         self.description = address(p.host, port)
@@ -150,10 +150,8 @@ class View(Sink):
     def write(self, tick: Tick, results: Results, valid: Valid | None = None) -> None:
         """Send the plain picture and the result message; the page draws one over the other.
 
-        Where no gel is, the picture is darker.
-
-        Browsers take in a message a kilobyte at a time, and each costs a switch between processes. So what is
-        only drawn comes in tenths of a pixel: the hull, and the markers, which stand beside the message.
+        Where no gel is, the picture is darker. Markers and hull come in tenths of a pixel; the field and the
+        height map only if a page shows them.
         """
         # What was wanted a moment ago may have become too much meanwhile.
         if self._hub is None or not self.wants():
@@ -161,19 +159,47 @@ class View(Sink):
         now = time.perf_counter()
         # Counted from when this one was due, so that an uneven source does not lower the rate.
         self._due = max(self._due, now - self._interval / 2) + self._interval
-        frame = tick.frame
-        contact, markers = results.contact, results.markers
-        if contact is not None:
-            contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1), separate=())
-        message = encode_message(tick, results._replace(contact=contact, markers=None), detail=True)
-        image = frame.image if results.image is None else results.image
-        jpeg = self._encode(image if valid is None else dimmed(image, valid))
-        latency = (now - frame.captured) * 1000 if frame.captured else -1.0
-        header = b'{"latency_ms":%.3f,"epoch":%d,"message":%b,"markers":%b' % (
-            *(latency, frame.epoch, message),
-            b"null" if markers is None else _compact(markers),
+        captured = tick.frame.captured
+        self._last = tick, results, valid, (now - captured) * 1000 if captured else -1.0
+        self._send(captured)
+
+    def _send(self, captured: float = 0.0) -> None:
+        """Send the last frame, once more if a page of a paused run shows what it did not show before.
+
+        captured : `time.perf_counter` at its capture, s; 0 where the delay until it is seen tells nothing.
+        """
+        with self._sending:
+            if self._hub is None or self._last is None:
+                return
+            tick, results, valid, latency = self._last
+            frame, contact = tick.frame, results.contact
+            if contact is not None:
+                contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1), separate=())
+            message = encode_message(tick, results._replace(contact=contact, markers=None), detail=True)
+            image = frame.image if results.image is None else results.image
+            jpeg = self._encode(image if valid is None else dimmed(image, valid))
+            heights, drawn = self._drawn(results, max(image.shape))
+            header = b'{"latency_ms":%.3f,"epoch":%d,"message":%b,%b' % (latency, frame.epoch, message, drawn)
+            self._hub.publish(header, heights + jpeg, captured)
+
+    def _drawn(self, results: Results, side: int) -> tuple[bytes, bytes]:
+        """Heights, and as JSON what is drawn beside the message.
+
+        A field or height map that there is, but that no page shows, is `true`: pages offer to show it.
+        """
+        assert self._hub is not None
+        markers, scale, field, depth = results.markers, results.scale, results.field, results.depth
+        arrows, surface = (b"null" if one is None else b"true" for one in (field, depth))
+        heights = b""
+        if field is not None and "field" in self._hub.shown:
+            arrows = compact_markers(field_arrows(field, FIELD_ARROWS * max(1.0, side / 400)))
+        if depth is not None and "surface" in self._hub.shown:
+            surface, heights = compact_surface(depth)
+        return heights, b'"markers":%b,"scale":%b,"field":%b,"surface":%b' % (
+            b"null" if markers is None else compact_markers(markers),
+            b"null" if scale is None else b"[%.8g,%.8g]" % (scale.x, scale.y),
+            *(arrows, surface),
         )
-        self._hub.publish(header, jpeg, frame.captured)
 
     def _encode(self, image: Image) -> bytes:
         height, width = image.shape[:2]
@@ -195,20 +221,3 @@ class View(Sink):
         if self._neighbours is not None:
             self._neighbours.leave()
         server.close()
-
-
-def _compact(markers: Markers) -> bytes:
-    """The markers as JSON, a fifth of what they take in the message: x0, y0, x1, ... in tenths of a pixel,
-    and a string with the first letter of each status."""
-
-    def tenths(points: NDArray[np.float64]) -> NDArray[np.int32]:
-        return np.rint(points * 10).astype(np.int32).ravel()
-
-    return orjson.dumps(
-        {
-            "origin": tenths(markers.origin),
-            "position": tenths(markers.position),
-            "status": STATUS_LETTERS[markers.status].tobytes().decode(),
-        },
-        option=orjson.OPT_SERIALIZE_NUMPY,
-    )

@@ -24,6 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: playwright is not installed")
 
@@ -135,15 +136,28 @@ def watched() -> Iterator[Run]:
     started.close()
 
 
+@pytest.fixture(scope="module")
+def browser_without_webgl(browser: Any) -> Iterator[Any]:
+    """One that cannot draw in three dimensions."""
+    flat = browser.browser_type.launch(
+        executable_path=CHROMIUM, args=[*FLAGS, "--disable-software-rasterizer"]
+    )
+    yield flat
+    flat.close()
+
+
 @pytest.fixture
-def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
+def open_page(browser: Any, request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
     """Opens pages. A complaint in the console, a script error or a request to elsewhere fails the test."""
     contexts: list[Any] = []
     complaints: list[str] = []
 
-    def open_(url: str, *, everywhere: bool = False, lost: bool = False, **options: Any) -> Any:
+    def open_(
+        url: str, *, everywhere: bool = False, lost: bool = False, webgl: bool = True, **options: Any
+    ) -> Any:
         options = {"viewport": {"width": 1400, "height": 900}, "color_scheme": "dark"} | options
-        context = browser.new_context(**options)
+        opened = browser if webgl else request.getfixturevalue("browser_without_webgl")
+        context = opened.new_context(**options)
         contexts.append(context)
         page = context.new_page()
         page.set_default_timeout(PATIENCE)
@@ -646,6 +660,27 @@ def frame(sensor: str, number: int, colour: int, *, contact: bool = False, direc
     return struct.pack("<I", len(header)) + header + jpeg
 
 
+def calibrated(number: int, *, slipping: bool = False, height: float = 0.5) -> bytes:
+    """A frame of a calibrated sensor with all that the page can show."""
+    plain = frame("main", number, 120, contact=True, directed=True)
+    length = struct.unpack_from("<I", plain)[0]
+    header = json.loads(plain[4 : 4 + length])
+    message = header["message"]
+    message["contact"] |= {"area_mm2": 3.0, "center_mm": [0.1, -0.2], "depth_mm": height}
+    message["contact"] |= {"depth_mm_stderr": 0.01, "volume_mm3": 0.7}
+    message["flow"] |= {"stderr": [0.3, 0.4], "mean_mm": [0.4, -0.2], "mean_mm_stderr": [0.03, 0.04]}
+    message["slip"] = {"slipping": slipping, "stick_ratio": 0.0 if slipping else 0.8}
+    message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": True}
+    y, x = np.mgrid[-1:1:16j, -1:1:20j]
+    heights = np.rint(np.maximum(0, 1 - x**2 - y**2) * 65535).astype("<u2").tobytes()
+    header["scale"] = [0.1, 0.1]
+    header["field"] = header["markers"] | {"status": "iii"}
+    header["surface"] = {"box": [20, 10, 20, 16], "size": [20, 16], "step": height / 65535}
+    header["surface"]["bytes"] = len(heights)
+    changed = json.dumps(header).encode()
+    return struct.pack("<I", len(changed)) + changed + heights + plain[4 + length :]
+
+
 def state(sensor: str, **changes: Any) -> str:
     """A state as the view sends it."""
     names = ("pause", "step", "reference", "record", "stop")
@@ -723,3 +758,96 @@ def test_a_tab_per_sensor_and_honest_empty_states(
     stage.send(state("left", end="eos"))
     status(page, "ended")
     assert "The source has ended." in page.inner_text("#empty-text")
+
+
+def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
+    staged: Callable[..., Stage], open_page: Callable[..., Any]
+) -> None:
+    stage = staged(hello("main"), state("main"), frame("main", 1, 120, contact=True, directed=True))
+    page = open_page(stage.url)
+    watch(page)
+    for absent in ("unit", "layer-field", "layer-surface", "tile-depth", "tile-force", "tile-slip"):
+        assert page.is_hidden(f"#{absent}"), absent
+    page.keyboard.press("u")
+    assert page.inner_text("#value-area") == "300"
+    stage.send(calibrated(2))
+    until(page, "() => document.getElementById('unit-area').textContent === 'mm² at 0.1, −0.2 mm'")
+    texts = {name: page.inner_text(f"#value-{name}") for name in ("area", "flow", "depth", "force", "slip")}
+    assert texts == {"area": "3.00", "flow": "0.447", "depth": "0.500", "force": "2.50", "slip": "holds"}
+    assert page.inner_text("#unit-flow").startswith("mm ± 0.032, 3 markers")
+    assert page.inner_text("#unit-force") == "N ± 0.20"
+    in_mm = {name: steady(page, name) for name in ("picture", "plot-area", "plot-flow")}
+    page.keyboard.press("u")
+    assert page.inner_text("#unit-area") == "px²"
+    assert page.inner_text("#unit-flow").startswith("px ± 0.32, 3 markers")
+    for name, seen in in_mm.items():
+        assert shows(page, name, lambda now, seen=seen: now != seen), name
+    page.reload()
+    watch(page)
+    stage.send(calibrated(3, slipping=True))
+    until(page, "() => document.getElementById('value-slip').textContent === 'slips'")
+    assert page.inner_text("#unit-area") == "px²", "the unit is remembered"
+    assert stage.heard[-1] != {"show": ["field"]}
+    without = steady(page, "picture")
+    page.keyboard.press("7")
+    assert shows(page, "picture", lambda seen: seen != without)
+    until_heard(page, stage, {"show": ["field"]})
+    # A page that finds its run again says anew what it shows.
+    stage.page.close()
+    until_heard(page, stage, {"show": ["field"]}, times=2)
+
+
+def until_heard(page: Any, stage: Stage, message: Any, times: int = 1) -> None:
+    """Wait until the page has said something so many times."""
+    deadline = time.monotonic() + PATIENCE / 1000
+    while stage.heard.count(message) < times:
+        assert time.monotonic() < deadline, stage.heard
+        page.wait_for_timeout(20)
+
+
+def middle(png: bytes) -> NDArray[np.uint8]:
+    """A picture without its rim, on which the ring around what has the focus may lie."""
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return np.asarray(picture[10:-10, 10:-10], np.uint8)
+
+
+@pytest.mark.parametrize("webgl", [True, False], ids=["webgl", "no webgl"])
+def test_the_surface_is_shaded_and_can_be_turned_where_there_is_webgl(
+    webgl: bool, staged: Callable[..., Stage], open_page: Callable[..., Any]
+) -> None:
+    stage = staged(hello("main"), state("main"), calibrated(1))
+    page = open_page(stage.url, webgl=webgl)
+    watch(page)
+    until(page, "() => !document.getElementById('layer-surface').hidden")
+    assert page.is_hidden("#surface")
+    page.click("#layer-surface")
+    until_heard(page, stage, {"show": ["surface"]})
+    stage.send(calibrated(2, height=0.5))
+    until(page, "() => document.getElementById('deepest').textContent === '0.6 mm'")
+    page.locator("#surface").scroll_into_view_if_needed()
+    picture = middle(steady(page, "surface"))
+    # Of each hue of the ramp something is seen: dark purple at rest, green at the top.
+    blue, green, red = (picture[..., channel].astype(int) for channel in range(3))
+    assert ((blue > green + 40) & (red > green + 30)).sum() > 1000
+    assert ((green > red + 40) & (green > blue + 20)).sum() > 50
+    page.focus("#surface")
+    page.keyboard.press("ArrowLeft")
+    if not webgl:
+        assert "no WebGL" in page.inner_text("#turn-hint")
+        assert np.array_equal(middle(steady(page, "surface")), picture)
+        return
+    assert shows(page, "surface", lambda seen: not np.array_equal(middle(seen), picture))
+    page.keyboard.press("Home")
+    assert shows(page, "surface", lambda seen: np.array_equal(middle(seen), picture))
+    box = page.locator("#surface").bounding_box()
+    page.mouse.move(box["x"] + 100, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 160, box["y"] + 80)
+    page.mouse.up()
+    assert shows(page, "surface", lambda seen: not np.array_equal(middle(seen), picture))
+    page.dblclick("#surface")
+    assert shows(page, "surface", lambda seen: np.array_equal(middle(seen), picture))
+    page.keyboard.press("z")
+    assert page.inner_text("#rise span") == "Heights × 5"
+    assert shows(page, "surface", lambda seen: not np.array_equal(middle(seen), picture))

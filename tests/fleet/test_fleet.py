@@ -252,13 +252,13 @@ def waiting(folder: Path, then: str) -> list[Path]:
     return [folder / "here-left", folder / "here-right"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
-    ("handler", "code"),
+    ("number", "handler", "code"),
     [
-        ("signal.SIG_DFL", 0),
-        ("signal.default_int_handler", 0),
-        ("lambda *_: os.kill(os.getpid(), signal.SIGKILL)", 3),
+        (signal.SIGINT, "signal.SIG_DFL", 0),
+        (signal.SIGTERM, "signal.SIG_DFL", 0),
+        (signal.SIGINT, "signal.default_int_handler", 0),
+        (signal.SIGTERM, "lambda *_: os.kill(os.getpid(), signal.SIGKILL)", 3),
     ],
 )
 def test_one_signal_soon_after_the_start_ends_all_sensors_well(

@@ -34,7 +34,8 @@ from tactflow.message import Results
 from tactflow.sinks.view import View
 from tactflow.view import server
 from tactflow.view.address import address, bind, is_loopback
-from tactflow.vision.types import Contact, Markers
+from tactflow.vision.flow import FieldModel
+from tactflow.vision.types import Contact, Depth, Markers, Scale
 from tests.clock import PATIENCE, until
 from tests.messages import build_message
 
@@ -317,6 +318,58 @@ def test_a_page_that_comes_late_to_a_paused_run_sees_the_last_picture(
     first.next("frame")
     run.pause(True)
     assert page(sink).next("frame")[0]["message"]["seq"] == 5
+
+
+def test_field_and_heights_are_sent_only_while_a_page_shows_them(
+    view: Callable[..., View], page: Callable[..., Page]
+) -> None:
+    origin = np.array([[10.0, 10], [50, 10], [10, 70], [50, 70]])
+    markers = Markers(origin, origin + np.array([2, 0]), np.zeros(4, np.uint8), np.full(4, 0.02))
+    heights = np.zeros((80, 60), np.float32)
+    heights[20:40, 10:50] = np.linspace(0.1, 0.5, 40)
+    found = Results(
+        picture(),
+        scale=Scale(0.1, 0.2, (0, 0), (30, 40)),
+        depth=Depth(heights, 0.5, None, 1.0, None),
+        field=FieldModel(origin, (60, 80))(markers),
+    )
+    run = FakeRun()
+    sink = view(run)
+    browser, other = page(sink), page(sink)
+
+    def shown(seq: int) -> tuple[Any, bytes]:
+        until(sink.wants)
+        sink.write(tick(seq), found)
+        return answered()
+
+    def answered() -> tuple[Any, bytes]:
+        header, data = browser.next("frame")
+        browser.say(ack=header["number"])
+        return header, data
+
+    header, jpeg = shown(1)
+    assert (header["field"], header["surface"], header["scale"]) == (True, True, [0.1, 0.2])
+    assert jpeg[:2] == b"\xff\xd8"
+    browser.say(show=["surface", "/etc/passwd", 7])
+    until(lambda: sink._hub is not None and sink._hub.shown == {"surface"})
+    header, data = shown(2)
+    said = header["surface"]
+    assert header["field"] is True
+    assert said["box"] == [10, 20, 40, 20]
+    assert data[said["bytes"] :][:2] == b"\xff\xd8"
+    cells = np.frombuffer(data[: said["bytes"]], "<u2").reshape(said["size"][::-1]) * said["step"]
+    middle = heights[20:40, 10:50].reshape(10, 2, 20, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(cells, middle, atol=said["step"])
+    # No further frame comes while the run is paused: the last one comes again.
+    run.pause(True)
+    browser.say(show=["field"])
+    header, _ = answered()
+    assert header["message"]["seq"] == 2
+    assert header["surface"] is True
+    assert np.ptp(np.subtract(header["field"]["position"], header["field"]["origin"])[::2]) <= 10
+    browser.say(show="field")
+    until(lambda: sink._hub is not None and not sink._hub.shown)
+    other.next("stats")
 
 
 # -- what pages may ask for ---------------------------------------------------------------------------------

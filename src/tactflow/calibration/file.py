@@ -77,8 +77,8 @@ class LinearForceEntry(_Strict):
 
     stiffness, greatest, error : see `LinearForce`. range : least and largest force of the fit, N.
     rmse : RMS error, N. r2 : share of the variance that is explained. hysteresis : mean distance between the
-    force while it grows and while it falls at the same prediction, relative to the largest; None where no
-    press shows both.
+    force while it grows and while it falls at the same prediction, over the largest of its press; None where
+    no press shows both.
     """
 
     stiffness: dict[str, float]

@@ -15,6 +15,9 @@ from mcap.summary import Summary
 from tactflow.recording.frames import TYPE_NAME
 from tactflow.recording.records import DAMAGE, Damage, NotARecordingError, intact_records
 
+MOST_NAMED = 20
+"""Topics that a message lists at most. Chosen by hand."""
+
 
 @dataclass(frozen=True, slots=True)
 class Contents:
@@ -77,10 +80,9 @@ def _is_ours(channel: Channel, schemas: dict[int, Schema]) -> bool:
 def _topics(ours: set[str], known: set[str]) -> tuple[str, str]:
     frames = sorted(topic for topic in ours if topic.endswith("/frames"))
     if not frames:
-        there = f"it has {', '.join(sorted(known)[:5])}" if known else "it is empty"
-        raise NotARecordingError(
-            f"holds no frames that tactflow recorded ({there}); tactflow record writes such files"
-        )
+        there = "it is empty" if not known else f"to play one of its topics, add ?topic={min(known)}"
+        others = f" or {', '.join(sorted(known)[1:MOST_NAMED])}" if len(known) > 1 else ""
+        raise NotARecordingError(f"holds no frames that tactflow recorded; {there}{others}")
     return frames[0], frames[0].removesuffix("frames") + "references"
 
 

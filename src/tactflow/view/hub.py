@@ -34,6 +34,9 @@ Chosen by hand."""
 REST_MS = 250
 """A page whose machine is full may ask for at most this long until its next frame. Chosen by hand."""
 
+SHOWN_IF_ASKED = frozenset({"field", "surface"})
+"""What is sent only while a page shows it."""
+
 MAX_PAGES = 16
 """More pages than this at a time are turned away. Chosen by hand."""
 
@@ -68,14 +71,16 @@ class Packet(NamedTuple):
 class Page:
     """One open page.
 
-    credit : it has asked for the next frame. sent, answered : numbers of the last frame it was sent, and of
-    the last it has shown. captured, sent_at : `time.perf_counter` of the one sent, s. screen_s : times from
-    capture to screen of the last frames, s. wake : there is something to send. ended : it is gone.
+    credit : it has asked for the next frame. shows : those of `SHOWN_IF_ASKED` that it shows. sent,
+    answered : numbers of the last frame it was sent, and of the last it has shown. captured, sent_at :
+    `time.perf_counter` of the one sent, s. screen_s : times from capture to screen of the last frames, s.
+    wake : there is something to send. ended : it is gone.
     """
 
     def __init__(self, wire: Wire) -> None:
         self.wire = wire
         self.credit = True
+        self.shows: frozenset[str] = frozenset()
         self.sent = 0
         self.answered = 0
         self.captured = 0.0
@@ -100,13 +105,15 @@ class Page:
 class Hub:
     """The pages that are open now.
 
-    `publish`, `wanted`, `owed` and `counters` may be used from any thread, the rest in the server's loop.
+    `publish`, `wanted`, `owed`, `shown` and `counters` may be used from any thread, the rest in the server's
+    loop.
 
     Parameters
     ----------
     control : handle on the run; None shows frames without any control over it.
     sensor : name of the sensor this run serves.
     neighbours : tells the ports of other sensors' pages by their names.
+    again : publishes the last frame once more. Called in a thread of its own.
     """
 
     def __init__(
@@ -114,16 +121,20 @@ class Hub:
         control: Control | None,
         sensor: str,
         neighbours: Callable[[], Mapping[str, int]] = dict,
+        again: Callable[[], None] = lambda: None,
     ) -> None:
         self.control = control
         self._run = Commands(control)
         self.sensor = sensor
         self.neighbours = neighbours
+        self._again = again
         self.run_id = secrets.token_hex(8)
         self.wanted = False
         """Whether a page has credit."""
         self.owed = False
         """Whether somebody asked for one single frame: it is shown however soon it comes."""
+        self.shown: frozenset[str] = frozenset()
+        """Those of `SHOWN_IF_ASKED` that some page shows."""
         self.pages: set[Page] = set()
         self._someone = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -146,20 +157,20 @@ class Hub:
         """Tell which loop serves the pages."""
         self._loop = loop
 
-    def publish(self, header: bytes, jpeg: bytes, captured: float) -> None:
+    def publish(self, header: bytes, pixels: bytes, captured: float) -> None:
         """Offer a frame to every page. From one thread, any; never waits.
 
         Parameters
         ----------
         header : JSON object that describes the frame, without its last brace.
-        jpeg : the picture.
+        pixels : heights of a surface, if the header describes one, then the picture as JPEG.
         captured : `time.perf_counter` at its capture, s.
         """
         self.owed = False
         self._number += 1
         header = header + b',"number":%d}' % self._number
-        # A little-endian length, the JSON header, the picture.
-        data = struct.pack("<I", len(header)) + header + jpeg
+        # A little-endian length, the JSON header, the heights and the picture.
+        data = struct.pack("<I", len(header)) + header + pixels
         packet = Packet(self._number, data, captured, time.perf_counter())
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._take, packet)
@@ -272,6 +283,7 @@ class Hub:
 
     def _recount(self) -> None:
         self.wanted = any(page.credit for page in self.pages)
+        self.shown = frozenset().union(*(page.shows for page in self.pages))
 
     async def _send(self, page: Page) -> None:
         while True:
@@ -304,8 +316,18 @@ class Hub:
                 return
             if "ack" in message:
                 self._acknowledged(page, message)
+            elif "show" in message:
+                await self._show(page, message["show"])
             else:
                 await self._command(page, message)
+
+    async def _show(self, page: Page, asked: Any) -> None:
+        page.shows = SHOWN_IF_ASKED.intersection(map(str, asked if isinstance(asked, list) else ()))
+        before = self.shown
+        self._recount()
+        # No further frame comes that would have it.
+        if self.shown - before and self.control is not None and self.control.paused:
+            await asyncio.to_thread(self._again)
 
     def _acknowledged(self, page: Page, message: Mapping[str, Any]) -> None:
         if message["ack"] != page.sent or page.sent == page.answered:

@@ -1,12 +1,16 @@
 // The page: one tab per sensor, its numbers and statistics, and the buttons that steer the run. The picture and
 // the plots are drawn by a worker, which also talks to the run.
 
+import { RAMP } from "./surface.js";
+import * as words from "./words.js";
+
+const { fixed, grouped } = words;
 const $ = (id) => document.getElementById(id);
-const MINUS = "−";
 const STALL_SECONDS = 2;
 const MAGNIFICATIONS = [1, 3, 5, 10];
-const CANVASES = ["picture", "plot-area", "plot-angle", "plot-flow", "plot-latency"];
-const COLOURS = ["tracked", "inferred", "lost", "hull", "axis", "ellipse", "mean", "series-a", "series-b", "grid", "quiet", "panel"];
+const PLOTS = ["area", "angle", "flow", "latency", "depth", "force", "slip"].map((name) => `plot-${name}`);
+const CANVASES = ["picture", "surface", ...PLOTS];
+const COLOURS = ["tracked", "inferred", "lost", "field", "hull", "axis", "ellipse", "mean", "series-a", "series-b", "series-c", "grid", "quiet", "panel", "well"];
 const LAYERS = [
   { id: "image", label: "Image", key: "1", colour: "var(--quiet)" },
   { id: "arrows", label: "Arrows", key: "2", colour: "var(--tracked)" },
@@ -14,11 +18,18 @@ const LAYERS = [
   { id: "axis", label: "Line and angle", key: "4", colour: "var(--axis)" },
   { id: "ellipse", label: "Ellipse", key: "5", colour: "var(--ellipse)", off: true },
   { id: "mean", label: "Mean flow", key: "6", colour: "var(--mean)" },
+  { id: "field", label: "Field", key: "7", colour: "var(--field)", off: true, offer: "field" },
+  { id: "surface", label: "Surface", key: "8", colour: `linear-gradient(90deg, ${RAMP})`, off: true, offer: "surface" },
 ];
+// What is shown only where the run has it: the tile or button, and what of a frame it needs.
+const OFFERED = { unit: "scale", "layer-field": "field", "layer-surface": "surface", "tile-depth": "surface", "tile-force": "force", "tile-slip": "slip" };
+const RISES = [1, 3, 5, 10];
 
 const sensors = new Map();
 const layers = Object.fromEntries(LAYERS.map((layer) => [layer.id, !layer.off]));
 let magnification = 3;
+let rise = 3;
+let wanted = localStorage.getItem("tactflow-unit") ?? "mm";
 let current = null;
 let run = null;
 let link = "connecting";  // connecting, open, lost, token
@@ -87,6 +98,10 @@ const news = {
     if (shownStatus !== status()) refresh();
   },
   note: ({ text, message }) => note(text ?? message.text),
+  turns({ turns }) {
+    document.body.dataset.turns = turns;
+    if (!turns) set("turn-hint", "seen from above: this browser has no WebGL");
+  },
   lost({ seconds }) {
     link = "lost";
     nextAttempt = performance.now() + seconds * 1000;
@@ -110,15 +125,15 @@ function drawAspect({ last }) {
 
 function drawValues(s) {
   const message = s?.last;
-  const contact = message?.contact;
-  const flow = message?.flow;
-  set("value-area", contact ? grouped(contact.area) : "–");
-  set("unit-area", contact ? "px²" : message ? "no contact" : "");
-  set("value-angle", contact && contact.angle !== null ? `${fixed(contact.angle, 1)}°` : "–");
-  set("unit-angle", !contact ? "" : contact.angle === null ? "no direction" : `confidence ${fixed(contact.confidence, 2)}`);
-  set("value-flow", flow?.mean ? fixed(Math.hypot(...flow.mean), 2) : "–");
-  const twist = flow?.rotation == null ? "" : `, twist ${fixed(flow.rotation, 1)}°`;
-  set("unit-flow", flow?.mean ? `px, ${flow.count} ${flow.count === 1 ? "marker" : "markers"}${twist}` : flow ? "no marker inside" : "");
+  drawOffers(message?.offers ?? []);
+  for (const name of ["area", "angle", "flow", "depth", "force", "slip"]) {
+    const [value, rest] = message ? words[name](message, unit()) : ["–", ""];
+    set(`value-${name}`, value);
+    set(`unit-${name}`, rest);
+  }
+  put($("tile-slip").dataset, "slipping", String(Boolean(message?.slip?.slipping)));
+  set("deepest", message ? `${Number(message.deepest.toPrecision(1))} mm` : "");
+  set("deepest-now", message?.contact?.depth_mm == null ? "no contact" : `${fixed(message.contact.depth_mm, 2)} mm deep`);
   const latency = message?.latency ?? -1;
   set("value-latency", latency < 0 ? "–" : fixed(latency, 1));
   for (const name of ["tracked", "inferred", "lost"]) set(`count-${name}`, message?.counts?.[name] ?? "–");
@@ -130,7 +145,20 @@ function drawValues(s) {
   put(bar, "hidden", !total);
   if (total) put(bar, "value", message ? (message.seq + 1) / total : 0);
   if (message) $("picture").dataset.seq = message.seq;
-  for (const id of CANVASES.slice(1)) $(id).dataset.points = message?.points ?? 0;
+  for (const id of PLOTS) $(id).dataset.points = message?.points ?? 0;
+}
+
+// The unit of lengths: millimetres only where the run knows them.
+function unit() {
+  return sensors.get(current)?.last?.offers.includes("scale") ? wanted : "px";
+}
+
+function drawOffers(offers) {
+  for (const [id, offer] of Object.entries(OFFERED)) put($(id), "hidden", !offers.includes(offer));
+  put($("tile-surface"), "hidden", !(layers.surface && offers.includes("surface")));
+  put($("unit"), "ariaPressed", String(unit() === "mm"));
+  put(document.body.dataset, "tiles", String(document.querySelectorAll("#plots .tile:not([hidden])").length));
+  if (unit() !== orderedUnit) orderLayers();
 }
 
 function drawStats(s) {
@@ -312,8 +340,10 @@ const actions = {
   record: () => command("record", !sensors.get(current)?.state?.recording),
   stop: () => command("stop"),
 };
+let orderedUnit = null;
 function orderLayers() {
-  order("layers", { layers, magnify: magnification });
+  orderedUnit = unit();
+  order("layers", { layers, magnify: magnification, rise, unit: orderedUnit });
 }
 const keys = { " ": "pause", s: "step", n: "reference", r: "record", q: "stop" };
 for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
@@ -332,25 +362,57 @@ for (const layer of LAYERS) {
     layers[layer.id] = !layers[layer.id];
     button.setAttribute("aria-pressed", String(layers[layer.id]));
     orderLayers();
+    drawValues(sensors.get(current));
   });
   $("layers").append(button);
   keys[layer.key] = button.id;
 }
-const magnify = document.createElement("button");
-Object.assign(magnify, { type: "button", id: "magnify", title: "How much longer arrows are than the displacement they show" });
-magnify.setAttribute("aria-keyshortcuts", "x");
-const drawMagnify = () => {
-  magnify.innerHTML = "<span></span><kbd aria-hidden=\"true\">x</kbd>";
-  magnify.firstChild.textContent = `Arrows × ${magnification}`;
-};
-magnify.addEventListener("click", () => {
-  magnification = MAGNIFICATIONS[(MAGNIFICATIONS.indexOf(magnification) + 1) % MAGNIFICATIONS.length];
-  drawMagnify();
-  orderLayers();
+// A button that goes through some factors.
+function addFactor(id, key, title, factors, text, choose) {
+  const button = document.createElement("button");
+  Object.assign(button, { type: "button", id, title });
+  button.setAttribute("aria-keyshortcuts", key);
+  button.innerHTML = `<span></span><kbd aria-hidden="true">${key}</kbd>`;
+  let chosen = factors.indexOf(3);
+  const draw = () => { button.firstChild.textContent = `${text} × ${factors[chosen]}`; };
+  button.addEventListener("click", () => {
+    chosen = (chosen + 1) % factors.length;
+    choose(factors[chosen]);
+    draw();
+    orderLayers();
+  });
+  draw();
+  keys[key] = id;
+  return button;
+}
+$("layers").append(
+  addFactor("magnify", "x", "How much longer arrows are than the displacement they show", MAGNIFICATIONS, "Arrows", (factor) => { magnification = factor; }),
+  $("unit"),
+);
+$("surface-tools").prepend(
+  addFactor("rise", "z", "How much higher the surface is shown than it is", RISES, "Heights", (factor) => { rise = factor; }),
+);
+document.querySelector("#ramp i").style.background = `linear-gradient(90deg, ${RAMP})`;
+keys.u = "unit";
+$("unit").addEventListener("click", () => {
+  wanted = wanted === "mm" ? "px" : "mm";
+  localStorage.setItem("tactflow-unit", wanted);
+  drawValues(sensors.get(current));
 });
-drawMagnify();
-$("layers").append(magnify);
-keys.x = "magnify";
+
+// Dragging turns the surface, arrow keys do when it has the focus.
+const TURNS = { ArrowLeft: [-20, 0], ArrowRight: [20, 0], ArrowUp: [0, 20], ArrowDown: [0, -20], Home: [] };
+$("surface").addEventListener("keydown", (event) => {
+  const turn = TURNS[event.key];
+  if (!turn) return;
+  event.preventDefault();
+  order("turn", { dx: turn[0], dy: turn[1] });
+});
+$("surface").addEventListener("pointerdown", (event) => $("surface").setPointerCapture(event.pointerId));
+$("surface").addEventListener("pointermove", (event) => {
+  if (event.buttons & 1) order("turn", { dx: event.movementX, dy: event.movementY });
+});
+$("surface").addEventListener("dblclick", () => order("turn"));
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, textarea, select")) return;
@@ -366,6 +428,7 @@ document.addEventListener("keydown", (event) => {
   if (!id || event.repeat) return;
   event.preventDefault();
   const button = $(id);
+  if (button.closest("[hidden]")) return;
   if (button.disabled) note(`${button.querySelector(".label")?.textContent ?? id}: ${button.title}`);
   else button.click();
 });
@@ -403,7 +466,7 @@ function orderSizes(ids) {
   const ratio = Math.min(window.devicePixelRatio || 1, 2);
   for (const id of ids) {
     const [width, height] = [$(id).clientWidth, $(id).clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
-    order("resize", { index: CANVASES.indexOf(id), width, height, ratio });
+    order("resize", { id, width, height, ratio });
   }
 }
 
@@ -429,8 +492,6 @@ function put(thing, property, value) {
 function set(id, text) {
   put($(id), "textContent", String(text));
 }
-const fixed = (value, digits) => value.toFixed(digits).replace("-", MINUS);
-const grouped = (value) => Math.round(value).toLocaleString("en").replaceAll(",", "\u202f");
 const milliseconds = (value) => (value === null ? "–" : value.toFixed(value < 10 ? 2 : 1));
 const percent = (share) => `${share > 0 && share < 0.01 ? "<1" : Math.round(100 * share)}\u202f%`;
 const clock = (t) => (t > 1e9 ? new Date(t * 1000).toLocaleTimeString("en-GB") : `${t.toFixed(2)} s`);

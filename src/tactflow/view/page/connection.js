@@ -4,7 +4,7 @@ const DELAYS = [0.3, 0.7, 1.5, 3, 5];  // s between attempts; the last one repea
 const WRONG_TOKEN = 4401;
 
 export class Connection {
-  // on: { open, text(message), frame(header, blob), lost(secondsToNextAttempt), refused }
+  // on: { open, text(message), frame(header, blob, heights), lost(secondsToNextAttempt), refused }
   constructor(token, on) {
     this.on = on;
     this.attempt = 0;
@@ -59,9 +59,11 @@ export class Connection {
   }
 }
 
-// A little-endian length, a JSON header of that length, a JPEG picture.
+// A little-endian length, a JSON header of that length, the heights of a surface if it has some, a JPEG picture.
 function decode(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-  return [header, new Blob([new Uint8Array(buffer, 4 + length)], { type: "image/jpeg" })];
+  const pixels = 4 + length + (header.surface?.bytes ?? 0);
+  const heights = header.surface?.bytes ? new Uint16Array(buffer.slice(4 + length, pixels)) : null;
+  return [header, new Blob([new Uint8Array(buffer, pixels)], { type: "image/jpeg" }), heights];
 }

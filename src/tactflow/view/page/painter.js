@@ -6,13 +6,16 @@
 import { Connection } from "./connection.js";
 import { Picture } from "./picture.js";
 import { Plot, SECONDS } from "./plot.js";
+import { Surface } from "./surface.js";
 
 const BUSY_MS = 20;  // a frame that took longer is followed by a rest: the machine is full
 const NEWS_MS = 200;  // between two changes of anything but the picture
 
 let connection = null;
 let picture = null;
-let plots = [];
+let surface = null;
+let plots = {};
+let shows = [];  // what is sent only because it is shown here
 let run = null;
 let current = null;
 let visible = Promise.resolve();
@@ -24,7 +27,7 @@ const tell = (type, content = {}) => postMessage({ type, ...content });
 
 function sensor(name) {
   if (!sensors.has(name)) {
-    sensors.set(name, { name, points: [], header: null, bitmap: null, shown: [], told: -Infinity, timer: 0 });
+    sensors.set(name, { name, points: [], header: null, bitmap: null, heights: null, offers: new Set(), shown: [], told: -Infinity, timer: 0 });
     current ??= name;
   }
   return sensors.get(name);
@@ -35,29 +38,42 @@ function sensor(name) {
 const orders = {
   begin({ canvases, token, hidden }) {
     const degrees = (value) => `${value}°`.replace("-", "−");
+    const plot = (id, options) => [id, new Plot(canvases[id], options)];
     picture = new Picture(canvases.picture);
-    plots = [
-      new Plot(canvases["plot-area"], { series: [(p) => p.area], range: "positive", minimum: 100 }),
-      new Plot(canvases["plot-angle"], { series: [(p) => p.angle], range: [-90, 90], jump: 90, format: degrees }),
-      new Plot(canvases["plot-flow"], { series: [(p) => p.dx, (p) => p.dy], range: "symmetric", minimum: 1 }),
-      new Plot(canvases["plot-latency"], { series: [(p) => p.latency], range: "positive", minimum: 4 }),
-    ];
+    surface = new Surface(canvases.surface);
+    plots = Object.fromEntries([
+      plot("plot-area", { series: [(p, unit) => p.area[unit]], range: "positive", minimum: { px: 100, mm: 0.1 } }),
+      plot("plot-angle", { series: [(p) => p.angle], range: [-90, 90], jump: 90, format: degrees }),
+      plot("plot-flow", { series: [0, 1].map((axis) => (p, unit) => p.flow[unit][axis]), range: "symmetric", minimum: { px: 1, mm: 0.1 } }),
+      plot("plot-latency", { series: [(p) => p.latency], range: "positive", minimum: 4 }),
+      plot("plot-depth", { series: [(p) => p.depth], range: "positive", minimum: 0.1 }),
+      plot("plot-force", { series: [0, 1, 2].map((axis) => (p) => p.force[axis]), range: "signed", minimum: 0.1 }),
+      plot("plot-slip", { series: [(p) => p.stick], range: [0, 1] }),
+    ]);
+    tell("turns", { turns: surface.turns });
     orders.hide({ hidden });
-    connection = new Connection(token, { open: () => tell("open"), text, frame, lost: (seconds) => tell("lost", { seconds }), refused: () => tell("refused") });
+    connection = new Connection(token, { open, text, frame, lost: (seconds) => tell("lost", { seconds }), refused: () => tell("refused") });
   },
-  resize({ index, width, height, ratio }) {
-    [picture, ...plots][index].resize(width, height, ratio);
+  resize({ id, width, height, ratio }) {
+    ({ picture, surface, ...plots })[id].resize(width, height, ratio);
   },
   colours({ colours }) {
-    for (const drawing of [picture, ...plots]) drawing.recolour(colours);
+    for (const drawing of [picture, surface, ...Object.values(plots)]) drawing.recolour(colours);
   },
-  layers({ layers, magnify }) {
-    picture.choose(layers, magnify);
+  layers({ layers, magnify, rise, unit }) {
+    picture.choose(layers, magnify, unit);
+    surface.choose(rise);
+    for (const plot of Object.values(plots)) plot.choose(unit);
+    const before = String(shows);
+    shows = ["field", "surface"].filter((name) => layers[name]);
+    if (String(shows) !== before) connection.send({ show: shows });
+  },
+  turn({ dx, dy }) {
+    surface.turn(dx, dy);
   },
   choose({ name }) {
     current = name;
-    const s = sensor(name);
-    picture.show(s.bitmap, s.header);
+    showFrame(sensor(name));
     replot();
   },
   hide({ hidden }) {
@@ -78,11 +94,17 @@ onmessage = ({ data }) => orders[data.order](data);
 
 // -- from the run -----------------------------------------------------------------------------------------
 
+function open() {
+  if (shows.length) connection.send({ show: shows });
+  tell("open");
+}
+
 function text(message) {
   if (message.type === "hello") {
     // Another run behind the same address: what is on the screen is not its own.
     if (run !== null && run !== message.run) {
       picture.show(null, null);
+      surface.show(null, null, 1);
       for (const { timer, bitmap } of sensors.values()) {
         clearTimeout(timer);
         bitmap?.close();
@@ -97,7 +119,7 @@ function text(message) {
   tell(message.type, { message });
 }
 
-async function frame(header, blob) {
+async function frame(header, blob, heights) {
   const received = performance.now();
   const s = sensor(header.message.sensor);
   let bitmap = null;
@@ -112,36 +134,46 @@ async function frame(header, blob) {
     s.bitmap?.close();
     s.bitmap = bitmap;
   }
-  addFrame(s, header);
+  addFrame(s, header, heights);
   // The run sends the next frame only now: a slow page gets fewer of them, never old ones.
   const busy = performance.now() - received;
   const late = hiddenSince > received;
   connection.send({ ack: header.number, late, rest: late || busy < BUSY_MS ? 0 : Math.round(busy) });
 }
 
-function addFrame(s, header) {
-  const message = header.message;
-  const flow = message.flow?.mean ?? null;
+function addFrame(s, header, heights) {
+  const { message } = header;
+  const { contact, flow, force, slip } = message;
   const last = s.points[s.points.length - 1];
   if (last && message.t < last.t) s.points.length = 0;
   s.points.push({
     t: message.t,
-    area: message.contact?.area ?? null,
-    angle: message.contact?.angle ?? null,
-    dx: flow && flow[0],
-    dy: flow && flow[1],
+    area: { px: contact?.area ?? null, mm: contact?.area_mm2 ?? null },
+    angle: contact?.angle ?? null,
+    flow: { px: flow?.mean ?? [null, null], mm: flow?.mean_mm ?? [null, null] },
     latency: header.latency_ms < 0 ? null : header.latency_ms,
+    depth: contact?.depth_mm ?? null,
+    force: force?.value ?? [null, null, null],
+    stick: slip?.stick_ratio ?? null,
   });
   const first = s.points.findIndex((point) => point.t >= message.t - SECONDS);
   if (first > 0) s.points.splice(0, first);
   if (s.header && header.epoch !== s.header.epoch) tell("note", { text: `new reference taken at frame ${message.seq}` });
-  s.header = header;
+  const there = { scale: header.scale, field: header.field, surface: header.surface, force, slip };
+  for (const [name, value] of Object.entries(there)) if (value) s.offers.add(name);
+  Object.assign(s, { header, heights });
   const now = performance.now();
   s.shown.push(now);
   while (now - s.shown[0] > 1000) s.shown.shift();
-  if (s.name === current) picture.show(s.bitmap, header);
+  if (s.name === current) showFrame(s);
   if (now - s.told >= NEWS_MS) summarise(s);
   else if (!s.timer) s.timer = setTimeout(summarise, s.told + NEWS_MS - now, s);
+}
+
+function showFrame(s) {
+  picture.show(s.bitmap, s.header);
+  // The colours' scale is that of the plot, which rarely changes.
+  if (shows.includes("surface")) surface.show(s.header, s.heights, plots["plot-depth"].limits(s.points)[1]);
 }
 
 // The plots, and what the page writes in words.
@@ -150,16 +182,17 @@ function summarise(s) {
   clearTimeout(s.timer);
   s.timer = 0;
   s.told = performance.now();
-  const { message: { seq, t, size, contact, flow }, markers, latency_ms } = s.header;
+  const { message: { seq, t, size, contact, flow, force, slip }, markers, latency_ms } = s.header;
   const count = (letter) => markers.status.split(letter).length - 1;
   tell("frames", {
     sensor: s.name,
     summary: {
-      seq, t,
+      seq, t, flow, force, slip,
       counts: markers && { tracked: count("t"), inferred: count("i"), lost: count("l") },
       aspect: size[0] / size[1],
-      contact: contact && { area: contact.area, angle: contact.angle, confidence: contact.confidence },
-      flow: flow && { mean: flow.mean, count: flow.count, rotation: flow.rotation },
+      contact: contact && { ...contact, hull: undefined },
+      offers: [...s.offers],
+      deepest: plots["plot-depth"].limits(s.points)[1],
       latency: latency_ms,
       shown: s.shown.length,
       points: s.points.length,
@@ -169,5 +202,5 @@ function summarise(s) {
 
 function replot() {
   const points = sensors.get(current)?.points ?? [];
-  for (const plot of plots) plot.draw(points);
+  for (const plot of Object.values(plots)) plot.draw(points);
 }

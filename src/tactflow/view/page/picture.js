@@ -10,6 +10,7 @@ export class Picture {
     this.colours = null;
     this.layers = null;
     this.magnify = 1;
+    this.units = "px";
     this.ratio = 0;
     this.bitmap = null;
     this.header = null;
@@ -27,9 +28,11 @@ export class Picture {
   }
 
   // layers: whether each is shown, by its name. magnify: how much longer arrows are than what they show.
-  choose(layers, magnify) {
+  // units: "px" or "mm", of the lengths that are written.
+  choose(layers, magnify, units) {
     this.layers = layers;
     this.magnify = magnify;
+    this.units = units;
     this.draw();
   }
 
@@ -51,12 +54,13 @@ export class Picture {
       c.fillRect(0, 0, width, height);
     }
     if (!this.header) return;
-    const { message, markers } = this.header;
+    const { message, markers, field, scale } = this.header;
     const sx = width / message.size[0];
     const sy = height / message.size[1];
     this.at = ([x, y]) => [(x + 0.5) * sx, (y + 0.5) * sy];
     this.unit = ratio * Math.max(1, Math.min(width, height) / ratio / 480);
     c.lineJoin = c.lineCap = "round";
+    if (layers.field && field?.origin) this.drawField(field);
     if (layers.arrows && markers) this.drawMarkers(markers);
     if (message.contact) {
       if (layers.hull) this.drawHull(message.contact.hull);
@@ -64,6 +68,7 @@ export class Picture {
       if (layers.axis) this.drawAxis(message.contact);
       if (layers.mean && message.flow?.mean) this.drawMean(message.contact.center, message.flow.mean);
     }
+    if (this.units === "mm" && scale) this.drawRuler(sx / scale[0]);
   }
 
   // Every line has a dark rim, so that it shows on any picture.
@@ -132,6 +137,43 @@ export class Picture {
     c.fillStyle = this.colours.tracked;
     c.fill(seen.body);
     if (status.includes("i")) this.stroke(placed.head, this.colours.inferred, 1.2);
+  }
+
+  // How the gel between the markers has moved, in the same tenths of a pixel.
+  drawField({ origin, position }) {
+    const rim = new Path2D();
+    const body = new Path2D();
+    const u = this.unit;
+    for (let i = 0; i < origin.length; i += 2) {
+      const [x, y] = this.at([origin[i] / 10, origin[i + 1] / 10]);
+      const [xe, ye] = this.at([position[i] / 10, position[i + 1] / 10]);
+      const length = Math.hypot(xe - x, ye - y) * this.magnify;
+      if (length < 2 * u) continue;
+      const [ux, uy] = [((xe - x) * this.magnify) / length, ((ye - y) * this.magnify) / length];
+      const size = Math.min(4.5 * u, length * 0.45);
+      solidArrow(rim, x, y, ux, uy, length, size, 1.2 * u, 1.1 * u);
+      solidArrow(body, x, y, ux, uy, length, size, 0.5 * u, 0.3 * u);
+    }
+    this.context.fillStyle = DARK;
+    this.context.fill(rim);
+    this.context.fillStyle = this.colours.field;
+    this.context.fill(body);
+  }
+
+  // A bar of 1, 2 or 5 times a power of ten of mm, about a fifth of the picture. pixels: of the canvas for 1 mm.
+  drawRuler(pixels) {
+    const { width, height } = this.canvas;
+    const u = this.unit;
+    const power = 10 ** Math.floor(Math.log10((0.3 * width) / pixels));
+    const length = [5, 2, 1].find((step) => step * power * pixels <= 0.3 * width) * power;
+    const [x, y] = [width - 12 * u, height - 14 * u];
+    const bar = new Path2D();
+    bar.moveTo(x, y - 3 * u);
+    bar.lineTo(x, y);
+    bar.lineTo(x - length * pixels, y);
+    bar.lineTo(x - length * pixels, y - 3 * u);
+    this.stroke(bar, "#fff", 1.6);
+    this.label(`${Number(length.toPrecision(1))} mm`, x + 6 * u, y - 13 * u, -1);
   }
 
   drawHull(hull) {

@@ -4,9 +4,15 @@ export const SECONDS = 10;
 const GAP = 0.6;  // s; points further apart are not joined
 const LEFT = 34;
 const TOP = 6;
+const SERIES = [
+  { colour: "series-a", dash: [] },
+  { colour: "series-b", dash: [5, 3] },
+  { colour: "series-c", dash: [1.5, 3] },
+];
 
 export class Plot {
-  // series: one function (point) -> number or null each. range: [low, high], or "positive", or "symmetric".
+  // series: one function (point, unit) -> number or null each. range: [low, high], or "positive", "symmetric",
+  // or "signed": positive until a value is not. minimum: least value at the top, or one for each unit.
   constructor(canvas, { series, range, jump = Infinity, minimum = 1, format = short }) {
     Object.assign(this, { canvas, series, range, jump, minimum, format });
     this.context = canvas.getContext("2d", { alpha: false });
@@ -14,6 +20,13 @@ export class Plot {
     this.colours = null;
     this.ratio = 0;
     this.points = [];
+    this.unit = "px";
+  }
+
+  choose(unit) {
+    this.unit = unit;
+    this.drawn = null;
+    this.draw();
   }
 
   resize(width, height, ratio) {
@@ -40,20 +53,20 @@ export class Plot {
     const end = points.length ? points[points.length - 1].t : 0;
     const x = (t) => w - 2 + ((t - end) / SECONDS) * (w - 2 - LEFT);
     const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - TOP);
-    if (this.drawn !== high) this.drawGround(w, h, [low, (low + high) / 2, high], y);
-    this.drawn = high;
+    if (this.drawn !== `${low} ${high}`) this.drawGround(w, h, [low, (low + high) / 2, high], y);
+    this.drawn = `${low} ${high}`;
     c.setTransform(1, 0, 0, 1, 0, 0);
     c.drawImage(this.ground, 0, 0);
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     c.lineWidth = 1.8;
     c.lineJoin = "round";
     this.series.forEach((pick, index) => {
-      c.strokeStyle = c.fillStyle = index ? colours["series-b"] : colours["series-a"];
-      c.setLineDash(index ? [5, 3] : []);
+      c.strokeStyle = c.fillStyle = colours[SERIES[index].colour];
+      c.setLineDash(SERIES[index].dash);
       c.beginPath();
       let last = null;
       for (const point of points) {
-        const value = pick(point);
+        const value = pick(point, this.unit);
         if (value === null) {
           last = null;
           continue;
@@ -102,15 +115,10 @@ export class Plot {
 
   limits(points) {
     if (Array.isArray(this.range)) return this.range;
-    let most = this.minimum;
-    for (const point of points) {
-      for (const pick of this.series) {
-        const value = pick(point);
-        if (value !== null) most = Math.max(most, Math.abs(value));
-      }
-    }
-    const high = nice(most);
-    return this.range === "symmetric" ? [-high, high] : [0, high];
+    const values = points.flatMap((point) => this.series.map((pick) => pick(point, this.unit) ?? 0));
+    const high = nice(Math.max(this.minimum[this.unit] ?? this.minimum, ...values.map(Math.abs)));
+    const below = this.range === "symmetric" || (this.range === "signed" && Math.min(...values) < 0);
+    return [below ? -high : 0, high];
   }
 }
 

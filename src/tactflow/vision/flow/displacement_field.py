@@ -18,7 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision import compiled
+from tactflow.vision.flow import region
 from tactflow.vision.flow.inside import check_mask
+from tactflow.vision.flow.region import sample_region, sum_pairs, sum_region
 from tactflow.vision.markers.family import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -180,29 +183,21 @@ class FieldModel:
         rows, columns = self.grid.shape
         self.to_markers = self._kernel(self.points.reshape(-1, 2)).reshape(rows, columns, -1)
         """(rows, columns, N), the kernel between cells and markers."""
-        down, across = np.mgrid[1 - rows : rows, 1 - columns : columns] * self.grid.spacing
+        down, across = np.mgrid[:rows, 1 - columns : columns] * self.grid.spacing
         self._between = matern(np.hypot(down, across) / self._length)
+        compiled.load(region)
 
     def _kernel(self, points: FloatArray) -> FloatArray:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
         offset = points[:, None] - self.origin
         return matern(np.sqrt(np.einsum("mnk,mnk->mn", offset, offset)) / self._length)
 
-    def covariance(self, functionals: FloatArray, shape: tuple[int, int], step: int = 1) -> FloatArray:
-        """(F,): variance of linear functionals of the field before any marker is known.
-
-        functionals : (F, rows * columns), weights of the cells of a window of the grid. shape : its rows and
-            columns. step : every so many cells of the grid count, along each axis.
-        """
-        rows, columns = shape
-        weights = np.ascontiguousarray(functionals.T).reshape(rows, columns, -1)
-        middle, center = self.grid.shape[0] - 1, self.grid.shape[1] - 1
-        down, across = step * (rows - 1), step * (columns - 1)
-        table = self._between[
-            middle - down : middle + down + 1 : step, center - across : center + across + 1 : step
-        ]
-        spread = cv2.filter2D(weights, cv2.CV_64F, table, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray((weights * spread.reshape(weights.shape)).sum(axis=(0, 1)))
+    def between(self, rows: int, columns: int, step: int) -> FloatArray:
+        """(rows, 2 columns - 1): kernel between cells so many rows and columns apart, the latter from
+        1 - columns on; rows and columns are those of every so many cells of the grid."""
+        middle, across = self.grid.shape[1] - 1, step * (columns - 1)
+        near = self._between[: step * (rows - 1) + 1 : step, middle - across : middle + across + 1 : step]
+        return np.ascontiguousarray(near)
 
     @cached_property
     def weights(self) -> FloatArray:
@@ -241,7 +236,7 @@ class _Update:
     @property
     def taken(self) -> FloatArray:
         """(N,): what the diagonal of the inverse loses."""
-        return np.asarray(np.einsum("ns,st,nt->n", self._columns, self._middle, self._columns))
+        return np.asarray(((self._columns @ self._middle) * self._columns).sum(axis=1))
 
 
 class DisplacementField:
@@ -311,42 +306,61 @@ class DisplacementField:
         check_mask(mask, 0)
         box = cv2.boundingRect(mask)
         step = 1 if box[2] * box[3] < MANY * self.grid.spacing**2 else 2
-        part = self._part(mask, box, step)
-        if part is None:
+        cells = self._cells(mask, box, step)
+        if cells is None or not cells.inside.any():
             return None
         model, spacing = self._model, step * self.grid.spacing
-        share = part.inside.ravel() / part.cells
-        points, moved = part.points.reshape(-1, 2), part.moved.reshape(-1, 2)
-        arms = points - share @ points
-        functionals = _affine(share, arms, spacing)
-        kernel = functionals @ part.kernel.reshape(len(share), -1)
-        weights = kernel @ model.inverse
+        sums, pairs = np.zeros(13), np.empty(4)
+        weights, kernel = np.empty((3, cells.inside.size)), np.zeros((3, len(model.origin)))
+        sum_region(cells.inside, cells.moved, model.to_markers, cells.window, spacing, sums, weights, kernel)
+        sum_pairs(weights, model.between(*cells.shape, step), pairs)
+        return self._motion(sums.tolist(), pairs.tolist(), kernel, spacing)
+
+    def _motion(self, sums: list[float], pairs: list[float], kernel: FloatArray, spacing: float) -> GelMotion:
+        """The motion of a region from sums over its cells, see `sum_region` and `sum_pairs`.
+
+        kernel : (3, N), changed. spacing : of the cells, px.
+        """
+        cells, u, v, xx, xy, yy, xu, xv, yu, yv, squares, at_x, at_y = sums
+        inverse = _inverse(xx, xy, yy, spacing)
+        priors = pairs[:1]
+        if inverse is None:
+            kernel = kernel[:1]
+        else:
+            kernel[1:] = np.array(inverse) @ kernel[1:]
+            priors += [p * p * pairs[1] + 2 * p * q * pairs[2] + q * q * pairs[3] for p, q in inverse]
+        weights = kernel @ self._model.inverse
         if self._update is not None:
             weights = self._update.apply(weights.T).T
-        prior = model.covariance(functionals, part.inside.shape, step)
-        left = np.maximum(prior - (kernel * weights).sum(axis=1), 0)
+        left = np.maximum(priors - (kernel * weights).sum(axis=1), 0)
         # The markers near the region tell how rough the field is there, for the slopes as for the mean.
         scale = float(self._scale(kernel[:1])[0])
         stderr = np.sqrt(scale * left + (weights * weights) @ self._variance).tolist()
-        mean, *slopes = (functionals @ moved).tolist()
-        rest = moved - mean
-        squares = rest * rest
-        outline = _outline_errors(part, squares, spacing)
+        # An outline that is d too far out at s adds (m(s) - mean) d ds / area. Across it, the share of a cell
+        # falls from 1 to 0 within its width: share (1 - share) is 1 / 6 for a whole side.
+        unit = OUTLINE * 6 * spacing / (cells * spacing * spacing) ** 2
+        outline = math.sqrt(unit * at_x), math.sqrt(unit * at_y)
         gradient = residual = None
-        if slopes:
-            gradient = Gradient(tuple(slopes[0]), tuple(slopes[1]), stderr[1], stderr[2])
+        if inverse is not None:
+            dx, dy = ((p * xu + q * yu, p * xv + q * yv) for p, q in inverse)
+            gradient = Gradient(dx, dy, stderr[1], stderr[2])
             spread, turn = gradient.growth
-            rest = rest - arms @ np.array([[spread, turn], [-turn, spread]])
-            residual = math.sqrt(float(share @ (rest * rest).sum(axis=1)))
-        return GelMotion(tuple(mean), stderr[0], outline, gradient, residual, float(left[0] / prior[0]))
+            rest = squares - 2 * (spread * (xu + yv) + turn * (xv - yu)) + (spread**2 + turn**2) * (xx + yy)
+            residual = math.sqrt(max(rest, 0.0))
+        return GelMotion((u, v), stderr[0], outline, gradient, residual, float(left[0]) / priors[0])
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
         """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
         check_mask(mask, 0)
-        return self._part(mask, cv2.boundingRect(mask), step=1)
+        cells = self._cells(mask, cv2.boundingRect(mask), step=1)
+        total = 0.0 if cells is None else float(cells.inside.sum())
+        if cells is None or total == 0:
+            return None
+        top, left = cells.window[:2].tolist()
+        return Part(cells.inside.reshape(cells.shape), total, (top, left))
 
-    def _part(self, mask: NDArray[np.uint8], box: Sequence[int], step: int) -> Part | None:
-        """Of every so many cells, those in a region. box : (left, top, width, height) of the region."""
+    def _cells(self, mask: NDArray[np.uint8], box: Sequence[int], step: int) -> _Cells | None:
+        """Every so many cells around a region. box : (left, top, width, height) of the region."""
         left, top, width, height = box
         if width == 0:
             return None
@@ -355,22 +369,25 @@ class DisplacementField:
         margin = OVERSHOOT * model.pitch + grid.spacing
         low = (left - most[0] - margin, top - most[1] - margin)
         high = (left + width - least[0] + margin, top + height - least[1] + margin)
-        window = grid.window(low, high)
-        every = slice(None, None, step)
-        points, kernel = model.points[window][every, every], model.to_markers[window][every, every]
-        rows, columns = points.shape[:2]
-        if rows == 0 or columns == 0:
+        down, across = grid.window(low, high)
+        shape = len(range(down.start, down.stop, step)), len(range(across.start, across.stop, step))
+        if 0 in shape:
             return None
-        moved = (kernel.reshape(rows * columns, -1) @ self._coefficients).reshape(rows, columns, 2)
-        inside = _coverage(mask, box, points + moved, step * grid.spacing)
-        left, top, width, height = cv2.boundingRect(inside)
-        if width == 0:
-            return None
-        cells = slice(top, top + height), slice(left, left + width)
-        begin = window[0].start + step * top, window[1].start + step * left
-        covered = inside[cells] / 255.0
-        total = float(covered.sum())
-        return Part(covered, total, begin, points[cells], moved[cells], kernel[cells])
+        spacing = step * grid.spacing
+        side = 2 * round((spacing - 1) / 2) + 1
+        # Whatever is around the region counts as outside, also beyond the border of the frame.
+        picture = cv2.copyMakeBorder(
+            mask[top : top + height, left : left + width], side, side, side, side, cv2.BORDER_CONSTANT
+        )
+        x = grid.first[0] + grid.spacing * across.start - left + side
+        y = grid.first[1] + grid.spacing * down.start - top + side
+        window = np.array([down.start, across.start, step, shape[1], side])
+        inside, moved = np.empty(shape[0] * shape[1]), np.empty((shape[0] * shape[1], 2))
+        coefficients = np.ascontiguousarray(self._coefficients.T)
+        place = np.array([x, y, spacing])
+        sums = np.asarray(cv2.integral(picture), np.int32)
+        sample_region(model.to_markers, coefficients, sums, place, window, inside, moved)
+        return _Cells(shape, window, inside, moved)
 
     def _scale(self, kernel: FloatArray) -> FloatArray:
         """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""
@@ -386,16 +403,24 @@ class Part(NamedTuple):
     """A part of the gel: the cells of a window of the grid, so many rows and columns of them.
 
     inside : (rows, columns), how much of each cell belongs to the part, 0 to 1. cells : their sum.
-    begin : row and column of the grid where the window begins. points : (rows, columns, 2), at rest, px.
-    moved : (rows, columns, 2), px. kernel : (rows, columns, N), between cells and markers.
+    begin : row and column of the grid where the window begins.
     """
 
     inside: FloatArray
     cells: float
     begin: tuple[int, int]
-    points: FloatArray
+
+
+class _Cells(NamedTuple):
+    """Cells around a region, as `sample_region` sees them.
+
+    shape : rows and columns. window, inside, moved : as there.
+    """
+
+    shape: tuple[int, int]
+    window: NDArray[np.int64]
+    inside: FloatArray
     moved: FloatArray
-    kernel: FloatArray
 
 
 def matern(distance: FloatArray) -> FloatArray:
@@ -417,50 +442,14 @@ def _grid(size: tuple[int, int], pitch: float) -> Grid:
     return Grid((rows, columns), first, spacing)
 
 
-def _coverage(
-    mask: NDArray[np.uint8], box: Sequence[int], places: FloatArray, spacing: float
-) -> NDArray[np.uint8]:
-    """(rows, columns) uint8: how much of the surroundings of each cell is in a mask, of 255.
+def _inverse(
+    xx: float, xy: float, yy: float, spacing: float
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """The inverse of a part's second moments, px^-2; None for a part too small to have slopes.
 
-    mask : (H, W) uint8. box : (left, top, width, height) of what is not 0 in it. places : (rows, columns, 2),
-    where the cells are, px. spacing : of the cells, px: as wide is the square around each that counts.
+    spacing : of its cells, px: a single one has the second moment spacing^2 / 12 along each axis.
     """
-    side = 2 * round((spacing - 1) / 2) + 1
-    left, top, width, height = box
-    # Whatever is around the mask counts as outside, also beyond the border of the frame.
-    region = cv2.copyMakeBorder(
-        mask[top : top + height, left : left + width], side, side, side, side, cv2.BORDER_CONSTANT
-    )
-    shares = cv2.blur(region, (side, side))
-    at = (places - (left - side, top - side)).astype(np.float32)
-    inside = cv2.remap(shares, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return np.asarray(inside, np.uint8)
-
-
-def _affine(share: FloatArray, arms: FloatArray, spacing: float) -> FloatArray:
-    """(3, n) weights of the cells for mean, slope along x and slope along y; (1, n) for a part too small.
-
-    share : (n,), in sum 1. arms : (n, 2), from the part's middle, px.
-    """
-    weighted = (share[:, None] * arms).T
-    (xx, xy), (_, yy) = (weighted @ arms).tolist()
     determinant = xx * yy - xy * xy
-    # A single cell has the second moment spacing^2 / 12 along each axis.
     if determinant <= (xx + yy) * spacing * spacing / 12:
-        return share[None]
-    slopes = np.array([[yy, -xy], [-xy, xx]]) / determinant @ weighted
-    return np.vstack([share, slopes])
-
-
-def _outline_errors(part: Part, squares: FloatArray, spacing: float) -> tuple[float, float]:
-    """Standard error of a part's mean displacement, (dx, dy), px, because its outline is not exact.
-
-    An outline that is d too far out at s adds (u(s) - mean) d ds / area. squares : (n, 2), of the cells'
-    u - mean, px^2. spacing : of the cells, px.
-    """
-    # Across an outline, the share of a cell falls from 1 to 0 within its width: share (1 - share) tells how
-    # much outline there is, 1 / 6 for a whole side.
-    length = 6 * spacing * (part.inside * (1 - part.inside)).ravel()
-    area = part.cells * spacing * spacing
-    x, y = (OUTLINE / (area * area) * (length @ squares)).tolist()
-    return math.sqrt(x), math.sqrt(y)
+        return None
+    return (yy / determinant, -xy / determinant), (-xy / determinant, xx / determinant)

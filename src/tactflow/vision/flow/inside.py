@@ -41,11 +41,17 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
     inside = np.zeros(len(points), np.bool_)
     if len(points) == 0 or mask.size == 0:
         return inside
+    reach = math.floor(dilate)
+    if reach == 0:
+        x, y = np.rint(points).T
+        height, width = mask.shape
+        seen = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
+        inside[seen] = mask[y[seen].astype(np.intp), x[seen].astype(np.intp)]
+        return inside
     left, top, width, height = cv2.boundingRect(mask)
     if width == 0:
         return inside
     pixels = np.rint(points) - (left, top)
-    reach = math.floor(dilate)
     near = np.flatnonzero(
         (pixels[:, 0] >= -reach)
         & (pixels[:, 0] < width + reach)
@@ -56,9 +62,6 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
         return inside
     x, y = pixels[near].astype(np.intp).T
     roi: NDArray[Any] = mask[top : top + height, left : left + width]
-    if reach == 0:
-        inside[near] = roi[y, x] != 0
-        return inside
     inside[near] = _near_mask(x, y, roi, dilate)
     return inside
 

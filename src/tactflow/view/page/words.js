@@ -1,0 +1,56 @@
+// What the tiles say: numbers of the result message in words, each [number, what stands behind it].
+
+const MINUS = "−";
+export const fixed = (value, digits) => value.toFixed(digits).replace("-", MINUS);
+export const grouped = (value) => Math.round(value).toLocaleString("en").replaceAll(",", "\u202f");
+const NONE = ["–", ""];
+
+export function area({ contact }, unit) {
+  if (!contact) return ["–", "no contact"];
+  if (unit === "px") return [grouped(contact.area), "px²"];
+  return [fixed(contact.area_mm2, 2), `mm² at ${contact.center_mm.map((value) => fixed(value, 1)).join(", ")} mm`];
+}
+
+export function angle({ contact }) {
+  if (!contact) return NONE;
+  if (contact.angle === null) return ["–", "no direction"];
+  return [`${fixed(contact.angle, 1)}°`, `confidence ${fixed(contact.confidence, 2)}`];
+}
+
+export function flow({ flow }, unit) {
+  if (!flow) return NONE;
+  if (!flow.mean) return ["–", "no marker inside"];
+  const [mean, stderr] = unit === "px" ? [flow.mean, flow.stderr] : [flow.mean_mm, flow.mean_mm_stderr];
+  const digits = unit === "px" ? 2 : 3;
+  const twist = flow.rotation == null ? "" : `, twist ${fixed(flow.rotation, 1)}°`;
+  const count = `${flow.count} ${flow.count === 1 ? "marker" : "markers"}`;
+  return [fixed(Math.hypot(...mean), digits), `${unit}${error(lengthError(mean, stderr), digits)}, ${count}${twist}`];
+}
+
+export function depth({ contact }) {
+  if (contact?.depth_mm == null) return NONE;
+  const { depth_mm, depth_mm_stderr, volume_mm3 } = contact;
+  return [fixed(depth_mm, 3), `mm${error(depth_mm_stderr, 3)}, ${fixed(volume_mm3, 2)} mm³`];
+}
+
+// The component across the gel is always there; those along it where the calibration has them.
+export function force({ force }) {
+  if (!force) return NONE;
+  const { value, stderr, in_range } = force;
+  const along = ["x", "y"].flatMap((axis, i) => (value[i] === null ? [] : [`${axis} ${fixed(value[i], 2)}`]));
+  const doubt = in_range === false ? ["unlike the calibration's contacts"] : [];
+  return [fixed(value[2], 2), [`N${error(stderr[2], 2)}`, ...along, ...doubt].join(", ")];
+}
+
+export function slip({ slip }) {
+  if (!slip) return NONE;
+  return [slip.slipping ? "slips" : "holds", `${Math.round(100 * slip.stick_ratio)}\u202f% of the contact sticks`];
+}
+
+const error = (stderr, digits) => (stderr == null ? "" : ` ± ${fixed(stderr, digits)}`);
+
+// Standard error of the length of a vector, from those of its components.
+function lengthError(vector, stderr) {
+  const length = Math.hypot(...vector);
+  return stderr && length > 0 ? Math.hypot(...vector.map((part, i) => part * stderr[i])) / length : null;
+}
