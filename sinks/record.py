@@ -23,7 +23,7 @@ from tactflow.engine.rate import SLACK, RateLimit
 from tactflow.files import expanded, next_name
 from tactflow.message import Results, encode_message
 from tactflow.ports import Image
-from tactflow.provenance import facts, texts
+from tactflow.provenance import arrays, facts, texts
 from tactflow.recording import missing_packages
 
 if TYPE_CHECKING:
@@ -411,7 +411,9 @@ class Record(Recorder):
     def _about(self) -> About:
         from tactflow.recording.writer import About
 
-        return About(self._sensor, facts(self._sensor, self._control), texts(self._control))
+        return About(
+            self._sensor, facts(self._sensor, self._control), texts(self._control), arrays(self._control)
+        )
 
 
 def _refuses(params: Record.Params) -> bool:
