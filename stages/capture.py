@@ -42,7 +42,8 @@ class Capture(Source):
         source: str = Field(
             "sim:press",
             description="sim:NAME?query, camera index, /dev/videoN or /dev/v4l/by-id/NAME, video file, "
-            "folder or glob of images, .npy file, .mcap recording, http:// rtsp:// udp:// stream",
+            "folder or glob of images, .npy file, .mcap recording, ROS bag with ?topic=, .h5 or .zarr with "
+            "?dataset=, lerobot:PATH?camera=KEY&episode=N, http:// rtsp:// udp:// stream",
         )
         realtime: bool = Field(
             False, description="play a recording at its own pace, with a live camera's drop policy"

@@ -50,7 +50,7 @@ class Force(Stage):
             if depth is None:
                 return Absent("no_depth")
         else:
-            change = total_change(unmarked, untouched) - model.change_at_rest
+            change = scale.area(total_change(unmarked, untouched)) - model.change_at_rest
         force = model.force(seen(contact, scale, depth, change, flow))
         if not force.in_range and not self._warned:
             self._warned = True

@@ -29,6 +29,8 @@ class Scale(Stage):
         """Prepare. calibration : the file."""
         super().__init__(params)
         self._calibration = None if calibration is None else Calibration.load(calibration)
+        self._recorded = calibration is not None and calibration.suffix == ".mcap"
+        self._looked_at: Untouched | None = None
 
     def process(
         self, untouched: Untouched, mapping: PixelMapping | None = None
@@ -39,14 +41,26 @@ class Scale(Stage):
             return Absent("no_calibration")
         size = (untouched.shape[1], untouched.shape[0])
         misfit = calibration.misfit(mapping or PixelMapping.identity(size))
+        if misfit is not None and self._recorded:
+            # Nobody asked for it: it came with the recording.
+            if self._looked_at is None:
+                logger.warning("scale: the calibration in the recording is not used: %s", misfit)
+            self._looked_at = untouched
+            return Absent("no_calibration")
         if misfit is not None:
             raise StageError(f"{misfit}; use the pipeline that it was made with, or calibrate anew")
-        unlike = calibration.unlikeness(untouched)
-        if unlike > UNLIKE:
-            logger.warning(
-                "scale: the untouched gel differs by %.0f %% of its brightness from the calibrated one "
-                "(%.0f %% is usual at most): another sensor, another light, or something touches it",
-                100 * unlike,
-                100 * UNLIKE,
-            )
+        if self._looked_at is not untouched:
+            self._looked_at = untouched
+            _look_at(untouched, calibration)
         return calibration.scale
+
+
+def _look_at(untouched: Untouched, calibration: Calibration) -> None:
+    unlike = calibration.unlikeness(untouched)
+    if unlike > UNLIKE:
+        logger.warning(
+            "scale: the untouched gel differs by %.0f %% of its brightness from the calibrated one "
+            "(%.0f %% is usual at most): another sensor, another light, or something touches it",
+            100 * unlike,
+            100 * UNLIKE,
+        )

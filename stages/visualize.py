@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import Field
@@ -10,7 +11,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Image, Picture, Valid
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import DisplacementField
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 
 
 class Visualize(Stage):
@@ -24,9 +25,12 @@ class Visualize(Stage):
         arrow_scale: float = Field(
             3.0, ge=0, le=1000, description="arrow length over displacement, 1; 1 ends it where the marker is"
         )
-        view: Literal["frame", "contact"] = Field(
-            "frame", description="contact: only the contact and the arrows inside it, the rest black"
+        view: Literal["frame", "contact", "depth"] = Field(
+            "frame",
+            description="contact: only the contact and the arrows inside it, the rest black. depth: the "
+            "height map instead of the picture; needs a calibration",
         )
+        deepest: float = Field(1.0, gt=0, le=100, description="view depth: height of the lightest colour, mm")
         ellipse: bool = Field(False, description="whether the fitted ellipse is drawn")
         field: bool = Field(False, description="whether the displacement between the markers is drawn")
         text: bool = Field(True, description="whether numbers are written")
@@ -34,14 +38,24 @@ class Visualize(Stage):
             8.0, ge=0, le=1000, description="view contact: how far outside the contact is shown, px"
         )
 
+        def needed_inputs(self) -> Mapping[str, str]:
+            """Heights, to show them."""
+            return {"depth": "view", "scale": "view"} if self.view == "depth" else {}
+
+        def unused_inputs(self) -> set[str]:
+            """What is not shown need not be computed."""
+            return ({"depth", "scale"} if self.view != "depth" else set()) | (
+                set() if self.field else {"field"}
+            )
+
     def __init__(self, params: Params) -> None:
-        self._field = params.field
         self._annotator = Annotator(
             arrow_scale=params.arrow_scale,
             view=params.view,
             ellipse=params.ellipse,
             text=params.text,
             dilate=params.dilate,
+            deepest=params.deepest,
         )
 
     def process(
@@ -53,6 +67,8 @@ class Visualize(Stage):
         contact_mask: ContactMask | None,
         valid: Valid | None = None,
         field: DisplacementField | None = None,
+        depth: Depth | None = None,
+        scale: Scale | None = None,
     ) -> Picture:
         """A new picture; what is absent is not drawn."""
         return self._annotator(
@@ -62,5 +78,7 @@ class Visualize(Stage):
             markers=markers,
             contact_mask=contact_mask,
             valid=valid,
-            field=field if self._field else None,
+            field=field,
+            depth=depth,
+            scale=scale,
         )

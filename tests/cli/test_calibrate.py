@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 import tactflow
 from tactflow.cli.main import main
 from tactflow.sim import open_scene
+from tactflow.vision.geometry import Preprocessor
 
 RAW_MM = 0.025
 """Millimetres per raw pixel of the simulated gel, chosen so that its ball has a radius of 2.375 mm."""
@@ -44,6 +46,40 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     sunk = float(open_scene("press?seed=11&frames=80").truth(deepest.seq).sunk.max()) * RAW_MM
     assert abs(deepest.depth.greatest - sunk) < max(3 * deepest.depth.greatest_stderr, 0.03 * sunk)
 
+    gauge = ["sim", "ball?frames=140&shear=0.6", "--truth", "gauge.csv", "--quiet"]
+    assert main(gauge) == 0
+    force = [
+        "force",
+        "calibration/main.yaml",
+        "--from",
+        "sim:ball?frames=140&shear=0.6",
+        "--csv",
+        "gauge.csv",
+    ]
+    assert calibrate(*force) == 0
+    told = capsys.readouterr().err
+    assert "heights are not known" not in told
+    assert "the gauge's x axis lies -90 degrees" in told
+    assert calibrate(*force) == 2
+    assert "has a force already" in capsys.readouterr().err
+    spec = "ball?frames=60&shear=0.6&seed=3"
+    felt = [r for r in tactflow.stream(source=f"sim:{spec}", settings=settings) if r.force]
+    mapping = Preprocessor((800, 600), rotate=90, downsample=2).mapping
+    off = []
+    for result in felt:
+        assert result.force is not None
+        true = open_scene(spec).truth(result.seq, mapping).force
+        # Sideways it is not known where no dot lies in the contact.
+        parts = zip(result.force.value, result.force.stderr, true, strict=True)
+        off += [
+            (axis, (value - real) / (stderr or 0))
+            for axis, (value, stderr, real) in enumerate(parts)
+            if value
+        ]
+    assert {axis for axis, _ in off} == {0, 1, 2}
+    assert np.mean([abs(error) < 2 for _, error in off]) > 0.85
+    assert max(abs(error) for _, error in off) < 6
+
     assert calibrate(*words) == 2
     assert "give --overwrite" in capsys.readouterr().err
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:ball?frames=80&seed=2") == 0
@@ -62,6 +98,8 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
         (["--from", "sim:idle?frames=3", "--area", "0", "20"], "falls"),
         (["check", "nowhere.yaml", "--from", "sim:idle"], "nowhere.yaml"),
         (["check"], "required a calibration file"),
+        (["force"], "required a calibration file"),
+        (["force", "nowhere.yaml", "--from", "sim:idle"], "nowhere.yaml"),
     ],
 )
 def test_what_gives_no_calibration_is_refused_in_words(

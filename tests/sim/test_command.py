@@ -42,7 +42,7 @@ def test_the_list_names_every_scene_and_every_setting(capsys: Capture) -> None:
         (["pres", "--out", "a.npy"], "did you mean press"),
         (["press?noise=x", "--out", "a.npy"], "noise"),
         (["press", "--out", "a.gif"], ".npy"),
-        (["press", "--out", "a.npy", "--truth", "a.csv"], ".jsonl"),
+        (["press", "--out", "a.npy", "--truth", "a.txt"], ".jsonl"),
         (["press", "--out", "there.npy"], "--overwrite"),
         (["press", "--out", "there.npy/a.npy"], "not a folder"),
         (["press", "--truth", "folder.jsonl"], "is a folder"),

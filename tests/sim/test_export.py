@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tactflow.calibration.reference import read_reference
 from tactflow.sim import export, open_scene
 from tactflow.sim.scenes import Scene
 
@@ -111,4 +112,12 @@ def test_unknown_suffixes_are_an_error(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\.npy"):
         export.write_frames(scene, tmp_path / "a.gif")
     with pytest.raises(ValueError, match=r"\.jsonl"):
-        export.write_truth(scene, tmp_path / "a.csv")
+        export.write_truth(scene, tmp_path / "a.txt")
+
+
+def test_a_csv_holds_what_a_force_gauge_would_say(scene: Scene, tmp_path: Path) -> None:
+    export.write_truth(scene, tmp_path / "a.csv")
+    gauge = read_reference(tmp_path / "a.csv")
+    assert gauge.time.tolist() == pytest.approx([i / 60 for i in range(12)])
+    np.testing.assert_allclose(gauge.force, [scene.truth(i).force for i in range(12)])
+    assert gauge.force[:, 2].max() > 0.1

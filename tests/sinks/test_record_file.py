@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +13,25 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+import tactflow
 from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
 from tactflow.message import Results, message_schema
 from tactflow.recording.frames import FrameCoder, StoredFrame
+from tactflow.recording.layout import layout
 from tactflow.recording.protobuf import decode, encode, unzigzag, zigzag
-from tactflow.recording.schemas import plain_schema
+from tactflow.recording.schemas import encode_annotations, plain_schema
 from tactflow.sinks.record import Record
 from tactflow.vision.types import Contact, Ellipse, Flow
+from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 PIPELINE = """\
 sensor: left    # a comment
@@ -59,6 +66,49 @@ def test_pictures_are_foxglove_compressed_images(recording: Path) -> None:
         pixels = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
         assert pixels is not None
         assert pixels.shape == (600, 800, 3)
+
+
+def test_annotations_of_foxglove_lie_on_contact_and_dots_counted_from_the_corner_of_a_pixel() -> None:
+    tracked = replace(MARKERS, status=np.array([0, 1, 2], np.uint8))
+    two = replace(CONTACT, separate=(CONTACT, replace(CONTACT, hull=CONTACT.hull + 100)))
+    encoded = encode_annotations(Results(PROCESSED, two, FLOW, tracked), 1_500_000_000)
+    read = ImageAnnotations.FromString(encoded)
+    assert (read.timestamp.seconds, read.timestamp.nanos) == (1, 500_000_000)
+    places = [(one.type, np.array([(point.x, point.y) for point in one.points])) for one in read.points]
+    outlines = [points for kind, points in places if kind == PointsAnnotation.LINE_LOOP]
+    assert np.array_equal(outlines, [CONTACT.hull + 0.5, CONTACT.hull + 100.5])
+    dots = np.concatenate([points for kind, points in places if kind == PointsAnnotation.POINTS])
+    assert np.array_equal(dots, MARKERS.position + 0.5)
+    (arrows,) = [points for kind, points in places if kind == PointsAnnotation.LINE_LIST]
+    tails, tips = arrows[::6], arrows[1::6]
+    assert np.array_equal(tails, MARKERS.origin[:2] + 0.5)
+    assert np.allclose(tips - tails, 3 * MARKERS.displacement[:2])
+
+
+def test_annotations_lie_on_the_dots_of_the_picture_beside_them(tmp_path: Path) -> None:
+    path = tmp_path / "press.mcap"
+    sinks = {"record": {"path": str(path), "preview": 60, "quality": 100}}
+    tactflow.run(source="sim:press?frames=100", settings={"sinks": sinks}, max_frames=30)
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        pictures = {m.log_time: p for _, _, m, p in reader.iter_decoded_messages("/main/image")}
+        annotations = {m.log_time: a for _, _, m, a in reader.iter_decoded_messages("/main/annotations")}
+        topics = {channel.topic for channel in reader.get_summary().channels.values()}
+    assert sorted(annotations) == sorted(pictures)
+    time = max(pictures)
+    gray = cv2.imdecode(np.frombuffer(pictures[time].data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    dark = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, 25, 20)
+    _, _, boxes, centres = cv2.connectedComponentsWithStats(dark)
+    found = centres[1:][boxes[1:, cv2.CC_STAT_AREA] > 20]
+    shown = {one.type: [(p.x, p.y) for p in one.points] for one in annotations[time].points}
+    assert shown[PointsAnnotation.LINE_LOOP]
+    # From the corner of a pixel, as Foxglove draws them.
+    distances = np.linalg.norm(np.array(shown[PointsAnnotation.POINTS])[:, None] - (found + 0.5), axis=2)
+    assert distances.shape[0] == 80
+    assert distances.min(axis=1).max() < 0.5
+    # The layout shows channels that are there.
+    text = json.dumps(layout("main"))
+    assert set(re.findall(r"/main/\w+", text)) <= topics
 
 
 def test_raw_frames_can_be_unpacked_by_anybody_from_the_schema_in_the_file(recording: Path) -> None:

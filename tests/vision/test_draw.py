@@ -13,7 +13,7 @@ from tactflow.vision.draw import Annotator, draw_arrows, draw_ellipse, draw_poly
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.lettering import Lettering
-from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
+from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
 
 GRAY = np.full((240, 320, 3), 100, np.uint8)
 
@@ -207,8 +207,9 @@ def test_a_polygon_of_one_point_is_a_point() -> None:
     [
         ({"arrow_scale": -1.0}, "arrow_scale"),
         ({"arrow_scale": math.nan}, "arrow_scale"),
-        ({"view": "left"}, "'frame' or 'contact'"),
+        ({"view": "left"}, "frame, contact, depth"),
         ({"dilate": -1.0}, "dilate"),
+        ({"deepest": 0.0}, "deepest"),
     ],
 )
 def test_bad_options_are_refused_with_a_reason(kwargs: dict[str, Any], message: str) -> None:
@@ -221,6 +222,27 @@ def test_pictures_of_another_kind_are_refused() -> None:
         Annotator()(np.zeros((4, 4), np.uint8))
     with pytest.raises(ValueError, match="contact_mask of shape"):
         Annotator(view="contact")(GRAY, contact_mask=np.zeros((4, 4), np.uint8))
+    flat, scale = Depth(np.zeros((4, 4), np.float32), 0.0, None, 0.0, None), Scale(1, 1, (0, 0), (0, 0))
+    with pytest.raises(ValueError, match="heights of shape"):
+        Annotator(view="depth")(GRAY, depth=flat, scale=scale)
+
+
+def test_a_height_map_has_its_numbers_and_a_bar_that_explains_its_colours() -> None:
+    scale = Scale(0.1, 0.1, (0, 0), (0, 0))
+    depth = Depth(np.full(GRAY.shape[:2], 0.2, np.float32), 0.2, None, 4.0, None)
+    with_text, plain = (
+        Annotator(view="depth", deepest=2.0, text=text)(GRAY, depth=depth, scale=scale)
+        for text in (True, False)
+    )
+    changed = (with_text != plain).any(axis=2)
+    height, width = changed.shape
+    assert changed[:40, :60].any(), "the numbers"
+    bar = with_text[-30:, : width // 2].reshape(-1, 3).tolist()
+    assert [84, 1, 68] in bar, "0"
+    assert [37, 231, 253] in bar, "the deepest"
+    assert not changed[height // 2].any()
+    tiny = Annotator(view="depth")(GRAY[:9, :9], depth=None, scale=None)
+    assert tiny.shape == (9, 9, 3)
 
 
 def test_letters_of_opencv_4_are_plain_but_there() -> None:

@@ -19,11 +19,12 @@ from tactflow.calibration.presses import Press, Session, find_presses
 from tactflow.calibration.scale import centre
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Scene, open_scene
+from tactflow.sim.elastic import MM
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Scale
 
-RAW_MM: Final = 0.025
+RAW_MM: Final = MM
 """Millimetres per raw pixel that the simulated gel is given."""
 BALL: Final = 95 * RAW_MM
 """Radius of the ball of the scene `ball`, mm."""

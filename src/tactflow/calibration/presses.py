@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.api import make_runner
-from tactflow.engine.conformance import component
+from tactflow.calibration.collecting import collect
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Mark, Node, Pipeline
+from tactflow.engine.graph import Pipeline
 from tactflow.ports import ContactMask, MarkerMask, Unmarked
-from tactflow.signals import ending_handled
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Markers
 
 MOVED_ON: Final = 0.5
 """How far a contact lies from the one before, in its own radii, to be another press. Chosen by hand."""
-
-_COLLECT: Final = "tactflow.calibrate"
-"""Id of the sink that collects; no id of a file has a point in it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -82,23 +77,8 @@ def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, 
     ConfigError : the pipeline lacks one of the stages, or its source has no frames.
     TactflowError : a stage or the source failed.
     """
-    values: dict[str, Any] = {"report": staticmethod(report), "__annotations__": {}}
-    sink = component(type("Collect", (_Collect,), values), _COLLECT, "tactflow calibrate", ())
-    inputs = {port.name: pipeline.last_output(port.name) for port in sink.ports.inputs}
-    # Of a gel without markers the picture itself is without them.
-    inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
-    for port, stage in (("unmarked", "preprocess"), ("contact", "hull")):
-        if inputs[port] is None:
-            raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
-    kept = {id_: node for id_, node in pipeline.nodes.items() if node.component.kind != "sink"}
-    kept[_COLLECT] = Node(_COLLECT, sink, StageParams(), inputs, Mark(_COLLECT, 0, 0))
-    runner = make_runner(replace(pipeline, nodes=kept, skipping=False, calibration=None))
-    with ending_handled(lambda _number, _frame: runner.stop()):
-        failure = runner.run().failure
-    if failure is not None:
-        raise failure
-    collected: Any = runner.nodes[_COLLECT].instance
-    return _session(collected)
+    needed = {"unmarked": "preprocess", "contact": "hull"}
+    return _session(collect(pipeline, _Collect, {"report": report}, needed))
 
 
 class _Collect(Sink):

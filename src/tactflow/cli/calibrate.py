@@ -15,6 +15,7 @@ from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_pi
 from tactflow.calibration.photometric import fit_photometry, try_photometry
 from tactflow.calibration.presses import Press, Report, Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
+from tactflow.cli.calibrate_force import add_force
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.vision.types import Scale
@@ -30,9 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what",
         nargs="*",
-        metavar="PIPELINE | check FILE [PIPELINE]",
+        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE]",
         help="a pipeline with the sensor's preprocess, to make a calibration (default: ./pipeline.yaml, else "
-        "the packaged one); or check, and a calibration file, to see how well it fits today",
+        "the packaged one); or check, and a calibration file, to see how well it fits today; or force, and a "
+        "calibration file, to add to it how the force follows from the contact",
     )
     parser.add_argument(
         "--source",
@@ -40,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="source",
         metavar="SRC",
         help="as in 'tactflow run': a camera, a recording or a folder of pictures. First the untouched gel, "
-        "then presses of the ball",
+        "then presses of the ball. For force, a recording with a CSV of the same name beside it, or a folder "
+        "of them",
     )
     parser.add_argument("--sensor", metavar="NAME", help="which one of a file with sensors")
     parser.add_argument("--out", type=Path, metavar="FILE", help="calibration/SENSOR.yaml unless given")
@@ -57,6 +60,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--presses", type=int, default=30, metavar="N", help="of a live source: enough presses (30)"
     )
+    parser.add_argument(
+        "--csv",
+        type=Path,
+        metavar="FILE",
+        help="for force: what the gauge said, where it does not lie beside the recording; columns t (s) or "
+        "frame, fz (N), and fx and fy if there are",
+    )
+    parser.add_argument(
+        "--offset",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="for force: add so much to the time of the CSV; what is left, up to 2 s, is estimated",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -72,6 +89,10 @@ def run(args: argparse.Namespace) -> int:
         if len(words) not in (2, 3):
             raise ConfigError("calibrate check: required a calibration file, and a pipeline if wanted")
         return _check(args, Path(words[1]), words[2] if len(words) == 3 else None)
+    if words[:1] == ["force"]:
+        if len(words) not in (2, 3):
+            raise ConfigError("calibrate force: required a calibration file, and a pipeline if wanted")
+        return add_force(args, Path(words[1]), words[2] if len(words) == 3 else None)
     if len(words) > 1:
         raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
     return _make(args, words[0] if words else None)

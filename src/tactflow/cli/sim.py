@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--truth",
         type=Path,
         metavar="FILE",
-        help=".jsonl (one line a frame) or .npz (with contact masks); raw pixel coordinates",
+        help=".jsonl (one line a frame) or .npz (with contact masks), in raw pixels; .csv for force",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace files that are already there")
     parser.add_argument("--list", action="store_true", help="print the scenes and the settings they know")
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     failed.
     """
     from tactflow.sim import open_scene
-    from tactflow.sim.export import NotLosslessError, frames_kind, write_frames, write_truth
+    from tactflow.sim.export import TRUTH_SUFFIXES, NotLosslessError, frames_kind, write_frames, write_truth
 
     if args.list:
         _list()
@@ -61,8 +61,8 @@ def run(args: argparse.Namespace) -> int:
             frames_kind(args.out)
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    if args.truth is not None and args.truth.suffix.lower() not in (".jsonl", ".npz"):
-        raise ConfigError(f"--truth: required a .jsonl or .npz file, got {args.truth}")
+    if args.truth is not None and args.truth.suffix.lower() not in TRUTH_SUFFIXES:
+        raise ConfigError(f"--truth: required a {', '.join(TRUTH_SUFFIXES)} file, got {args.truth}")
     jobs = [("--out", args.out, write_frames), ("--truth", args.truth, write_truth)]
     for option, path, _write in jobs:
         if path is not None:

@@ -103,6 +103,7 @@ class _Wiring:
 
     def connect_inputs(self, draft: Draft, component: Component) -> None:
         explicit = self._explicit(draft, component)
+        unused = draft.params.unused_inputs() if draft.params else ()
         for port in component.ports.inputs:
             draft.inputs[port.name] = None
             mark = draft.mark
@@ -115,6 +116,8 @@ class _Wiring:
                         self._problems.add(mark, f"{path}: this input is required; name the output to take")
                     continue
                 ref = self._reference(item, path, draft)
+            elif port.optional and port.name in unused:
+                continue
             else:
                 path = draft.path
                 ref = self._nearest(port.name, draft)

@@ -31,7 +31,7 @@ part whose `open()` was started, also after an error.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -59,6 +59,11 @@ class StageParams(BaseModel):
     def needed_inputs(self) -> Mapping[str, str]:
         """Optional inputs that these settings cannot do without: port -> the parameter that needs it."""
         return {}
+
+    def unused_inputs(self) -> Collection[str]:
+        """Optional inputs that these settings make no use of: they are not connected, and nothing is computed
+        for them."""
+        return ()
 
     def changed(self, **values: Any) -> Self:
         """A copy with other values; they are not validated again."""

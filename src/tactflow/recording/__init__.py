@@ -6,6 +6,7 @@ One file holds the frames of one sensor. Its channels, with `/main` for the sens
     /main/references   those that show the untouched gel     the same
     /main/results      the result messages                   JSON tactflow.frame
     /main/image        pictures for people, at a low rate    protobuf foxglove.CompressedImage
+    /main/annotations  contact, dots, arrows on those        protobuf foxglove.ImageAnnotations
 
 Attachments: `pipeline.yaml` (with every override, so that it can be run as it is), `pipeline.original.yaml`
 (the file as it was written), `message.schema.json`. Metadata `tactflow`: versions and the source.
@@ -19,7 +20,7 @@ from __future__ import annotations
 
 from tactflow.extras import missing
 
-NEEDED = ("mcap", "zstandard")
+NEEDED = ("mcap", "zstandard", "mcap_protobuf", "foxglove_schemas_protobuf")
 
 
 def missing_packages() -> str | None:

@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Message, Schema
+from mcap.records import Attachment, Channel, Message, Schema
 from mcap.summary import Summary
 
 from tactflow.recording.frames import TYPE_NAME
 from tactflow.recording.records import DAMAGE, Damage, NotARecordingError, intact_records
+
+MOST_NAMED = 20
+"""Topics that a message lists at most. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +80,25 @@ def _is_ours(channel: Channel, schemas: dict[int, Schema]) -> bool:
 def _topics(ours: set[str], known: set[str]) -> tuple[str, str]:
     frames = sorted(topic for topic in ours if topic.endswith("/frames"))
     if not frames:
-        there = f"it has {', '.join(sorted(known)[:5])}" if known else "it is empty"
-        raise NotARecordingError(
-            f"holds no frames that tactflow recorded ({there}); tactflow record writes such files"
-        )
+        there = "it is empty" if not known else f"to play one of its topics, add ?topic={min(known)}"
+        others = f" or {', '.join(sorted(known)[1:MOST_NAMED])}" if len(known) > 1 else ""
+        raise NotARecordingError(f"holds no frames that tactflow recorded; {there}{others}")
     return frames[0], frames[0].removesuffix("frames") + "references"
+
+
+def attachments(path: Path) -> dict[str, bytes]:
+    """Name -> bytes of the files that stand before the frames of a recording, as ours do; {} where none do.
+
+    Raises OSError if it cannot be read, NotARecordingError if it is no MCAP file.
+    """
+    found: dict[str, bytes] = {}
+    with path.open("rb") as file:
+        for record in intact_records(file):
+            if isinstance(record, Attachment):
+                found[record.name] = bytes(record.data)
+            elif isinstance(record, Message):
+                break
+    return found
 
 
 def read_summary(file: BinaryIO) -> Summary | None:

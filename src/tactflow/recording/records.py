@@ -188,7 +188,7 @@ def _records_of(chunk: Chunk) -> Iterator[McapRecord]:
     """The records of an unpacked chunk, one by one: as objects, small ones take ten times their bytes."""
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
     while stream.count < size:
-        kind, length = stream.read1(), stream.read8()
+        kind, length = stream.read1(), _bounded(stream.read8())
         if kind == Opcode.MESSAGE:
             yield Message.read(stream, length)
         elif kind in (Opcode.CHANNEL, Opcode.SCHEMA):

@@ -1,24 +1,92 @@
-"""The other message types of a recording: pictures for people, and results."""
+"""The other message types of a recording: pictures for people, what is drawn on them, and results.
+
+The types of Foxglove are those of its package `foxglove-schemas-protobuf`.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
-from tactflow.recording.protobuf import describe, encode, timestamp
+import numpy as np
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.Point2_pb2 import Point2
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
+from numpy.typing import NDArray
 
-PICTURE_TYPE = "foxglove.CompressedImage"
-PICTURE_DESCRIPTOR = describe(
-    PICTURE_TYPE,
-    [("timestamp", 1, "Timestamp"), ("data", 2, "bytes"), ("format", 3, "string"), ("frame_id", 4, "string")],
-)
-"""https://docs.foxglove.dev/docs/visualization/message-schemas/compressed-image"""
+from tactflow.message import Results
+from tactflow.vision.types import Markers, MarkerStatus
 
 RESULT_TYPE = "tactflow.frame"
+CORNER = 0.5
+"""Foxglove counts pixels from the corner of the first one, tactflow from its centre, px."""
+ARROW_SCALE = 3.0
+"""Length of an arrow over the displacement that it shows, as in `visualize`."""
+HEAD = 0.2
+"""Length of the two strokes of an arrow's head over its own. Chosen by hand."""
+LINE, DOT = 2.0, 4.0
+"""Width of lines, diameter of dots, px. Chosen by hand."""
+CONTACT = Color(r=0.2, g=0.9, b=1.0, a=1.0)
+ARROWS = Color(r=1.0, g=0.85, b=0.1, a=1.0)
+DOTS = {
+    MarkerStatus.TRACKED: Color(r=0.2, g=1.0, b=0.3, a=1.0),
+    MarkerStatus.INFERRED: Color(r=1.0, g=0.6, b=0.0, a=1.0),
+    MarkerStatus.LOST: Color(r=1.0, g=0.1, b=0.1, a=1.0),
+}
+"""Colours. Chosen by hand."""
 
 
 def encode_picture(jpeg: bytes, sensor: str, nanoseconds: int) -> bytes:
     """One `foxglove.CompressedImage`."""
-    return encode([(1, timestamp(nanoseconds)), (2, jpeg), (3, "jpeg"), (4, sensor)])
+    picture = CompressedImage(timestamp=_stamp(nanoseconds), data=jpeg, format="jpeg", frame_id=sensor)
+    return bytes(picture.SerializeToString())
+
+
+def encode_annotations(results: Results, nanoseconds: int) -> bytes:
+    """One `foxglove.ImageAnnotations`: outlines of contacts, dots by their status, arrows of displacements.
+
+    results : in pixels of the processed frame, which is the picture.
+    """
+    stamp = _stamp(nanoseconds)
+
+    def drawn(
+        kind: PointsAnnotation.Type.ValueType, points: NDArray[np.float64], colour: Color, thickness: float
+    ) -> PointsAnnotation:
+        places = [Point2(x=x, y=y) for x, y in (points + CORNER).tolist()]
+        return PointsAnnotation(
+            timestamp=stamp, type=kind, points=places, outline_color=colour, thickness=thickness
+        )
+
+    parts: list[PointsAnnotation] = []
+    contact = results.contact
+    if contact is not None:
+        separate = contact.separate or (contact,)
+        parts += [drawn(PointsAnnotation.LINE_LOOP, one.hull, CONTACT, LINE) for one in separate]
+    markers = results.markers
+    if markers is not None:
+        parts.append(drawn(PointsAnnotation.LINE_LIST, _arrows(markers), ARROWS, LINE))
+        for status, colour in DOTS.items():
+            chosen = markers.position[markers.status == status]
+            if len(chosen):
+                parts.append(drawn(PointsAnnotation.POINTS, chosen, colour, DOT))
+    return bytes(ImageAnnotations(timestamp=stamp, points=parts).SerializeToString())
+
+
+def _arrows(markers: Markers) -> NDArray[np.float64]:
+    """Ends of three strokes for each marker that is not lost, one pair of rows after the other."""
+    known = markers.status != MarkerStatus.LOST
+    tail, moved = markers.origin[known], ARROW_SCALE * markers.displacement[known]
+    tip, across = tail + moved, np.column_stack([-moved[:, 1], moved[:, 0]])
+    left, right = tip - HEAD * (moved - across), tip - HEAD * (moved + across)
+    ends: NDArray[np.float64] = np.stack([tail, tip, tip, left, tip, right], axis=1).reshape(-1, 2)
+    return ends
+
+
+def _stamp(nanoseconds: int) -> Timestamp:
+    seconds, rest = divmod(nanoseconds, 1_000_000_000)
+    return Timestamp(seconds=seconds, nanos=rest)
 
 
 def plain_schema(schema: dict[str, Any]) -> dict[str, Any]:

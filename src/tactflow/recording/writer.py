@@ -10,12 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, cast
 
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
 
 from tactflow.files import claim, make_folder, taken_away
 from tactflow.message import message_schema
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
-from tactflow.recording.schemas import PICTURE_DESCRIPTOR, PICTURE_TYPE, RESULT_TYPE, plain_schema
+from tactflow.recording.schemas import RESULT_TYPE, plain_schema
 
 NEVER = 1 << 62
 """Size at which a chunk would end by itself, bytes: they are ended by hand."""
@@ -28,7 +31,8 @@ class Entry:
     """What is recorded about one frame, ready to be written.
 
     time : of the frame, ns. seq, reference, epoch : as in `Frame`.
-    frame : `tactflow.RawFrame`. message : the result message, or None. picture : `foxglove.CompressedImage`.
+    frame : `tactflow.RawFrame`. message : the result message, or None. picture, annotations : of Foxglove, a
+    `CompressedImage` and the `ImageAnnotations` on it, or None.
     """
 
     time: int
@@ -38,23 +42,27 @@ class Entry:
     frame: bytes
     message: bytes | None = None
     picture: bytes | None = None
+    annotations: bytes | None = None
 
     @property
     def size(self) -> int:
         """Bytes of memory, about."""
-        return len(self.frame) + len(self.message or b"") + len(self.picture or b"") + _OVERHEAD
+        others = (self.message, self.picture, self.annotations)
+        return len(self.frame) + sum(len(other or b"") for other in others) + _OVERHEAD
 
 
 @dataclass(frozen=True, slots=True)
 class About:
     """What a recording says about itself.
 
-    sensor : name. facts : metadata, such as versions. texts : attachments by name, in UTF-8.
+    sensor : name. facts : metadata, such as versions. texts : attachments by name, in UTF-8. arrays : others,
+    as the bytes of `.npz` files.
     """
 
     sensor: str
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
     texts: Mapping[str, str] = field(default_factory=dict[str, str])
+    arrays: Mapping[str, bytes] = field(default_factory=dict[str, bytes])
 
 
 class RecordingWriter:
@@ -114,7 +122,8 @@ class RecordingWriter:
     def _describe(self, about: About) -> None:
         writer, name = self._writer, about.sensor
         frame_type = writer.register_schema(TYPE_NAME, "protobuf", DESCRIPTOR)
-        picture_type = writer.register_schema(PICTURE_TYPE, "protobuf", PICTURE_DESCRIPTOR)
+        picture_type = register_schema(writer, CompressedImage)
+        annotation_type = register_schema(writer, ImageAnnotations)
         schema = message_schema()
         result_type = writer.register_schema(
             RESULT_TYPE, "jsonschema", json.dumps(plain_schema(schema)).encode()
@@ -123,11 +132,14 @@ class RecordingWriter:
         self._references = writer.register_channel(f"/{name}/references", "protobuf", frame_type)
         self._results = writer.register_channel(f"/{name}/results", "json", result_type)
         self._pictures = writer.register_channel(f"/{name}/image", "protobuf", picture_type)
+        self._annotations = writer.register_channel(f"/{name}/annotations", "protobuf", annotation_type)
         writer.add_metadata("tactflow", dict(about.facts))
         texts = {"message.schema.json": json.dumps(schema, indent=1)} | dict(about.texts)
         for file, text in texts.items():
             kind = "application/json" if file.endswith(".json") else "application/yaml"
             writer.add_attachment(0, 0, file, kind, text.encode())
+        for file, data in about.arrays.items():
+            writer.add_attachment(0, 0, file, "application/octet-stream", data)
 
     def write(self, entry: Entry, time: int | None = None) -> None:
         """Add one frame and what belongs to it.
@@ -146,6 +158,7 @@ class RecordingWriter:
             (frames, entry.frame),
             (self._results, entry.message),
             (self._pictures, entry.picture),
+            (self._annotations, entry.annotations),
         )
         for channel, data in parts:
             if data is not None:

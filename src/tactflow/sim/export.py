@@ -6,6 +6,7 @@ then its name ends in `.partial`.
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import shutil
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from tactflow.sim.scenes import Scene
 
 VIDEO_SUFFIXES = (".avi", ".mkv")
-TRUTH_SUFFIXES = (".jsonl", ".npz")
+TRUTH_SUFFIXES = (".jsonl", ".npz", ".csv")
 Report = Callable[[int], None]
 # Lossless through OpenCV, and every frame written so far can be read after a crash.
 _FOURCC = "HFYU"
@@ -62,6 +63,7 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
         origin, position, visible, mean_flow, with null for what there is not. `.npz` holds the same as
         arrays, with contact_mask (N, H, W) bool besides: center, angle and mean_flow are 0 where `touching`,
         `directed` and `has_flow` are false; the hull of frame i is hull[hull_start[i]:hull_start[i + 1]].
+        `.csv` is what a gauge would write: t (s), fx, fy, fz (N).
     report : called with the number of frames written so far.
 
     Raises ValueError for another suffix and OSError where the place cannot be written.
@@ -70,7 +72,7 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
     if suffix not in TRUTH_SUFFIXES:
         raise ValueError(f"required the truth as {' or '.join(TRUTH_SUFFIXES)}, got {path.name!r}")
     with _completed(path) as partial:
-        (_write_jsonl if suffix == ".jsonl" else _write_npz)(scene, partial, report)
+        {".jsonl": _write_jsonl, ".npz": _write_npz, ".csv": _write_forces}[suffix](scene, partial, report)
 
 
 def frames_kind(path: Path) -> str:
@@ -169,6 +171,15 @@ def _write_jsonl(scene: Scene, path: Path, report: Report) -> None:
                 "mean_flow": truth.mean_flow,
             }
             file.write(json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n")
+            report(index + 1)
+
+
+def _write_forces(scene: Scene, path: Path, report: Report) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["t", "fx", "fy", "fz"])
+        for index in range(len(scene)):
+            table.writerow([index / scene.fps, *scene.truth(index).force])
             report(index + 1)
 
 

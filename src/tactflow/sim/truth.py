@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim.camera import Camera
+from tactflow.sim.elastic import force
 from tactflow.sim.gel import Press, displacement, in_contact, reached, surface
 
 FLOW_POINTS = 1500
@@ -64,6 +65,7 @@ class Truth:
     _lower: Callable[[], NDArray[np.float32]] = field(repr=False)
     _move: Callable[[NDArray[np.float64]], NDArray[np.float64]] = field(repr=False)
     _touched: Callable[[NDArray[np.float64]], NDArray[np.bool_]] = field(repr=False)
+    _push: Callable[[], tuple[float, float, float]] = field(repr=False)
 
     def displacement(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 2) float64: how far the gel has moved that rests at points (N, 2), px."""
@@ -104,6 +106,11 @@ class Truth:
     def sunk(self) -> NDArray[np.float32]:
         """(H, W) float32, raw px: how far the gel's surface has sunk. Computed when first asked for."""
         return self._lower()
+
+    @cached_property
+    def force(self) -> tuple[float, float, float]:
+        """(x, y, z), N, on the gel: x right and y down in the picture, z presses (`tactflow.sim.elastic`)."""
+        return self._push()
 
 
 def pixel_mapping(mapping: Any) -> Any:
@@ -225,6 +232,7 @@ def measure(
         _lower=partial(_sunk, pressed, camera, size, to),
         _move=partial(_moved, pressed, camera, to),
         _touched=partial(_touched, pressed, camera, to, size),
+        _push=partial(_pushed, pressed, camera, to),
     )
 
 
@@ -235,6 +243,18 @@ def _moved(
     rest = camera.to_gel(points if to is None else np.asarray(to.to_raw(points), np.float64))
     now = camera.to_raw(rest + displacement(pressed, rest))
     return now if to is None else np.asarray(to.to_processed(now), np.float64)
+
+
+def _pushed(pressed: Sequence[Press], camera: Camera, to: Any) -> tuple[float, float, float]:
+    """The force, with x and y along the axes of the truth's coordinates where the first indenter presses."""
+    x, y, z = force(pressed)
+    if not pressed or not (x or y):
+        return x, y, z
+    here = np.array([[pressed[0].x, pressed[0].y]])
+    raw = camera.to_raw(np.concatenate([here, here + np.array([x, y]) / np.hypot(x, y)]))
+    start, end = raw if to is None else np.asarray(to.to_processed(raw), np.float64)
+    along = (end - start) * (np.hypot(x, y) / np.hypot(*(end - start)))
+    return float(along[0]), float(along[1]), z
 
 
 def _touched(

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from tactflow.engine.errors import SourceError
+from tactflow.files import expanded
 from tactflow.redaction import public_address
 from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream
@@ -34,6 +35,8 @@ __all__ = [
 KINDS = (
     "sim:NAME (simulated sensor), a camera index, /dev/videoN or /dev/v4l/by-id/NAME, a video file, "
     "a folder or glob of images, a .npy file, an .mcap recording of tactflow, "
+    "a ROS or Foxglove recording (.mcap, .bag or folder, with ?topic=), .h5 or .zarr with ?dataset=, "
+    "lerobot:PATH?camera=...&episode=..., "
     "an http://, rtsp:// or udp:// stream"
 )
 """What a source can be, for messages."""
@@ -54,8 +57,9 @@ def open_source(
     Parameters
     ----------
     spec : `sim:NAME?frames=300&seed=7`, a camera index, `/dev/videoN` or `/dev/v4l/by-id/NAME`, a video
-        file, a folder or glob of images, a `.npy` file, an `.mcap` recording, or an `http://`, `rtsp://`,
-        `udp://` stream.
+        file, a folder or glob of images, a `.npy` file, an `.mcap` recording, `FILE?topic=/name` of a ROS or
+        Foxglove recording, `file.h5?dataset=/name`, `lerobot:PATH?camera=KEY&episode=N`, or an `http://`,
+        `rtsp://`, `udp://` stream.
     directory : where a relative path is looked for if it is not in the current directory.
     fps : rate of recordings that do not know their own (images, arrays), frames per second; 30 by default.
     camera : size, rate and format to ask a camera for.
@@ -94,11 +98,39 @@ def open_source(
         return _open_stream(spec, scheme[1], watch)
     if spec.isdecimal() or spec.startswith(("/dev/video", "/dev/v4l/")):
         return _live(partial(Camera, spec, camera, ArrivalClock()), watch, f"camera {spec}")
-    if re.search(r"\.mcap($|\?)", spec, re.IGNORECASE) and not glob.has_magic(spec.partition("?")[0]):
+    reader = _open_container(spec, directory, fps)
+    if reader is not None:
+        return reader
+    return open_recording(spec, directory, fps)
+
+
+def _open_container(spec: str, directory: Path | None, fps: float | None) -> FrameReader | None:
+    """A file or folder in which frames are one thing among others; None if it is none."""
+    if spec.startswith("lerobot:"):
+        from tactflow.sources.lerobot import LeRobotEpisode
+
+        return LeRobotEpisode(spec, directory)
+    bases = (Path(), directory or Path())
+    there = any((base / expanded(spec)).exists() for base in bases)
+    name, _, query = (spec, "", "") if there else spec.partition("?")
+    suffix = Path(name).suffix.lower()
+    if glob.has_magic(name) and not there:
+        return None
+    if suffix == ".mcap" and not query.startswith("topic="):
         from tactflow.sources.mcap import Recording
 
         return Recording(spec, directory)
-    return open_recording(spec, directory, fps)
+    if suffix in (".mcap", ".bag", ".db3") or any(
+        (base / expanded(name) / "metadata.yaml").is_file() for base in bases
+    ):
+        from tactflow.sources.bags import Bag
+
+        return Bag(spec, directory)
+    if suffix in (".h5", ".hdf5", ".zarr"):
+        from tactflow.sources.datasets import ArrayDataset
+
+        return ArrayDataset(spec, directory, fps)
+    return None
 
 
 def _open_stream(spec: str, scheme: str, watch: Watch | None) -> FrameReader:

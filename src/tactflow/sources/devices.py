@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import sys
+import time
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
@@ -127,6 +128,17 @@ class Camera:
                 f"{self._name}: delivers no more frames; unplugged, or in use by another program?"
             )
         return self._normalise(image), t
+
+    def delay(self) -> float | None:
+        """Time since the driver stamped the frame that was read last, s; None where it does not say.
+
+        Linux's driver for USB cameras stamps a frame when its first bytes come, by the monotonic clock.
+        """
+        if self._capture is None or sys.platform != "linux":
+            return None
+        stamped = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+        delay = time.clock_gettime(time.CLOCK_MONOTONIC) - stamped
+        return delay if stamped > 0 and 0 <= delay < self.READ_TIMEOUT else None
 
     def close(self) -> None:
         """Give the camera back."""

@@ -77,10 +77,15 @@ def read_image(path: Path) -> NDArray[Any]:
         data = path.read_bytes()
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return decode_image(data, str(path))
+
+
+def decode_image(data: bytes, name: str) -> NDArray[Any]:
+    """Decode the bytes of an image file; `name` is what messages call it. As `read_image`."""
     if not data:
-        raise SourceError(f"{path}: the file is empty")
+        raise SourceError(f"{name}: the image is empty")
     if _cut_off(data):
-        raise SourceError(f"{path}: the image is cut off ({len(data)} bytes); copy it again or remove it")
+        raise SourceError(f"{name}: the image is cut off ({len(data)} bytes); copy it again or remove it")
     image: NDArray[Any] | None
     try:
         with quiet_opencv():
@@ -88,12 +93,12 @@ def read_image(path: Path) -> NDArray[Any]:
     except cv2.error as error:
         if "MAX_IMAGE" in str(error):
             raise SourceError(
-                f"{path}: has more than {MOST_PIXELS} pixels; if that is right, set the environment variable "
+                f"{name}: has more than {MOST_PIXELS} pixels; if that is right, set the environment variable "
                 "OPENCV_IO_MAX_IMAGE_PIXELS"
             ) from None
         image = None
     if image is None:
-        raise SourceError(f"{path}: not an image that OpenCV can read, or a damaged one")
+        raise SourceError(f"{name}: not an image that OpenCV can read, or a damaged one")
     return image
 
 

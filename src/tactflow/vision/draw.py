@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import cv2
 import numpy as np
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from tactflow.vision.flow import DisplacementField, inside_mask
 from tactflow.vision.lettering import Lettering
-from tactflow.vision.types import Contact, Ellipse, Flow, Markers, MarkerStatus
+from tactflow.vision.relief import colour_bar, relief
+from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
 
-View = Literal["frame", "contact"]
+View = Literal["frame", "contact", "depth"]
 Colour = tuple[int, int, int]
 
 YELLOW: Final[Colour] = (0, 255, 255)
@@ -57,6 +58,8 @@ _TEXT: Final = 11
 """Size of the text, px."""
 _LINE_SPACING: Final = 14
 """Distance of two lines of text, px."""
+_BAR: Final = (70, 6)
+"""Width and height of the bar that explains the colours of heights, px."""
 _BETWEEN: Final = 12.0
 """Distance of the arrows of a field, px, at least."""
 _STATUS_COLOURS: Final = (
@@ -86,10 +89,12 @@ class Annotator:
     """Draws contact, markers and flow on a copy of the processed frame.
 
     arrow_scale : length of an arrow over the displacement it shows; 1 ends it where the marker is now.
-    view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest black.
+    view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest black;
+        "depth" the height map instead of the picture.
     ellipse : whether the fitted ellipse is drawn.
     text : whether numbers are written.
     dilate : px, for the "contact" view: how far outside the contact the picture and its arrows reach.
+    deepest : mm, for the "depth" view: height of the lightest colour.
 
     Arrows are yellow for tracked markers, white for inferred ones, dim gray for lost ones. The hull is green,
     the principal axis orange with a dot on the centroid and its angle beside it.
@@ -112,18 +117,22 @@ class Annotator:
         ellipse: bool = False,
         text: bool = True,
         dilate: float = 8.0,
+        deepest: float = 1.0,
     ) -> None:
         if not (arrow_scale >= 0 and math.isfinite(arrow_scale)):
             raise ValueError(f"required arrow_scale >= 0, got {arrow_scale}")
-        if view not in ("frame", "contact"):
-            raise ValueError(f"required view to be 'frame' or 'contact', got {view!r}")
+        if view not in get_args(View):
+            raise ValueError(f"required view to be one of {', '.join(get_args(View))}, got {view!r}")
         if not (dilate >= 0 and math.isfinite(dilate)):
             raise ValueError(f"required dilate >= 0 px, got {dilate}")
+        if not (deepest > 0 and math.isfinite(deepest)):
+            raise ValueError(f"required deepest > 0 mm, got {deepest}")
         self._arrow_scale = arrow_scale
         self._view = view
         self._ellipse = ellipse
         self._text = text
         self._dilate = dilate
+        self._deepest = deepest
         self._letters = Lettering()
 
     def __call__(
@@ -136,11 +145,14 @@ class Annotator:
         contact_mask: NDArray[np.uint8] | None = None,
         valid: NDArray[np.uint8] | None = None,
         field: DisplacementField | None = None,
+        depth: Depth | None = None,
+        scale: Scale | None = None,
     ) -> NDArray[np.uint8]:
         """A new picture of the size of `image`, with whatever is given drawn on it.
 
         image : (H, W, 3) uint8 BGR. contact_mask : (H, W) uint8, needed by the "contact" view alone.
-        valid : (H, W) uint8, 0 where no gel is, which is shown darker.
+        valid : (H, W) uint8, 0 where no gel is, which is shown darker. depth, scale : for the "depth" view;
+        without the first the gel lies flat, without both there is no calibration.
         Returns (H, W, 3) uint8; the inputs stay as they are. Raises ValueError on another shape.
         """
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
@@ -149,6 +161,8 @@ class Annotator:
             picture = self._cut_out(image, contact_mask)
             if markers is not None:
                 markers = self._inside(markers, contact_mask)
+        elif self._view == "depth":
+            picture = self._heights(image, depth, scale)
         else:
             picture = (image if valid is None else dimmed(image, valid)).copy()
         unit = max(1.0, min(image.shape[:2]) / _UNIT_SIDE)
@@ -166,8 +180,32 @@ class Annotator:
         if contact is not None:
             self._axis(picture, contact, unit)
         if self._text:
-            self._write(picture, self._lines(contact, flow, markers), unit)
+            lines = self._lines(contact, flow, markers)
+            if self._view == "depth":
+                lines.append(_depth_line(depth, scale))
+                self._bar(picture, unit)
+            self._write(picture, lines, unit)
         return picture
+
+    def _heights(
+        self, image: NDArray[np.uint8], depth: Depth | None, scale: Scale | None
+    ) -> NDArray[np.uint8]:
+        if depth is None or scale is None:
+            return relief(np.zeros(image.shape[:2], np.float32), Scale(1, 1, (0, 0), (0, 0)), self._deepest)
+        if depth.heights.shape != image.shape[:2]:
+            raise ValueError(f"required heights of shape {image.shape[:2]}, got {depth.heights.shape}")
+        return relief(depth.heights, scale, self._deepest)
+
+    def _bar(self, picture: NDArray[np.uint8], unit: float) -> None:
+        """Which colour is which height, in the lower left corner."""
+        width, height = (round(side * unit) for side in _BAR)
+        left, bottom = round(6 * unit), picture.shape[0] - round(6 * unit)
+        if left + width >= picture.shape[1] or bottom - height < 0:
+            return
+        picture[bottom - height : bottom, left : left + width] = colour_bar(width, height)
+        cv2.rectangle(picture, (left - 1, bottom - height - 1), (left + width, bottom), WHITE, 1)
+        place = (left + width + round(4 * unit), bottom)
+        self._letters.write(picture, f"{self._deepest:g} mm", place, WHITE, round(_TEXT * unit))
 
     def _cut_out(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
         picture = np.zeros_like(image)
@@ -258,6 +296,12 @@ class Annotator:
         shade: NDArray[Any] = picture[max(0, y - tall - 1) : y + 3, max(0, x - 2) : x + wide + 3]
         shade[...] = shade // 3
         self._letters.write(picture, text, (x, y), colour, size)
+
+
+def _depth_line(depth: Depth | None, scale: Scale | None) -> tuple[str, Colour]:
+    if depth is not None:
+        return (f"{depth.greatest:.2f} mm deep  {depth.volume:.2f} mm³", WHITE)
+    return ("no calibration" if scale is None else "0 mm deep", PALE)
 
 
 def field_arrows(field: DisplacementField, distance: float) -> Markers:

@@ -1,11 +1,11 @@
 """The force on the gel, linear in what is seen of the contact.
 
 An elastic gel answers to a press in one of two ways. A layer that is thin compared with the contact is a bed
-of springs: the force is proportional to the indented volume (Winkler). In a deep one it is proportional to
-depth times width, for a ball (Hertz) as for a flat punch. A real gel lies between the two, and so do linear
-combinations of both. The area is there for objects that are softer than the gel, which spread instead of
-sinking in. Where heights are not known, the change of the light stands for them: under a ball the integral of
-the slopes is proportional to Hertz's force.
+of springs: the force is proportional to the volume that is indented in the contact (Winkler). In a deep one
+it is proportional to depth times width, for a ball (Hertz) as for a flat punch. A real gel lies between the
+two, and so do linear combinations of both. The area is there for objects that are softer than the gel, which
+spread instead of sinking in. Where heights are not known, the change of the light stands for them: under a
+ball the integral of the slopes is proportional to Hertz's force.
 
 Sideways it is the same: a thin layer answers with the integral of the shear over the contact, a deep one with
 shear times width (Mindlin).
@@ -34,6 +34,9 @@ BY_CHANGE: Final = ("change", "area")
 """The same without heights: grey levels times mm^2, mm^2."""
 BY_SHEAR: Final = ("shear_by_area", "shear_by_width")
 """What the force sideways is linear in, along x and y: mm^3, mm^2."""
+EVERY_ROW: Final = 4
+"""The change of the light is summed over every so many rows: contacts are far larger, and all rows would cost
+0.2 copies of a raw frame of 800 x 600 px."""
 BEYOND: Final = 1.1
 """How far beyond the largest contact of the fit a contact may be to count as in range, relative. By hand."""
 
@@ -52,19 +55,21 @@ class Seen(NamedTuple):
 def total_change(image: NDArray[np.uint8], untouched: NDArray[np.uint8]) -> float:
     """Sum of all differences between two pictures, (H, W, 3) uint8 without markers, grey levels.
 
-    >>> total_change(np.full((2, 2, 3), 7, np.uint8), np.full((2, 2, 3), 9, np.uint8))
-    24.0
+    It is the sum over every `EVERY_ROW`-th row, times that.
+
+    >>> total_change(np.full((8, 2, 3), 7, np.uint8), np.full((8, 2, 3), 9, np.uint8))
+    96.0
     """
-    return float(cv2.norm(image, untouched, cv2.NORM_L1))
+    return EVERY_ROW * float(cv2.norm(image[::EVERY_ROW], untouched[::EVERY_ROW], cv2.NORM_L1))
 
 
 def seen(contact: Contact, scale: Scale, depth: Depth | None, change: float, flow: Flow | None) -> Seen:
     """What is seen of a contact.
 
-    contact : with its hull's area. change : `total_change`, less that of a gel which nothing touches.
+    contact : with its hull's area. change : less that of a gel which nothing touches, grey levels times mm^2.
 
     >>> contact = Contact(400.0, (0, 0), None, None, np.zeros((0, 2)), None)
-    >>> found = seen(contact, Scale(0.1, 0.1, (0, 0), (0, 0)), None, 500.0, Flow((3.0, 0.0), 4))
+    >>> found = seen(contact, Scale(0.1, 0.1, (0, 0), (0, 0)), None, 5.0, Flow((3.0, 0.0), 4))
     >>> {name: round(value, 6) for name, value in found.press.items()}
     {'area': 4.0, 'change': 5.0}
     >>> [round(x, 6) for x, _ in found.drag.values()]
@@ -72,9 +77,9 @@ def seen(contact: Contact, scale: Scale, depth: Depth | None, change: float, flo
     """
     area = scale.area(contact.area)
     width = math.sqrt(area)
-    press = {"area": area, "change": scale.area(max(change, 0.0))}
+    press = {"area": area, "change": max(change, 0.0)}
     if depth is not None:
-        press["volume"] = depth.volume
+        press["volume"] = depth.pressed
         press["depth_by_width"] = depth.greatest * width
     if flow is None or flow.mean is None:
         return Seen(press, {})
@@ -112,7 +117,7 @@ class ForceModel:
     """The force on the gel from what is seen of a contact.
 
     press : of z. drag : of x and of y, the same for both; None where the calibration had no such reference.
-    change_at_rest : `total_change` of a gel that nothing touches, from noise alone, grey levels.
+    change_at_rest : the change of a gel that nothing touches, from noise alone, grey levels times mm^2.
 
     >>> model = ForceModel(LinearForce({"volume": 2.0}, {"volume": 1.0}, (0.1, 0.0)), None, 0.0)
     >>> model.force(Seen({"volume": 0.5, "area": 3.0}, {}))

@@ -14,7 +14,7 @@ _STROKES: Final = cv2.FONT_HERSHEY_SIMPLEX
 _STROKE_SCALE: Final = 1 / 30
 """Scale of OpenCV 4's strokes over the letters' size, 1/px: at scale 1 capitals are 22 px high; in a usual
 font seven tenths of its size."""
-_PLAIN: Final = str.maketrans({"°": " deg", "²": "2", "−": "-"})
+_PLAIN: Final = str.maketrans({"°": " deg", "²": "2", "³": "3", "−": "-"})
 """OpenCV 4's strokes know ASCII only."""
 
 

@@ -214,6 +214,7 @@ class Depth:
     heights : (H, W) float32, mm, >= 0; 0 where nothing touches. Of the processed frame's size.
     greatest : the largest of them, mm. greatest_stderr : its standard error, mm; None where unknown.
     volume : between the untouched surface and this one, mm^3. volume_stderr : the same for it.
+    pressed : the part of the volume that lies in the contact, mm^3.
 
     >>> Depth(np.zeros((2, 3), np.float32), 0.0, None, 0.0, None).heights.shape
     (2, 3)
@@ -224,6 +225,7 @@ class Depth:
     greatest_stderr: float | None
     volume: float
     volume_stderr: float | None
+    pressed: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,13 +133,16 @@ class Surface:
         size = (columns.stop - columns.start, rows.stop - rows.start)
         heights[window.whole] = cv2.resize(low, size, interpolation=cv2.INTER_LINEAR)
         greatest = float(low.max())
-        volume = float(low.sum()) * self._scale.area(4.0)
+        cell = self._scale.area(4.0)
+        volume = float(low.sum()) * cell
+        pressed = float(low[mask[window.whole][::2, ::2] > 0].sum()) * cell
         return Depth(
             heights,
             greatest,
             None if self._depth_error is None else self._depth_error * greatest,
             volume,
             None if self._volume_error is None else self._volume_error * volume,
+            pressed,
         )
 
     def heights(self, image: Bytes, rest: Rest, window: Window) -> Float:

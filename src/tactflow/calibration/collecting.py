@@ -1,0 +1,56 @@
+"""Run a pipeline on its source and collect what it gives, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from tactflow.api import make_runner
+from tactflow.engine.conformance import component
+from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Mark, Node, Pipeline
+from tactflow.signals import ending_handled
+
+_COLLECT: Final = "tactflow.calibrate"
+"""Id of the sink that collects; no id of a file has a point in it."""
+
+
+def collect(
+    pipeline: Pipeline,
+    sink: type[Sink],
+    values: Mapping[str, Any],
+    needed: Mapping[str, str],
+    calibration: Path | None = None,
+) -> Any:
+    """Run a pipeline with a sink of ours in place of its own, nothing skipped; returns the sink.
+
+    A signal such as Ctrl-C ends it; what was collected until then counts.
+
+    Parameters
+    ----------
+    sink, values : its class, and attributes that it gets.
+    needed : port -> the stage that gives it. calibration : the file to use, in place of the pipeline's own.
+
+    Raises
+    ------
+    ConfigError : a needed port is missing. TactflowError : a stage or the source failed.
+    """
+    attributes: dict[str, Any] = {name: staticmethod(value) for name, value in values.items()}
+    made = component(type(sink.__name__, (sink,), attributes), _COLLECT, "tactflow calibrate", ())
+    inputs = {port.name: pipeline.last_output(port.name) for port in made.ports.inputs}
+    # Of a gel without markers the picture itself is without them.
+    inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
+    for port, stage in needed.items():
+        if inputs[port] is None:
+            raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
+    kept = {id_: node for id_, node in pipeline.nodes.items() if node.component.kind != "sink"}
+    kept[_COLLECT] = Node(_COLLECT, made, StageParams(), inputs, Mark(_COLLECT, 0, 0))
+    runner = make_runner(replace(pipeline, nodes=kept, skipping=False, calibration=calibration))
+    with ending_handled(lambda _number, _frame: runner.stop()):
+        failure = runner.run().failure
+    if failure is not None:
+        raise failure
+    return runner.nodes[_COLLECT].instance

@@ -1,0 +1,110 @@
+"""`tactflow calibrate force`: add the force to a calibration file, from recordings with a gauge's CSV."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from tactflow.api import load
+from tactflow.calibration.file import Calibration, LinearForceEntry
+from tactflow.calibration.force import Fit, Watched, fit_force, watch
+from tactflow.calibration.reference import Reference, read_reference
+from tactflow.engine.errors import ConfigError
+from tactflow.files import expanded
+
+
+def add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
+    """Fit the force and write it into the calibration file; returns the exit code.
+
+    Raises ConfigError if options, CSVs or recordings give no fit, TactflowError if a recording fails.
+    """
+    calibration = Calibration.load(path)
+    if calibration.force is not None and not args.overwrite:
+        raise ConfigError(f"calibrate force: {path} has a force already; give --overwrite to replace it")
+    if args.source is None:
+        raise ConfigError(
+            "calibrate force: required --from, a recording with a CSV of the same name beside it"
+        )
+    pairs = [(args.source, args.csv)] if args.csv else recordings_with_csv(args.source)
+    references = {source: _read(file, args.offset) for source, file in pairs}
+    watched: dict[str, Watched] = {}
+    for source in references:
+        settings = {"calibration": None}
+        loaded = load(pipeline, source=source, sensor=args.sensor, settings=settings)
+        watched[source] = watch(loaded, path)
+        seen = watched[source]
+        _say(f"{source}: {len(seen.times)} frames, {seen.touched.sum()} of them with contact")
+    fit = fit_force(watched, references)
+    for words in _words(fit, references):
+        _say(words)
+    replace(calibration, force=fit.entry).save(path)
+    _say(f"{path} has the force now")
+    return 0
+
+
+def recordings_with_csv(source: str) -> list[tuple[str, Path]]:
+    """(recording, its CSV): a recording with a CSV of the same name beside it, or all such in a folder.
+
+    Raises ConfigError if there is none.
+    """
+    path = expanded(source)
+    if path.is_file() and path.with_suffix(".csv").is_file():
+        return [(source, path.with_suffix(".csv"))]
+    pairs = []
+    for file in sorted(path.glob("*.csv")) if path.is_dir() else []:
+        beside = [other for other in sorted(path.glob("*")) if other.stem == file.stem and other != file]
+        pairs += [(str(beside[0]), file)] if len(beside) == 1 else []
+    if not pairs:
+        raise ConfigError(
+            f"calibrate force: found no recording with a CSV of the same name beside it in {source}; name "
+            "the CSV with --csv"
+        )
+    return pairs
+
+
+def _read(file: Path, offset: float) -> Reference:
+    reference = read_reference(file)
+    return reference if reference.by_frame else replace(reference, time=reference.time + offset)
+
+
+def _words(fit: Fit, references: dict[str, Reference]) -> list[str]:
+    entry = fit.entry
+    said = [
+        f"{name}: its clock is {offset:+.3f} s ahead of its CSV's"
+        for name, offset in entry.recordings.items()
+    ]
+    said.append(f"force, {entry.presses} presses: {_quality(entry.press, entry.left_out)}")
+    if entry.press.hysteresis is not None:
+        said.append(f"hysteresis: {100 * entry.press.hysteresis:.0f} % of the largest force of a press")
+    if "volume" not in entry.press.stiffness:
+        said.append(
+            "heights are not known, so it is by the change of the light and the area: good for objects "
+            "like these only"
+        )
+    if fit.turned is not None:
+        side = ", mirrored" if fit.mirrored else ""
+        said.append(
+            f"the gauge's x axis lies {fit.turned:+.0f} degrees counter-clockwise in the picture{side}"
+        )
+        if entry.drag is None:
+            said.append("fx and fy do not follow the flow of the contact, and are left out")
+        else:
+            said.append(f"force sideways: {_quality(entry.drag, entry.left_out)}")
+    elif any(reference.sideways for reference in references.values()):
+        said.append("fx and fy are left out: not every CSV has them")
+    return said
+
+
+def _quality(part: LinearForceEntry, left_out: str) -> str:
+    absolute, relative = part.error
+    return (
+        f"RMS error {part.rmse:.2f} N of {part.range[0]:.1f} to {part.range[1]:.1f} N, "
+        f"{100 * part.r2:.0f} % of the variance explained, by {left_out}s that the fit has not seen; "
+        f"standard error {absolute:.2f} N and {100 * relative:.0f} % of the force"
+    )
+
+
+def _say(words: str) -> None:
+    print(words, file=sys.stderr)

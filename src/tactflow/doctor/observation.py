@@ -1,0 +1,162 @@
+"""Read a source for a while, and keep of it what the checks need: all times, and some pairs of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.doctor.measures import Exposure, Gray, Image, exposure, grey
+from tactflow.engine.errors import SourceError
+from tactflow.sources import StampedReader, open_source
+from tactflow.sources.base import FrameReader
+from tactflow.sources.devices import Camera
+from tactflow.sources.files import ArrayFile, ImageFiles
+from tactflow.vision.geometry.valid_area import valid_area
+from tactflow.vision.markers import Detection, NoMarkersError, detect_markers
+
+KEPT: Final = 24
+"""Pairs of frames that are kept, up to twice as many while reading. Chosen by hand: 70 MB at 800 x 600."""
+LEAST_FRAMES: Final = 3
+"""Frames without which nothing can be told of time."""
+
+
+class Pair(NamedTuple):
+    """number : of the first frame. image : (H, W, 3) uint8. after : the next frame, None at the end."""
+
+    number: int
+    image: Image
+    after: Image | None
+
+
+@dataclass
+class Observation:
+    """What was seen of a source.
+
+    source, description : how it was named, and what it is. live : a camera or a stream.
+    promised : frames per second that it says it has, or None. times : (N,) s, or None where a source of
+    single pictures has none. frames : how many came. repeated : of these the same as the one before, bit for
+    bit. missing : frames that a recording knows it has lost. stopped : why it ended too early, else "".
+    delays : s, from the driver's stamp to here, for each frame whose driver stamps. pairs : kept frames.
+    """
+
+    source: str
+    description: str
+    live: bool
+    promised: float | None = None
+    times: NDArray[np.float64] | None = None
+    frames: int = 0
+    repeated: int = 0
+    missing: int = 0
+    stopped: str = ""
+    delays: list[float] = field(default_factory=list[float])
+    pairs: list[Pair] = field(default_factory=list[Pair])
+
+    @cached_property
+    def grays(self) -> list[Gray]:
+        """The kept frames in grey, (H, W) float32 of whole levels."""
+        return [grey(pair.image) for pair in self.pairs]
+
+    @cached_property
+    def exposures(self) -> list[Exposure]:
+        """How the kept frames are exposed."""
+        return [exposure(pair.image) for pair in self.pairs]
+
+    @cached_property
+    def typical(self) -> Gray:
+        """The median of the kept frames, (H, W) float32: without noise, and without short contacts."""
+        return np.asarray(np.median(np.stack(self.grays), axis=0), np.float32)
+
+    @cached_property
+    def dots(self) -> Detection | None:
+        """The dots of the first frame, or of the second that is kept."""
+        for pair in self.pairs[:2]:
+            try:
+                return detect_markers(pair.image, valid=valid_area(pair.image))
+            except NoMarkersError:
+                continue
+        return None
+
+
+def observe(source: str, seconds: float, report: Callable[[int], None] = lambda _: None) -> Observation:
+    """Look at a source for so many seconds of its own time, or to its end.
+
+    source : as `open_source` takes it. report : called with the number of frames so far.
+
+    Raises
+    ------
+    SourceError
+        If it cannot be opened, or delivers no frame.
+
+    Examples
+    --------
+    >>> seen = observe("sim:idle?frames=5", 10.0)
+    >>> seen.frames, seen.promised, len(seen.pairs)
+    (5, 60.0, 5)
+    """
+    reader = open_source(source)
+    try:
+        seen = Observation(source, reader.description, reader.live, reader.fps)
+        _read(reader, seconds, seen, report)
+    finally:
+        reader.close()
+    if not seen.frames:
+        raise SourceError(f"{source}: {seen.stopped or 'there is no frame in it'}")
+    if isinstance(reader, ImageFiles | ArrayFile):
+        # Its rate is made up.
+        seen.times = seen.promised = None
+    return seen
+
+
+def _read(reader: FrameReader, seconds: float, seen: Observation, report: Callable[[int], None]) -> None:
+    times: list[float] = []
+    last: Image | None = None
+    last_seq: int | None = None
+    stride = 1
+    try:
+        while (frame := _next(reader)) is not None:
+            image, t, seq = frame
+            if times and t - times[0] > seconds:
+                break
+            if seq is not None and last_seq is not None:
+                seen.missing += max(seq - last_seq - 1, 0)
+            last_seq = seq
+            if last is not None:
+                seen.repeated += bool(np.array_equal(last, image))
+                if seen.pairs and seen.pairs[-1].number == seen.frames - 1:
+                    seen.pairs[-1] = seen.pairs[-1]._replace(after=image)
+            if seen.frames % stride == 0:
+                seen.pairs.append(Pair(seen.frames, image, None))
+                if len(seen.pairs) > 2 * KEPT:
+                    stride *= 2
+                    seen.pairs[:] = [pair for pair in seen.pairs if pair.number % stride == 0]
+            if isinstance(reader, Camera) and (delay := reader.delay()) is not None:
+                seen.delays.append(delay)
+            times.append(t)
+            last = image
+            seen.frames += 1
+            report(seen.frames)
+        else:
+            seen.stopped = f"it ended after {times[-1] - times[0]:.1f} s" if reader.live and times else ""
+    except SourceError as error:
+        seen.stopped = str(error)
+    except KeyboardInterrupt:
+        # What was seen so far is told.
+        seen.stopped = ""
+    seen.times = np.array(times)
+
+
+def _next(reader: FrameReader) -> tuple[Image, float, int | None] | None:
+    """The next frame, its time, and its number where the recording remembers one."""
+    if not isinstance(reader, StampedReader):
+        frame = reader.read()
+        return None if frame is None else (*frame, None)
+    while (stamped := reader.read_stamped()) is not None:
+        image, t, stamp = stamped
+        if stamp.paced:
+            return image, t, stamp.seq
+    return None

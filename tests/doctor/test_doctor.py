@@ -1,0 +1,157 @@
+"""`doctor` names what is wrong with a recording, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.cli.main import main
+from tactflow.doctor import examine, observe
+from tactflow.sim import open_scene
+from tactflow.sources.devices import Camera
+
+Image = NDArray[np.uint8]
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def clean() -> list[Image]:
+    """A press and a rest, at half the size: dots of radius 5 px."""
+    scene = open_scene("press?frames=120")
+    pictures = [scene.frame(5 * index) for index in range(FRAMES)]
+    return [np.asarray(cv2.resize(p, (400, 300), interpolation=cv2.INTER_AREA), np.uint8) for p in pictures]
+
+
+def blurred(image: Image, _: int) -> Image:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 3.0), np.uint8)
+
+
+def clipped(image: Image, _: int) -> Image:
+    return np.asarray(cv2.convertScaleAbs(image, alpha=1.9), np.uint8)
+
+
+def banded(image: Image, index: int) -> Image:
+    rows = np.arange(len(image)) / len(image)
+    gain = 1 + 0.05 * np.sin(2 * np.pi * (2 * rows - 0.37 * index))
+    return np.asarray(np.rint(image * gain[:, None, None]), np.uint8)
+
+
+def compressed(image: Image, _: int) -> Image:
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 10])[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
+def drifted(image: Image, index: int) -> Image:
+    move = np.array([[1, 0, 1.5 * index / FRAMES], [0, 1, 0]])
+    return np.asarray(cv2.warpAffine(image, move, (400, 300), borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def untouched(image: Image, _: int) -> Image:
+    return image
+
+
+def written(path: Path, frames: list[Image], fps: float) -> Path:
+    """A lossless video."""
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"HFYU"), fps, (400, 300))
+    for frame in frames:
+        video.write(frame)
+    video.release()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("fault", "fps", "name"),
+    [
+        (untouched, 60.0, None),
+        (blurred, 60.0, "focus"),
+        (clipped, 60.0, "clipping"),
+        (banded, 60.0, "banding"),
+        (compressed, 60.0, "compression"),
+        (untouched, 8.0, "rate"),
+        (drifted, 60.0, "drift"),
+    ],
+)
+def test_each_fault_is_named_and_no_other(
+    clean: list[Image], fault: Callable[[Image, int], Image], fps: float, name: str | None, tmp_path: Path
+) -> None:
+    frames = [fault(image, index) for index, image in enumerate(clean)]
+    findings = examine(observe(str(written(tmp_path / "recording.avi", frames, fps)), 60.0))
+    bad = [finding for finding in findings if finding.verdict in ("warning", "fault")]
+    assert [finding.name for finding in bad] == ([] if name is None else [name])
+    assert all(finding.effect and finding.advice for finding in bad)
+    assert not [f.name for f in findings if f.verdict == "unknown" and f.name != "latency"]
+
+
+def test_missing_and_repeated_frames_of_a_camera_are_counted(
+    clean: list[Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = np.delete(np.arange(FRAMES + 4) / 30.0, [5, 6, 7, 20])
+    frames = [clean[max(0, index - index % 4)] for index in range(FRAMES)]
+
+    class Stuttering:
+        live, fps, size, total, description = True, 30.0, (400, 300), None, "a camera"
+
+        def __init__(self) -> None:
+            self._frames = iter(zip(frames, times, strict=True))
+
+        def read(self) -> tuple[Image, float] | None:
+            return next(self._frames, None)
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr("tactflow.doctor.observation.open_source", lambda _: Stuttering())
+    found = {finding.name: finding for finding in examine(observe("0", 1.0))}
+    assert found["drop-outs"].verdict == "fault"
+    assert "4 of " in found["drop-outs"].says
+    assert found["latency"].verdict == "unknown"
+
+
+def test_a_camera_whose_driver_stamps_tells_how_old_its_frames_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Capture:
+        def get(self, _: int) -> float:
+            return 9_950.0
+
+    camera = Camera.__new__(Camera)
+    camera._capture = Capture()  # type: ignore[assignment]
+    monkeypatch.setattr("tactflow.sources.devices.time.clock_gettime", lambda _: 10.0)
+    monkeypatch.setattr("tactflow.sources.devices.sys.platform", "linux")
+    assert camera.delay() == pytest.approx(0.05)
+
+
+def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
+    clean: list[Image], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for index, image in enumerate(clean[:4]):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), cv2.GaussianBlur(image, (0, 0), 6.0))
+    assert main(["doctor", "--source", str(tmp_path)]) == 3
+    table = capsys.readouterr().out
+    assert "FAULT  focus" in table
+    assert "change: focus the lens" in table
+    assert "?      rate         single pictures have no times" in table
+    assert main(["doctor", "--source", str(tmp_path), "--json"]) == 3
+    told = json.loads(capsys.readouterr().out)
+    assert told["verdict"] == "fault"
+    (focus,) = [check for check in told["checks"] if check["name"] == "focus"]
+    assert (focus["verdict"], focus["unit"]) == ("fault", "px")
+    assert focus["says"] in table
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["--source", "sim:idle", "--seconds", "0"], 2, "required a number above 0"),
+        (["--source", "nowhere.avi"], 4, "no such file"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_said(
+    arguments: list[str], code: int, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["doctor", *arguments]) == code
+    assert says in capsys.readouterr().err
