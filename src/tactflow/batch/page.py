@@ -99,8 +99,8 @@ def _row(folder: Folder, row: Row) -> str:
     cells = [_cell(row.recording.name, name), _cell(status, f'<span class="{kind}">{status}</span>')]
     if outcome is None or outcome.status != "done":
         why = "" if outcome is None else escape(outcome.error or "")
-        blank = _cell("", "") * (len(_COLUMNS) - len(cells))
-        return f'<tr>{"".join(cells)}{blank}<td class="why" colspan="2">{why}</td></tr>\n'
+        across = len(_COLUMNS) - len(cells) + 2
+        return f'<tr>{"".join(cells)}<td class="why" colspan="{across}">{why}</td></tr>\n'
     cells += _numbers(outcome)
     record = folder.record(outcome.key) or {"curve": [], "pictures": []}
     notes = "".join(f"<small>{escape(note)}</small>" for note in outcome.notes)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 from rich.console import Console
 
+from tactflow.batch.cluster import DaskCluster
 from tactflow.batch.engine import Engine
 from tactflow.batch.folder import Folder, Ledger
 from tactflow.batch.local import LocalProcesses
@@ -58,6 +60,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sensor", metavar="NAME", help="which one of a pipeline with several sensors")
     parser.add_argument(
         "--workers", type=_positive, metavar="N", help="processes on this machine (default: one a processor)"
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="work on the Dask cluster of this scheduler, as in tcp://host:8786, instead",
+    )
+    parser.add_argument(
+        "--dask", choices=("local",), help="start a Dask cluster on this machine, and work on that instead"
     )
     parser.add_argument(
         "--shard",
@@ -144,7 +154,16 @@ def _overrides(args: argparse.Namespace, file: Path) -> list[str]:
 
 
 def _engine(args: argparse.Namespace) -> Engine:
-    return LocalProcesses(args.workers or len(os.sched_getaffinity(0)))
+    workers = args.workers or _processors()
+    address = args.scheduler or args.dask
+    return LocalProcesses(workers) if address is None else DaskCluster(address, workers)
+
+
+def _processors() -> int:
+    """Processors that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _opening(plan: Plan, file: Path, shard: tuple[int, int]) -> str:
