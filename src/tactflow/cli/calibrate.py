@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from tactflow.api import load
 from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_picture
+from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
-from tactflow.calibration.presses import Press, Report, Session, find_presses
+from tactflow.calibration.presses import Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
 from tactflow.cli.calibrate_force import add_force
+from tactflow.cli.guide import Guide, typed_lines
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.vision.types import Scale
 
-LIGHT: Final = 0.3
-"""Radius of a contact over that of the ball, below which a press is called light. Chosen by hand."""
 WORSE: Final = 1.5
 """Error on new presses over that in the file, from which on a calibration is called drifted. By hand."""
 
@@ -47,6 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sensor", metavar="NAME", help="which one of a file with sensors")
     parser.add_argument("--out", type=Path, metavar="FILE", help="calibration/SENSOR.yaml unless given")
+    parser.add_argument(
+        "--realtime", action="store_true", help="play a recording at its own pace, like a camera, to try it"
+    )
+    parser.add_argument(
+        "--fresh", action="store_true", help="forget the presses of a session that was broken off"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
     parser.add_argument("--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel")
     parser.add_argument(
@@ -110,9 +113,33 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     if args.ball_radius is not None:
         _say(
             "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
-            f"all over the gel and to several depths. {args.presses} presses will do; Ctrl-C ends earlier."
+            f"all over the gel and to several depths. {args.presses} presses will do. Type u and Enter to "
+            "undo the last one, q and Enter or Ctrl-C to end earlier; what was pressed is kept."
         )
-    session = find_presses(loaded, _guide(args))
+    kept = KeptPresses(out.with_suffix(".presses"))
+    if args.fresh:
+        kept.clear()
+    session = find_presses(loaded, Guide(args.presses, _say, typed_lines()), kept)
+    try:
+        calibration = _learned(args, loaded, session)
+    except ConfigError as error:
+        if not kept.presses:
+            raise
+        raise ConfigError(
+            f"{error}. {len(kept.presses)} presses are kept in {kept.folder}: run the command again to go "
+            "on, or with --fresh to begin anew"
+        ) from None
+    calibration.save(out)
+    if len(kept.presses) >= args.presses:
+        kept.clear()
+    elif kept.presses:
+        _say(f"to go on to {args.presses} presses, run the command again with --overwrite")
+    _say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
+    return 0
+
+
+def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Calibration:
+    """What a session gives. Raises ConfigError if that is no calibration."""
     scale = _scale(args, session)
     _say(f"scale: {_scale_words(scale)}")
     found = None
@@ -123,7 +150,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
             if not kept:
                 _say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
         _say(_photometric_words(found.found.model_dump()))
-    Calibration(
+    return Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
         raw_size=session.mapping.raw_size,
@@ -136,14 +163,12 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         else f"area of {args.area[0]:g} x {args.area[1]:g} mm",
         slopes=None if found is None else found.model,
         photometric=None if found is None else found.found,
-    ).save(out)
-    _say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
-    return 0
+    )
 
 
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
-    session = find_presses(_load(args, pipeline), _guide(args))
+    session = find_presses(_load(args, pipeline), Guide(args.presses, _say))
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
         print(f"does not fit: {misfit}")
@@ -164,7 +189,13 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
 
 
 def _load(args: argparse.Namespace, pipeline: str | None) -> Pipeline:
-    return load(pipeline, source=args.source, sensor=args.sensor, settings={"calibration": None})
+    return load(
+        pipeline,
+        source=args.source,
+        sensor=args.sensor,
+        settings={"calibration": None},
+        realtime=args.realtime,
+    )
 
 
 def _scale(args: argparse.Namespace, session: Session) -> Scale:
@@ -184,28 +215,6 @@ def _given(args: argparse.Namespace) -> str:
     if args.pitch is not None:
         return f"dots with a pitch of {args.pitch:g} mm"
     return f"a picture of {args.area[0]:g} x {args.area[1]:g} mm"
-
-
-def _guide(args: argparse.Namespace) -> Report:
-    """Tell of each press when it is over, and when there are enough."""
-    told = 0
-
-    def report(_frames: int, presses: Sequence[Press], lasts: bool) -> bool:
-        nonlocal told
-        over = len(presses) - lasts
-        for number in range(told, over):
-            press = presses[number]
-            size = f"radius {press.radius:.0f} px at ({press.center[0]:.0f}, {press.center[1]:.0f})"
-            _say(f"press {number + 1}: {size}{_advice(presses[:over], number)}")
-        told = max(told, over)
-        return over >= int(args.presses)
-
-    return report
-
-
-def _advice(presses: Sequence[Press], number: int) -> str:
-    usual = float(np.median([press.radius for press in presses]))
-    return "; light, press harder" if presses[number].radius < LIGHT * usual else ""
 
 
 def _scale_words(scale: Scale) -> str:
