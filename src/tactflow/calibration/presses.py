@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Node, Pipeline
 from tactflow.ports import ContactMask, MarkerMask, Unmarked
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Markers
@@ -56,12 +56,19 @@ class Session:
     frames: int
 
 
-Report = Callable[[int, Sequence["Press"], bool], bool]
-"""Called with each frame: how many there were, the presses so far, and whether the last one still lasts.
-Returns whether that is enough for a live source; of a recording all is read."""
+Wish = Literal["enough", "undo"] | None
+"""What is to become of a session: enough ends it, if its source is live; of a recording all is read. undo
+drops the last press."""
+
+Report = Callable[[int, Sequence["Press"], bool], Wish]
+"""Called with each frame: how many there were, the presses so far, and whether the last one still lasts."""
 
 
-def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, _lasts: False) -> Session:
+def find_presses(
+    pipeline: Pipeline,
+    report: Report = lambda _frames, _presses, _lasts: None,
+    watchers: Mapping[str, Node] | None = None,
+) -> Session:
     """Run a pipeline on its source and collect the presses in it.
 
     A press lasts as long as something touches at about one place; of each, the frame with the largest
@@ -71,6 +78,7 @@ def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, 
     Parameters
     ----------
     pipeline : with stages that give `unmarked` and `contact`. report : see `Report`.
+    watchers : sinks that look on, by their ids.
 
     Raises
     ------
@@ -78,7 +86,7 @@ def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, 
     TactflowError : a stage or the source failed.
     """
     needed = {"unmarked": "preprocess", "contact": "hull"}
-    return _session(collect(pipeline, _Collect, {"report": report}, needed))
+    return _session(collect(pipeline, _Collect, {"report": report}, needed, watchers=watchers))
 
 
 class _Collect(Sink):
@@ -95,6 +103,7 @@ class _Collect(Sink):
         self.dots = np.zeros((0, 2))
         self.frames = 0
         self._open = False
+        self._dropped = False
 
     def write(
         self,
@@ -114,14 +123,18 @@ class _Collect(Sink):
         if markers is not None:
             self.dots = markers.origin
         if contact is None or contact_mask is None or tick.frame.reference:
-            self._open = False
-        else:
+            self._open = self._dropped = False
+        elif not self._dropped:
             radius = float(np.sqrt(np.count_nonzero(contact_mask) / np.pi))
             hidden = np.zeros(unmarked.shape[:2], np.bool_) if marker_mask is None else marker_mask > 0
             self._add(Press(tick.frame.seq, unmarked, contact_mask, hidden, contact.center, radius))
-        enough = self.report(self.frames, self.presses, self._open)
-        if enough and self._control.source is not None and self._control.source.live:
+        wish = self.report(self.frames, self.presses, self._open)
+        if wish == "enough" and self._control.source is not None and self._control.source.live:
             self._control.stop()
+        if wish == "undo" and self.presses:
+            self.presses.pop()
+            # The rest of a press that still lasts is none either.
+            self._dropped, self._open = self._open, False
 
     def _add(self, press: Press) -> None:
         """A press of its own, or another moment of the last one."""

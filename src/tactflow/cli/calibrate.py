@@ -5,23 +5,25 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
+from rich.console import Console
 
 from tactflow.api import load
 from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_picture
+from tactflow.calibration.guide import Guide
 from tactflow.calibration.photometric import fit_photometry, try_photometry
-from tactflow.calibration.presses import Press, Report, Session, find_presses
+from tactflow.calibration.presses import Press, Report, Session, Wish, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
 from tactflow.cli.calibrate_force import add_force
+from tactflow.cli.notes import notes_on
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Node, Pipeline
+from tactflow.view.guided import Guiding
 from tactflow.vision.types import Scale
 
-LIGHT: Final = 0.3
-"""Radius of a contact over that of the ball, below which a press is called light. Chosen by hand."""
 WORSE: Final = 1.5
 """Error on new presses over that in the file, from which on a calibration is called drifted. By hand."""
 
@@ -58,7 +60,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--ball-radius", type=float, metavar="MM", help="of the ball; without it, scale only")
     parser.add_argument(
-        "--presses", type=int, default=30, metavar="N", help="of a live source: enough presses (30)"
+        "--presses", type=int, default=30, metavar="N", help="of a live source: enough good presses (30)"
+    )
+    parser.add_argument(
+        "--view", action="store_true", help="show the live page, which says where to press next"
     )
     parser.add_argument(
         "--csv",
@@ -107,12 +112,14 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         raise ConfigError(f"--out: required a file whose name ends in .yaml, got {out}")
     if out.exists() and not args.overwrite:
         raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
+    guide = Guide(args.presses)
     if args.ball_radius is not None:
         _say(
             "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
             f"all over the gel and to several depths. {args.presses} presses will do; Ctrl-C ends earlier."
         )
-    session = find_presses(loaded, _guide(args))
+    with notes_on(Console(stderr=True)):
+        session = find_presses(loaded, _telling(guide), _page(loaded, guide) if args.view else None)
     scale = _scale(args, session)
     _say(f"scale: {_scale_words(scale)}")
     found = None
@@ -143,7 +150,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
 
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
-    session = find_presses(_load(args, pipeline), _guide(args))
+    session = find_presses(_load(args, pipeline), _telling(Guide(args.presses)))
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
         print(f"does not fit: {misfit}")
@@ -186,26 +193,33 @@ def _given(args: argparse.Namespace) -> str:
     return f"a picture of {args.area[0]:g} x {args.area[1]:g} mm"
 
 
-def _guide(args: argparse.Namespace) -> Report:
-    """Tell of each press when it is over, and when there are enough."""
+def _telling(guide: Guide) -> Report:
+    """Tell of each press when it is over, and where the next one is wanted."""
     told = 0
 
-    def report(_frames: int, presses: Sequence[Press], lasts: bool) -> bool:
+    def report(frames: int, presses: Sequence[Press], lasts: bool) -> Wish:
         nonlocal told
+        wish = guide(frames, presses, lasts)
         over = len(presses) - lasts
         for number in range(told, over):
-            press = presses[number]
+            press, fault = presses[number], guide.state["presses"][number]["fault"]
             size = f"radius {press.radius:.0f} px at ({press.center[0]:.0f}, {press.center[1]:.0f})"
-            _say(f"press {number + 1}: {size}{_advice(presses[:over], number)}")
-        told = max(told, over)
-        return over >= int(args.presses)
+            _say(f"press {number + 1}: {size}; {fault or 'good'}. {guide.state['now']}")
+        if over < told:
+            _say(f"press {told} is forgotten. {guide.state['now']}")
+        told = over
+        return wish
 
     return report
 
 
-def _advice(presses: Sequence[Press], number: int) -> str:
-    usual = float(np.median([press.radius for press in presses]))
-    return "; light, press harder" if presses[number].radius < LIGHT * usual else ""
+def _page(loaded: Pipeline, guide: Guide) -> dict[str, Node]:
+    """The live page as the pipeline sets it, made to guide."""
+    for id_, node in loaded.nodes.items():
+        if issubclass(node.component.cls, Guiding):
+            component = replace(node.component, cls=node.component.cls.through(guide))
+            return {id_: replace(node, component=component)}
+    raise ConfigError("calibrate --view: required a pipeline with the sink view; add `view: {}` to its sinks")
 
 
 def _scale_words(scale: Scale) -> str:

@@ -47,6 +47,15 @@ export function slip({ slip }) {
   return [slip.slipping ? "slips" : "holds", `${Math.round(100 * slip.stick_ratio)}\u202f% of the contact sticks`];
 }
 
+// How a session of presses goes: [count, share, the last press, whether it is good].
+export function guide({ good, enough, presses, lasts }) {
+  const count = `${good} of ${enough} good presses`;
+  const share = Math.min(1, good / enough);
+  const last = presses[presses.length - 1];
+  if (!last || lasts) return [count, share, "", true];
+  return [count, share, `Press ${presses.length}: ${last.fault ?? "good"}.`, last.fault === null];
+}
+
 const error = (stderr, digits) => (stderr == null ? "" : ` ± ${fixed(stderr, digits)}`);
 
 // Standard error of the length of a vector, from those of its components.
