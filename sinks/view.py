@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
+from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
 from tactflow.ports import Image, Valid
 from tactflow.view.address import Neighbours, address, bind, is_loopback
@@ -210,11 +211,9 @@ class View(Guiding):
         if factor < 1:
             size = (max(1, round(width * factor)), max(1, round(height * factor)))
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        done, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, self.params.quality))
-        if not done:
-            raise ValueError(f"required an image that JPEG can hold, got {image.shape} {image.dtype}")
+        jpeg = encode_jpeg(image, self.params.quality)
         self._encoded += 1
-        return jpeg.tobytes()
+        return jpeg
 
     def close(self) -> None:
         """Tell the pages that the run has ended, and serve no more."""

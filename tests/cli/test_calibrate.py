@@ -30,7 +30,7 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     words = ["--from", "sim:ball?frames=240", "--pitch", pitch, "--ball-radius", "2.375"]
     assert calibrate(*words) == 0
     told = capsys.readouterr().err
-    assert "press 8: radius" in told
+    assert "press 8 of 30: good, radius" in told
     assert "calibration/main.yaml is written" in told
     said = yaml.safe_load(Path("calibration/main.yaml").read_text())
     assert said["made_from"] == "sim:ball?frames=240"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -13,11 +12,12 @@ from rich.console import Console
 
 from tactflow.api import load
 from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_picture
-from tactflow.calibration.guide import Guide
+from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
-from tactflow.calibration.presses import Press, Report, Session, Wish, find_presses
+from tactflow.calibration.presses import Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
 from tactflow.cli.calibrate_force import add_force
+from tactflow.cli.guide import Guide, typed_lines
 from tactflow.cli.notes import notes_on
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
@@ -49,6 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sensor", metavar="NAME", help="which one of a file with sensors")
     parser.add_argument("--out", type=Path, metavar="FILE", help="calibration/SENSOR.yaml unless given")
+    parser.add_argument(
+        "--realtime", action="store_true", help="play a recording at its own pace, like a camera, to try it"
+    )
+    parser.add_argument(
+        "--fresh", action="store_true", help="forget the presses of a session that was broken off"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
     parser.add_argument("--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel")
     parser.add_argument(
@@ -60,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--ball-radius", type=float, metavar="MM", help="of the ball; without it, scale only")
     parser.add_argument(
-        "--presses", type=int, default=30, metavar="N", help="of a live source: enough good presses (30)"
+        "--presses", type=int, default=30, metavar="N", help="of a live source: enough presses (30)"
     )
     parser.add_argument(
         "--view", action="store_true", help="show the live page, which says where to press next"
@@ -112,14 +118,38 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         raise ConfigError(f"--out: required a file whose name ends in .yaml, got {out}")
     if out.exists() and not args.overwrite:
         raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
-    guide = Guide(args.presses)
     if args.ball_radius is not None:
         _say(
             "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
-            f"all over the gel and to several depths. {args.presses} presses will do; Ctrl-C ends earlier."
+            f"all over the gel and to several depths. {args.presses} presses will do. Type u and Enter to "
+            "undo the last one, q and Enter or Ctrl-C to end earlier; what was pressed is kept."
         )
-    with notes_on(Console(stderr=True)):
-        session = find_presses(loaded, _telling(guide), _page(loaded, guide) if args.view else None)
+    kept = KeptPresses(out.with_suffix(".presses"))
+    if args.fresh:
+        kept.clear()
+    guide = Guide(args.presses, _say, typed_lines())
+    with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
+        session = find_presses(loaded, guide, kept, _page(loaded, guide) if args.view else None)
+    try:
+        calibration = _learned(args, loaded, session)
+    except ConfigError as error:
+        if not kept.presses:
+            raise
+        raise ConfigError(
+            f"{error}. {len(kept.presses)} presses are kept in {kept.folder}: run the command again to go "
+            "on, or with --fresh to begin anew"
+        ) from None
+    calibration.save(out)
+    if len(kept.presses) >= args.presses:
+        kept.clear()
+    elif kept.presses:
+        _say(f"to go on to {args.presses} presses, run the command again with --overwrite")
+    _say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
+    return 0
+
+
+def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Calibration:
+    """What a session gives. Raises ConfigError if that is no calibration."""
     scale = _scale(args, session)
     _say(f"scale: {_scale_words(scale)}")
     found = None
@@ -130,7 +160,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
             if not kept:
                 _say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
         _say(_photometric_words(found.found.model_dump()))
-    Calibration(
+    return Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
         raw_size=session.mapping.raw_size,
@@ -143,14 +173,12 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         else f"area of {args.area[0]:g} x {args.area[1]:g} mm",
         slopes=None if found is None else found.model,
         photometric=None if found is None else found.found,
-    ).save(out)
-    _say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
-    return 0
+    )
 
 
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
-    session = find_presses(_load(args, pipeline), _telling(Guide(args.presses)))
+    session = find_presses(_load(args, pipeline), Guide(args.presses, _say))
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
         print(f"does not fit: {misfit}")
@@ -171,7 +199,13 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
 
 
 def _load(args: argparse.Namespace, pipeline: str | None) -> Pipeline:
-    return load(pipeline, source=args.source, sensor=args.sensor, settings={"calibration": None})
+    return load(
+        pipeline,
+        source=args.source,
+        sensor=args.sensor,
+        settings={"calibration": None},
+        realtime=args.realtime,
+    )
 
 
 def _scale(args: argparse.Namespace, session: Session) -> Scale:
@@ -191,26 +225,6 @@ def _given(args: argparse.Namespace) -> str:
     if args.pitch is not None:
         return f"dots with a pitch of {args.pitch:g} mm"
     return f"a picture of {args.area[0]:g} x {args.area[1]:g} mm"
-
-
-def _telling(guide: Guide) -> Report:
-    """Tell of each press when it is over, and where the next one is wanted."""
-    told = 0
-
-    def report(frames: int, presses: Sequence[Press], lasts: bool) -> Wish:
-        nonlocal told
-        wish = guide(frames, presses, lasts)
-        over = len(presses) - lasts
-        for number in range(told, over):
-            press, fault = presses[number], guide.state["presses"][number]["fault"]
-            size = f"radius {press.radius:.0f} px at ({press.center[0]:.0f}, {press.center[1]:.0f})"
-            _say(f"press {number + 1}: {size}; {fault or 'good'}. {guide.state['now']}")
-        if over < told:
-            _say(f"press {told} is forgotten. {guide.state['now']}")
-        told = over
-        return wish
-
-    return report
 
 
 def _page(loaded: Pipeline, guide: Guide) -> dict[str, Node]:

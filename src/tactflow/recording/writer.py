@@ -55,12 +55,14 @@ class Entry:
 class About:
     """What a recording says about itself.
 
-    sensor : name. facts : metadata, such as versions. texts : attachments by name, in UTF-8.
+    sensor : name. facts : metadata, such as versions. texts : attachments by name, in UTF-8. arrays : others,
+    as the bytes of `.npz` files.
     """
 
     sensor: str
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
     texts: Mapping[str, str] = field(default_factory=dict[str, str])
+    arrays: Mapping[str, bytes] = field(default_factory=dict[str, bytes])
 
 
 class RecordingWriter:
@@ -136,6 +138,8 @@ class RecordingWriter:
         for file, text in texts.items():
             kind = "application/json" if file.endswith(".json") else "application/yaml"
             writer.add_attachment(0, 0, file, kind, text.encode())
+        for file, data in about.arrays.items():
+            writer.add_attachment(0, 0, file, "application/octet-stream", data)
 
     def write(self, entry: Entry, time: int | None = None) -> None:
         """Add one frame and what belongs to it.

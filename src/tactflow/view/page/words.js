@@ -48,12 +48,12 @@ export function slip({ slip }) {
 }
 
 // How a session of presses goes: [count, share, the last press, whether it is good].
-export function guide({ good, enough, presses, lasts }) {
-  const count = `${good} of ${enough} good presses`;
-  const share = Math.min(1, good / enough);
+export function guide({ done, good, wanted, presses, lasts }) {
+  const count = `${done} of ${wanted} presses${good < done ? `, ${good} good` : ""}`;
+  const share = Math.min(1, done / wanted);
   const last = presses[presses.length - 1];
   if (!last || lasts) return [count, share, "", true];
-  return [count, share, `Press ${presses.length}: ${last.fault ?? "good"}.`, last.fault === null];
+  return [count, share, `Press ${done}: ${last.fault ?? "good"}.`, last.fault === null];
 }
 
 const error = (stderr, digits) => (stderr == null ? "" : ` ± ${fixed(stderr, digits)}`);

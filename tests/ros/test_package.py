@@ -1,0 +1,90 @@
+"""The files of the ROS 2 package fit each other."""
+
+from __future__ import annotations
+
+import ast
+import runpy
+import subprocess
+import sys
+from types import ModuleType
+from typing import Any, cast
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+from tests.ros.programs import PACKAGE, environment
+
+
+def sources() -> list[str]:
+    """Every line of the package."""
+    return [line.strip() for file in PACKAGE.glob("*/*.py") for line in file.read_text().splitlines()]
+
+
+def parameters() -> dict[str, tuple[Any, str]]:
+    """`PARAMETERS` of the bridge, without the rclpy that its module imports."""
+    for statement in ast.parse((PACKAGE / "tactflow_ros" / "bridge.py").read_text()).body:
+        if isinstance(statement, ast.AnnAssign) and ast.unparse(statement.target) == "PARAMETERS":
+            assert statement.value is not None
+            return cast(dict[str, tuple[Any, str]], ast.literal_eval(statement.value))
+    raise AssertionError("the bridge has no PARAMETERS")
+
+
+def test_the_package_names_what_is_there_and_all_that_it_needs() -> None:
+    package = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    assert package.findtext("name") == "tactflow_ros"
+    assert package.findtext("export/build_type") == "ament_python"
+    setup = (PACKAGE / "setup.py").read_text()
+    assert f'version="{package.findtext("version")}"' in setup
+    for file in ("config/tactflow.yaml", "launch/tactflow.launch.py", "package.xml"):
+        assert file in setup
+        assert (PACKAGE / file).exists()
+    assert (PACKAGE / "resource" / "tactflow_ros").exists()
+    imported = {line.split()[1].split(".")[0] for line in sources() if line.startswith(("from ", "import "))}
+    depends = {node.text for node in package.findall("exec_depend")}
+    comes_with_rclpy = {"rcl_interfaces", "builtin_interfaces"}
+    foreign = {name for name in imported if name.endswith(("_msgs", "_srvs", "_interfaces", "rclpy"))}
+    assert foreign - comes_with_rclpy <= depends
+    assert "tactflow" not in imported
+
+
+def test_the_file_of_parameters_has_every_parameter_with_its_default() -> None:
+    (node,) = yaml.safe_load((PACKAGE / "config" / "tactflow.yaml").read_text()).values()
+    assert node["ros__parameters"] == {name: default for name, (default, _) in parameters().items()}
+
+
+def test_the_launch_file_starts_the_node_with_parameters_that_it_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # No wheel has launch: what the file calls is noted here, and not run.
+    calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
+
+    class Noting(ModuleType):
+        def __getattr__(self, name: str) -> Any:
+            def note(*words: Any, **named: Any) -> Any:
+                calls.append((name, words, named))
+                return (name, *words)
+
+            return note
+
+    parts = ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions")
+    for module in (*parts, "launch_ros.parameter_descriptions", "launch_ros.substitutions"):
+        monkeypatch.setitem(sys.modules, module, Noting(module))
+    found = runpy.run_path(str(PACKAGE / "launch" / "tactflow.launch.py"))
+    found["generate_launch_description"]()
+    (node,) = [named for name, _, named in calls if name == "LifecycleNode"]
+    assert (node["package"], node["executable"]) == ("tactflow_ros", "bridge")
+    declared = {words[0] for name, words, _ in calls if name == "DeclareLaunchArgument"}
+    asked = {words[0] for name, words, _ in calls if name == "LaunchConfiguration"}
+    assert asked == declared
+    _, given, _ = node["parameters"]
+    assert given.keys() <= parameters().keys()
+
+
+def test_without_ros_the_program_says_what_is_missing() -> None:
+    # The environment of these tests has no rclpy.
+    command = [sys.executable, "-m", "tactflow_ros"]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "rclpy is missing" in done.stderr
+    assert "source /opt/ros" in done.stderr
