@@ -14,6 +14,7 @@ from tactflow.calibration.photometric import fit_photometry, try_photometry
 from tactflow.calibration.presses import Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
 from tactflow.cli.calibrate_force import add_force
+from tactflow.cli.calibrate_lens import print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
@@ -28,10 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what",
         nargs="*",
-        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE]",
+        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE] | lens PICTURES",
         help="a pipeline with the sensor's preprocess, to make a calibration (default: ./pipeline.yaml, else "
         "the packaged one); or check, and a calibration file, to see how well it fits today; or force, and a "
-        "calibration file, to add to it how the force follows from the contact",
+        "calibration file, to add to it how the force follows from the contact; or lens, and pictures of a "
+        "printed target, to get undistort and homography of a preprocess",
     )
     parser.add_argument(
         "--source",
@@ -51,7 +53,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--fresh", action="store_true", help="forget the presses of a session that was broken off"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
-    parser.add_argument("--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel")
+    parser.add_argument(
+        "--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel, or of the target"
+    )
+    parser.add_argument(
+        "--target",
+        metavar="PICTURE",
+        help="scale from this raw picture of a printed target where the gel is, of --grid and --pitch",
+    )
+    parser.add_argument(
+        "--grid",
+        metavar="COLUMNSxROWS",
+        help="of the target: inner corners of its checkerboard, or dots with --dots",
+    )
+    parser.add_argument("--dots", action="store_true", help="the target is a grid of dots")
     parser.add_argument(
         "--area",
         type=float,
@@ -96,6 +111,8 @@ def run(args: argparse.Namespace) -> int:
         if len(words) not in (2, 3):
             raise ConfigError("calibrate force: required a calibration file, and a pipeline if wanted")
         return add_force(args, Path(words[1]), words[2] if len(words) == 3 else None)
+    if words[:1] == ["lens"]:
+        return print_lens(args, words[1:])
     if len(words) > 1:
         raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
     return _make(args, words[0] if words else None)
@@ -140,7 +157,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
 
 def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Calibration:
     """What a session gives. Raises ConfigError if that is no calibration."""
-    scale = _scale(args, session)
+    scale = _scale(args, loaded, session)
     _say(f"scale: {_scale_words(scale)}")
     found = None
     if args.ball_radius is not None:
@@ -158,9 +175,7 @@ def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Ca
         corners=raw_corners(session.mapping),
         look=small_picture(session.untouched),
         scale=scale,
-        scale_by=f"pitch of {args.pitch:g} mm"
-        if args.pitch
-        else f"area of {args.area[0]:g} x {args.area[1]:g} mm",
+        scale_by=_given(args),
         slopes=None if found is None else found.model,
         photometric=None if found is None else found.found,
     )
@@ -198,9 +213,11 @@ def _load(args: argparse.Namespace, pipeline: str | None) -> Pipeline:
     )
 
 
-def _scale(args: argparse.Namespace, session: Session) -> Scale:
+def _scale(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Scale:
     width, height = session.mapping.size
     try:
+        if args.target is not None:
+            return target_scale(args, loaded)
         if args.pitch is not None:
             return scale_from_pitch(session.dots, args.pitch, (width, height))
         # The picture reaches half a pixel beyond the centres of its outermost pixels.
@@ -212,9 +229,10 @@ def _scale(args: argparse.Namespace, session: Session) -> Scale:
 
 
 def _given(args: argparse.Namespace) -> str:
-    if args.pitch is not None:
-        return f"dots with a pitch of {args.pitch:g} mm"
-    return f"a picture of {args.area[0]:g} x {args.area[1]:g} mm"
+    """How the scale is found."""
+    if args.target is not None:
+        return f"target of {args.grid}, pitch of {args.pitch:g} mm"
+    return f"pitch of {args.pitch:g} mm" if args.pitch else f"area of {args.area[0]:g} x {args.area[1]:g} mm"
 
 
 def _scale_words(scale: Scale) -> str:
