@@ -184,8 +184,9 @@ class Parquet(Sink):
         except OSError as error:
             hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
             raise StageError(
-                f"{self._folder}: cannot be written into: {error.strerror or error}; the "
-                f"{self._counts['frames']} frames written before are complete, {len(messages)} are lost{hint}"
+                f"{self._folder}: cannot be written into: {error.strerror or error}; "
+                f"the {self._counts['frames']} frames written before are complete; "
+                f"not written: {len(messages)}{hint}"
             ) from error
         self._next += 1
         self._counts = {"frames": self._counts["frames"] + len(messages), "parts": self._counts["parts"] + 1}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -90,7 +91,7 @@ def _note(direct: Subscriber, arrivals: dict[float, int]) -> None:
 
 
 def _compare(sent: int, arrivals: dict[float, int], told: list[dict[str, Any]]) -> Passage:
-    by_stamp = {round(t * 1e9): at for t, at in arrivals.items()}
+    by_stamp = {math.floor(t) * 1_000_000_000 + round(t % 1 * 1e9): at for t, at in arrivals.items()}
     stamps = []
     for line in told:
         stamp = line["message"]["header"]["stamp"]

@@ -86,7 +86,8 @@ def units(message: Message) -> list[Unit]:
 
 def stamp(t: float) -> Time:
     """Time of the capture, to the nanosecond that the number tells."""
-    nanoseconds = round(t * NANOSECONDS)
+    # Unix times have no room for nanoseconds in one double.
+    nanoseconds = math.floor(t) * NANOSECONDS + round(t % 1 * NANOSECONDS)
     return Time(sec=nanoseconds // NANOSECONDS, nanosec=nanoseconds % NANOSECONDS)
 
 

@@ -60,7 +60,14 @@ class Engine(Protocol):
 
 def died(task: Task, status: Status, why: str) -> Outcome:
     """The outcome of a task that no worker has told about."""
-    return Outcome(task.recording.source, task.recording.name, status, error=why, started=time.time())
+    return Outcome(
+        task.recording.source,
+        task.recording.name,
+        status,
+        error=why,
+        pipeline=task.pipeline.digest,
+        started=time.time(),
+    )
 
 
 ThreadLimits = Mapping[str, str]

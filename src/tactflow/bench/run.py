@@ -269,7 +269,8 @@ class _Run:
     def finished(self, growth: float | None) -> Result:
         """The result, its promises judged."""
         result = self.result
-        result.copy_ms, result.touch_ms = self.unit.copy_ms, self.unit.touch_ms
+        unit = self.unit
+        result.copy_ms, result.touch_ms, result.fault_us = unit.copy_ms, unit.touch_ms, unit.fault_us
         wedge = WEDGE if WEDGE in self.loaded else DEFAULT
         result.targets = judge(result, DEFAULT, growth, wedge=wedge, markerless=MARKERLESS)
         self.progress("done", self.total, self.total)

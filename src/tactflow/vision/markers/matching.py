@@ -111,28 +111,19 @@ def choose_spots(
     count = len(free)
     if count == 0 or len(spots) == 0:
         return np.full(count, -1, np.int64)
-    slot = np.full(len(origin), -1, np.int64)
     named = np.concatenate([edges.ravel(), free])
     if named.min() < 0 or named.max() >= len(origin):
         raise IndexError(f"required marks 0 to {len(origin) - 1} in edges and free, got others")
+    slot: IntArray = np.full(len(origin), -1, np.int64)
     slot[free] = np.arange(count)
     origin, spots = (np.ascontiguousarray(array, np.float64) for array in (origin, spots))
     edges, free = np.ascontiguousarray(edges, np.int64), np.ascontiguousarray(free, np.int64)
     links = _Links(_complex(origin), edges, free, slot, np.asarray(inliers, np.bool_), _complex(displacement))
-    chosen: IntArray = np.full(count, -1, np.int64)
     label, unary = _near_spots(_complex(expected), _complex(spots), strength, pitch, farthest)
-    labels = label.shape[1]
-    if labels == 0:
-        return chosen
-    moved = _complex(spots)[label] - links.rest[free][:, None]
-    _add_links_to_inliers(links, moved, unary)
-    best = np.argmin(unary, axis=1)
-    if (best < labels).all():
-        rows = np.arange(count)
-        own: IntArray = label[rows, best]
-        if len(np.unique(own)) == count and _is_smooth(links, moved[rows, best]):
-            return own
-    propagate_beliefs(origin, edges, free, slot, spots, label, unary, labels, chosen)
+    chosen = _own_best(links, _complex(spots), label, unary)
+    if chosen is None:
+        chosen = np.empty(count, np.int64)
+        propagate_beliefs(origin, edges, free, slot, spots, label, unary, label.shape[1], chosen)
     return chosen
 
 
@@ -170,6 +161,23 @@ def _near_spots(
     cost = SURPRISE_COST * (away / pitch) ** 2 + FAINT_COST * np.maximum(1.0 - strength[label], 0.0)
     unary[:, :labels] = np.where(away > farthest, FORBIDDEN_COST, cost)
     return label, unary
+
+
+def _own_best(links: _Links, spots: ComplexArray, label: IntArray, unary: FloatArray) -> IntArray | None:
+    """What each mark chooses alone, if that is a smooth choice or there is none; else None.
+
+    label, unary : of `_near_spots`; the costs of links to inliers are added to `unary`.
+    """
+    count, labels = label.shape
+    if labels == 0:
+        return np.full(count, -1, np.int64)
+    moved = spots[label] - links.rest[links.free][:, None]
+    _add_links_to_inliers(links, moved, unary)
+    best, rows = np.argmin(unary, axis=1), np.arange(count)
+    if (best == labels).any():
+        return None
+    own: IntArray = label[rows, best]
+    return own if len(np.unique(own)) == count and _is_smooth(links, moved[rows, best]) else None
 
 
 def _add_links_to_inliers(links: _Links, moved: ComplexArray, unary: FloatArray) -> None:
