@@ -13,8 +13,8 @@ from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
 from tactflow.calibration.presses import Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
-from tactflow.cli.calibrate_force import add_force
-from tactflow.cli.calibrate_lens import print_lens, target_scale
+from tactflow.cli.calibrate_force import add_force, add_force_arguments
+from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
@@ -57,17 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel, or of the target"
     )
     parser.add_argument(
-        "--target",
-        metavar="PICTURE",
-        help="scale from this raw picture of a printed target where the gel is, of --grid and --pitch",
-    )
-    parser.add_argument(
-        "--grid",
-        metavar="COLUMNSxROWS",
-        help="of the target: inner corners of its checkerboard, or dots with --dots",
-    )
-    parser.add_argument("--dots", action="store_true", help="the target is a grid of dots")
-    parser.add_argument(
         "--area",
         type=float,
         nargs=2,
@@ -78,20 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--presses", type=int, default=30, metavar="N", help="of a live source: enough presses (30)"
     )
-    parser.add_argument(
-        "--csv",
-        type=Path,
-        metavar="FILE",
-        help="for force: what the gauge said, where it does not lie beside the recording; columns t (s) or "
-        "frame, fz (N), and fx and fy if there are",
-    )
-    parser.add_argument(
-        "--offset",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="for force: add so much to the time of the CSV; what is left, up to 2 s, is estimated",
-    )
+    add_target_arguments(parser)
+    add_force_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -22,6 +22,21 @@ from tactflow.sources import open_source
 from tactflow.vision.types import Scale
 
 
+def add_target_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of a printed target."""
+    parser.add_argument(
+        "--target",
+        metavar="PICTURE",
+        help="scale from this raw picture of a printed target where the gel is, of --grid and --pitch",
+    )
+    parser.add_argument(
+        "--grid",
+        metavar="COLUMNSxROWS",
+        help="of the target: inner corners of its checkerboard, or dots with --dots",
+    )
+    parser.add_argument("--dots", action="store_true", help="the target is a grid of dots")
+
+
 class _First(Sink):
     """Keeps the first processed frame."""
 
