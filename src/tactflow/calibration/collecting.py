@@ -44,7 +44,8 @@ def collect(
     made = component(type(sink.__name__, (sink,), attributes), _COLLECT, "tactflow calibrate", ())
     inputs = {port.name: pipeline.last_output(port.name) for port in made.ports.inputs}
     # Of a gel without markers the picture itself is without them.
-    inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
+    if "unmarked" in inputs:
+        inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
     for port, stage in needed.items():
         if inputs[port] is None:
             raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")

@@ -161,8 +161,7 @@ class _Collect(Sink):
 
     def untouched(self) -> NDArray[np.uint8]:
         """(H, W, 3): mean of the reference frames."""
-        mean: NDArray[np.floating] = np.mean(self.rest, axis=0)
-        return np.asarray(np.rint(mean), np.uint8)
+        return np.asarray(np.rint(np.mean(self.rest, axis=0)), np.uint8)
 
     def size(self) -> tuple[int, int]:
         """Width and height of the frames, px."""
