@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 from pydantic import Field, model_validator
@@ -17,6 +18,8 @@ from tactflow.view.address import is_loopback
 if TYPE_CHECKING:
     from foxglove import Channel, Context
     from foxglove.websocket import WebSocketServer
+
+log = logging.getLogger("tactflow")
 
 BACKLOG = 32
 """Messages that may wait for each viewer. Chosen by hand."""
@@ -102,6 +105,7 @@ class Foxglove(Sink):
                 "foxglove_bridge: end it, or choose another port (--set sinks.foxglove.port=8766)"
             ) from error
         self.address = self.description = f"ws://{p.host}:{self._server.port}"
+        log.info("foxglove: %s", self.address)
 
     def wants(self) -> bool:
         """Whether anybody looks at any channel. From any thread."""
