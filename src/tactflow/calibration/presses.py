@@ -160,7 +160,8 @@ class _Collect(Sink):
     def untouched(self) -> NDArray[np.uint8]:
         """(H, W, 3): mean of the reference frames."""
         mean: NDArray[np.floating] = np.mean(self.rest, axis=0)
-        return np.rint(mean).astype(np.uint8)
+        rounded: NDArray[np.uint8] = np.rint(mean).astype(np.uint8)
+        return rounded
 
     def size(self) -> tuple[int, int]:
         """Width and height of the frames, px."""
