@@ -109,6 +109,9 @@ class Parquet(Sink):
         problem = missing("Parquet tables", "parquet", ["pyarrow"])
         if problem is not None:
             raise StageError(problem)
+        # Now, and not in the middle of the run, when the first part is written.
+        import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
+
         from tactflow.tables import Tables
 
         try:
@@ -192,7 +195,7 @@ class Parquet(Sink):
         self._counts = {"frames": self._counts["frames"] + len(messages), "parts": self._counts["parts"] + 1}
 
     def _write_part(self, name: str, table: pa.Table) -> None:
-        import pyarrow.parquet as pq  # type: ignore[import-untyped]
+        import pyarrow.parquet as pq
 
         part = self._folder / name / f"part-{self._next:05d}.parquet"
         unfinished = part.with_name(f"{UNFINISHED}-{part.name}")

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import orjson
 from pydantic import Field, model_validator
 
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
 from tactflow.jpeg import encode_jpeg
@@ -22,6 +23,7 @@ from tactflow.message import Results, encode_message
 from tactflow.ports import Image, Valid
 from tactflow.view.address import Neighbours, address, bind, is_loopback
 from tactflow.view.compact import compact_markers, compact_surface
+from tactflow.view.guided import Guiding
 from tactflow.vision.draw import dimmed, field_arrows
 
 if TYPE_CHECKING:
@@ -34,7 +36,7 @@ FIELD_ARROWS = 14.0
 """Distance of the arrows of a displacement field in a picture of 400 px, px. Chosen by hand."""
 
 
-class View(Sink):
+class View(Guiding):
     """Serves a page that draws the results over the processed frame, and can pause and end the run.
 
     While no page is open, or none is ready for another frame, nothing is wanted and nothing is encoded. A
@@ -129,7 +131,7 @@ class View(Sink):
         port = listener.getsockname()[1]
         if p.port not in (0, port) and self._neighbours is None:
             log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
-        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send)
+        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send, self.session)
         self._server = Server(self._hub, listener, p.host, p.token)
         self._server.start()
         self.description = address(p.host, port)
@@ -196,10 +198,11 @@ class View(Sink):
             arrows = compact_markers(field_arrows(field, FIELD_ARROWS * max(1.0, side / 400)))
         if depth is not None and "surface" in self._hub.shown:
             surface, heights = compact_surface(depth)
-        return heights, b'"markers":%b,"scale":%b,"field":%b,"surface":%b' % (
+        return heights, b'"markers":%b,"scale":%b,"field":%b,"surface":%b,"guide":%b' % (
             b"null" if markers is None else compact_markers(markers),
             b"null" if scale is None else b"[%.8g,%.8g]" % (scale.x, scale.y),
             *(arrows, surface),
+            b"null" if self.session is None else orjson.dumps(self.session.state),
         )
 
     def _encode(self, image: Image) -> bytes:

@@ -91,7 +91,7 @@ KINDS = {
     "video .mkv": Kind("film.mkv", "path", PICTURE, look_at_film),
     "video .mp4": Kind("film.mp4", "path", PICTURE, look_at_film),
     "record": Kind("press.mcap", "path", {}, look_at_recording),
-    "parquet": Kind("tables", "path", {"flush": 0.01}, look_at_tables),
+    "parquet": Kind("tables", "path", {"flush": 0.002}, look_at_tables),
 }
 
 

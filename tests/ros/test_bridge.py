@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -52,18 +53,11 @@ class Pair:
 
     def __init__(self) -> None:
         self.run = FakeRun()
-        params = Zmq.Params(
-            endpoint="tcp://127.0.0.1:*",
-            control="tcp://127.0.0.1:*",
-            detail=True,
-            pictures=100,
-            stats_every=0.1,
-        )
-        self.sink = Zmq(params, "left", cast(Control, self.run))
-        self.sink.open()
+        self.sink = self._sink("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+        self.control = self.sink.control_endpoint or ""
         given = {
             "endpoint": self.sink.endpoint,
-            "control": self.sink.control_endpoint,
+            "control": self.control,
             "frame_id": "gel",
             "tactile": "true",
             "publish_clock": "true",
@@ -79,6 +73,19 @@ class Pair:
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._publish)
         self._thread.start()
+
+    def _sink(self, endpoint: str, control: str) -> Zmq:
+        params = Zmq.Params(endpoint=endpoint, control=control, detail=True, pictures=100, stats_every=0.1)
+        sink = Zmq(params, "left", cast(Control, self.run))
+        sink.open()
+        return sink
+
+    def restart(self, meanwhile: Callable[[], None]) -> None:
+        """End tactflow, and start it again at the same addresses."""
+        old = self.sink
+        old.close()
+        meanwhile()
+        self.sink = self._sink(old.endpoint, self.control)
 
     def _publish(self) -> None:
         """A frame every 20 ms, as a camera would."""
@@ -222,6 +229,29 @@ def test_the_diagnostics_tell_rate_drops_and_lost_markers(pair: Pair) -> None:
     assert values["frames missing"] == 0
     assert values["lost markers, share"] == 0.5
     assert {"latency of the run, p99, ms", "frames dropped by the run", "damaged messages"} <= values.keys()
+
+
+@needs_rclpy
+def test_damaged_messages_are_passed_over_and_counted(pair: Pair) -> None:
+    for text in (b"{broken", b"[]", b"7", b'{"sensor": "left"}', b'{"sensor": "left", "seq": 1}\nx', b"\xff"):
+        pair.sink._send(b"tactflow.left " + text)
+    for text in (b'{"sensor": "left", "t": 1.0}\n', b'{"sensor": "left", "t": 1.0, "size": [9, 9]}\n123'):
+        pair.sink._send(b"tactflow_depth.left " + text)
+    far = {"sensor": "left", "seq": 1, "t": 1e300, "contact": None, "flow": None, "markers": None}
+    pair.sink._send(b"tactflow.left " + json.dumps(far).encode())
+    pair.receive("touching")
+    pair.receive("/diagnostics")
+    (status,) = pair.receive("/diagnostics")["status"]
+    assert {"key": "damaged messages", "value": "9"} in status["values"]
+
+
+@needs_rclpy
+def test_when_tactflow_has_ended_that_is_told_and_its_next_run_is_taken_up(pair: Pair) -> None:
+    def silent(told: dict[str, Any]) -> bool:
+        return told.get("topic") == "/diagnostics" and "no message for" in str(told)
+
+    pair.restart(lambda: pair.listener.told(silent) and None)
+    assert pair.receive("touching") == {"data": True}
 
 
 @needs_rclpy

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from tests.ros.programs import PACKAGE, environment
+from tests.ros.programs import PACKAGE, PYTHON, environment, needs_rclpy
 
 
 def sources() -> list[str]:
@@ -79,6 +79,15 @@ def test_the_launch_file_starts_the_node_with_parameters_that_it_has(
     assert asked == declared
     _, given, _ = node["parameters"]
     assert given.keys() <= parameters().keys()
+
+
+@needs_rclpy
+def test_a_parameter_of_the_wrong_type_is_told_without_a_traceback() -> None:
+    command = [str(PYTHON), "-m", "tactflow_ros", "--ros-args", "-p", "timeout:=2"]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "'timeout' to '2' of type 'INTEGER', expecting type 'DOUBLE'" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_without_ros_the_program_says_what_is_missing() -> None:

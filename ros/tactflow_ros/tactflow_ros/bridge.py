@@ -19,8 +19,10 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock as Steady
 from rclpy.clock import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.logging import get_logger
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
@@ -349,7 +351,12 @@ class Bridge(LifecycleNode):
 def main() -> int:
     """Run the node until it is told to end."""
     rclpy.init()
-    node = Bridge()
+    try:
+        node = Bridge()
+    except ParameterException as error:
+        get_logger("tactflow").error(f"{error}; a number with a point, as in 2.0, is a DOUBLE")
+        rclpy.try_shutdown()
+        return 1
     try:
         if node.value("autostart"):
             done = TransitionCallbackReturn.SUCCESS

@@ -74,8 +74,8 @@ class LocalProcesses:
 
     @property
     def window(self) -> int:
-        """One more than there are workers, so that none waits."""
-        return self._count + 1
+        """One task for each worker: the next comes as soon as one is done."""
+        return self._count
 
     def submit(self, task: Task) -> None:
         """Give a task to a free worker, or keep it for the next one."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -14,7 +14,7 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Node, Pipeline
 from tactflow.ports import ContactMask, MarkerMask, Unmarked
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Markers
@@ -80,6 +80,7 @@ def find_presses(
     pipeline: Pipeline,
     report: Report = lambda _frames, _presses, _lasts: False,
     keeper: Keeper | None = None,
+    watchers: Mapping[str, Node] | None = None,
 ) -> Session:
     """Run a pipeline on its source and collect the presses in it.
 
@@ -90,7 +91,7 @@ def find_presses(
     Parameters
     ----------
     pipeline : with stages that give `unmarked` and `contact`. report : see `Report`. keeper : has the presses
-        of before, and keeps the new ones, of a live source.
+        of before, and keeps the new ones, of a live source. watchers : sinks that look on, by their ids.
 
     Raises
     ------
@@ -98,7 +99,8 @@ def find_presses(
     TactflowError : a stage or the source failed.
     """
     needed = {"unmarked": "preprocess", "contact": "hull"}
-    return _session(collect(pipeline, _Collect, {"report": report, "keeper": lambda: keeper}, needed))
+    values = {"report": report, "keeper": lambda: keeper}
+    return _session(collect(pipeline, _Collect, values, needed, watchers=watchers))
 
 
 class _Collect(Sink):
@@ -159,9 +161,7 @@ class _Collect(Sink):
 
     def untouched(self) -> NDArray[np.uint8]:
         """(H, W, 3): mean of the reference frames."""
-        mean: NDArray[np.floating] = np.mean(self.rest, axis=0)
-        rounded: NDArray[np.uint8] = np.rint(mean).astype(np.uint8)
-        return rounded
+        return np.asarray(np.rint(np.mean(self.rest, axis=0)), np.uint8)
 
     def size(self) -> tuple[int, int]:
         """Width and height of the frames, px."""

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
+
+from rich.console import Console
 
 from tactflow.api import load
 from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_picture
@@ -13,10 +16,13 @@ from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
 from tactflow.calibration.presses import Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
-from tactflow.cli.calibrate_force import add_force
+from tactflow.cli.calibrate_force import add_force, add_force_arguments
+from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
+from tactflow.cli.notes import notes_on
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Node, Pipeline
+from tactflow.view.guided import Guiding
 from tactflow.vision.types import Scale
 
 WORSE: Final = 1.5
@@ -28,10 +34,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what",
         nargs="*",
-        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE]",
+        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE] | lens PICTURES",
         help="a pipeline with the sensor's preprocess, to make a calibration (default: ./pipeline.yaml, else "
         "the packaged one); or check, and a calibration file, to see how well it fits today; or force, and a "
-        "calibration file, to add to it how the force follows from the contact",
+        "calibration file, to add to it how the force follows from the contact; or lens, and pictures of a "
+        "printed target, to get undistort and homography of a preprocess",
     )
     parser.add_argument(
         "--source",
@@ -51,7 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--fresh", action="store_true", help="forget the presses of a session that was broken off"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
-    parser.add_argument("--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel")
+    parser.add_argument(
+        "--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel, or of the target"
+    )
     parser.add_argument(
         "--area",
         type=float,
@@ -64,19 +73,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--presses", type=int, default=30, metavar="N", help="of a live source: enough presses (30)"
     )
     parser.add_argument(
-        "--csv",
-        type=Path,
-        metavar="FILE",
-        help="for force: what the gauge said, where it does not lie beside the recording; columns t (s) or "
-        "frame, fz (N), and fx and fy if there are",
+        "--view", action="store_true", help="show the live page, which says where to press next"
     )
-    parser.add_argument(
-        "--offset",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="for force: add so much to the time of the CSV; what is left, up to 2 s, is estimated",
-    )
+    add_target_arguments(parser)
+    add_force_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -96,6 +96,8 @@ def run(args: argparse.Namespace) -> int:
         if len(words) not in (2, 3):
             raise ConfigError("calibrate force: required a calibration file, and a pipeline if wanted")
         return add_force(args, Path(words[1]), words[2] if len(words) == 3 else None)
+    if words[:1] == ["lens"]:
+        return print_lens(args, words[1:])
     if len(words) > 1:
         raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
     return _make(args, words[0] if words else None)
@@ -119,7 +121,9 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     kept = KeptPresses(out.with_suffix(".presses"))
     if args.fresh:
         kept.clear()
-    session = find_presses(loaded, Guide(args.presses, _say, typed_lines()), kept)
+    guide = Guide(args.presses, _say, typed_lines())
+    with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
+        session = find_presses(loaded, guide, kept, _page(loaded, guide) if args.view else None)
     try:
         calibration = _learned(args, loaded, session)
     except ConfigError as error:
@@ -140,7 +144,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
 
 def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Calibration:
     """What a session gives. Raises ConfigError if that is no calibration."""
-    scale = _scale(args, session)
+    scale = _scale(args, loaded, session)
     _say(f"scale: {_scale_words(scale)}")
     found = None
     if args.ball_radius is not None:
@@ -158,9 +162,7 @@ def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Ca
         corners=raw_corners(session.mapping),
         look=small_picture(session.untouched),
         scale=scale,
-        scale_by=f"pitch of {args.pitch:g} mm"
-        if args.pitch
-        else f"area of {args.area[0]:g} x {args.area[1]:g} mm",
+        scale_by=_given(args),
         slopes=None if found is None else found.model,
         photometric=None if found is None else found.found,
     )
@@ -198,9 +200,11 @@ def _load(args: argparse.Namespace, pipeline: str | None) -> Pipeline:
     )
 
 
-def _scale(args: argparse.Namespace, session: Session) -> Scale:
+def _scale(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Scale:
     width, height = session.mapping.size
     try:
+        if args.target is not None:
+            return target_scale(args, loaded)
         if args.pitch is not None:
             return scale_from_pitch(session.dots, args.pitch, (width, height))
         # The picture reaches half a pixel beyond the centres of its outermost pixels.
@@ -212,9 +216,19 @@ def _scale(args: argparse.Namespace, session: Session) -> Scale:
 
 
 def _given(args: argparse.Namespace) -> str:
-    if args.pitch is not None:
-        return f"dots with a pitch of {args.pitch:g} mm"
-    return f"a picture of {args.area[0]:g} x {args.area[1]:g} mm"
+    """How the scale is found."""
+    if args.target is not None:
+        return f"target of {args.grid}, pitch of {args.pitch:g} mm"
+    return f"pitch of {args.pitch:g} mm" if args.pitch else f"area of {args.area[0]:g} x {args.area[1]:g} mm"
+
+
+def _page(loaded: Pipeline, guide: Guide) -> dict[str, Node]:
+    """The live page as the pipeline sets it, made to guide."""
+    for id_, node in loaded.nodes.items():
+        if issubclass(node.component.cls, Guiding):
+            component = replace(node.component, cls=node.component.cls.through(guide))
+            return {id_: replace(node, component=component)}
+    raise ConfigError("calibrate --view: required a pipeline with the sink view; add `view: {}` to its sinks")
 
 
 def _scale_words(scale: Scale) -> str:

@@ -15,6 +15,24 @@ from tactflow.engine.errors import ConfigError
 from tactflow.files import expanded
 
 
+def add_force_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `calibrate force`."""
+    parser.add_argument(
+        "--csv",
+        type=Path,
+        metavar="FILE",
+        help="for force: what the gauge said, where it does not lie beside the recording; columns t (s) or "
+        "frame, fz (N), and fx and fy if there are",
+    )
+    parser.add_argument(
+        "--offset",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="for force: add so much to the time of the CSV; what is left, up to 2 s, is estimated",
+    )
+
+
 def add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     """Fit the force and write it into the calibration file; returns the exit code.
 

@@ -5,19 +5,14 @@ from __future__ import annotations
 import queue
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from typing import Any
 
 import numpy as np
 
 from tactflow.calibration.presses import Press
-
-LIGHT: Final = 0.5
-"""Radius of a contact over the usual one, below which a press is called light. Chosen by hand."""
-PARTS: Final = 3
-"""Columns and rows of parts of the gel that should each have a press. Chosen by hand."""
-_ROWS: Final = ("upper", "middle", "lower")
-_COLUMNS: Final = ("left", "centre", "right")
+from tactflow.calibration.progress import PARTS, fault, part, part_name, progress
 
 
 class Guide:
@@ -25,6 +20,8 @@ class Guide:
 
     wanted : so many presses are enough. say : shows a line. typed : what was typed since the last call: `u`
         undoes the last press, `q` ends the session.
+
+    `state` (see `progress`) may be read, and `undo` called, from any thread: that is what the live page does.
     """
 
     def __init__(
@@ -34,6 +31,13 @@ class Guide:
         self._say = say
         self._typed = typed
         self._told: int | None = None
+        self._seen = (0, False)
+        self._asked: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.state: Mapping[str, Any] = progress([], False, wanted)
+
+    def undo(self) -> None:
+        """Undo the last press, as `u` does."""
+        self._asked.put("u")
 
     def __call__(self, _frames: int, presses: list[Press], lasts: bool) -> bool:
         """Look at the presses so far; whether they are enough."""
@@ -46,12 +50,15 @@ class Guide:
             self._say(f"press {number + 1} of {self._wanted}: {judged(presses[:over], number)}")
         self._told = over
         ended = False
-        for word in self._typed():
+        for word in (*self._typed(), *(self._asked.get() for _ in range(self._asked.qsize()))):
             ended = ended or word == "q"
             if word == "u" and self._told:
                 self._told -= 1
                 del presses[self._told]
                 self._say(f"press {self._told + 1} is undone; press again")
+        if self._seen != (len(presses), lasts):
+            self._seen = (len(presses), lasts)
+            self.state = progress(presses, lasts, self._wanted)
         return ended or self._told >= self._wanted
 
 
@@ -64,20 +71,17 @@ def judged(presses: Sequence[Press], number: int) -> str:
     """
     press = presses[number]
     usual = float(np.median([other.radius for other in presses]))
-    height, width = press.mask.shape
-    x, y = press.center
-    if press.radius < LIGHT * usual:
-        return f"light, radius {press.radius:.0f} px where {usual:.0f} px is usual; press harder (u: undo)"
-    if min(x, y, width - 1 - x, height - 1 - y) < press.radius:
-        return f"cut off by the border of the picture at ({x:.0f}, {y:.0f}); press further inside (u: undo)"
+    wrong = fault(press, usual)
+    if wrong is not None:
+        return f"{wrong} (u: undo)"
     return f"good, radius {press.radius:.0f} px; {_missing(presses)}"
 
 
 def _missing(presses: Sequence[Press]) -> str:
     """Which parts of the gel have no press yet."""
-    height, width = presses[0].mask.shape
-    there = {(int(PARTS * p.center[1] / height), int(PARTS * p.center[0] / width)) for p in presses}
-    empty = [f"{_ROWS[r]} {_COLUMNS[c]}" for r in range(PARTS) for c in range(PARTS) if (r, c) not in there]
+    there = {part(press) for press in presses}
+    everywhere = product(range(PARTS), repeat=2)
+    empty = [part_name(row, column) for row, column in everywhere if (row, column) not in there]
     if not empty:
         return "all parts of the gel have one"
     return f"nothing yet at the {', '.join(empty[:4])}{', ...' if len(empty) > 4 else ''}"

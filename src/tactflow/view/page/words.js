@@ -47,6 +47,15 @@ export function slip({ slip }) {
   return [slip.slipping ? "slips" : "holds", `${Math.round(100 * slip.stick_ratio)}\u202f% of the contact sticks`];
 }
 
+// How a session of presses goes: [count, share, the last press, whether it is good].
+export function guide({ done, good, wanted, presses, lasts }) {
+  const count = `${done} of ${wanted} presses${good < done ? `, ${good} good` : ""}`;
+  const share = Math.min(1, done / wanted);
+  const last = presses[presses.length - 1];
+  if (!last || lasts) return [count, share, "", true];
+  return [count, share, `Press ${done}: ${last.fault ?? "good"}.`, last.fault === null];
+}
+
 const error = (stderr, digits) => (stderr == null ? "" : ` ± ${fixed(stderr, digits)}`);
 
 // Standard error of the length of a vector, from those of its components.
