@@ -21,7 +21,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results, message_schema
 from tactflow.sinks import parquet as parquet_module
 from tactflow.sinks.parquet import TABLES, Parquet
-from tactflow.vision.types import Depth, Scale, Slip
+from tactflow.vision.types import Depth, Force, Scale, Slip
 from tests.clock import PATIENCE, until
 from tests.messages import build_message
 from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
@@ -36,10 +36,11 @@ DEPTH = Depth(np.zeros((4, 3), np.float32), 0.4, 0.1, 3.2, None)
 SECOND = replace(CONTACT, area=12.0, angle=None, ellipse=None, hull=CONTACT.hull + 100)
 TWO = replace(CONTACT, separate=(CONTACT, SECOND))
 SLIP = Slip(slipping=True, stick_ratio=0.25)
+FORCE = Force((0.1, None, 2.5), (0.01, None, 0.2), True)
 FOUND = [
     Results(PROCESSED),
     Results(PROCESSED, CONTACT, FLOW, MARKERS),
-    Results(PROCESSED, TWO, FLOW, MARKERS, SCALE, DEPTH, None, SLIP),
+    Results(PROCESSED, TWO, FLOW, MARKERS, SCALE, DEPTH, None, SLIP, FORCE),
     Results(PROCESSED, SECOND, replace(FLOW, mean=None), replace(MARKERS, stderr=np.zeros(3))),
 ]
 """What the columns hold: nothing, a contact, all there is, and some of it."""
@@ -77,8 +78,9 @@ def leaves(value: Any, *names: str) -> Iterator[tuple[str, Any]]:
         for key, inner in value.items():
             yield from leaves(inner, *names, key)
     elif isinstance(value, list) and not isinstance(value[0], list):
-        for suffix, number in zip(NAMES.get(names[-1], ["x", "y"]), value, strict=True):
-            yield "_".join([*names, suffix]), number
+        for suffix, number in zip(NAMES.get(names[-1], ["x", "y", "z"][: len(value)]), value, strict=True):
+            if number is not None:
+                yield "_".join([*names, suffix]), number
     elif value is not None:
         yield "_".join(names), list(value.items()) if isinstance(value, dict) else value
 
