@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from typing import Any
 
 from tactflow.batch.engine import ONE_THREAD, Headway
 from tactflow.batch.task import Outcome, Report, Task
@@ -97,10 +98,9 @@ class LocalProcesses:
 
     def finished(self, timeout: float) -> Sequence[Outcome]:
         """See `Engine.finished`."""
-        by_connection = {worker.connection: worker for worker in self._workers}
+        by_connection: dict[Any, _Worker] = {worker.connection: worker for worker in self._workers}
         outcomes: list[Outcome] = []
         for ready in wait(list(by_connection), timeout):
-            assert isinstance(ready, Connection)
             outcomes += self._listen(by_connection[ready])
         self._hand_out()
         return outcomes
