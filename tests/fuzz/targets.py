@@ -429,6 +429,7 @@ COMMANDS = (
     b'{"ack": 1, "late": false, "rest": 50}',
     b'{"do": "pause", "value": true}',
     b'{"do": "step"}',
+    b'{"show": ["surface", "field"]}',
     b'{"do": "record", "value": [1, {"a": null}]}',
 )
 
