@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import logging
 
-import cv2
 import numpy as np
 import orjson
 import zmq
@@ -13,6 +12,7 @@ from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.frame import Tick
+from tactflow.jpeg import encode_jpeg
 from tactflow.ports import Image
 from tactflow.publisher import FloodError, Publisher, is_reachable
 
@@ -79,8 +79,8 @@ class LerobotCamera(Sink):
             return
         # LeRobot takes what it decodes for red, green, blue, whereas a JPEG is decoded to blue, green, red.
         swapped = np.ascontiguousarray(image[:, :, ::-1])
-        _, jpeg = cv2.imencode(".jpg", swapped, (cv2.IMWRITE_JPEG_QUALITY, self.params.quality))
-        images = {self._sensor: base64.b64encode(jpeg.tobytes()).decode()}
+        jpeg = encode_jpeg(swapped, self.params.quality)
+        images = {self._sensor: base64.b64encode(jpeg).decode()}
         message = {"timestamps": {self._sensor: tick.frame.t}, "images": images}
         publisher.socket.send(orjson.dumps(message), zmq.NOBLOCK)
         self._sent += 1

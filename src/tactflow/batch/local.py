@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any
 
 from tactflow.batch.engine import ONE_THREAD, Headway
 from tactflow.batch.task import Outcome, Report, Task
@@ -98,10 +97,10 @@ class LocalProcesses:
 
     def finished(self, timeout: float) -> Sequence[Outcome]:
         """See `Engine.finished`."""
-        by_connection: dict[Any, _Worker] = {worker.connection: worker for worker in self._workers}
+        ready = wait([worker.connection for worker in self._workers], timeout)
         outcomes: list[Outcome] = []
-        for ready in wait(list(by_connection), timeout):
-            outcomes += self._listen(by_connection[ready])
+        for worker in [worker for worker in self._workers if worker.connection in ready]:
+            outcomes += self._listen(worker)
         self._hand_out()
         return outcomes
 
