@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import select
+import socket
 import threading
 import time
 import webbrowser
@@ -103,6 +105,8 @@ class View(Guiding):
         self._control = control
         self._hub: Hub | None = None
         self._server: Server | None = None
+        self._door: threading.Thread | None = None
+        self._closed = False
         self._neighbours = None if params.neighbours is None else Neighbours(Path(params.neighbours), sensor)
         self._interval = 1.0 / params.max_fps
         self._due = float("-inf")
@@ -119,27 +123,44 @@ class View(Guiding):
         """Serve the page; afterwards `description` is its address, or None if it cannot be served."""
         p = self.params
         try:
-            from tactflow.view.hub import Hub
-            from tactflow.view.server import Server
-
             listener = bind(p.host, p.port)
             if self._neighbours is not None:
                 self._neighbours.announce(listener.getsockname()[1])
-        except (ImportError, OSError, UnicodeError) as error:
+        except (OSError, UnicodeError) as error:
             log.warning("view: not shown, because %s:%d cannot be served: %s", p.host, p.port, error)
             return
         port = listener.getsockname()[1]
         if p.port not in (0, port) and self._neighbours is None:
             log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
-        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send, self.session)
-        self._server = Server(self._hub, listener, p.host, p.token)
-        self._server.start()
+        self._closing = socket.socketpair()
+        self._door = threading.Thread(
+            target=self._answer, args=(listener,), name="tactflow-view-door", daemon=True
+        )
+        self._door.start()
         self.description = address(p.host, port)
         with_token = self.description + (f"?token={p.token}" if p.token else "")
         log.info("view: %s", with_token)
         if p.open_browser:
             # It may take its time, or wait for the browser to end.
             threading.Thread(target=webbrowser.open, args=(with_token,), daemon=True).start()
+
+    def _answer(self, listener: socket.socket) -> None:
+        """Start the server at the first visit: what it needs takes a tenth of a run's start to import."""
+        select.select([listener, self._closing[1]], [], [])
+        if self._closed:
+            listener.close()
+            return
+        try:
+            from tactflow.view.hub import Hub
+            from tactflow.view.server import Server
+        except ImportError as error:
+            log.warning("view: not shown: %s", error)
+            listener.close()
+            return
+        hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send, self.session)
+        self._server = Server(hub, listener, self.params.host, self.params.token)
+        self._server.start()
+        self._hub = hub
 
     def wants(self) -> bool:
         """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""
@@ -217,9 +238,14 @@ class View(Guiding):
 
     def close(self) -> None:
         """Tell the pages that the run has ended, and serve no more."""
-        server, self._server = self._server, None
-        if server is None:
+        door, self._door = self._door, None
+        if door is None:
             return
         if self._neighbours is not None:
             self._neighbours.leave()
-        server.close()
+        self._closed = True
+        self._closing[0].close()
+        door.join()
+        self._closing[1].close()
+        if self._server is not None:
+            self._server.close()

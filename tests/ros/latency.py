@@ -22,12 +22,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tactflow.client import Subscriber
-from tests.clock import PATIENCE, until
+from tests.clock import until
 from tests.ros.programs import LISTENER, Program
 
 TOPIC = "contact_pixels"
 RATE = 60.0
 """Of the simulated camera, Hz."""
+SILENCE = 10.0
+"""So long without a message, and the run has ended, s."""
 
 
 class Passage(NamedTuple):
@@ -56,8 +58,10 @@ def measure(seconds: float, folder: Path) -> Passage:
     listener.told(lambda told: "found" in told)
     arrivals: dict[float, int] = {}
     try:
-        with Subscriber(endpoint, timeout=PATIENCE) as direct:
-            run = subprocess.Popen(_command(endpoint, round(seconds * RATE), folder))
+        run = subprocess.Popen(_command(endpoint, round(seconds * RATE), folder))
+        # The run waits for its first subscriber, which shall be the bridge.
+        listener.told(lambda told: told.get("topic") == TOPIC)
+        with Subscriber(endpoint) as direct:
             reader = threading.Thread(target=_note, args=(direct, arrivals))
             reader.start()
             assert run.wait() == 0
@@ -80,12 +84,11 @@ def _command(endpoint: str, frames: int, folder: Path) -> list[str]:
 
 def _note(direct: Subscriber, arrivals: dict[float, int]) -> None:
     """When each message came over ZeroMQ, ns, by its capture time."""
-    direct.timeout = PATIENCE
+    direct.timeout = SILENCE
     try:
         while True:
             message = direct.receive()
             arrivals[message["t"]] = time.monotonic_ns()
-            direct.timeout = 3.0
     except TimeoutError:
         return
 
@@ -96,7 +99,7 @@ def _compare(sent: int, arrivals: dict[float, int], told: list[dict[str, Any]]) 
     for line in told:
         stamp = line["message"]["header"]["stamp"]
         stamps.append(stamp["sec"] * 1_000_000_000 + stamp["nanosec"])
-    # The plain subscriber may have connected a moment later: only what both have is compared.
+    # The plain subscriber has connected a moment later: only what both have is compared.
     first = min(by_stamp)
     later = [stamp for stamp in stamps if stamp >= first]
     times = [line["at"] for line in told]

@@ -804,8 +804,20 @@ def test_a_package_that_cannot_be_imported_disables_the_view_only(
     monkeypatch: pytest.MonkeyPatch, view: Callable[..., View], caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setitem(sys.modules, "tactflow.view.server", None)
-    assert not view().wants()
-    assert "not shown" in caplog.text
+    sink = view()
+    assert sink.description is not None
+    socket.create_connection(("127.0.0.1", urlsplit(sink.description).port or 0)).close()
+    until(lambda: "not shown" in caplog.text)
+    assert not sink.wants()
+
+
+def test_what_serves_the_page_is_loaded_when_somebody_comes(
+    view: Callable[..., View], page: Callable[..., Page]
+) -> None:
+    sink = view()
+    assert "tactflow-view-server" not in {thread.name for thread in threading.enumerate()}
+    page(sink).next("hello")
+    assert "tactflow-view-server" in {thread.name for thread in threading.enumerate()}
 
 
 def test_at_the_end_pages_learn_how_it_ended(view: Callable[..., View], page: Callable[..., Page]) -> None:

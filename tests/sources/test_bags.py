@@ -49,6 +49,12 @@ def test_every_kind_of_bag_gives_the_pictures_and_the_stamps_in_the_messages(tmp
         assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))
 
 
+def test_a_folder_of_pictures_may_have_a_metadata_file_too(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), pictures(1)[0])
+    (tmp_path / "metadata.yaml").write_text("sensor: left\n")
+    assert len(played(str(tmp_path))) == 1
+
+
 def in_encoding(image: NDArray[np.uint8], encoding: str) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """An image as a camera with this encoding gives it, and what it must become: (H, W, 3) BGR."""
     gray = image[:, :, 0]

@@ -97,11 +97,10 @@ class LocalProcesses:
 
     def finished(self, timeout: float) -> Sequence[Outcome]:
         """See `Engine.finished`."""
-        by_connection = {worker.connection: worker for worker in self._workers}
+        ready = wait([worker.connection for worker in self._workers], timeout)
         outcomes: list[Outcome] = []
-        for ready in wait(list(by_connection), timeout):
-            assert isinstance(ready, Connection)
-            outcomes += self._listen(by_connection[ready])
+        for worker in [worker for worker in self._workers if worker.connection in ready]:
+            outcomes += self._listen(worker)
         self._hand_out()
         return outcomes
 
