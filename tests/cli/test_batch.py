@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from pathlib import Path
 
 import orjson
 import pytest
 
 from tactflow.cli import batch as command
-from tactflow.cli.main import main
+from tactflow.cli.main import main, make_parser
 from tests.batch.doubles import PIPELINE, InTurn, recording
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -108,3 +112,13 @@ def test_parquet_without_pyarrow_says_what_to_install(
     monkeypatch.setattr("tactflow.batch.runs.missing", lambda *_: "Parquet tables need pyarrow: pip install")
     assert main(["batch", "p.yaml", "rec", "--out", str(folder / "o")]) == 2
     assert "pip install; or give --format jsonl" in capsys.readouterr().err
+
+
+def test_every_command_of_the_page_is_one() -> None:
+    page = (REPOSITORY / "docs" / "batch.md").read_text()
+    commands = re.findall(r"^tactflow (batch .*?)(?:  +#.*)?$", page, re.MULTILINE)
+    assert len(commands) > 5
+    parser = make_parser(["batch"])
+    for line in commands:
+        words = shlex.split(line.replace("$SLURM_ARRAY_TASK_ID", "3"))
+        assert parser.parse_args(words).out == Path("out"), line

@@ -207,12 +207,13 @@ def resume(args: argparse.Namespace, folder: Path) -> None:
     pipeline.write_text(LIGHT)
     sources, out = simulated(folder, args.recordings, frames=20), folder / "out"
     chance = random.Random(args.seed)
+    undisturbed = watch(batch(str(pipeline), sources, folder / "undisturbed", "--workers", "2"))
     complete: dict[str, int] = {}
     rows, done_twice = [], 0
     for kill in range(args.kills + 1):
         process = subprocess.Popen(batch(str(pipeline), sources, out, "--workers", "2"))
         if kill < args.kills:
-            wait = chance.uniform(0.5, args.longest)
+            wait = chance.uniform(0.0, undisturbed.wall)
             time.sleep(wait)
             process.kill()
         code = process.wait()
@@ -226,9 +227,7 @@ def resume(args: argparse.Namespace, folder: Path) -> None:
         rows.append([kill + 1, moment, code, len(now) - len(complete), again, left])
         complete = now
     table(["call", "killed after, s", "exit code", "new results", "done again", "unfinished files"], rows)
-    undisturbed = folder / "undisturbed"
-    watch(batch(str(pipeline), sources, undisturbed, "--workers", "2"))
-    same = results(out) == results(undisturbed)
+    same = results(out) == results(folder / "undisturbed")
     print(f"{len(complete)} of {args.recordings} done, {done_twice} twice; as if undisturbed: {same}")
 
 
@@ -243,7 +242,6 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=2, help="of speed: A B A B")
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 100, 1000])
     parser.add_argument("--kills", type=int, default=10)
-    parser.add_argument("--longest", type=float, default=8.0, help="before a kill, s")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="tactflow-batch-") as folder:

@@ -289,6 +289,16 @@ def test_parameters_that_cannot_be_are_refused_with_what_to_do(
 
 
 @needs_rclpy
+def test_the_transform_says_where_the_sensor_is(pair: Pair) -> None:
+    pair.listener.order(do="transform", place=[[0.1, 0.2, 0.3], [0.0, 0.0, 3.0, 4.0]])
+    told = pair.listener.told(lambda told: "transform" in told)["transform"]
+    assert told["header"] == {"stamp": {"sec": 1_700_000_000, "nanosec": 125_000_000}, "frame_id": "finger"}
+    assert told["child_frame_id"] == "gel"
+    assert told["transform"]["translation"] == {"x": 0.1, "y": 0.2, "z": 0.3}
+    assert told["transform"]["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+
+
+@needs_rclpy
 def test_silence_and_keys_that_are_refused_are_told(pair: Pair, tmp_path: Path) -> None:
     own, _ = make_keys(tmp_path / "keys", "robot")
     _, stranger = make_keys(tmp_path / "other", "robot")

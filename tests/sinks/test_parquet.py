@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -172,6 +173,19 @@ def test_without_pyarrow_the_error_has_the_command_that_installs_it(
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(StageError, match=r"need pyarrow: pip install 'tactflow\[parquet\]'"):
         opened(tmp_path)
+
+
+def test_the_calibration_of_the_run_is_in_every_table(tmp_path: Path) -> None:
+    (tmp_path / "left.yaml").write_text("sensor: left\n")
+    pipeline = SimpleNamespace(settings={}, file=tmp_path / "no.yaml", calibration=tmp_path / "left.yaml")
+    control: Any = SimpleNamespace(pipeline=pipeline, source=None)
+    sink = Parquet(Parquet.Params(path=str(tmp_path / "out")), "left", control)
+    sink.open()
+    write(sink, range(1))
+    sink.close()
+    for name in TABLES:
+        facts = pq.read_schema(tmp_path / "out" / name / "part-00000.parquet").metadata
+        assert facts[b"calibration.yaml"] == b"sensor: left\n"
 
 
 def test_the_example_of_the_page_runs(
