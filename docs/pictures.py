@@ -4,7 +4,7 @@
 
 calibrates the simulated sensor, draws what it feels with the stage `visualize`, and takes pictures of the
 live page in Chromium. Needs what the browser tests need, and a quiet machine, whose latency the page shows;
-takes a minute.
+takes two minutes.
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ DOCS = Path(__file__).resolve().parent
 PITCH: Final = 1.724
 BALL_RADIUS: Final = 2.375
 """Of the simulated sensor and its ball, mm, if a raw pixel is taken for 0.025 mm."""
+GAUGED: Final = "twist?frames=800&seed=3"
+"""Scene with a gauge, from which the force is learned."""
+WATCHED: Final = "sim:twist?frames=100000"
+"""Source of the page."""
 SHOWN: Final = {"press": (30, 50), "cable": (30, 50), "slide": (40, 60)}
 """Scene -> frames among which the deepest is drawn."""
 DEEPEST: Final = 0.8
@@ -45,7 +49,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         calibration = Path(folder) / "main.yaml"
         scale = ("--pitch", str(PITCH), "--ball-radius", str(BALL_RADIUS), "--out", str(calibration))
-        _tactflow("calibrate", "--from", "sim:ball?frames=600", *scale).wait()
+        _tactflow("calibrate", "--from", "sim:ball?frames=600", *scale)
+        gauge = str(Path(folder) / "gauge.csv")
+        _tactflow("sim", GAUGED, "--truth", gauge)
+        force = ("calibrate", "force", str(calibration), "--from", f"sim:{GAUGED}", "--csv", gauge)
+        _tactflow(*force)
         drawn = [_drawn(scene, calibration, *frames) for scene, frames in SHOWN.items()]
         cv2.imwrite(str(DOCS / "results.jpg"), np.hstack(drawn), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         _pages(calibration)
@@ -69,8 +77,8 @@ def _drawn(scene: str, calibration: Path, first: int, last: int) -> NDArray[np.u
 
 
 def _pages(calibration: Path) -> None:
-    run = _tactflow(
-        *("run", "--realtime", "--quiet", "--source", "sim:twist?frames=100000"),
+    run = _started(
+        *("run", "--realtime", "--quiet", "--source", WATCHED),
         *("--set", "sinks={view: {port: 0, max_fps: 10}}", "--set", f"calibration={calibration}"),
     )
     try:
@@ -108,8 +116,12 @@ def _page(browser: Browser, url: str, name: str, *, surface: bool, **options: An
     page.close()
 
 
-def _tactflow(*words: str) -> subprocess.Popen[str]:
+def _started(*words: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-m", "tactflow", *words], stderr=subprocess.PIPE, text=True)
+
+
+def _tactflow(*words: str) -> None:
+    subprocess.run([sys.executable, "-m", "tactflow", *words], check=True)
 
 
 if __name__ == "__main__":

@@ -667,7 +667,7 @@ def with_header(packet: bytes, heights: bytes = b"", **added: Any) -> bytes:
     return struct.pack("<I", len(header)) + header + heights + packet[4 + length :]
 
 
-def calibrated(number: int, *, slipping: bool = False, height: float = 0.5) -> bytes:
+def calibrated(number: int, *, slipping: bool = False, height: float = 0.5, in_range: bool = True) -> bytes:
     """A frame of a calibrated sensor with all that the page can show."""
     plain = frame("main", number, 120, contact=True, directed=True)
     length = struct.unpack_from("<I", plain)[0]
@@ -677,7 +677,7 @@ def calibrated(number: int, *, slipping: bool = False, height: float = 0.5) -> b
     message["contact"] |= {"depth_mm_stderr": 0.01, "volume_mm3": 0.7}
     message["flow"] |= {"stderr": [0.3, 0.4], "mean_mm": [0.4, -0.2], "mean_mm_stderr": [0.03, 0.04]}
     message["slip"] = {"slipping": slipping, "stick_ratio": 0.0 if slipping else 0.8}
-    message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": True}
+    message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": in_range}
     y, x = np.mgrid[-1:1:16j, -1:1:20j]
     heights = np.rint(np.maximum(0, 1 - x**2 - y**2) * 65535).astype("<u2").tobytes()
     surface = {"box": [20, 10, 20, 16], "size": [20, 16], "step": height / 65535, "bytes": len(heights)}
@@ -780,6 +780,8 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
     assert texts == {"area": "3.00", "flow": "0.447", "depth": "0.500", "force": "2.50", "slip": "holds"}
     assert page.inner_text("#unit-flow").startswith("mm ± 0.032, 3 markers")
     assert page.inner_text("#unit-force") == "N ± 0.20"
+    stage.send(calibrated(3, height=0.4, in_range=False))
+    until(page, "() => document.getElementById('unit-force').textContent === 'N, outside the fit'")
     in_mm = {name: steady(page, name) for name in ("picture", "plot-area", "plot-flow")}
     page.keyboard.press("u")
     assert page.inner_text("#unit-area") == "px²"
@@ -788,7 +790,7 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
         assert shows(page, name, lambda now, seen=seen: now != seen), name
     page.reload()
     watch(page)
-    stage.send(calibrated(3, slipping=True))
+    stage.send(calibrated(4, slipping=True))
     until(page, "() => document.getElementById('value-slip').textContent === 'slips'")
     assert page.inner_text("#unit-area") == "px²", "the unit is remembered"
     assert stage.heard[-1] != {"show": ["field"]}

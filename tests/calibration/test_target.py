@@ -87,6 +87,15 @@ def test_a_target_in_the_plane_of_the_gel_gives_the_scale_however_it_lies(dots: 
     assert scale_from_target(tilted, target, SIZE)[1] > 0.02
 
 
+def test_the_standard_error_of_a_scale_by_a_target_is_honest() -> None:
+    rng, off = np.random.default_rng(1), []
+    for _ in range(300):
+        scale, _ = scale_from_target(TARGET.places * 10 + rng.normal(0, 0.3, (35, 2)), TARGET, SIZE)
+        off += [(scale.x - 0.1) / scale.stderr[0], (scale.y - 0.1) / scale.stderr[1]]
+    assert 0.61 <= np.mean(np.abs(off) < 1) <= 0.75
+    assert 0.91 <= np.mean(np.abs(off) < 2) <= 0.99
+
+
 def test_the_command_prints_what_a_pipeline_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number, turn in enumerate(TURNS):
         cv2.imwrite(str(tmp_path / f"{number}.png"), picture(turn))

@@ -53,32 +53,48 @@ def test_the_file_of_parameters_has_every_parameter_with_its_default() -> None:
     assert node["ros__parameters"] == {name: default for name, (default, _) in parameters().items()}
 
 
+class Noted:
+    """What a launch file has made of a class of `launch`, which no wheel has."""
+
+    def __init__(self, name: str, words: tuple[Any, ...], named: dict[str, Any]) -> None:
+        self.name, self.words, self.named = name, words, named
+
+    def perform(self, context: dict[str, str]) -> str:
+        """As a LaunchConfiguration does it."""
+        return context[self.words[0]]
+
+
+class Noting(ModuleType):
+    """A module of `launch` whose classes only note what they are given."""
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *words, **named: Noted(name, words, named)
+
+
 def test_the_launch_file_starts_the_node_with_parameters_that_it_has(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # No wheel has launch: what the file calls is noted here, and not run.
-    calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
-
-    class Noting(ModuleType):
-        def __getattr__(self, name: str) -> Any:
-            def note(*words: Any, **named: Any) -> Any:
-                calls.append((name, words, named))
-                return (name, *words)
-
-            return note
-
     parts = ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions")
-    for module in (*parts, "launch_ros.parameter_descriptions", "launch_ros.substitutions"):
+    for module in (*parts, "launch_ros.substitutions"):
         monkeypatch.setitem(sys.modules, module, Noting(module))
-    found = runpy.run_path(str(PACKAGE / "launch" / "tactflow.launch.py"))
-    found["generate_launch_description"]()
-    (node,) = [named for name, _, named in calls if name == "LifecycleNode"]
-    assert (node["package"], node["executable"]) == ("tactflow_ros", "bridge")
-    declared = {words[0] for name, words, _ in calls if name == "DeclareLaunchArgument"}
-    asked = {words[0] for name, words, _ in calls if name == "LaunchConfiguration"}
-    assert asked == declared
-    _, given, _ = node["parameters"]
-    assert given.keys() <= parameters().keys()
+    file = runpy.run_path(str(PACKAGE / "launch" / "tactflow.launch.py"))
+    (actions,) = file["generate_launch_description"]().words
+    declared = {one.words[0]: one.named["default_value"] for one in actions if one.name != "OpaqueFunction"}
+    (start,) = [one.named["function"] for one in actions if one.name == "OpaqueFunction"]
+
+    def parameters_for(**given: str) -> Any:
+        (node,) = start(declared | {"params": "mine.yaml"} | given)
+        assert (node.named["package"], node.named["executable"]) == ("tactflow_ros", "bridge")
+        assert node.named["namespace"] == given.get("sensor", "main")
+        return node.named["parameters"]
+
+    # What is not given does not hide what the file says.
+    assert parameters_for() == ["mine.yaml", {"sensor": "main"}, {}]
+    given = dict.fromkeys(declared.keys() - {"params"}, "true")
+    _, sensor, others = parameters_for(**given)
+    assert sensor == {"sensor": "true"}
+    assert others.keys() <= parameters().keys() | {"use_sim_time"}
+    assert others["publish_clock"] is True
 
 
 @needs_rclpy

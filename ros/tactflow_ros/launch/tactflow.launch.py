@@ -2,45 +2,57 @@
 
 from __future__ import annotations
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import LifecycleNode
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 ARGUMENTS = {
-    "sensor": ("main", "name of the sensor in tactflow; also the namespace of the node"),
-    "endpoint": ("tcp://127.0.0.1:5556", "where tactflow publishes"),
-    "control": ("", "where tactflow takes commands; empty: nowhere"),
-    "frame_id": ("tactile_optical_frame", "frame of the picture"),
-    "parent_frame": ("", "what it is fixed to; empty: no transform"),
-    "reliability": ("best_effort", "or reliable"),
+    "endpoint": "where tactflow publishes",
+    "control": "where tactflow takes commands",
+    "keys": "the subscriber's folder of tactflow keys new",
+    "frame_id": "frame of the picture",
+    "parent_frame": "what it is fixed to",
+    "reliability": "best_effort or reliable",
 }
-"""Argument -> its default, and what it means."""
+"""Argument -> what it means; where it is not given, the file of parameters says it."""
+
+
+def start(context: LaunchContext) -> list[LifecycleNode]:
+    """The node: parameters of the file, and above them what was given."""
+
+    def argument(name: str) -> str:
+        return str(LaunchConfiguration(name).perform(context))
+
+    given = {name: argument(name) for name in ARGUMENTS if argument(name)}
+    flags = {name: argument(name) == "true" for name in ("use_sim_time", "publish_clock") if argument(name)}
+    node = LifecycleNode(
+        package="tactflow_ros",
+        executable="bridge",
+        name="tactflow",
+        namespace=argument("sensor"),
+        parameters=[argument("params"), {"sensor": argument("sensor")}, given | flags],
+        output="screen",
+    )
+    return [node]
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Arguments, and the node with the parameters of config/tactflow.yaml below them."""
+    """The arguments, and the node."""
     config = PathJoinSubstitution([FindPackageShare("tactflow_ros"), "config", "tactflow.yaml"])
-    given = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ARGUMENTS}
-    params = LaunchConfiguration("params")
-    sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     return LaunchDescription(
         [
-            *(
-                DeclareLaunchArgument(name, default_value=default, description=meaning)
-                for name, (default, meaning) in ARGUMENTS.items()
+            DeclareLaunchArgument(
+                "sensor", default_value="main", description="name in tactflow, and namespace"
             ),
             DeclareLaunchArgument("params", default_value=config, description="YAML file of parameters"),
-            DeclareLaunchArgument("use_sim_time", default_value="false", description="for recordings"),
-            LifecycleNode(
-                package="tactflow_ros",
-                executable="bridge",
-                name="tactflow",
-                namespace=LaunchConfiguration("sensor"),
-                parameters=[params, given, {"use_sim_time": sim_time}],
-                output="screen",
+            DeclareLaunchArgument("use_sim_time", default_value="", description="true: for recordings"),
+            DeclareLaunchArgument("publish_clock", default_value="", description="true: send /clock"),
+            *(
+                DeclareLaunchArgument(name, default_value="", description=meaning)
+                for name, meaning in ARGUMENTS.items()
             ),
+            OpaqueFunction(function=start),
         ]
     )

@@ -23,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from tactflow import __version__
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.depth.slopes import SlopeModel
+from tactflow.vision.depth.surface import SurfaceErrors
 from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, ForceModel, LinearForce
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
@@ -60,7 +61,7 @@ class PhotometricEntry(_Strict):
 
     ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. radius_error : median
     of the fitted radius over the true one, less 1. sphere_rms : of the heights from the fitted ball, mm.
-    depth_stderr, volume_stderr : relative to the value.
+    depth_stderr, volume_stderr : of balls, relative to the value. steepest : see `SurfaceErrors`.
     """
 
     ball_radius: float = Field(gt=0)
@@ -71,6 +72,11 @@ class PhotometricEntry(_Strict):
     sphere_rms: float
     depth_stderr: float
     volume_stderr: float
+    steepest: float | None = None
+
+    def errors(self) -> SurfaceErrors:
+        """What the standard errors of heights come from."""
+        return SurfaceErrors(self.depth_stderr, self.volume_stderr, self.steepest)
 
 
 class LinearForceEntry(_Strict):

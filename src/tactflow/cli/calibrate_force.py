@@ -117,9 +117,10 @@ def _words(fit: Fit, references: dict[str, Reference]) -> list[str]:
 
 def _quality(part: LinearForceEntry, left_out: str) -> str:
     absolute, relative = part.error
+    many = "recordings" if left_out == "recording" else "presses"
     return (
         f"RMS error {part.rmse:.2f} N of {part.range[0]:.1f} to {part.range[1]:.1f} N, "
-        f"{100 * part.r2:.0f} % of the variance explained, by {left_out}s that the fit has not seen; "
+        f"{100 * part.r2:.0f} % of the variance explained, by {many} that the fit has not seen; "
         f"standard error {absolute:.2f} N and {100 * relative:.0f} % of the force"
     )
 

@@ -49,7 +49,7 @@ class Bag:
             self._frames = self._play(topic)
             self._first = next(self._frames, None)
             if self._first is None:
-                raise SourceError(f"{self._name}: there is no message of this topic")
+                raise SourceError(f"{self._name}: there is no picture in it")
         except SourceError:
             self._store.close()
             raise
