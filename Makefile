@@ -7,17 +7,22 @@
 # make audit        known weaknesses of the packages that are used, where the list can be reached
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
 # make kernels      measures what compiling gains, and writes docs/kernels.md
-# make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
+# make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
+# make system-deps  what the tests need from the system: a browser, ffmpeg, ROS 1 (Debian; needs root)
 
 VENV := .venv
 PY := $(VENV)/bin/python
 TOOLS := $(VENV)-tools
+ROS := $(VENV)-ros
 PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak load fuzz reliability audit lock lint types kernels system-deps clean
+# For the script for ROS 1; Debian 12 has them, later ones do not, and its test says so.
+ROS1_DEPS := python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs python3-zmq
+
+.PHONY: run test soak load fuzz reliability audit lock lint types kernels ros-env system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -66,6 +71,15 @@ $(VENV)/.installed-test: pyproject.toml setup.py requirements-test.txt | $(VENV)
 	$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@ $(VENV)/.installed
 
+ros-env: $(ROS)/.installed
+
+# Beside it there is no tactflow, as on a robot.
+$(ROS)/.installed: ros/requirements.txt
+	python3 -m venv $(ROS)
+	$(ROS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+		--require-hashes --requirement ros/requirements.txt
+	@touch $@
+
 $(TOOLS)/.installed:
 	python3 -m venv $(TOOLS)
 	$(TOOLS)/bin/python -m pip --quiet --disable-pip-version-check install pip-audit uv
@@ -78,6 +92,8 @@ lock: $(TOOLS)/.installed
 	echo "setuptools>=77" | $(COMPILE) $(LOCK) --extra test --output-file requirements-test.txt pyproject.toml -
 	echo "setuptools>=77" | $(COMPILE) --extra all --constraint requirements-test.txt \
 		--output-file requirements.txt pyproject.toml -
+	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
+		--custom-compile-command "make lock" $(LOCK) --output-file ros/requirements.txt ros/requirements.in
 
 ADVISORIES := https://pypi.org/pypi/numpy/2.0.0/json
 audit: $(TOOLS)/.installed
@@ -92,6 +108,9 @@ system-deps:
 			install --yes --no-install-recommends $(SYSTEM_DEPS) >/dev/null && exit 0; \
 		echo "system-deps: attempt $$attempt failed" >&2; sleep 10; \
 	done; dpkg --status $(SYSTEM_DEPS) >/dev/null
+	@dpkg --status $(ROS1_DEPS) >/dev/null 2>&1 || DEBIAN_FRONTEND=noninteractive \
+		apt-get -qq -o DPkg::Lock::Timeout=300 install --yes --no-install-recommends $(ROS1_DEPS) >/dev/null || \
+		echo "system-deps: ROS 1 is not to be had here; its test is skipped" >&2
 
 clean:
-	rm -rf $(VENV) $(TOOLS) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(TOOLS) $(ROS) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

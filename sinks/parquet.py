@@ -109,6 +109,9 @@ class Parquet(Sink):
         problem = missing("Parquet tables", "parquet", ["pyarrow"])
         if problem is not None:
             raise StageError(problem)
+        # Now, and not in the middle of the run, when the first part is written.
+        import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
+
         from tactflow.tables import Tables
 
         try:
@@ -184,14 +187,15 @@ class Parquet(Sink):
         except OSError as error:
             hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
             raise StageError(
-                f"{self._folder}: cannot be written into: {error.strerror or error}; the "
-                f"{self._counts['frames']} frames written before are complete, {len(messages)} are lost{hint}"
+                f"{self._folder}: cannot be written into: {error.strerror or error}; "
+                f"the {self._counts['frames']} frames written before are complete; "
+                f"not written: {len(messages)}{hint}"
             ) from error
         self._next += 1
         self._counts = {"frames": self._counts["frames"] + len(messages), "parts": self._counts["parts"] + 1}
 
     def _write_part(self, name: str, table: pa.Table) -> None:
-        import pyarrow.parquet as pq  # type: ignore[import-untyped]
+        import pyarrow.parquet as pq
 
         part = self._folder / name / f"part-{self._next:05d}.parquet"
         unfinished = part.with_name(f"{UNFINISHED}-{part.name}")

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import cv2
 from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Output, Recorder, StageParams
@@ -21,9 +20,9 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.rate import SLACK, RateLimit
 from tactflow.files import expanded, next_name
+from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
-from tactflow.ports import Image
-from tactflow.provenance import facts, texts
+from tactflow.provenance import arrays, facts, texts
 from tactflow.recording import missing_packages
 
 if TYPE_CHECKING:
@@ -241,17 +240,12 @@ class Record(Recorder):
         if frame.seq >= 0:
             message = encode_message(tick, results, detail=True)
             if self._previews is not None and self._previews.due(frame.t):
-                jpeg = self._jpeg(frame.image if results.image is None else results.image)
+                image = frame.image if results.image is None else results.image
+                jpeg = encode_jpeg(image, self.params.quality)
                 picture = encode_picture(jpeg, self._sensor, time)
                 annotations = encode_annotations(results, time)
         pixels = self._coder.encode(frame)
         return Entry(time, frame.seq, frame.reference, frame.epoch, pixels, message, picture, annotations)
-
-    def _jpeg(self, image: Image) -> bytes:
-        done, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, self.params.quality))
-        if not done:
-            raise ValueError(f"required an image that JPEG can hold, got {image.shape} {image.dtype}")
-        return jpeg.tobytes()
 
     def _follow(self, touching: bool, t: float) -> None:
         """Begin a file when a contact begins, and end it some time after the contact."""
@@ -411,7 +405,9 @@ class Record(Recorder):
     def _about(self) -> About:
         from tactflow.recording.writer import About
 
-        return About(self._sensor, facts(self._sensor, self._control), texts(self._control))
+        return About(
+            self._sensor, facts(self._sensor, self._control), texts(self._control), arrays(self._control)
+        )
 
 
 def _refuses(params: Record.Params) -> bool:

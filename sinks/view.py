@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import select
+import socket
 import threading
 import time
 import webbrowser
@@ -12,15 +14,18 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import orjson
 from pydantic import Field, model_validator
 
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
+from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
 from tactflow.ports import Image, Valid
 from tactflow.view.address import Neighbours, address, bind, is_loopback
 from tactflow.view.compact import compact_markers, compact_surface
+from tactflow.view.guided import Guiding
 from tactflow.vision.draw import dimmed, field_arrows
 
 if TYPE_CHECKING:
@@ -33,7 +38,7 @@ FIELD_ARROWS = 14.0
 """Distance of the arrows of a displacement field in a picture of 400 px, px. Chosen by hand."""
 
 
-class View(Sink):
+class View(Guiding):
     """Serves a page that draws the results over the processed frame, and can pause and end the run.
 
     While no page is open, or none is ready for another frame, nothing is wanted and nothing is encoded. A
@@ -100,6 +105,8 @@ class View(Sink):
         self._control = control
         self._hub: Hub | None = None
         self._server: Server | None = None
+        self._door: threading.Thread | None = None
+        self._closed = False
         self._neighbours = None if params.neighbours is None else Neighbours(Path(params.neighbours), sensor)
         self._interval = 1.0 / params.max_fps
         self._due = float("-inf")
@@ -116,27 +123,44 @@ class View(Sink):
         """Serve the page; afterwards `description` is its address, or None if it cannot be served."""
         p = self.params
         try:
-            from tactflow.view.hub import Hub
-            from tactflow.view.server import Server
-
             listener = bind(p.host, p.port)
             if self._neighbours is not None:
                 self._neighbours.announce(listener.getsockname()[1])
-        except (ImportError, OSError, UnicodeError) as error:
+        except (OSError, UnicodeError) as error:
             log.warning("view: not shown, because %s:%d cannot be served: %s", p.host, p.port, error)
             return
         port = listener.getsockname()[1]
         if p.port not in (0, port) and self._neighbours is None:
             log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
-        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send)
-        self._server = Server(self._hub, listener, p.host, p.token)
-        self._server.start()
+        self._closing = socket.socketpair()
+        self._door = threading.Thread(
+            target=self._answer, args=(listener,), name="tactflow-view-door", daemon=True
+        )
+        self._door.start()
         self.description = address(p.host, port)
         with_token = self.description + (f"?token={p.token}" if p.token else "")
         log.info("view: %s", with_token)
         if p.open_browser:
             # It may take its time, or wait for the browser to end.
             threading.Thread(target=webbrowser.open, args=(with_token,), daemon=True).start()
+
+    def _answer(self, listener: socket.socket) -> None:
+        """Start the server at the first visit: what it needs takes a tenth of a run's start to import."""
+        select.select([listener, self._closing[1]], [], [])
+        if self._closed:
+            listener.close()
+            return
+        try:
+            from tactflow.view.hub import Hub
+            from tactflow.view.server import Server
+        except ImportError as error:
+            log.warning("view: not shown: %s", error)
+            listener.close()
+            return
+        hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send, self.session)
+        self._server = Server(hub, listener, self.params.host, self.params.token)
+        self._server.start()
+        self._hub = hub
 
     def wants(self) -> bool:
         """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""
@@ -195,10 +219,11 @@ class View(Sink):
             arrows = compact_markers(field_arrows(field, FIELD_ARROWS * max(1.0, side / 400)))
         if depth is not None and "surface" in self._hub.shown:
             surface, heights = compact_surface(depth)
-        return heights, b'"markers":%b,"scale":%b,"field":%b,"surface":%b' % (
+        return heights, b'"markers":%b,"scale":%b,"field":%b,"surface":%b,"guide":%b' % (
             b"null" if markers is None else compact_markers(markers),
             b"null" if scale is None else b"[%.8g,%.8g]" % (scale.x, scale.y),
             *(arrows, surface),
+            b"null" if self.session is None else orjson.dumps(self.session.state),
         )
 
     def _encode(self, image: Image) -> bytes:
@@ -207,17 +232,20 @@ class View(Sink):
         if factor < 1:
             size = (max(1, round(width * factor)), max(1, round(height * factor)))
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        done, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, self.params.quality))
-        if not done:
-            raise ValueError(f"required an image that JPEG can hold, got {image.shape} {image.dtype}")
+        jpeg = encode_jpeg(image, self.params.quality)
         self._encoded += 1
-        return jpeg.tobytes()
+        return jpeg
 
     def close(self) -> None:
         """Tell the pages that the run has ended, and serve no more."""
-        server, self._server = self._server, None
-        if server is None:
+        door, self._door = self._door, None
+        if door is None:
             return
         if self._neighbours is not None:
             self._neighbours.leave()
-        server.close()
+        self._closed = True
+        self._closing[0].close()
+        door.join()
+        self._closing[1].close()
+        if self._server is not None:
+            self._server.close()

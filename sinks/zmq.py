@@ -7,6 +7,7 @@ import re
 import threading
 import time
 
+import numpy as np
 import orjson
 import zmq
 from pydantic import Field, field_validator, model_validator
@@ -16,7 +17,9 @@ from tactflow.control_socket import ControlSocket
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.engine.frame import Tick
+from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.rate import RateLimit
+from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
 from tactflow.publisher import FloodError, Publisher, is_reachable
 
@@ -40,6 +43,10 @@ class Zmq(Sink):
     Whoever subscribes to `tactflow.stats` by that name gets the statistics of the run every `stats_every`
     seconds: `tactflow.stats`, a space, the JSON of the statistics file with the sensor's name. A shorter
     prefix, such as `tactflow.`, does not ask for them, but receives them while somebody else does.
+
+    Whoever subscribes to `tactflow_picture.<sensor>` or `tactflow_depth.<sensor>` by that name gets the
+    processed picture (JPEG) or the depth map (float32, mm, row by row, little-endian) at the rate `pictures`:
+    the topic, a space, JSON with sensor, seq, t and size (width, height), a line end, the data.
 
     With `control`, other programs may pause the run, take a new reference, start and end recordings.
     """
@@ -96,6 +103,14 @@ class Zmq(Sink):
             description="time between two messages of statistics (topic tactflow.stats), s; 0: none",
         )
 
+        pictures: float = Field(
+            0.0,
+            ge=0,
+            le=240,
+            description="rate of pictures and depth maps for whoever subscribes to "
+            "tactflow_picture.<sensor> or tactflow_depth.<sensor>, Hz; 0: none",
+        )
+        quality: int = Field(80, ge=1, le=100, description="of the pictures; higher is sharper and larger")
         control: str | None = Field(
             None,
             min_length=1,
@@ -155,6 +170,11 @@ class Zmq(Sink):
         self._publisher: Publisher | None = None
         self._socket: zmq.Socket[bytes] | None = None
         self._subscriptions: set[bytes] = set()
+        extras = ("picture", "depth") if params.pictures else ()
+        self._extras = {name: f"tactflow_{name}.{sensor} ".encode() for name in extras}
+        self._asked: frozenset[str] = frozenset()
+        self._rate = RateLimit(params.pictures or None)
+        self._had_depth = False
         self._flooded = False
         self._wanted = False
         self._serialised = 0
@@ -231,9 +251,30 @@ class Zmq(Sink):
             return
         body = encode_message(tick, results, detail=self.params.detail, field=self.params.field)
         self._serialised += 1
+        self._send(self._topic + body)
+        if self._asked and tick.frame.seq >= 0 and self._rate.due(tick.frame.t):
+            self._send_pictures(tick.frame, results)
+
+    def _send_pictures(self, frame: Frame, results: Results) -> None:
+        """The picture and the depth map, for whom has asked for them."""
+        image = frame.image if results.image is None else results.image
+        height, width = image.shape[:2]
+        about = {"sensor": self._sensor, "seq": frame.seq, "t": frame.t, "size": [width, height]}
+        header = orjson.dumps(about) + b"\n"
+        if "picture" in self._asked:
+            self._send(self._extras["picture"] + header + encode_jpeg(image, self.params.quality))
+        if "depth" in self._asked:
+            heights = None if results.depth is None else results.depth.heights
+            if heights is None and self._had_depth and results.contact is None:
+                heights = np.zeros((height, width), np.float32)
+            if heights is not None:
+                self._had_depth = True
+                self._send(self._extras["depth"] + header + heights.astype("<f4").tobytes())
+
+    def _send(self, message: bytes) -> None:
         with self._lock:
             if self._socket is not None:
-                self._socket.send(self._topic + body, zmq.NOBLOCK)
+                self._socket.send(message, zmq.NOBLOCK)
 
     def _publish_statistics(self, control: Control) -> None:
         """Body of the thread that publishes the statistics while somebody has asked for them."""
@@ -243,10 +284,7 @@ class Zmq(Sink):
                 wanted = self._stats_wanted
             if not wanted:
                 continue
-            body = orjson.dumps({"sensor": self._sensor, **control.snapshot()})
-            with self._lock:
-                if self._socket is not None:
-                    self._socket.send(STATS_TOPIC + body, zmq.NOBLOCK)
+            self._send(STATS_TOPIC + orjson.dumps({"sensor": self._sensor, **control.snapshot()}))
 
     def close(self) -> None:
         """Deliver what is under way, for at most `linger` seconds, and free the addresses."""
@@ -277,7 +315,8 @@ class Zmq(Sink):
                     self._subscriptions.discard(event[1:])
         except FloodError as error:
             self._begin_anew(error)
-        self._wanted = any(map(self._asks_for_results, self._subscriptions))
+        self._asked = frozenset(name for name in self._extras if self._asks_for(name))
+        self._wanted = bool(self._asked) or any(map(self._asks_for_results, self._subscriptions))
         self._stats_wanted = any(map(_asks_for_statistics, self._subscriptions))
 
     def _begin_anew(self, reason: FloodError) -> None:
@@ -297,8 +336,17 @@ class Zmq(Sink):
 
     def _is_kept(self, subscription: bytes) -> bool:
         """Of those to others only some are counted, or their memory would have no bound."""
-        ours = self._asks_for_results(subscription) or _asks_for_statistics(subscription)
+        ours = (
+            self._asks_for_results(subscription)
+            or _asks_for_statistics(subscription)
+            or any(subscription.startswith(topic.rstrip()) for topic in self._extras.values())
+        )
         return ours or len(self._subscriptions) < MOST_OTHERS
+
+    def _asks_for(self, extra: str) -> bool:
+        """Whether somebody has subscribed to pictures or depth maps, by their full name."""
+        name = self._extras[extra].rstrip()
+        return any(subscription.startswith(name) for subscription in self._subscriptions)
 
     def _asks_for_results(self, subscription: bytes) -> bool:
         """A subscription is a prefix of the message; it may be longer than the topic."""

@@ -38,9 +38,7 @@ class Depth(Stage):
         if not contact_mask.any():
             return Absent("no_contact")
         if self._surface is None or self._surface[0] is not scale:
-            errors = known.photometric
-            surface = Surface(known.slopes, scale, errors.depth_stderr, errors.volume_stderr)
-            self._surface = scale, surface
+            self._surface = scale, Surface(known.slopes, scale, known.photometric.errors())
         if self._rest is None or self._rest[0] is not untouched:
             self._rest = untouched, Rest(untouched)
         return self._surface[1].depth(unmarked, self._rest[1], contact_mask)

@@ -29,6 +29,7 @@ class Scale(Stage):
         """Prepare. calibration : the file."""
         super().__init__(params)
         self._calibration = None if calibration is None else Calibration.load(calibration)
+        self._recorded = calibration is not None and calibration.suffix == ".mcap"
         self._looked_at: Untouched | None = None
 
     def process(
@@ -40,6 +41,12 @@ class Scale(Stage):
             return Absent("no_calibration")
         size = (untouched.shape[1], untouched.shape[0])
         misfit = calibration.misfit(mapping or PixelMapping.identity(size))
+        if misfit is not None and self._recorded:
+            # Nobody asked for it: it came with the recording.
+            if self._looked_at is None:
+                logger.warning("scale: the calibration in the recording is not used: %s", misfit)
+            self._looked_at = untouched
+            return Absent("no_calibration")
         if misfit is not None:
             raise StageError(f"{misfit}; use the pipeline that it was made with, or calibrate anew")
         if self._looked_at is not untouched:

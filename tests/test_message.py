@@ -338,6 +338,8 @@ def test_a_calibrated_message_has_millimetres_and_with_detail_their_errors() -> 
     assert plain["contact"]["depth_mm"] == 0.75
     assert plain["contact"]["volume_mm3"] == 4.5
     assert plain["flow"]["mean_mm"] == pytest.approx([0.121, -0.066])
+    place = np.array(plain["contact"]["center"]) - plain["scale"]["origin"]
+    assert place * plain["scale"]["mm_per_px"] == pytest.approx(plain["contact"]["center_mm"])
     assert "center_mm_stderr" not in plain["contact"]
     detailed = build_message(TICK, results, detail=True)
     VALIDATOR.validate(detailed)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
 from tactflow.config.yamlmap import Problems, wrap
 from tactflow.engine.conformance import build
-from tactflow.engine.errors import ConfigError
+from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Mark, Pipeline
 from tactflow.engine.run import Runner, RunResult
 
@@ -129,7 +131,35 @@ def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
     """
     if pipeline.opencv_threads is not None:
         cv2.setNumThreads(pipeline.opencv_threads)
-    return Runner(pipeline, **options)
+    return Runner(_calibrated(pipeline), **options)
+
+
+def _calibrated(pipeline: Pipeline) -> Pipeline:
+    """With the calibration that its recording was made with, unless the pipeline names one, or null."""
+    spec = pipeline.source.params.model_dump().get("source")
+    name = str(spec).partition("?")[0]
+    if pipeline.calibration or "calibration" in pipeline.settings or not name.endswith(".mcap"):
+        return pipeline
+    from tactflow.calibration.file import is_kept
+    from tactflow.recording import missing_packages
+    from tactflow.sources.base import find_path
+
+    # What is wrong with the file the source will say.
+    with suppress(SourceError, OSError):
+        path = find_path(name, pipeline.directory)
+        if missing_packages() is None and is_kept(_attachments(path)):
+            return replace(pipeline, calibration=path)
+    return pipeline
+
+
+def _attachments(path: Path) -> Collection[str]:
+    from tactflow.recording.reader import attachments
+    from tactflow.recording.records import NotARecordingError
+
+    try:
+        return attachments(path)
+    except NotARecordingError:
+        return ()
 
 
 def stage(use: str, /, **params: Any) -> Any:

@@ -125,6 +125,8 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False, field:
         "markers": None if markers is None else _markers(markers, detail),
         "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
     }
+    if scale is not None:
+        message["scale"] = _scale(scale)
     if slip is not None:
         ratio = _number(slip.stick_ratio, "slip.stick_ratio")
         message["slip"] = {"slipping": bool(slip.slipping), "stick_ratio": ratio}
@@ -133,6 +135,13 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False, field:
     if field:
         message["field"] = None if results.field is None else _field(results.field)
     return orjson.dumps(message, option=_OPTIONS)
+
+
+def _scale(scale: Scale) -> dict[str, Any]:
+    return {
+        "mm_per_px": _pair((scale.x, scale.y), "scale.mm_per_px"),
+        "origin": _pair(scale.origin, "scale.origin"),
+    }
 
 
 def _contact(contact: Contact, scale: Scale | None, detail: bool) -> dict[str, Any]:
@@ -368,6 +377,13 @@ class _SlipModel(_Strict):
     )
 
 
+class _ScaleModel(_Strict):
+    """Millimetres of pixels: mm = mm_per_px * (px - origin) along each axis."""
+
+    mm_per_px: tuple[_Positive, _Positive] = Field(description="along (x, y), mm per px")
+    origin: _Point = Field(description="(x, y) where the mm coordinates are 0, px")
+
+
 class _ForceModel(_Strict):
     """The force on the gel."""
 
@@ -418,6 +434,7 @@ class _Message(_Strict):
     slip: _SlipModel | None = Field(
         None, description="of the contact (only where the pipeline has the stage slip)"
     )
+    scale: _ScaleModel | None = Field(None, description="makes mm of px (calibrated)")
     force: _ForceModel | None = Field(
         None, description="on the gel; only where something touches (calibrated)"
     )

@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from tactflow import __version__
+from tactflow.calibration.file import stored_arrays, stored_text
 from tactflow.engine.control import Control
 from tactflow.redaction import without_secrets
 from tactflow.vision import compiled
@@ -38,6 +39,18 @@ def facts(sensor: str, control: Control | None) -> dict[str, str]:
     return told
 
 
+def arrays(control: Control | None) -> dict[str, bytes]:
+    """`calibration.npz`, which belongs to the `calibration.yaml` of `texts`: name -> bytes."""
+    calibration = None if control is None else control.pipeline.calibration
+    if calibration is None:
+        return {}
+    try:
+        return {"calibration.npz": stored_arrays(calibration)}
+    except (OSError, ValueError) as error:
+        log.debug("%s: its arrays are not kept: %s", calibration, error)
+        return {}
+
+
 def texts(control: Control | None) -> dict[str, str]:
     """The files of a run, without passwords: name -> text.
 
@@ -53,7 +66,8 @@ def texts(control: Control | None) -> dict[str, str]:
         files["calibration.yaml"] = pipeline.calibration
     for name, file in files.items():
         try:
-            found[name] = without_secrets(file.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError) as error:
+            data = stored_text(file) if file == pipeline.calibration else file.read_bytes()
+            found[name] = without_secrets(data.decode("utf-8"))
+        except (OSError, ValueError) as error:
             log.debug("%s: not kept: %s", file, error)
     return found

@@ -9,14 +9,17 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import zmq
-from zmq.auth.thread import ThreadAuthenticator
 
 from tactflow.engine.errors import StageError
 from tactflow.files import expanded, files_left
 from tactflow.keys import DOMAIN, WrongKeysError, secure_publisher, subscribers_folder
 from tactflow.view.address import is_loopback
+
+if TYPE_CHECKING:
+    from zmq.auth.thread import ThreadAuthenticator
 
 LONGEST_REQUEST = 4096
 """Bytes of a subscription or a command, which have some twenty. ZeroMQ keeps subscriptions in a tree and
@@ -97,6 +100,9 @@ class BoundSocket:
     def _ask_for_keys(self, folder: Path) -> None:
         secure_publisher(self.socket, folder)
         allowed = subscribers_folder(folder)
+        # It imports asyncio, a tenth of what a run takes to start.
+        from zmq.auth.thread import ThreadAuthenticator
+
         self._authenticator = ThreadAuthenticator(self._context)
         self._authenticator.start()
         self._authenticator.configure_curve(domain=DOMAIN, location=allowed)

@@ -8,6 +8,7 @@ be put below each other; what a message lacks is null.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -63,7 +64,8 @@ MARKER_COLUMNS = (
 """Of the table `markers`, behind `seq`."""
 
 
-def frame_columns() -> list[Column]:
+@cache
+def frame_columns() -> Sequence[Column]:
     """The columns of `frames`, in the order of the message.
 
     >>> [column.name for column in frame_columns()][:6]
@@ -71,10 +73,11 @@ def frame_columns() -> list[Column]:
     """
     schema = message_schema()
     kept = {key: part for key, part in schema["properties"].items() if key not in APART}
-    return list(_columns({"properties": kept, "type": "object"}, schema["$defs"], (), ()))
+    return tuple(_columns({"properties": kept, "type": "object"}, schema["$defs"], (), ()))
 
 
-def contact_columns() -> list[Column]:
+@cache
+def contact_columns() -> Sequence[Column]:
     """The columns of `contacts` that describe one contact.
 
     >>> [column.name for column in contact_columns()][:3]
@@ -82,7 +85,7 @@ def contact_columns() -> list[Column]:
     """
     schema = message_schema()
     one = schema["properties"]["contacts"]["items"]
-    return list(_columns(one, schema["$defs"], (), ()))
+    return tuple(_columns(one, schema["$defs"], (), ()))
 
 
 def _columns(

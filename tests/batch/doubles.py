@@ -11,7 +11,7 @@ from tactflow.batch.engine import Headway
 from tactflow.batch.folder import Folder, Ledger
 from tactflow.batch.recordings import find_recordings
 from tactflow.batch.run import Plan, Result, Stopping, make_plan, resolved, run_batch
-from tactflow.batch.task import Outcome, Task
+from tactflow.batch.task import Format, Outcome, Task
 from tactflow.batch.work import work
 
 PIPELINE = """
@@ -69,6 +69,7 @@ class Batch:
         self.file = folder / "pipeline.yaml"
         self.file.write_text(pipeline)
         self.folder = Folder(folder / "out")
+        self.format: Format = "jsonl"
         self.plan: Plan
         self.engine: InTurn
 
@@ -76,7 +77,7 @@ class Batch:
         self, *overrides: str, verify: bool = False, fail_fast: bool = False, stop_after: int | None = None
     ) -> Result:
         """One call; after `stop_after` outcomes a signal comes."""
-        request = resolved(self.file, overrides, None, "jsonl")
+        request = resolved(self.file, overrides, None, self.format)
         self.engine = InTurn()
         stopping = Stopping()
         seen: list[Outcome] = []
@@ -90,7 +91,7 @@ class Batch:
             self.plan = make_plan(self.folder, find_recordings(words), request, verify=verify)
             return run_batch(
                 self.plan,
-                lambda one: Task(one, request, "jsonl", str(self.folder.path), str(scratch), verify),
+                lambda one: Task(one, request, self.format, str(self.folder.path), str(scratch), verify),
                 self.engine,
                 ledger,
                 stopping=stopping,

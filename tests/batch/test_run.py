@@ -67,6 +67,18 @@ def test_a_result_that_is_not_as_it_was_written_is_no_result(batch: Batch, damag
     assert path.read_bytes() == whole
 
 
+def test_tables_are_whole_only_with_all_their_parts(batch: Batch) -> None:
+    pytest.importorskip("pyarrow", reason="needs pyarrow: pip install 'tactflow[parquet]'")
+    batch.format = "parquet"
+    batch()
+    (tables,) = batch.folder.results.glob("1.npy-*")
+    parts = {path: path.read_bytes() for path in tables.rglob("*.parquet")}
+    assert len(parts) == 3
+    next(iter(parts)).unlink()
+    assert statuses(batch) == ["0.npy done before", "1.npy done", "2.npy done before"]
+    assert {path: path.read_bytes() for path in tables.rglob("*.parquet")} == parts
+
+
 def test_a_change_that_size_and_time_do_not_show_is_found_by_verify(batch: Batch) -> None:
     batch()
     (path,) = batch.folder.results.glob("0.npy-*")

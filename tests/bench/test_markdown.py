@@ -12,7 +12,7 @@ from tactflow.bench.results import Measurement, Result, Target
 
 @pytest.fixture
 def result() -> Result:
-    made = Result(quick=True, copy_ms=0.1, touch_ms=0.05)
+    made = Result(quick=True, copy_ms=0.1, touch_ms=0.05, fault_us=0.4)
     for method, milliseconds, rms in (("default", 1.5, 0.01), ("classic", 50.0, 0.3), (ORIGINAL, 100.0, 0.3)):
         measurement = Measurement("pipeline", method, "press", errors={"displacement_rms": rms})
         measurement.time["contact"] = {"cpu_ms_p50": milliseconds}

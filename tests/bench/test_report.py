@@ -22,7 +22,7 @@ def measurement(method: str, scene: str, cost: float, **errors: float) -> Measur
 
 @pytest.fixture
 def result() -> Result:
-    made = Result(quick=True, copy_ms=0.1, touch_ms=0.05)
+    made = Result(quick=True, copy_ms=0.1, touch_ms=0.05, fault_us=0.4)
     made.measurements = [
         measurement("slow & <exact>", "press", 50, displacement_rms=0.01, wrong_percent=0),
         measurement("slow & <exact>", "cable", 60, displacement_rms=0.02, wrong_percent=0),

@@ -84,3 +84,4 @@ def test_the_unit_is_the_time_of_a_real_copy_and_a_real_pass() -> None:
     assert np.all(unit._pool[3 * quarter] == 255 - before[quarter])
     assert unit.copy_ms > 0
     assert unit.touch_ms > 0
+    assert unit.fault_us >= 0

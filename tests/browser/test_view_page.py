@@ -660,7 +660,14 @@ def frame(sensor: str, number: int, colour: int, *, contact: bool = False, direc
     return struct.pack("<I", len(header)) + header + jpeg
 
 
-def calibrated(number: int, *, slipping: bool = False, height: float = 0.5) -> bytes:
+def with_header(packet: bytes, heights: bytes = b"", **added: Any) -> bytes:
+    """A frame as the view sends it, with more in its header."""
+    length = struct.unpack_from("<I", packet)[0]
+    header = json.dumps(json.loads(packet[4 : 4 + length]) | added).encode()
+    return struct.pack("<I", len(header)) + header + heights + packet[4 + length :]
+
+
+def calibrated(number: int, *, slipping: bool = False, height: float = 0.5, in_range: bool = True) -> bytes:
     """A frame of a calibrated sensor with all that the page can show."""
     plain = frame("main", number, 120, contact=True, directed=True)
     length = struct.unpack_from("<I", plain)[0]
@@ -670,15 +677,12 @@ def calibrated(number: int, *, slipping: bool = False, height: float = 0.5) -> b
     message["contact"] |= {"depth_mm_stderr": 0.01, "volume_mm3": 0.7}
     message["flow"] |= {"stderr": [0.3, 0.4], "mean_mm": [0.4, -0.2], "mean_mm_stderr": [0.03, 0.04]}
     message["slip"] = {"slipping": slipping, "stick_ratio": 0.0 if slipping else 0.8}
-    message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": True}
+    message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": in_range}
     y, x = np.mgrid[-1:1:16j, -1:1:20j]
     heights = np.rint(np.maximum(0, 1 - x**2 - y**2) * 65535).astype("<u2").tobytes()
-    header["scale"] = [0.1, 0.1]
-    header["field"] = header["markers"] | {"status": "iii"}
-    header["surface"] = {"box": [20, 10, 20, 16], "size": [20, 16], "step": height / 65535}
-    header["surface"]["bytes"] = len(heights)
-    changed = json.dumps(header).encode()
-    return struct.pack("<I", len(changed)) + changed + heights + plain[4 + length :]
+    surface = {"box": [20, 10, 20, 16], "size": [20, 16], "step": height / 65535, "bytes": len(heights)}
+    field = header["markers"] | {"status": "iii"}
+    return with_header(plain, heights, message=message, scale=[0.1, 0.1], field=field, surface=surface)
 
 
 def state(sensor: str, **changes: Any) -> str:
@@ -776,6 +780,8 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
     assert texts == {"area": "3.00", "flow": "0.447", "depth": "0.500", "force": "2.50", "slip": "holds"}
     assert page.inner_text("#unit-flow").startswith("mm ± 0.032, 3 markers")
     assert page.inner_text("#unit-force") == "N ± 0.20"
+    stage.send(calibrated(3, height=0.4, in_range=False))
+    until(page, "() => document.getElementById('unit-force').textContent === 'N, outside the fit'")
     in_mm = {name: steady(page, name) for name in ("picture", "plot-area", "plot-flow")}
     page.keyboard.press("u")
     assert page.inner_text("#unit-area") == "px²"
@@ -784,7 +790,7 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
         assert shows(page, name, lambda now, seen=seen: now != seen), name
     page.reload()
     watch(page)
-    stage.send(calibrated(3, slipping=True))
+    stage.send(calibrated(4, slipping=True))
     until(page, "() => document.getElementById('value-slip').textContent === 'slips'")
     assert page.inner_text("#unit-area") == "px²", "the unit is remembered"
     assert stage.heard[-1] != {"show": ["field"]}
@@ -851,3 +857,37 @@ def test_the_surface_is_shaded_and_can_be_turned_where_there_is_webgl(
     page.keyboard.press("z")
     assert page.inner_text("#rise span") == "Heights × 5"
     assert shows(page, "surface", lambda seen: not np.array_equal(middle(seen), picture))
+
+
+def test_a_session_of_presses_is_guided_and_the_last_one_can_be_undone(
+    staged: Callable[..., Stage], open_page: Callable[..., Any]
+) -> None:
+    def guided(number: int, **changes: Any) -> bytes:
+        good = {"center": [10.0, 10.0], "radius": 5.0, "fault": None}
+        light = {"center": [40.0, 20.0], "radius": 2.0, "fault": "light; press harder"}
+        guide = {"now": "Press the ball firmly at the upper left.", "done": 2, "good": 1, "wanted": 4}
+        guide |= {"next": [0, 0], "lasts": False, "presses": [good, light]} | changes
+        return with_header(frame("main", number, 120), guide=guide)
+
+    stage = staged(hello("main"), state("main"), frame("main", 1, 120))
+    page = open_page(stage.url)
+    watch(page)
+    assert page.is_hidden("#tile-guide")
+    plain = steady(page, "picture")
+    stage.send(guided(2))
+    until(page, "() => !document.getElementById('tile-guide').hidden")
+    assert page.inner_text("#guide-now") == "Press the ball firmly at the upper left."
+    assert page.get_attribute("#guide-now", "role") == "status"
+    assert page.inner_text("#guide-count") == "2 of 4 presses, 1 good"
+    assert page.inner_text("#guide-last") == "Press 2: light; press harder."
+    assert page.evaluate("document.getElementById('guide-progress').value") == 0.5
+    until(page, "() => document.querySelector('#stop .label').textContent === 'Finish'")
+    assert shows(page, "picture", lambda seen: seen != plain)
+    page.keyboard.press("Backspace")
+    page.click("#undo")
+    until_heard(page, stage, {"do": "undo", "value": None}, times=2)
+    stage.send(guided(3, lasts=True, now="Lift the ball.", presses=[]))
+    until(page, "() => document.getElementById('guide-now').textContent === 'Lift the ball.'")
+    assert page.is_disabled("#undo")
+    stage.send(state("main", end="signal"))
+    until(page, "() => document.getElementById('empty-title').textContent === 'The presses are collected'")

@@ -130,6 +130,35 @@ def test_a_file_that_is_no_calibration_is_refused(
         Calibration.load(path)
 
 
+def test_a_recording_keeps_the_calibration_and_playing_it_finds_it(pipeline: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    recording = tmp_path / "press.mcap"
+    sinks = {"sinks": {"record": {"path": str(recording)}}}
+    tactflow.run(pipeline, settings=sinks, max_frames=12)
+    plain = tmp_path / "plain.yaml"
+    plain.write_text(PIPELINE.replace("calibration: left.yaml", ""))
+    again = {result.scale for result in tactflow.stream(plain, source=str(recording))}
+    assert again == {CALIBRATION.scale}
+    assert Calibration.load(recording).scale == CALIBRATION.scale
+    without = tactflow.stream(plain, source=str(recording), settings={"calibration": None})
+    assert next(without).scale is None
+
+
+def test_a_recorded_calibration_of_other_frames_is_left_out_with_a_warning(
+    pipeline: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("mcap")
+    recording = tmp_path / "press.mcap"
+    sinks = {"sinks": {"record": {"path": str(recording)}}}
+    tactflow.run(pipeline, settings=sinks, max_frames=3)
+    plain = tmp_path / "plain.yaml"
+    plain.write_text(PIPELINE.replace("calibration: left.yaml", "").replace("rotate: 90", "rotate: 270"))
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        results = list(tactflow.stream(plain, source=str(recording)))
+    assert {result.scale for result in results} == {None}
+    assert caplog.text.count("is not used") == 1
+
+
 def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "left.yaml"
     CALIBRATION.save(path)

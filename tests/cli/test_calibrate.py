@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -30,7 +31,7 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     words = ["--from", "sim:ball?frames=240", "--pitch", pitch, "--ball-radius", "2.375"]
     assert calibrate(*words) == 0
     told = capsys.readouterr().err
-    assert "press 8: radius" in told
+    assert "press 8 of 30: good, radius" in told
     assert "calibration/main.yaml is written" in told
     said = yaml.safe_load(Path("calibration/main.yaml").read_text())
     assert said["made_from"] == "sim:ball?frames=240"
@@ -60,6 +61,9 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     told = capsys.readouterr().err
     assert "heights are not known" not in told
     assert "the gauge's x axis lies -90 degrees" in told
+    today = ["check", *force[1:]]
+    assert calibrate(*today) == 0
+    assert "N RMS from the gauge today; when it was made" in capsys.readouterr().out
     assert calibrate(*force) == 2
     assert "has a force already" in capsys.readouterr().err
     spec = "ball?frames=60&shear=0.6&seed=3"
@@ -86,6 +90,24 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert "it still fits" in capsys.readouterr().out
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:round_gel?frames=3") == 3
     assert "calibrate anew" in capsys.readouterr().out
+
+
+def test_a_printed_target_gives_the_scale(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    squares = np.add.outer(np.arange(600) // 60, np.arange(800) // 60) % 2
+    board = np.full((600, 800, 3), 200, np.uint8)
+    board[60:420, 60:540] -= np.uint8(150) * squares[60:420, 60:540, None].astype(np.uint8)
+    cv2.imwrite("board.png", board)
+    words = ["--from", "sim:idle?frames=3", "--target", "board.png", "--pitch", "3"]
+    assert calibrate(*words, "--grid", "9x6") == 2
+    assert "board.png does not show 9 x 6 inner corners" in capsys.readouterr().err
+    assert calibrate(*words, "--grid", "5x7") == 0
+    said = yaml.safe_load(Path("calibration/main.yaml").read_text())["scale"]
+    # 60 raw pixels are 30 processed ones.
+    assert said["mm_per_pixel"] == pytest.approx([0.1, 0.1], rel=2e-3)
+    assert said["found_by"] == "target of 5x7, pitch of 3 mm"
 
 
 @pytest.mark.parametrize(

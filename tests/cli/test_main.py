@@ -46,7 +46,7 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
     [
         ([], "required: COMMAND"),
         (["chek"], "there is no command chek; did you mean check?"),
-        (["teleport"], "there is no command teleport; there are run, check"),
+        (["juggle"], "there is no command juggle; there are run, check"),
         (["check", "--sett", "a=b"], "unrecognized arguments: --sett"),
         (["run", "--max-fames", "6"], "usage: tactflow run"),
         (["run", "--max-fames=6"], "unrecognized arguments: --max-fames=6; did you mean --max-frames?"),

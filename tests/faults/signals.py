@@ -19,7 +19,7 @@ from tests.faults.rig import Seen, array, write_pipeline
 from tests.faults.sinks import KINDS, settings_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-WRITES = ("jsonl", "images", "video .avi", "record")
+WRITES = ("jsonl", "images", "video .avi", "record", "parquet")
 """The sinks that run together. Of the films, only an .avi can be played before it is finished."""
 SECONDS = 60.0
 """Length of what is played, s: longer than any test waits before it ends the run."""

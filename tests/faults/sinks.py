@@ -61,6 +61,19 @@ def look_at_recording(path: Path) -> str:
     return f"{frames} frames can be played"
 
 
+def look_at_tables(folder: Path) -> str:
+    """Frames of the tables, whose parts are all whole and whose other rows belong to them."""
+    import pyarrow.parquet as pq
+
+    if not any((folder / "frames").glob("part-*")):
+        return "0 frames"
+    frames, contacts, markers = (pq.read_table(folder / name) for name in ("frames", "contacts", "markers"))
+    seqs = frames["seq"].to_pylist()
+    assert seqs == sorted(set(seqs))
+    assert set(contacts["seq"].to_pylist()) <= set(markers["seq"].to_pylist()) | set(seqs)
+    return f"{len(seqs)} frames can be read"
+
+
 @dataclass(frozen=True)
 class Kind:
     """A sink that writes. parameter : names the output. settings : all others. look : sees what is there."""
@@ -78,6 +91,7 @@ KINDS = {
     "video .mkv": Kind("film.mkv", "path", PICTURE, look_at_film),
     "video .mp4": Kind("film.mp4", "path", PICTURE, look_at_film),
     "record": Kind("press.mcap", "path", {}, look_at_recording),
+    "parquet": Kind("tables", "path", {"flush": 0.002}, look_at_tables),
 }
 
 
@@ -185,15 +199,16 @@ def _read_only_folder(folder: Path) -> Iterator[Path]:
 def at_once(kind: str, what: str, folder: Path) -> Seen:
     """What stands at the place of the output when the run begins. what : "a file" or "a pipe"."""
     output = folder / KINDS[kind].output
+    inside = {"images": "frame-000000.png", "parquet": "frames/part-00000.parquet"}
+    theirs = output / inside[kind] if kind in inside else output
     if what == "a pipe":
         os.mkfifo(output)
-    elif kind == "images":
-        output.mkdir()
-        (output / "frame-000000.png").write_text(THEIRS)
+    elif output.suffix == "":
+        theirs.parent.mkdir(parents=True)
+        theirs.write_text(THEIRS)
     else:
         output.write_text(THEIRS)
     _, seen = run(folder, settings_of(kind, output), source=str(array(folder)))
-    theirs = output / "frame-000000.png" if kind == "images" else output
     kept = "the pipe" if output.is_fifo() else "the file" if theirs.read_text() == THEIRS else "ours"
     return Seen(seen.exit, seen.said, kept)
 

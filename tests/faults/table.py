@@ -50,6 +50,7 @@ WRITING_STOPS = ENDS + "; "
 LINES_STAY = "all lines written before stay, complete"
 PICTURES_STAY = "all pictures written before stay; none is there in half"
 FRAMES_STAY = "all frames written before can be played, and tactflow repair adds the index"
+PARTS_STAY = "all parts written before stay, complete"
 FILM_ENDS = "what it says about the film is what a player shows"
 NOT_TOUCHED = "what is there is not touched"
 NOT_WHOLE = "the run ends and says that the film is not whole"
@@ -93,6 +94,8 @@ FAULTS_OF_OUTPUTS: tuple[tuple[str, str, str, int, str, str], ...] = (
     ("record", "replaced", TOLD + "; " + NOT_TOUCHED, 3, "was replaced by another", "the other's file"),
     ("record", "turned into a pipe", TOLD, 3, "was replaced by another", "the pipe"),
     ("record", "cut to nothing", TOLD, 3, "was cut by another program", "not an MCAP file"),
+    ("parquet", "disk full", WRITING_STOPS + PARTS_STAY, 3, "No space left.* written before", "can be read"),
+    ("parquet", "removed", ENDS, 3, "cannot be written into: No such file", "nothing"),
 )
 """Sink, what happens to its output in mid-run, promise, exit code, what is said, what is left."""
 
@@ -182,7 +185,7 @@ def _sinks() -> list[Case]:
         Case(kind, "size of files limited", promise, partial(sinks.size_limited, kind), 3, says, keeps)
         for kind, promise, says, keeps in SIZE_LIMITED
     ]
-    for kind in ("jsonl", "images", "video .avi", "record"):
+    for kind in ("jsonl", "images", "video .avi", "record", "parquet"):
         refused = "refused at the start; " + NOT_TOUCHED
         read_only, there = partial(sinks.read_only, kind), partial(sinks.at_once, kind)
         cases += [

@@ -21,7 +21,9 @@ from tactflow.calibration.file import Calibration
 from tactflow.cli import explain, listen
 from tactflow.cli.statistics import read_statistics
 from tactflow.client import _parsed
+from tactflow.commands import Commands
 from tactflow.config.load import load_pipeline
+from tactflow.control_socket import ControlSocket
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.plan import make_plan
@@ -427,6 +429,7 @@ COMMANDS = (
     b'{"ack": 1, "late": false, "rest": 50}',
     b'{"do": "pause", "value": true}',
     b'{"do": "step"}',
+    b'{"show": ["surface", "field"]}',
     b'{"do": "record", "value": [1, {"a": null}]}',
 )
 
@@ -479,11 +482,27 @@ def commands(folder: Path) -> Iterator[Parser]:
     yield Parser(COMMANDS, feed)
 
 
+@contextmanager
+def orders(folder: Path) -> Iterator[Parser]:
+    """What another program asks of a run."""
+    del folder
+    control = ControlSocket("tcp://127.0.0.1:*", None, "main", Commands(None))
+
+    def feed(data: bytes) -> None:
+        answer = json.loads(control._answer([data]))
+        assert answer["message"]
+
+    try:
+        yield Parser([b'{"do": "ping"}', b'{"do": "record_start"}'], feed)
+    finally:
+        control.close()
+
+
 # No HDF5: its library hangs on some damaged files, as docs/security.md says.
 TARGETS: dict[str, Callable[[Path], AbstractContextManager[Parser]]] = {
     function.__name__: cast(Any, function)
     for function in (
         *(pipelines, overrides, recordings, arrays, pictures, videos, calibrations, statistics, messages),
-        *(bags, lerobot, subscriptions, requests, websockets, commands),
+        *(bags, lerobot, subscriptions, requests, websockets, commands, orders),
     )
 }

@@ -1,4 +1,4 @@
-"""Plain versions of the kernels that choose spots for marks."""
+"""Plain version of the kernel that chooses spots for marks."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.markers import matching
-from tactflow.vision.markers.matching import propagate_beliefs, unary_costs
+from tactflow.vision.markers.matching import propagate_beliefs
 from tests.oracles.gains import Gain
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 
 def _complex(points: FloatArray) -> ComplexArray:
@@ -28,65 +27,6 @@ def _link_cost(first: ComplexArray, second: ComplexArray, span: ComplexArray) ->
     return np.asarray(cost + matching.FOLD_COST * (change.real < matching.FOLD_STRAIN), np.float64)
 
 
-def plain_unary_costs(
-    origin: FloatArray,
-    edges: IntArray,
-    free: IntArray,
-    inliers: BoolArray,
-    displacement: FloatArray,
-    expected: FloatArray,
-    spots: FloatArray,
-    strength: FloatArray,
-    pitch: float,
-    farthest: float,
-    slot: IntArray,
-    label: IntArray,
-    unary: FloatArray,
-    chosen: IntArray,
-) -> int:
-    """All marks, spots and links at once, in complex numbers."""
-    count = len(free)
-    slot[:] = -1
-    slot[free] = np.arange(count)
-    rest, place, shift = _complex(origin), _complex(spots), _complex(displacement)
-    away = np.abs(_complex(expected)[:, :, None] - place).min(axis=0)
-    most = min(matching.LABELS, len(spots))
-    label[:, :most] = np.argsort(away, axis=1, kind="stable")[:, :most]
-    labels = min(most, int((away <= farthest).sum(axis=1).max()))
-    if labels == 0:
-        return 0
-    near = label[:, :labels]
-    away = np.take_along_axis(away, near, axis=1)
-    cost = matching.SURPRISE_COST * (away / pitch) ** 2
-    cost += matching.FAINT_COST * np.maximum(1.0 - strength[near], 0.0)
-    unary[:, :labels] = np.where(away > farthest, matching.FORBIDDEN_COST, cost)
-    unary[:, labels] = matching.MISSING_COST
-    moved = place[near] - rest[free][:, None]
-    one, other = edges.T
-    there, back = (slot[one] >= 0) & inliers[other], (slot[other] >= 0) & inliers[one]
-    mark = np.concatenate([slot[one][there], slot[other][back]])
-    anchor = np.concatenate([other[there], one[back]])
-    span = rest[anchor] - rest[free[mark]]
-    links = np.full((len(mark), labels + 1), matching.MISSING_LINK_COST)
-    links[:, :labels] = _link_cost(moved[mark], shift[anchor][:, None], span[:, None])
-    np.add.at(unary[:, : labels + 1], mark, links)
-
-    best = np.argmin(unary[:, : labels + 1], axis=1)
-    if (best == labels).any():
-        return labels
-    own = near[np.arange(count), best]
-    if len(np.unique(own)) < count:
-        return labels
-    now, known = shift.copy(), inliers.copy()
-    now[free], known[free] = place[own] - rest[free], True
-    linked = known[one] & known[other] & ((slot[one] >= 0) | (slot[other] >= 0))
-    one, other = one[linked], other[linked]
-    if not (np.abs(now[other] - now[one]) < matching.SMOOTH_STRAIN * np.abs(rest[other] - rest[one])).all():
-        return labels
-    chosen[:] = own
-    return 0
-
-
 def plain_propagate_beliefs(
     origin: FloatArray,
     edges: IntArray,
@@ -99,7 +39,6 @@ def plain_propagate_beliefs(
     chosen: IntArray,
 ) -> None:
     """Messages of all links at once."""
-    label, unary = label[:, :labels], unary[:, : labels + 1]
     inner = edges[(slot[edges] >= 0).all(axis=1)]
     first, second = slot[inner].T
     rest = _complex(origin)
@@ -147,8 +86,4 @@ def _propagate(unary: FloatArray, first: IntArray, second: IntArray, pair: Float
     return belief
 
 
-GAINS = [
-    # Where marks do not find a smooth choice, the kernel has begun to write down the one it gave up.
-    Gain(unary_costs, plain_unary_costs, tolerance=1e-9, scratch=("chosen",)),
-    Gain(propagate_beliefs, plain_propagate_beliefs),
-]
+GAINS = [Gain(propagate_beliefs, plain_propagate_beliefs)]

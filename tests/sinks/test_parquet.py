@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results, message_schema
 from tactflow.sinks import parquet as parquet_module
 from tactflow.sinks.parquet import TABLES, Parquet
-from tactflow.vision.types import Depth, Scale, Slip
+from tactflow.vision.types import Depth, Force, Scale, Slip
 from tests.clock import PATIENCE, until
 from tests.messages import build_message
 from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
@@ -36,10 +37,11 @@ DEPTH = Depth(np.zeros((4, 3), np.float32), 0.4, 0.1, 3.2, None)
 SECOND = replace(CONTACT, area=12.0, angle=None, ellipse=None, hull=CONTACT.hull + 100)
 TWO = replace(CONTACT, separate=(CONTACT, SECOND))
 SLIP = Slip(slipping=True, stick_ratio=0.25)
+FORCE = Force((0.1, None, 2.5), (0.01, None, 0.2), True)
 FOUND = [
     Results(PROCESSED),
     Results(PROCESSED, CONTACT, FLOW, MARKERS),
-    Results(PROCESSED, TWO, FLOW, MARKERS, SCALE, DEPTH, None, SLIP),
+    Results(PROCESSED, TWO, FLOW, MARKERS, SCALE, DEPTH, None, SLIP, FORCE),
     Results(PROCESSED, SECOND, replace(FLOW, mean=None), replace(MARKERS, stderr=np.zeros(3))),
 ]
 """What the columns hold: nothing, a contact, all there is, and some of it."""
@@ -77,8 +79,9 @@ def leaves(value: Any, *names: str) -> Iterator[tuple[str, Any]]:
         for key, inner in value.items():
             yield from leaves(inner, *names, key)
     elif isinstance(value, list) and not isinstance(value[0], list):
-        for suffix, number in zip(NAMES.get(names[-1], ["x", "y"]), value, strict=True):
-            yield "_".join([*names, suffix]), number
+        for suffix, number in zip(NAMES.get(names[-1], ["x", "y", "z"][: len(value)]), value, strict=True):
+            if number is not None:
+                yield "_".join([*names, suffix]), number
     elif value is not None:
         yield "_".join(names), list(value.items()) if isinstance(value, dict) else value
 
@@ -170,6 +173,19 @@ def test_without_pyarrow_the_error_has_the_command_that_installs_it(
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(StageError, match=r"need pyarrow: pip install 'tactflow\[parquet\]'"):
         opened(tmp_path)
+
+
+def test_the_calibration_of_the_run_is_in_every_table(tmp_path: Path) -> None:
+    (tmp_path / "left.yaml").write_text("sensor: left\n")
+    pipeline = SimpleNamespace(settings={}, file=tmp_path / "no.yaml", calibration=tmp_path / "left.yaml")
+    control: Any = SimpleNamespace(pipeline=pipeline, source=None)
+    sink = Parquet(Parquet.Params(path=str(tmp_path / "out")), "left", control)
+    sink.open()
+    write(sink, range(1))
+    sink.close()
+    for name in TABLES:
+        facts = pq.read_schema(tmp_path / "out" / name / "part-00000.parquet").metadata
+        assert facts[b"calibration.yaml"] == b"sensor: left\n"
 
 
 def test_the_example_of_the_page_runs(

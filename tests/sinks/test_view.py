@@ -10,7 +10,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -415,6 +415,7 @@ def test_buttons_reach_the_run_and_every_page_learns_of_it(
         (True, {"do": "step"}, "live source"),
         (False, {"do": "record", "value": True}, "no record sink"),
         (False, {"do": "read", "value": "/etc/passwd"}, "no command"),
+        (False, {"do": "undo"}, "no command"),
         (False, {"do": ["pause"]}, "no command"),
         (False, {}, "no command"),
     ],
@@ -455,6 +456,28 @@ def test_a_failing_recorder_is_reported_and_ends_nothing(
     assert "no space left" in browser.next("note")["text"]
     assert "no space left" in caplog.text
     browser.next("stats")
+
+
+def test_a_page_that_guides_is_told_what_to_do_and_can_undo(
+    stack: ExitStack, page: Callable[..., Page]
+) -> None:
+    class Session:
+        state: Mapping[str, Any] = {"now": "Press the ball"}
+        undone = 0
+
+        def undo(self) -> None:
+            self.undone += 1
+
+    session = Session()
+    sink = View.through(session)(View.Params(port=0, max_fps=240.0), "main", control=FakeRun())
+    stack.callback(sink.close)
+    sink.open()
+    browser = page(sink)
+    write(sink, 1)
+    assert browser.next("frame")[0]["guide"] == {"now": "Press the ball"}
+    browser.say(do="undo")
+    until(lambda: session.undone == 1)
+    assert View.session is None
 
 
 def test_junk_ends_that_page_and_no_other(view: Callable[..., View], page: Callable[..., Page]) -> None:
@@ -781,8 +804,20 @@ def test_a_package_that_cannot_be_imported_disables_the_view_only(
     monkeypatch: pytest.MonkeyPatch, view: Callable[..., View], caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setitem(sys.modules, "tactflow.view.server", None)
-    assert not view().wants()
-    assert "not shown" in caplog.text
+    sink = view()
+    assert sink.description is not None
+    socket.create_connection(("127.0.0.1", urlsplit(sink.description).port or 0)).close()
+    until(lambda: "not shown" in caplog.text)
+    assert not sink.wants()
+
+
+def test_what_serves_the_page_is_loaded_when_somebody_comes(
+    view: Callable[..., View], page: Callable[..., Page]
+) -> None:
+    sink = view()
+    assert "tactflow-view-server" not in {thread.name for thread in threading.enumerate()}
+    page(sink).next("hello")
+    assert "tactflow-view-server" in {thread.name for thread in threading.enumerate()}
 
 
 def test_at_the_end_pages_learn_how_it_ended(view: Callable[..., View], page: Callable[..., Page]) -> None:

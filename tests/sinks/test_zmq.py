@@ -21,7 +21,7 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
 from tactflow.sinks.zmq import MOST_OTHERS, Zmq
-from tactflow.vision.types import Markers
+from tactflow.vision.types import Depth, Markers
 from tests.clock import PATIENCE, until
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
@@ -440,3 +440,42 @@ def test_connections_that_leave_no_files_are_ended(
     until(lambda: sink.wants() is None or "too many connections" in caplog.text)
     until(lambda: listener.poll(1) or (sink.wants() and write(sink, range(1))))
     sink.close()
+
+
+def test_pictures_and_depth_maps_go_to_who_asks_for_them_by_name(subscribe: Subscribing) -> None:
+    sink = opened(pictures=100)
+    picture = subscribe(sink.endpoint, b"tactflow_picture.main")
+    wait_until_wanted(sink)
+    heights = np.arange(12, dtype=np.float32).reshape(3, 4)
+    small = np.zeros((3, 4, 3), np.uint8)
+    depth = Depth(heights, 11.0, None, 1.0, None)
+    sink.write(tick(0), Results(small, depth=depth))
+    header, _, data = picture.recv().partition(b"\n")
+    assert header.startswith(b'tactflow_picture.main {"sensor":"main","seq":0,"t":0.0,"size":[4,3]}')
+    assert data[:2] == b"\xff\xd8"
+    assert not picture.poll(0)
+
+    maps = subscribe(sink.endpoint, b"tactflow_depth.main")
+    until(lambda: sink.wants() and "depth" in sink._asked)
+    sink.write(tick(1), Results(small, depth=depth))
+    sink.write(tick(2), Results(small))
+    for expected in (heights, np.zeros((3, 4))):
+        data = maps.recv().partition(b"\n")[2]
+        assert np.array_equal(np.frombuffer(data, "<f4").reshape(3, 4), expected)
+    sink.close()
+
+
+def test_pictures_have_their_rate_and_are_off_unless_asked_for(subscribe: Subscribing) -> None:
+    sink = opened(pictures=5)
+    picture = subscribe(sink.endpoint, b"tactflow_picture.main")
+    wait_until_wanted(sink)
+    write(sink, range(10))
+    seqs = [json.loads(picture.recv().split(b" ", 1)[1].split(b"\n")[0])["seq"] for _ in range(5)]
+    assert seqs == [0, 2, 4, 6, 8]
+    assert not picture.poll(0)
+    sink.close()
+    silent = opened()
+    subscribe(silent.endpoint, b"tactflow_picture.main")
+    until(lambda: silent.wants() or silent.counters()["subscriptions"])
+    assert not silent.wants()
+    silent.close()

@@ -49,6 +49,12 @@ def test_every_kind_of_bag_gives_the_pictures_and_the_stamps_in_the_messages(tmp
         assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))
 
 
+def test_a_folder_of_pictures_may_have_a_metadata_file_too(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), pictures(1)[0])
+    (tmp_path / "metadata.yaml").write_text("sensor: left\n")
+    assert len(played(str(tmp_path))) == 1
+
+
 def in_encoding(image: NDArray[np.uint8], encoding: str) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """An image as a camera with this encoding gives it, and what it must become: (H, W, 3) BGR."""
     gray = image[:, :, 0]
@@ -113,6 +119,7 @@ def test_a_video_in_messages_is_decoded(tmp_path: Path) -> None:
     encoder = av.CodecContext.create("libx264", "w")
     encoder.width, encoder.height, encoder.pix_fmt, encoder.framerate = 64, 48, "yuv420p", 25
     encoder.options = {"tune": "zerolatency"}
+    encoder.gop_size = 3
     for index in range(5):
         frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 40 * index, np.uint8), format="bgr24")
         for packet in encoder.encode(frame):
@@ -122,6 +129,11 @@ def test_a_video_in_messages_is_decoded(tmp_path: Path) -> None:
     found = played(f"{write_foxglove(tmp_path / 'press.mcap', messages, 'protobuf')}?topic={TOPIC}")
     assert [round(float(image.mean()) / 40) for image, _ in found] == [0, 1, 2, 3, 4]
     assert [t for _, t in found] == [0.0, 0.04, 0.08, 0.12, 0.16]
+    # Begun in the middle, it is shown from the next picture on that stands alone.
+    found = played(f"{write_foxglove(tmp_path / 'late.mcap', messages[1:], 'protobuf')}?topic={TOPIC}")
+    assert [round(float(image.mean()) / 40) for image, _ in found] == [3, 4]
+    with pytest.raises(SourceError, match="there is no picture in it"):
+        open_source(f"{write_foxglove(tmp_path / 'none.mcap', messages[1:3], 'protobuf')}?topic={TOPIC}")
 
 
 def test_a_bag_of_real_frames_gives_the_results_of_the_folder_to_the_bit(

@@ -110,7 +110,7 @@ def write_lerobot(root: Path, images: NDArray[np.uint8], version: str, dtype: st
     info = {"codebase_version": version, "fps": 25, "total_episodes": 2, "features": features}
     v3 = version.startswith("v3")
     rows = [
-        {"timestamp": index / 25, "episode_index": episode}
+        {"frame_index": index, "episode_index": episode}
         | (
             {KEY: {"bytes": cv2.imencode(".png", images[2 * episode + index])[1].tobytes()}}
             if dtype == "image"

@@ -237,7 +237,7 @@ def test_a_height_map_has_its_numbers_and_a_bar_that_explains_its_colours() -> N
     changed = (with_text != plain).any(axis=2)
     height, width = changed.shape
     assert changed[:40, :60].any(), "the numbers"
-    bar = with_text[-30:, width // 2 :].reshape(-1, 3).tolist()
+    bar = with_text[-30:, : width // 2].reshape(-1, 3).tolist()
     assert [84, 1, 68] in bar, "0"
     assert [37, 231, 253] in bar, "the deepest"
     assert not changed[height // 2].any()

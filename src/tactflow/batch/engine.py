@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from tactflow.batch.task import Outcome, Task
+from tactflow.batch.task import Outcome, Status, Task
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +58,16 @@ class Engine(Protocol):
         ...
 
 
-def died(task: Task, how: str) -> Outcome:
-    """The outcome of a task whose worker died, where nobody tries it again."""
-    return Outcome(task.recording.source, task.recording.name, "failed", error=how)
+def died(task: Task, status: Status, why: str) -> Outcome:
+    """The outcome of a task that no worker has told about."""
+    return Outcome(
+        task.recording.source,
+        task.recording.name,
+        status,
+        error=why,
+        pipeline=task.pipeline.digest,
+        started=time.time(),
+    )
 
 
 ThreadLimits = Mapping[str, str]

@@ -78,8 +78,11 @@ class Folder:
             if claim is not None:
                 os.close(claim)
 
-    def known(self) -> dict[str, Outcome]:
-        """What the ledgers say: source -> its last outcome. A line that was cut off counts for nothing."""
+    def known(self, pipeline: str) -> dict[str, Outcome]:
+        """What the ledgers say: source -> its last outcome, by this pipeline if there is one.
+
+        pipeline : its digest. A line that was cut off counts for nothing.
+        """
         found: dict[str, Outcome] = {}
         for path in sorted(self.ledgers.glob("*.jsonl")):
             with path.open("rb") as lines:
@@ -88,7 +91,7 @@ class Folder:
                     if outcome is None:
                         continue
                     earlier = found.get(outcome.recording)
-                    if earlier is None or earlier.started <= outcome.started:
+                    if earlier is None or _rank(earlier, pipeline) <= _rank(outcome, pipeline):
                         found[outcome.recording] = outcome
         return found
 
@@ -122,6 +125,10 @@ class Folder:
             return digest_of(path) == outcome.result_digest
         except OSError:
             return False
+
+
+def _rank(outcome: Outcome, pipeline: str) -> tuple[bool, float]:
+    return outcome.pipeline == pipeline, outcome.started
 
 
 class Ledger:

@@ -7,7 +7,8 @@ import hashlib
 import os
 import sys
 from dataclasses import dataclass
-from importlib import import_module, metadata
+from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,11 @@ from tactflow.engine.graph import Node, Pipeline
 
 LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba")
 """Packages whose version may change a number."""
-COMPUTING = ("calibration", "classic", "engine", "sim", "sinks", "sources", "stages", "vision")
-"""Rooms whose code may change a number."""
+COMPUTING = (
+    *("calibration", "classic", "engine", "recording", "sim", "sinks", "sources", "stages", "vision"),
+    *("message", "tables"),
+)
+"""Rooms and modules whose code may change a number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +103,11 @@ def _code() -> str:
     """Digest of the code that computes: in a clone, it changes while the version stays the same."""
     whole = hashlib.sha256()
     for name in COMPUTING:
-        folder = Path(import_module(f"tactflow.{name}").__path__[0])
-        for file in sorted(folder.rglob("*.py")):
+        found = find_spec(f"tactflow.{name}")
+        assert found is not None, "it comes with this one"
+        rooms = found.submodule_search_locations
+        files = [Path(str(found.origin))] if rooms is None else sorted(Path(rooms[0]).rglob("*.py"))
+        for file in files:
             whole.update(file.read_bytes())
     return whole.hexdigest()[:8]
 

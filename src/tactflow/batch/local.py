@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -63,6 +64,7 @@ class LocalProcesses:
 
     def __init__(self, workers: int, work: Work = work) -> None:
         self._work = work
+        self._host = socket.gethostname()
         self.description = f"{workers} {'process' if workers == 1 else 'processes'}"
         self._count = workers
         self._waiting: deque[Task] = deque()
@@ -72,8 +74,8 @@ class LocalProcesses:
 
     @property
     def window(self) -> int:
-        """One more than there are workers, so that none waits."""
-        return self._count + 1
+        """One task for each worker: the next comes as soon as one is done."""
+        return self._count
 
     def submit(self, task: Task) -> None:
         """Give a task to a free worker, or keep it for the next one."""
@@ -95,11 +97,10 @@ class LocalProcesses:
 
     def finished(self, timeout: float) -> Sequence[Outcome]:
         """See `Engine.finished`."""
-        by_connection = {worker.connection: worker for worker in self._workers}
+        ready = wait([worker.connection for worker in self._workers], timeout)
         outcomes: list[Outcome] = []
-        for ready in wait(list(by_connection), timeout):
-            assert isinstance(ready, Connection)
-            outcomes += self._listen(by_connection[ready])
+        for worker in [worker for worker in self._workers if worker.connection in ready]:
+            outcomes += self._listen(worker)
         self._hand_out()
         return outcomes
 
@@ -132,7 +133,7 @@ class LocalProcesses:
 
     def headway(self) -> Sequence[Headway]:
         """What each worker is doing."""
-        return [Headway(str(w.process.pid), w.task, w.frames, w.total) for w in self._workers]
+        return [Headway(f"{self._host}:{w.process.pid}", w.task, w.frames, w.total) for w in self._workers]
 
     def close(self, *, kill: bool) -> None:
         """End all workers."""

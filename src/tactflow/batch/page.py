@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from html import escape
 from importlib.resources import files
-from itertools import groupby, islice
+from itertools import chain, groupby, islice
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -50,22 +50,39 @@ def write_page(folder: Folder, rows: Sequence[Row], title: str, facts: Iterable[
     ------
     StageError : it cannot be written.
     """
-    path = folder.path / "index.html"
-    unfinished = folder.path / f".index-{os.getpid()}.html"
-    template = files("tactflow.batch").joinpath("page.html").read_text(encoding="utf-8")
-    head, foot = template.split("<!-- rows -->\n")
     shown = list(islice(sorted(rows, key=_failed_first), MOST_ROWS))
     lines = [*facts, *_left_out(len(shown), len(rows))]
     heads = "\n".join(
         f'<th scope="col" title="{escape(help_)}"><button>{name}</button></th>'
         for name, help_ in _COLUMNS.items()
     )
-    values = {"title": escape(title), "facts": "\n".join(f"<p>{line}</p>" for line in lines)}
+    values = {
+        "title": escape(title),
+        "facts": "\n".join(f"<p>{escape(line)}</p>" for line in lines),
+        "columns": heads,
+    }
+    head, foot = filled_in("index.html", values).split("<!-- rows -->\n")
+    return replaced(folder.path / "index.html", chain([head], (_row(folder, row) for row in shown), [foot]))
+
+
+def filled_in(name: str, values: Mapping[str, str]) -> str:
+    """A page of this package with values, in HTML, in it."""
+    room = files("tactflow.batch")
+    style = room.joinpath("page.css").read_text(encoding="utf-8")
+    return Template(room.joinpath(name).read_text(encoding="utf-8")).substitute(values, style=style)
+
+
+def replaced(path: Path, parts: Iterable[str]) -> Path:
+    """Write a file in place of an earlier one, never in half; returns its path.
+
+    Raises
+    ------
+    StageError : it cannot be written.
+    """
+    unfinished = path.with_name(f".{os.getpid()}-{path.name}")
     try:
         with unfinished.open("w", encoding="utf-8") as file:
-            file.write(Template(head).substitute(values, columns=heads))
-            file.writelines(_row(folder, row) for row in shown)
-            file.write(foot)
+            file.writelines(parts)
         unfinished.replace(path)
     except OSError as error:
         raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
@@ -99,8 +116,8 @@ def _row(folder: Folder, row: Row) -> str:
     cells = [_cell(row.recording.name, name), _cell(status, f'<span class="{kind}">{status}</span>')]
     if outcome is None or outcome.status != "done":
         why = "" if outcome is None else escape(outcome.error or "")
-        blank = _cell("", "") * (len(_COLUMNS) - len(cells))
-        return f'<tr>{"".join(cells)}{blank}<td class="why" colspan="2">{why}</td></tr>\n'
+        across = len(_COLUMNS) - len(cells) + 2
+        return f'<tr>{"".join(cells)}<td class="why" colspan="{across}">{why}</td></tr>\n'
     cells += _numbers(outcome)
     record = folder.record(outcome.key) or {"curve": [], "pictures": []}
     notes = "".join(f"<small>{escape(note)}</small>" for note in outcome.notes)

@@ -15,9 +15,29 @@ from tactflow.sources.base import find_path
 from tactflow.sources.files import IMAGE_SUFFIXES, natural_key
 
 FILE_SUFFIXES = frozenset(
-    [".avi", ".m4v", ".mcap", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".npy", ".ogv", ".webm", ".wmv"]
+    [
+        ".avi",
+        ".bag",
+        ".h5",
+        ".hdf5",
+        ".m4v",
+        ".mcap",
+        ".mkv",
+        ".mov",
+        ".mp4",
+        ".mpeg",
+        ".mpg",
+        ".npy",
+        ".ogv",
+        ".webm",
+        ".wmv",
+    ]
 )
 """Files of a folder that are taken for recordings; one that is named is taken whatever it is called."""
+FOLDERS = frozenset([".zarr"])
+"""Folders that are taken for one recording."""
+LEROBOT = "lerobot:"
+"""How the name of an episode of a LeRobot dataset begins."""
 LISTS = frozenset([".txt", ".list"])
 """Files that name recordings, one a line."""
 _SHOWN = 10
@@ -40,7 +60,7 @@ class Recording:
         """The file, or the folder, also of a pattern; None for the simulated sensor."""
         if self.source.startswith("sim:"):
             return None
-        path = Path(self.source.partition("?")[0])
+        path = Path(self.source.removeprefix(LEROBOT).partition("?")[0])
         while "*" in path.name or "[" in path.name:
             path = path.parent
         return path
@@ -88,6 +108,7 @@ def _named(word: str, directory: Path | None, mistakes: list[str]) -> Iterator[s
     if word.isdecimal() or word.startswith("/dev/") or re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", word):
         mistakes.append(f"{word}: is live; a batch takes recordings. `tactflow record` makes one")
         return
+    kind, word = (LEROBOT, word.removeprefix(LEROBOT)) if word.startswith(LEROBOT) else ("", word)
     plain, mark, options = word.partition("?")
     if glob.has_magic(plain):
         yield from _matching(word, directory)
@@ -95,7 +116,7 @@ def _named(word: str, directory: Path | None, mistakes: list[str]) -> Iterator[s
     path = find_path(plain, directory)
     if path.suffix.lower() in LISTS and path.is_file():
         yield from _sources(_lines(path), path.parent, mistakes)
-    elif path.is_dir() and not mark and path.suffix.lower() not in FILE_SUFFIXES:
+    elif path.is_dir() and not mark and path.suffix.lower() not in FOLDERS:
         found = list(_inside(path))
         if not found:
             mistakes.append(f"{word}: there is no recording in this folder")
@@ -103,7 +124,7 @@ def _named(word: str, directory: Path | None, mistakes: list[str]) -> Iterator[s
     elif path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
         mistakes.append(f"{word}: is one picture; name its folder, or quote the pattern: '{path.parent}/*'")
     else:
-        yield _absolute(path) + mark + options
+        yield kind + _absolute(path) + mark + options
 
 
 def _matching(pattern: str, directory: Path | None) -> Iterator[str]:
@@ -129,7 +150,9 @@ def _matching(pattern: str, directory: Path | None) -> Iterator[str]:
 def _inside(folder: Path) -> Iterator[str]:
     """A folder with pictures is a recording; else what is in it, and in the folders in it."""
     for place, folders, files in os.walk(folder):
-        folders[:] = sorted((name for name in folders if name[0] != "."), key=natural_key)
+        whole = sorted((n for n in folders if Path(n).suffix.lower() in FOLDERS), key=natural_key)
+        folders[:] = sorted((n for n in folders if n[0] != "." and n not in whole), key=natural_key)
+        yield from (_absolute(Path(place, name)) for name in whole)
         seen = sorted((name for name in files if name[0] != "."), key=natural_key)
         if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in seen):
             yield _absolute(Path(place))

@@ -40,7 +40,7 @@ class Plan:
         if self.done:
             parts.append(f"{len(self.done)} done before")
         if self.changed:
-            parts.append(f"{self.changed} changed since")
+            parts.append(f"{self.changed} done of another input, pipeline or version")
         if self.done or self.changed:
             parts.append(f"{len(self.left) - self.changed} new or failed before")
         return ", ".join(parts)
@@ -65,7 +65,7 @@ def make_plan(
 
     A recording whose size and time are as they were when it was read is not read again, unless `verify`.
     """
-    known = {} if verify else folder.known()
+    known = {} if verify else folder.known(request.digest)
     done: dict[str, Outcome] = {}
     left: list[Recording] = []
     changed = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -92,6 +92,14 @@ class Thumbnail:
     jpeg: str
 
 
+class Looker(Protocol):
+    """Looks at every result of a run."""
+
+    def add(self, tick: Tick, results: Results) -> None:
+        """Take one frame."""
+        ...
+
+
 class Summary:
     """Looks at every result of a run; memory does not grow with the recording."""
 
@@ -154,17 +162,17 @@ def picture_of(raw: NDArray[np.uint8], results: Results, side: int = PICTURE_SID
 
 
 class _LookOn(Sink):
-    """Hands every result to a summary."""
+    """Hands every result to whoever looks on."""
 
-    summary: Summary
+    looker: Looker
 
     def write(self, tick: Tick, results: Results) -> None:
-        self.summary.add(tick, results)
+        self.looker.add(tick, results)
 
 
-def with_summary(pipeline: Pipeline, summary: Summary) -> Pipeline:
-    """The pipeline with a sink that lets a summary look on."""
-    values: dict[str, Any] = {"summary": summary, "__annotations__": {}}
+def with_looker(pipeline: Pipeline, looker: Looker) -> Pipeline:
+    """The pipeline with a sink that lets somebody look on."""
+    values: dict[str, Any] = {"looker": looker, "__annotations__": {}}
     sink = component(type("LookOn", (_LookOn,), values), _SINK, "tactflow.batch", ())
     inputs = {port.name: pipeline.last_output(port.name) for port in sink.ports.inputs}
     node = Node(_SINK, sink, StageParams(), inputs, Mark("tactflow.batch", 0, 0))

@@ -11,11 +11,10 @@ import os
 import socket
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import orjson
 
@@ -29,15 +28,18 @@ from tactflow.batch.keys import (
     result_key,
     versions,
 )
-from tactflow.batch.summary import Summary, with_summary
+from tactflow.batch.recordings import Recording
+from tactflow.batch.summary import Summary, with_looker
 from tactflow.batch.task import Format, Outcome, PipelineRequest, Report, Task, result_name
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Mark, Pipeline
 from tactflow.engine.run import Progress
 
 DEADLY = 2
 """Workers that a recording may kill before it is set aside."""
+_SRC = Mark("SRC", 0, 0)
+"""Where the source stands: not in the pipeline file, which is not to blame for it."""
 _MOST_NOTES = 5
 """Warnings that are kept of one recording. Chosen by hand."""
 
@@ -116,7 +118,7 @@ def _run(task: Task, blank: Outcome, report: Report) -> tuple[Outcome, Summary]:
     unfinished = Path(task.scratch, f"{os.getpid()}-{name}")
     summary = Summary()
     pipeline = _for_recording(task, unfinished)
-    runner = make_runner(with_summary(pipeline, summary))
+    runner = make_runner(with_looker(pipeline, summary))
 
     def progress(now: Progress) -> None:
         report(now.frames, None if runner.source is None else runner.source.total)
@@ -200,22 +202,28 @@ def _for_recording(task: Task, path: Path) -> Pipeline:
             f"the worker {socket.gethostname()} would compute something else: "
             + (", ".join(other) or f"{task.pipeline.file}, or a file that it names, has changed; call again")
         )
-    nodes = dict(pipeline.nodes)
-    source, (sink,) = pipeline.source, pipeline.sinks
-    wanted = {"source": task.recording.source, "realtime": False}
-    read = source.params.changed(**{k: v for k, v in wanted.items() if k in type(source.params).model_fields})
-    nodes[source.id] = replace(source, params=read)
+    (sink,) = pipeline.sinks
     # Not in parts of so many seconds each: the same recording shall give the same files.
     flush = {"flush": math.inf} if task.format == "parquet" else {}
-    nodes[sink.id] = replace(sink, params=sink.params.changed(path=str(path), overwrite=True, **flush))
-    return replace(pipeline, nodes=nodes, settings=_as_run(pipeline, wanted, sink.component.name))
+    params = sink.params.changed(path=str(path), overwrite=True, **flush)
+    opened = reading(pipeline, task.recording)
+    return replace(opened, nodes={**opened.nodes, sink.id: replace(sink, params=params)})
 
 
-def _as_run(pipeline: Pipeline, source: Mapping[str, Any], sink: str) -> Mapping[str, Any]:
-    """The settings, for who finds them in a result: of what was run."""
+def reading(pipeline: Pipeline, recording: Recording) -> Pipeline:
+    """The pipeline with a recording as its source; its settings, which results keep, say so."""
+    source = pipeline.source
+    wanted = {"source": recording.source, "realtime": False}
+    wanted = {key: value for key, value in wanted.items() if key in type(source.params).model_fields}
     stages = dict(pipeline.settings["stages"])
-    stages[pipeline.source.id] = {**(stages[pipeline.source.id] or {}), **source}
-    return {**pipeline.settings, "stages": stages, "sinks": {sink: {}}}
+    stages[source.id] = {**(stages[source.id] or {}), **wanted}
+    settings = {
+        **pipeline.settings,
+        "stages": stages,
+        "sinks": {n.component.name: {} for n in pipeline.sinks},
+    }
+    nodes = {**pipeline.nodes, source.id: replace(source, params=source.params.changed(**wanted), mark=_SRC)}
+    return replace(pipeline, nodes=nodes, settings=settings)
 
 
 def _is_disk_full(error: BaseException | None) -> bool:

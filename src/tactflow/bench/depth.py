@@ -46,10 +46,17 @@ def measure_simulated(unit: CopyUnit) -> list[Measurement]:
     made = []
     for light in LIGHTS:
         known = learn(f"ball?frames=600&light={light}")
+        ratios: list[float] = []
         for name in SCENES:
             scene = open_scene(f"{name}?seed=11&light={light}")
-            made.append(_tried(known, scene, Measurement("depth", light, name), unit))
+            made.append(_tried(known, scene, Measurement("depth", light, name), unit, ratios))
+        within = {f"depth_within_{name}": _share(ratios, bound) for name, bound in (("one", 1), ("two", 2))}
+        made.append(Measurement("depth", light, "all", frames=len(ratios), errors=within))
     return made
+
+
+def _share(ratios: list[float], bound: float) -> float:
+    return 100 * float(np.mean(np.array(ratios) < bound))
 
 
 def learn(spec: str) -> Photometry:
@@ -94,10 +101,12 @@ def noisy(image: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
     return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
 
 
-def _tried(known: Photometry, scene: Scene, measurement: Measurement, unit: CopyUnit) -> Measurement:
+def _tried(
+    known: Photometry, scene: Scene, measurement: Measurement, unit: CopyUnit, ratios: list[float]
+) -> Measurement:
     preprocess = _preprocessor()
     rest = Rest(scene.truth(0, preprocess).unmarked)
-    surface = Surface(known.model, scale())
+    surface = Surface(known.model, scale(), known.found.errors())
     rms, volumes, samples = [], [], Samples()
     for index in deepest(scene):
         truth = scene.truth(index, preprocess)
@@ -107,6 +116,8 @@ def _tried(known: Photometry, scene: Scene, measurement: Measurement, unit: Copy
         sunk = truth.sunk * RAW_MM
         around = sunk > 0.02 * sunk.max()
         rms.append(float(np.sqrt(np.mean((found.heights - sunk)[around] ** 2)) / sunk.max()))
+        assert found.greatest_stderr is not None
+        ratios.append(abs(found.greatest - float(sunk.max())) / found.greatest_stderr)
         volumes.append(abs(found.volume / (float(sunk.sum()) * scale().area(1.0)) - 1))
     measurement.frames = len(rms)
     measurement.errors = {

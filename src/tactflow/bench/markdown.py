@@ -77,8 +77,9 @@ def markdown(result: Result, default: str) -> str:
     kind = "quick" if result.quick else "full"
     parts = [
         f"Measured by a {kind} run of {result.wall_s:.0f} s on {machine}. One copy of a raw frame took "
-        f"{result.copy_ms:.3f} ms; to read and write every byte of it once, "
-        f"{format_number(result.touch_ms / result.copy_ms)} copies.",
+        f"{result.copy_ms:.3f} ms, between memory that is there; to read and write every byte of it once, "
+        f"{format_number(result.touch_ms / result.copy_ms)} copies. A page of fresh memory costs "
+        f"{format_number(result.fault_us)} µs.",
         "### Promises and results",
         _targets(result),
         "### Whole pipelines, scene by scene",

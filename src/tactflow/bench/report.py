@@ -26,6 +26,7 @@ TITLES = {
     "tracker": "Marker tracking",
     "flow_in_mask": "Flow inside the contact",
     "depth": "Heights in mm, by light",
+    "motion": "Motion of the gel between the dots, and slip",
 }
 """Group -> heading."""
 
@@ -38,6 +39,7 @@ PRIMARY = {
     "tracker": ("displacement_rms", "displacement_p99", "wrong_percent"),
     "flow_in_mask": ("flow_error",),
     "depth": ("depth_rms", "volume_error"),
+    "motion": ("field_rms",),
 }
 """Group -> quantities that are plotted; the first one decides the answer."""
 

@@ -72,13 +72,15 @@ class Result:
     """A whole run of the bench.
 
     quick : whether it was the short one. machine : what it ran on. copy_ms, touch_ms : the unit of time and
-    the cost of touching every byte of a raw frame once, ms. wall_s : how long the run took.
+    the cost of touching every byte of a raw frame once, ms. fault_us : the cost of a page of fresh memory,
+    us. wall_s : how long the run took.
     """
 
     quick: bool
     machine: dict[str, str] = field(default_factory=dict)
     copy_ms: float = math.nan
     touch_ms: float = math.nan
+    fault_us: float = math.nan
     wall_s: float = 0.0
     measurements: list[Measurement] = field(default_factory=list)
     targets: list[Target] = field(default_factory=list)

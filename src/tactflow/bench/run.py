@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tactflow.bench import depth, gels, recordings
+from tactflow.bench import depth, gels, motion, recordings
 from tactflow.bench.methods import CLASSIC, measure_methods
 from tactflow.bench.pictures import draw
 from tactflow.bench.pipelines import (
@@ -215,6 +215,8 @@ class _Run:
         if not self.plan.quick and self.plan.scenes is None:
             self.doing = "depth"
             found += depth.measure_simulated(self.unit)
+            self.doing = "motion"
+            found += motion.measure(self.unit)
 
     def growth(self, scratch: Path) -> float | None:
         """What `pipelines.growth` says of the default pipeline; None in a run that leaves it out."""
@@ -269,7 +271,8 @@ class _Run:
     def finished(self, growth: float | None) -> Result:
         """The result, its promises judged."""
         result = self.result
-        result.copy_ms, result.touch_ms = self.unit.copy_ms, self.unit.touch_ms
+        unit = self.unit
+        result.copy_ms, result.touch_ms, result.fault_us = unit.copy_ms, unit.touch_ms, unit.fault_us
         wedge = WEDGE if WEDGE in self.loaded else DEFAULT
         result.targets = judge(result, DEFAULT, growth, wedge=wedge, markerless=MARKERLESS)
         self.progress("done", self.total, self.total)

@@ -12,6 +12,7 @@ The unit "copy" is the median time in which the same machine, in the same run, c
 from __future__ import annotations
 
 import gc
+import mmap
 import statistics
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping
@@ -21,6 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 BLOCK = 20
 """Frames that an alternative gets in a turn. After the turns of others its first frame takes 1.5 to 2 times
@@ -134,14 +136,20 @@ class CopyUnit:
     belong to a file in the page cache make no difference. Take many in a row, as pipelines are given many
     frames in a row: the first copy after other work takes a fifth to a half longer than the next ones, and
     the median of single ones changes with whatever that work was.
+
+    All of that memory has been written before. What it costs to write to memory for the first time, so that
+    the operating system must provide it page by page, is `fault_us`: on some machines a copy into fresh
+    memory takes several times as long as one into memory that is there.
     """
 
     _POOL = 120
+    _FRESH_EVERY = 8
 
     def __init__(self) -> None:
         self._pool = [np.full(RAW_SHAPE, value, dtype=np.uint8) for value in range(self._POOL)]
         self._copies: list[float] = []
         self._touches: list[float] = []
+        self._fresh: list[float] = []
 
     def take(self, repeats: int = 1) -> None:
         """Measure `repeats` times."""
@@ -156,6 +164,22 @@ class CopyUnit:
             end = time.perf_counter()
             self._copies.append(middle - start)
             self._touches.append(end - middle)
+            if here % self._FRESH_EVERY == 0:
+                self._take_fresh(a)
+
+    def _take_fresh(self, source: NDArray[np.uint8]) -> None:
+        with mmap.mmap(-1, source.nbytes) as memory:
+            fresh = np.frombuffer(memory, np.uint8).reshape(source.shape)
+            start = time.perf_counter()
+            np.copyto(fresh, source)
+            self._fresh.append(time.perf_counter() - start)
+            del fresh
+
+    @property
+    def fault_us(self) -> float:
+        """Median time to provide one page of fresh memory, us."""
+        pages = self._pool[0].nbytes / mmap.PAGESIZE
+        return max(0.0, 1e6 * (statistics.median(self._fresh) - statistics.median(self._copies)) / pages)
 
     @property
     def copy_ms(self) -> float:

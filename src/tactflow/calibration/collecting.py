@@ -24,6 +24,7 @@ def collect(
     values: Mapping[str, Any],
     needed: Mapping[str, str],
     calibration: Path | None = None,
+    watchers: Mapping[str, Node] | None = None,
 ) -> Any:
     """Run a pipeline with a sink of ours in place of its own, nothing skipped; returns the sink.
 
@@ -33,6 +34,7 @@ def collect(
     ----------
     sink, values : its class, and attributes that it gets.
     needed : port -> the stage that gives it. calibration : the file to use, in place of the pipeline's own.
+    watchers : sinks that look on, by their ids.
 
     Raises
     ------
@@ -42,11 +44,13 @@ def collect(
     made = component(type(sink.__name__, (sink,), attributes), _COLLECT, "tactflow calibrate", ())
     inputs = {port.name: pipeline.last_output(port.name) for port in made.ports.inputs}
     # Of a gel without markers the picture itself is without them.
-    inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
+    if "unmarked" in inputs:
+        inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
     for port, stage in needed.items():
         if inputs[port] is None:
             raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
     kept = {id_: node for id_, node in pipeline.nodes.items() if node.component.kind != "sink"}
+    kept.update(watchers or {})
     kept[_COLLECT] = Node(_COLLECT, made, StageParams(), inputs, Mark(_COLLECT, 0, 0))
     runner = make_runner(replace(pipeline, nodes=kept, skipping=False, calibration=calibration))
     with ending_handled(lambda _number, _frame: runner.stop()):

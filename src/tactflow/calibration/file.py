@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Container
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from tactflow import __version__
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.depth.slopes import SlopeModel
+from tactflow.vision.depth.surface import SurfaceErrors
 from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, ForceModel, LinearForce
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
@@ -59,7 +61,7 @@ class PhotometricEntry(_Strict):
 
     ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. radius_error : median
     of the fitted radius over the true one, less 1. sphere_rms : of the heights from the fitted ball, mm.
-    depth_stderr, volume_stderr : relative to the value.
+    depth_stderr, volume_stderr : of balls, relative to the value. steepest : see `SurfaceErrors`.
     """
 
     ball_radius: float = Field(gt=0)
@@ -70,6 +72,11 @@ class PhotometricEntry(_Strict):
     sphere_rms: float
     depth_stderr: float
     volume_stderr: float
+    steepest: float | None = None
+
+    def errors(self) -> SurfaceErrors:
+        """What the standard errors of heights come from."""
+        return SurfaceErrors(self.depth_stderr, self.volume_stderr, self.steepest)
 
 
 class LinearForceEntry(_Strict):
@@ -203,13 +210,13 @@ class Calibration:
 
     @classmethod
     def load(cls, path: Path) -> Calibration:
-        """Read a calibration file.
+        """Read a calibration file, or the one that a recording (`.mcap`) was made with.
 
         Raises ConfigError if it or its arrays are not there, or are no calibration.
         """
         try:
-            said = _File.model_validate(yaml.safe_load(_bounded(path).decode("utf-8")))
-            arrays = _arrays(_bounded(path.with_suffix(".npz")))
+            said = _File.model_validate(yaml.safe_load(stored_text(path).decode("utf-8")))
+            arrays = _arrays(stored_arrays(path))
             look = np.asarray(arrays["look"], np.float32)
             slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
         except OSError as error:
@@ -298,6 +305,39 @@ def _bounded(path: Path) -> bytes:
     if len(data) > LARGEST:
         raise ValueError(f"{path} is larger than {LARGEST >> 20} MiB")
     return data
+
+
+def stored_text(path: Path) -> bytes:
+    """The YAML file of a calibration: the file itself, or what is attached to a recording.
+
+    Raises OSError or ValueError if it is not there, or larger than any calibration.
+    """
+    return _recorded(path, "calibration.yaml") if path.suffix == ".mcap" else _bounded(path)
+
+
+def stored_arrays(path: Path) -> bytes:
+    """The `.npz` file of a calibration; as `stored_text`."""
+    if path.suffix == ".mcap":
+        return _recorded(path, "calibration.npz")
+    return _bounded(path.with_suffix(".npz"))
+
+
+def _recorded(path: Path, name: str) -> bytes:
+    from tactflow.recording.reader import attachments
+
+    found = attachments(path)
+    if not is_kept(found):
+        raise ValueError("the recording was made without a calibration")
+    return found[name]
+
+
+def is_kept(attached: Container[str]) -> bool:
+    """Whether a recording with these files attached was made with a calibration.
+
+    >>> is_kept(["pipeline.yaml"])
+    False
+    """
+    return "calibration.yaml" in attached and "calibration.npz" in attached
 
 
 def _arrays(data: bytes) -> dict[str, NDArray[Any]]:

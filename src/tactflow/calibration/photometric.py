@@ -118,7 +118,11 @@ def fit_photometry(session: Session, scale: Scale, ball_radius: float) -> Photom
         centers[good] = refitted[good]
     errors = _held_out(session, samples, good, rest, scale, ball_radius)
     found = PhotometricEntry(
-        ball_radius=ball_radius, presses=len(good), rejected=len(samples) - len(good), **errors
+        ball_radius=ball_radius,
+        presses=len(good),
+        rejected=len(samples) - len(good),
+        steepest=max(samples[i].reach for i in good) / ball_radius,
+        **errors,
     )
     pixels = centers / (scale.x, scale.y) + scale.origin
     return Photometry(SlopeModel(_shaped(weights)), found, pixels, kept, misfit)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Node, Pipeline
 from tactflow.ports import ContactMask, MarkerMask, Unmarked
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Markers
@@ -56,12 +56,32 @@ class Session:
     frames: int
 
 
-Report = Callable[[int, Sequence["Press"], bool], bool]
+Report = Callable[[int, list["Press"], bool], bool]
 """Called with each frame: how many there were, the presses so far, and whether the last one still lasts.
-Returns whether that is enough for a live source; of a recording all is read."""
+Returns whether that is enough for a live source; of a recording all is read. A press that is over may be
+taken out of the list: it was undone."""
 
 
-def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, _lasts: False) -> Session:
+class Keeper(Protocol):
+    """Where presses of a live source are kept, see `tactflow.calibration.keeping`."""
+
+    @property
+    def presses(self) -> list[Press]:
+        """Those of before."""
+
+    def check(self, untouched: NDArray[np.uint8], mapping: PixelMapping) -> None:
+        """Raise ConfigError if the session cannot go on with these frames."""
+
+    def sync(self, presses: Sequence[Press]) -> None:
+        """Save those that are new, forget those that are no more."""
+
+
+def find_presses(
+    pipeline: Pipeline,
+    report: Report = lambda _frames, _presses, _lasts: False,
+    keeper: Keeper | None = None,
+    watchers: Mapping[str, Node] | None = None,
+) -> Session:
     """Run a pipeline on its source and collect the presses in it.
 
     A press lasts as long as something touches at about one place; of each, the frame with the largest
@@ -70,7 +90,8 @@ def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, 
 
     Parameters
     ----------
-    pipeline : with stages that give `unmarked` and `contact`. report : see `Report`.
+    pipeline : with stages that give `unmarked` and `contact`. report : see `Report`. keeper : has the presses
+        of before, and keeps the new ones, of a live source. watchers : sinks that look on, by their ids.
 
     Raises
     ------
@@ -78,13 +99,15 @@ def find_presses(pipeline: Pipeline, report: Report = lambda _frames, _presses, 
     TactflowError : a stage or the source failed.
     """
     needed = {"unmarked": "preprocess", "contact": "hull"}
-    return _session(collect(pipeline, _Collect, {"report": report}, needed))
+    values = {"report": report, "keeper": lambda: keeper}
+    return _session(collect(pipeline, _Collect, values, needed, watchers=watchers))
 
 
 class _Collect(Sink):
     """Keeps the largest contact of each press."""
 
     report: Report
+    keeper: Callable[[], Keeper | None]
 
     def __init__(self, params: StageParams, control: Control) -> None:
         super().__init__(params)
@@ -95,6 +118,14 @@ class _Collect(Sink):
         self.dots = np.zeros((0, 2))
         self.frames = 0
         self._open = False
+        self._keeper: Keeper | None = None
+        self._checked = False
+
+    def open(self) -> None:
+        """Go on with the presses of before."""
+        if self._control.source is not None and self._control.source.live:
+            self._keeper = self.keeper()
+            self.presses = [] if self._keeper is None else self._keeper.presses
 
     def write(
         self,
@@ -118,10 +149,23 @@ class _Collect(Sink):
         else:
             radius = float(np.sqrt(np.count_nonzero(contact_mask) / np.pi))
             hidden = np.zeros(unmarked.shape[:2], np.bool_) if marker_mask is None else marker_mask > 0
+            if self._keeper is not None and not self._checked:
+                self._checked = True
+                self._keeper.check(self.untouched(), mapping or PixelMapping.identity(self.size()))
             self._add(Press(tick.frame.seq, unmarked, contact_mask, hidden, contact.center, radius))
         enough = self.report(self.frames, self.presses, self._open)
+        if self._keeper is not None:
+            self._keeper.sync(self.presses[: len(self.presses) - self._open])
         if enough and self._control.source is not None and self._control.source.live:
             self._control.stop()
+
+    def untouched(self) -> NDArray[np.uint8]:
+        """(H, W, 3): mean of the reference frames."""
+        return np.asarray(np.rint(np.mean(self.rest, axis=0)), np.uint8)
+
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames, px."""
+        return self.rest[0].shape[1], self.rest[0].shape[0]
 
     def _add(self, press: Press) -> None:
         """A press of its own, or another moment of the last one."""
@@ -139,11 +183,9 @@ class _Collect(Sink):
 def _session(collected: _Collect) -> Session:
     if not collected.rest:
         raise ConfigError("calibrate: the source has no frames")
-    untouched = np.rint(np.mean(collected.rest, axis=0)).astype(np.uint8)
-    size = (untouched.shape[1], untouched.shape[0])
     return Session(
-        untouched,
-        collected.mapping or PixelMapping.identity(size),
+        collected.untouched(),
+        collected.mapping or PixelMapping.identity(collected.size()),
         collected.presses,
         collected.dots,
         collected.frames,

@@ -5,25 +5,33 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
+from tactflow.batch.cluster import DaskCluster
+from tactflow.batch.compare import compare
+from tactflow.batch.compare_page import described, text_table, write_comparison
 from tactflow.batch.engine import Engine
 from tactflow.batch.folder import Folder, Ledger
 from tactflow.batch.local import LocalProcesses
 from tactflow.batch.page import write_page
 from tactflow.batch.recordings import Recording, find_recordings
-from tactflow.batch.run import Plan, Result, Stopping, make_plan, resolved, run_batch
+from tactflow.batch.run import Result, Stopping, make_plan, resolved, run_batch
 from tactflow.batch.runs import Row, require_pyarrow, write_runs
-from tactflow.batch.task import Task
+from tactflow.batch.task import Format, PipelineRequest, Task
+from tactflow.batch.work import pipeline_for, reading
 from tactflow.cli.batch_progress import batch_display, in_short
 from tactflow.cli.printable import printable
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
+from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import INTERRUPTED
 from tactflow.signals import ending_handled
 
@@ -60,6 +68,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=_positive, metavar="N", help="processes on this machine (default: one a processor)"
     )
     parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="work on the Dask cluster of this scheduler, as in tcp://host:8786, instead",
+    )
+    parser.add_argument(
+        "--dask", choices=("local",), help="start a Dask cluster on this machine, and work on that instead"
+    )
+    parser.add_argument(
         "--shard",
         type=_shard,
         default=(1, 1),
@@ -72,6 +88,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="read all recordings and results instead of trusting that what has the same size and time of "
         "change is the same",
+    )
+    parser.add_argument(
+        "--compare",
+        metavar="OTHER",
+        help="run this pipeline over the same recordings too, and tell how the numbers differ and in which "
+        "frames most; --set changes the first pipeline alone",
     )
     parser.add_argument("--fail-fast", action="store_true", help="begin nothing more once a recording fails")
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
@@ -88,37 +110,118 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "parquet":
         require_pyarrow()
     file, words = _pipeline_and_sources(args.words)
-    request = resolved(file, _overrides(args, file), args.sensor, args.format)
+    requests = [resolved(file, _overrides(args, file), args.sensor, args.format)]
+    if args.compare is not None:
+        requests.append(resolved(find_pipeline(args.compare), [], args.sensor, args.format))
+        _refuse_the_same(requests)
     recordings = find_recordings(words)
-    number, of = args.shard
-    shard = f"{number}-of-{of}"
     folder = Folder(args.out.absolute())
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
-    stopping = Stopping()
+    shard = "{}-of-{}".format(*args.shard)
     with ExitStack() as stack:
         scratch = stack.enter_context(folder.claimed(shard))
-        plan = make_plan(folder, recordings[number - 1 :: of], request, verify=args.verify)
-        if not args.quiet:
-            console.print(printable(_opening(plan, file, args.shard)), markup=False)
         ledger = stack.enter_context(Ledger(folder, shard))
+        call = _Call(args, folder, scratch, ledger, recordings)
+        stack.enter_context(ending_handled(call.stopping.count))
+        results = [call.run(request) for request in requests]
+        # Before the table is written, which a full disk may not take.
+        call.say("\n".join(_closing(results)))
+        page = call.write_reports(requests[0], results[0])
+        if len(requests) > 1:
+            page = call.compare(requests, results)
+        call.say(f"look at {page}")
+    return _code(results, call.stopping)
+
+
+class _Call:
+    """One call of the command, which may be about two pipelines."""
+
+    def __init__(
+        self,
+        args: argparse.Namespace,
+        folder: Folder,
+        scratch: Path,
+        ledger: Ledger,
+        recordings: Sequence[Recording],
+    ) -> None:
+        self.stopping = Stopping()
+        self._args = args
+        self._folder = folder
+        self._scratch = scratch
+        self._ledger = ledger
+        self._recordings = recordings
+        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
+
+    def say(self, text: str) -> None:
+        """Tell people, unless they want quiet."""
+        if not self._args.quiet:
+            self._console.print(printable(text), markup=False)
+
+    def run(self, request: PipelineRequest) -> Result:
+        """Do what is missing of one pipeline."""
+        args = self._args
+        number, of = args.shard
+        plan = make_plan(self._folder, self._recordings[number - 1 :: of], request, verify=args.verify)
+        part = "" if of == 1 else f" (part {number} of {of})"
+        self.say(f"{request.file}: {plan.words}{part}")
+        if not plan.left:
+            return Result(dict(plan.done))
 
         def make_task(recording: Recording) -> Task:
-            return Task(recording, request, args.format, str(folder.path), str(scratch), args.verify)
+            out, scratch = str(self._folder.path), str(self._scratch)
+            return Task(recording, request, args.format, out, scratch, args.verify)
 
-        stack.enter_context(ending_handled(stopping.count))
         engine = _engine(args)
-        with batch_display(console, plan, engine, shown=not args.quiet) as display:
-            result = run_batch(
-                *(plan, make_task, engine, ledger),
-                stopping=stopping,
+        with batch_display(self._console, plan, engine, shown=not args.quiet) as display:
+            return run_batch(
+                *(plan, make_task, engine, self._ledger),
+                stopping=self.stopping,
                 fail_fast=args.fail_fast,
                 told=display.told,
                 shown=display.shown,
             )
-        paths = _write_reports(args, folder, recordings, result, file)
-        if not args.quiet:
-            console.print(printable("\n".join(_closing(result, paths))), markup=False)
-    return _code(result, stopping)
+
+    def write_reports(self, request: PipelineRequest, result: Result) -> Path:
+        """The table and the page, of all parts; returns the path of the page."""
+        outcomes = result.outcomes
+        if self._args.shard != (1, 1):
+            known = self._folder.known(request.digest)
+            others = {source: o for source, o in known.items() if o.pipeline == request.digest}
+            outcomes = others | outcomes
+        rows = [Row(recording, outcomes.get(recording.source)) for recording in self._recordings]
+        write_runs(self._folder.path, rows, self._args.format)
+        title = f"{Path(request.file).stem}: {len(rows)} recordings"
+        return write_page(self._folder, rows, title, _facts(rows))
+
+    def compare(self, requests: Sequence[PipelineRequest], results: Sequence[Result]) -> Path:
+        """Say and write how the results of two pipelines differ; returns the path of the page."""
+        first, second = (result.outcomes for result in results)
+        comparison = compare(self._folder, self._recordings, first, second)
+        names = _two_names(requests)
+        self.say("\n".join([*described(comparison, names), *text_table(comparison)]))
+        openers = [partial(_opened, request, self._args.format) for request in requests]
+        return write_comparison(self._folder, comparison, names, (openers[0], openers[1]))
+
+
+def _opened(request: PipelineRequest, format_: Format, recording: Recording) -> Pipeline:
+    """A pipeline that reads a recording."""
+    pipeline, _ = pipeline_for(replace(request, digest="", versions=()), format_)
+    return reading(pipeline, recording)
+
+
+def _two_names(requests: Sequence[PipelineRequest]) -> tuple[str, str]:
+    """What two pipelines are called side by side."""
+    first, second = (Path(request.file).stem for request in requests)
+    if first == second:
+        first = f"{first} {' '.join(requests[0].overrides)}".strip()
+    return (first, second) if first != second else (requests[0].file, requests[1].file)
+
+
+def _refuse_the_same(requests: Sequence[PipelineRequest]) -> None:
+    if requests[0].digest == requests[1].digest:
+        raise ConfigError(
+            f"--compare {requests[1].file}: computes just what {requests[0].file} does; name another one, or "
+            "change the first with --set"
+        )
 
 
 def _pipeline_and_sources(words: Sequence[str]) -> tuple[Path, Sequence[str]]:
@@ -144,28 +247,16 @@ def _overrides(args: argparse.Namespace, file: Path) -> list[str]:
 
 
 def _engine(args: argparse.Namespace) -> Engine:
-    return LocalProcesses(args.workers or len(os.sched_getaffinity(0)))
+    workers = args.workers or _processors()
+    address = args.scheduler or args.dask
+    return LocalProcesses(workers) if address is None else DaskCluster(address, workers)
 
 
-def _opening(plan: Plan, file: Path, shard: tuple[int, int]) -> str:
-    part = "" if shard == (1, 1) else f" (part {shard[0]} of {shard[1]})"
-    return f"{file}: {plan.words}{part}"
-
-
-def _write_reports(
-    args: argparse.Namespace,
-    folder: Folder,
-    recordings: Sequence[Recording],
-    result: Result,
-    file: Path,
-) -> list[Path]:
-    """The table and the page, of all parts; returns their paths."""
-    outcomes = result.outcomes
-    if args.shard != (1, 1):
-        outcomes = folder.known() | outcomes
-    rows = [Row(recording, outcomes.get(recording.source)) for recording in recordings]
-    runs = write_runs(folder.path, rows, args.format)
-    return [runs, write_page(folder, rows, f"{file.stem}: {len(rows)} recordings", _facts(rows))]
+def _processors() -> int:
+    """Processors that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _facts(rows: Sequence[Row]) -> list[str]:
@@ -181,25 +272,27 @@ def _facts(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def _closing(result: Result, paths: Sequence[Path]) -> list[str]:
+def _closing(results: Sequence[Result]) -> list[str]:
     """The summary at the end."""
-    fresh = [o for o in result.outcomes.values() if o.status == "done" and not o.reused]
-    again = sum(o.reused for o in result.outcomes.values())
-    lines = [f"{len(fresh)} done now, {again} were done before, {len(result.failed)} failed"]
-    if result.undone:
-        lines[0] += f", {len(result.undone)} not done: call again to do the rest"
-    if result.ended is not None:
-        lines.append(f"ended early: {result.ended}")
-    lines += [f"  {o.status}: {o.name}: {in_short(o)}" for o in result.failed[:_FAILED_SHOWN]]
-    if len(result.failed) > _FAILED_SHOWN:
-        lines.append(f"  and {len(result.failed) - _FAILED_SHOWN} more, see {paths[0]}")
-    return [*lines, f"look at {paths[1]}"]
+    outcomes = [outcome for result in results for outcome in result.outcomes.values()]
+    failed = [outcome for result in results for outcome in result.failed]
+    undone = sum(len(result.undone) for result in results)
+    again = sum(outcome.reused for outcome in outcomes)
+    lines = [f"{len(outcomes) - len(failed) - again} done now, {again} done before, {len(failed)} failed"]
+    if undone:
+        lines[0] += f", {undone} not done: call again to do the rest"
+    lines += [f"ended early: {result.ended}" for result in results if result.ended is not None]
+    lines += [f"  {o.status}: {o.name}: {in_short(o)}" for o in failed[:_FAILED_SHOWN]]
+    if len(failed) > _FAILED_SHOWN:
+        lines.append(f"  and {len(failed) - _FAILED_SHOWN} more; the table of runs has all")
+    return lines
 
 
-def _code(result: Result, stopping: Stopping) -> int:
-    if stopping.signals and result.undone:
+def _code(results: Sequence[Result], stopping: Stopping) -> int:
+    undone = any(result.undone for result in results)
+    if stopping.signals and undone:
         return INTERRUPTED
-    return StageError.exit_code if result.failed or result.undone else 0
+    return StageError.exit_code if undone or any(result.failed for result in results) else 0
 
 
 def _positive(text: str) -> int:

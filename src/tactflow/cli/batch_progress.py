@@ -20,6 +20,8 @@ DRAW_EVERY = 0.5
 """Time between two pictures of the progress, s. Chosen by hand."""
 
 
+_MOST_WORKERS = 16
+"""Workers that are shown. Chosen by hand: they fit on a terminal."""
 _LONGEST = 200
 """Letters of a message in a list of many. Chosen by hand."""
 
@@ -41,9 +43,8 @@ class BatchDisplay:
         """Count an outcome; one that failed is named at once."""
         self._count += 1
         self._frames += outcome.frames
-        process = outcome.worker.rpartition(":")[2]
         if outcome.seconds > 0:
-            self._rates[process] = outcome.frames / outcome.seconds
+            self._rates[outcome.worker] = outcome.frames / outcome.seconds
         if outcome.status != "done":
             self._failed += 1
             if self._talks:
@@ -70,12 +71,21 @@ class BatchDisplay:
             f"{rate:.0f} frames/s",
             f"{_time(elapsed)} so far, {_estimate(self._count, left, elapsed)}",
         )
-        for worker in engine.headway():
+        at_work = engine.headway()
+        if not at_work:
+            for name in sorted(self._rates)[:_MOST_WORKERS]:
+                table.add_row(f"  worker {name}", self._pace(name))
+        for worker in at_work[:_MOST_WORKERS]:
             what = "waits" if worker.task is None else worker.task.recording.name
             frames = f"{worker.frames} of {worker.total or '?'} frames" if worker.task else ""
-            pace = f"{self._rates[worker.worker]:.0f} frames/s" if worker.worker in self._rates else ""
-            table.add_row(f"  worker {worker.worker}", pace, escape(printable(what)), frames)
+            table.add_row(
+                f"  worker {worker.worker}", self._pace(worker.worker), escape(printable(what)), frames
+            )
         return table
+
+    def _pace(self, worker: str) -> str:
+        """How fast a worker was in its last recording."""
+        return f"{self._rates[worker]:.0f} frames/s" if worker in self._rates else ""
 
 
 def in_short(outcome: Outcome) -> str:

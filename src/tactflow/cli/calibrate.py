@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
+from rich.console import Console
 
 from tactflow.api import load
 from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_picture
+from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
-from tactflow.calibration.presses import Press, Report, Session, find_presses
+from tactflow.calibration.presses import Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
-from tactflow.cli.calibrate_force import add_force
+from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_force
+from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
+from tactflow.cli.guide import Guide, typed_lines
+from tactflow.cli.notes import notes_on
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Node, Pipeline
+from tactflow.view.guided import Guiding
 from tactflow.vision.types import Scale
 
-LIGHT: Final = 0.3
-"""Radius of a contact over that of the ball, below which a press is called light. Chosen by hand."""
 WORSE: Final = 1.5
 """Error on new presses over that in the file, from which on a calibration is called drifted. By hand."""
 
@@ -31,10 +34,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what",
         nargs="*",
-        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE]",
+        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE] | lens PICTURES",
         help="a pipeline with the sensor's preprocess, to make a calibration (default: ./pipeline.yaml, else "
         "the packaged one); or check, and a calibration file, to see how well it fits today; or force, and a "
-        "calibration file, to add to it how the force follows from the contact",
+        "calibration file, to add to it how the force follows from the contact; or lens, and pictures of a "
+        "printed target, to get undistort and homography of a preprocess",
     )
     parser.add_argument(
         "--source",
@@ -47,8 +51,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sensor", metavar="NAME", help="which one of a file with sensors")
     parser.add_argument("--out", type=Path, metavar="FILE", help="calibration/SENSOR.yaml unless given")
+    parser.add_argument(
+        "--realtime", action="store_true", help="play a recording at its own pace, like a camera, to try it"
+    )
+    parser.add_argument(
+        "--fresh", action="store_true", help="forget the presses of a session that was broken off"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
-    parser.add_argument("--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel")
+    parser.add_argument(
+        "--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel, or of the target"
+    )
     parser.add_argument(
         "--area",
         type=float,
@@ -61,19 +73,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--presses", type=int, default=30, metavar="N", help="of a live source: enough presses (30)"
     )
     parser.add_argument(
-        "--csv",
-        type=Path,
-        metavar="FILE",
-        help="for force: what the gauge said, where it does not lie beside the recording; columns t (s) or "
-        "frame, fz (N), and fx and fy if there are",
+        "--view", action="store_true", help="show the live page, which says where to press next"
     )
-    parser.add_argument(
-        "--offset",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="for force: add so much to the time of the CSV; what is left, up to 2 s, is estimated",
-    )
+    add_target_arguments(parser)
+    add_force_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -93,6 +96,8 @@ def run(args: argparse.Namespace) -> int:
         if len(words) not in (2, 3):
             raise ConfigError("calibrate force: required a calibration file, and a pipeline if wanted")
         return add_force(args, Path(words[1]), words[2] if len(words) == 3 else None)
+    if words[:1] == ["lens"]:
+        return print_lens(args, words[1:])
     if len(words) > 1:
         raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
     return _make(args, words[0] if words else None)
@@ -110,10 +115,36 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     if args.ball_radius is not None:
         _say(
             "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
-            f"all over the gel and to several depths. {args.presses} presses will do; Ctrl-C ends earlier."
+            f"all over the gel and to several depths. {args.presses} presses will do. Type u and Enter to "
+            "undo the last one, q and Enter or Ctrl-C to end earlier; what was pressed is kept."
         )
-    session = find_presses(loaded, _guide(args))
-    scale = _scale(args, session)
+    kept = KeptPresses(out.with_suffix(".presses"))
+    if args.fresh:
+        kept.clear()
+    guide = Guide(args.presses, _say, typed_lines())
+    with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
+        session = find_presses(loaded, guide, kept, _page(loaded, guide) if args.view else None)
+    try:
+        calibration = _learned(args, loaded, session)
+    except ConfigError as error:
+        if not kept.presses:
+            raise
+        raise ConfigError(
+            f"{error}. {len(kept.presses)} presses are kept in {kept.folder}: run the command again to go "
+            "on, or with --fresh to begin anew"
+        ) from None
+    calibration.save(out)
+    if len(kept.presses) >= args.presses:
+        kept.clear()
+    elif kept.presses:
+        _say(f"to go on to {args.presses} presses, run the command again with --overwrite")
+    _say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
+    return 0
+
+
+def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Calibration:
+    """What a session gives. Raises ConfigError if that is no calibration."""
+    scale = _scale(args, loaded, session)
     _say(f"scale: {_scale_words(scale)}")
     found = None
     if args.ball_radius is not None:
@@ -123,7 +154,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
             if not kept:
                 _say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
         _say(_photometric_words(found.found.model_dump()))
-    Calibration(
+    return Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
         raw_size=session.mapping.raw_size,
@@ -131,19 +162,15 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         corners=raw_corners(session.mapping),
         look=small_picture(session.untouched),
         scale=scale,
-        scale_by=f"pitch of {args.pitch:g} mm"
-        if args.pitch
-        else f"area of {args.area[0]:g} x {args.area[1]:g} mm",
+        scale_by=_given(args),
         slopes=None if found is None else found.model,
         photometric=None if found is None else found.found,
-    ).save(out)
-    _say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
-    return 0
+    )
 
 
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
-    session = find_presses(_load(args, pipeline), _guide(args))
+    session = find_presses(_load(args, pipeline), Guide(args.presses, _say))
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
         print(f"does not fit: {misfit}")
@@ -159,17 +186,27 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
         print(f"{len(session.presses)} presses today: {_photometric_words(now)}")
         print(f"when it was made: {_photometric_words(then.model_dump())}")
         fits = fits and now["normal_error"] <= WORSE * then.normal_error
+    if args.csv is not None:
+        fits = check_force(args, path, pipeline, WORSE) and fits
     print("it still fits" if fits else "it has drifted; calibrate anew")
     return 0 if fits else 3
 
 
 def _load(args: argparse.Namespace, pipeline: str | None) -> Pipeline:
-    return load(pipeline, source=args.source, sensor=args.sensor, settings={"calibration": None})
+    return load(
+        pipeline,
+        source=args.source,
+        sensor=args.sensor,
+        settings={"calibration": None},
+        realtime=args.realtime,
+    )
 
 
-def _scale(args: argparse.Namespace, session: Session) -> Scale:
+def _scale(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Scale:
     width, height = session.mapping.size
     try:
+        if args.target is not None:
+            return target_scale(args, loaded)
         if args.pitch is not None:
             return scale_from_pitch(session.dots, args.pitch, (width, height))
         # The picture reaches half a pixel beyond the centres of its outermost pixels.
@@ -181,31 +218,19 @@ def _scale(args: argparse.Namespace, session: Session) -> Scale:
 
 
 def _given(args: argparse.Namespace) -> str:
-    if args.pitch is not None:
-        return f"dots with a pitch of {args.pitch:g} mm"
-    return f"a picture of {args.area[0]:g} x {args.area[1]:g} mm"
+    """How the scale is found."""
+    if args.target is not None:
+        return f"target of {args.grid}, pitch of {args.pitch:g} mm"
+    return f"pitch of {args.pitch:g} mm" if args.pitch else f"area of {args.area[0]:g} x {args.area[1]:g} mm"
 
 
-def _guide(args: argparse.Namespace) -> Report:
-    """Tell of each press when it is over, and when there are enough."""
-    told = 0
-
-    def report(_frames: int, presses: Sequence[Press], lasts: bool) -> bool:
-        nonlocal told
-        over = len(presses) - lasts
-        for number in range(told, over):
-            press = presses[number]
-            size = f"radius {press.radius:.0f} px at ({press.center[0]:.0f}, {press.center[1]:.0f})"
-            _say(f"press {number + 1}: {size}{_advice(presses[:over], number)}")
-        told = max(told, over)
-        return over >= int(args.presses)
-
-    return report
-
-
-def _advice(presses: Sequence[Press], number: int) -> str:
-    usual = float(np.median([press.radius for press in presses]))
-    return "; light, press harder" if presses[number].radius < LIGHT * usual else ""
+def _page(loaded: Pipeline, guide: Guide) -> dict[str, Node]:
+    """The live page as the pipeline sets it, made to guide."""
+    for id_, node in loaded.nodes.items():
+        if issubclass(node.component.cls, Guiding):
+            component = replace(node.component, cls=node.component.cls.through(guide))
+            return {id_: replace(node, component=component)}
+    raise ConfigError("calibrate --view: required a pipeline with the sink view; add `view: {}` to its sinks")
 
 
 def _scale_words(scale: Scale) -> str:

@@ -33,6 +33,7 @@ COMMANDS = {
     "warmup": "compile what `run` would compile on its first use",
     "batch": "run a pipeline over many recordings; a second call does what is missing",
     "record": "run a pipeline and record its frames and results",
+    "export": "make a LeRobot dataset of recordings",
     "repair": "give a recording that was cut off its index",
     "calibrate": "make the calibration file of a sensor, or see whether it still fits",
     "detect": "find the marks of a gel and show what was found and why, in one picture",

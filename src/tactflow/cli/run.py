@@ -16,9 +16,9 @@ from types import FrameType
 from typing import Any
 
 from rich.console import Console
-from rich.logging import RichHandler
 
 from tactflow.api import make_runner
+from tactflow.cli.notes import notes_on
 from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline
 from tactflow.cli.printable import printable
@@ -189,7 +189,7 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
         threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
     if args.sign_of_life is not None:
         start_beating(args.sign_of_life, Headway(runner.calls))
-    with _logging_to(console), _signals(runner) as caught:
+    with notes_on(console), _signals(runner) as caught:
         _refuse_unwritable("--stats", args.stats, begins=STATISTICS_BEGIN)
         _refuse_unwritable("--trace", args.trace, begins=TRACE_BEGINS)
         logger = logging.getLogger("tactflow")
@@ -274,31 +274,6 @@ def _refuse_unwritable(option: str, path: str | None, begins: str) -> None:
         raise ConfigError(f"{option} {path}: cannot be written: {error.strerror}") from None
     if there not in (b"", begins.encode()):
         raise ConfigError(f"{option} {path}: holds something else; choose another file, or delete it")
-
-
-def _without_control_characters(record: logging.LogRecord) -> bool:
-    """Lets every note pass, made safe for a terminal."""
-    record.msg, record.args = printable(record.getMessage()), ()
-    return True
-
-
-@contextmanager
-def _logging_to(console: Console) -> Iterator[None]:
-    """Show the program's notes and warnings on standard error while the run lasts."""
-    logger = logging.getLogger("tactflow")
-    handler: logging.Handler
-    if console.is_terminal:
-        handler = RichHandler(console=console, show_time=False, show_path=False, markup=False)
-    else:
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(logging.Formatter("tactflow: %(levelname)s: %(message)s"))
-    handler.addFilter(_without_control_characters)
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """As much of Protocol Buffers as recordings need: writing and reading one message, and describing its type.
 
-The wire format is described at https://protobuf.dev/programming-guides/encoding; a `FileDescriptorSet` (what
-an MCAP schema of a protobuf channel holds) is itself such a message.
+The wire format is described at https://protobuf.dev/programming-guides/encoding. Frames are written and read
+here without a copy; types are described by Google's package.
 """
 
 from __future__ import annotations
@@ -10,24 +10,17 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
+from google.protobuf.descriptor_pb2 import (  # type: ignore[import-untyped]
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
+from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
+
 Value = bool | int | float | str | bytes | memoryview
 FieldType = Literal["double", "int64", "int32", "bool", "string", "bytes", "uint32", "sint64", "Timestamp"]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-_TYPE_NUMBERS: dict[FieldType, int] = {
-    "double": 1,
-    "int64": 3,
-    "int32": 5,
-    "bool": 8,
-    "string": 9,
-    "Timestamp": 11,
-    "bytes": 12,
-    "uint32": 13,
-    "sint64": 18,
-}
-_OPTIONAL = 1
-"""Label of a field, as protobuf's `descriptor.proto` numbers it."""
-_TIMESTAMP_FILE = "google/protobuf/timestamp.proto"
 
 
 def encode(fields: Iterable[tuple[int, Value]]) -> bytes:
@@ -117,34 +110,20 @@ def describe(name: str, fields: Sequence[tuple[str, int, FieldType]]) -> bytes:
     name : with its package, such as "foxglove.CompressedImage". fields : (name, number, type).
     """
     package, _, short = name.rpartition(".")
-    file = encode(
-        [
-            (1, f"{package}/{short}.proto"),
-            (2, package),
-            (3, _TIMESTAMP_FILE),
-            (4, _message_type(short, fields)),
-            (12, "proto3"),
-        ]
+    time = FileDescriptorProto()
+    Timestamp.DESCRIPTOR.file.CopyToProto(time)
+    file = FileDescriptorProto(
+        name=f"{package}/{short}.proto", package=package, dependency=[time.name], syntax="proto3"
     )
-    timestamp_file = encode(
-        [
-            (1, _TIMESTAMP_FILE),
-            (2, "google.protobuf"),
-            (4, _message_type("Timestamp", [("seconds", 1, "int64"), ("nanos", 2, "int32")])),
-            (12, "proto3"),
-        ]
-    )
-    return encode([(1, timestamp_file), (1, file)])
-
-
-def _message_type(name: str, fields: Sequence[tuple[str, int, FieldType]]) -> bytes:
-    described: list[tuple[int, Value]] = [(1, name)]
+    message = file.message_type.add(name=short)
     for field, number, kind in fields:
-        parts: list[tuple[int, Value]] = [(1, field), (3, number), (4, _OPTIONAL), (5, _TYPE_NUMBERS[kind])]
+        described = message.field.add(name=field, number=number, label=FieldDescriptorProto.LABEL_OPTIONAL)
         if kind == "Timestamp":
-            parts.append((6, ".google.protobuf.Timestamp"))
-        described.append((2, encode(parts)))
-    return encode(described)
+            described.type = FieldDescriptorProto.TYPE_MESSAGE
+            described.type_name = f".{Timestamp.DESCRIPTOR.full_name}"
+        else:
+            described.type = FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
+    return bytes(FileDescriptorSet(file=[time, file]).SerializeToString())
 
 
 def _varint(number: int) -> bytes:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Message, Schema
+from mcap.records import Attachment, Channel, Message, Schema
 from mcap.summary import Summary
 
 from tactflow.recording.frames import TYPE_NAME
@@ -84,6 +84,21 @@ def _topics(ours: set[str], known: set[str]) -> tuple[str, str]:
         others = f" or {', '.join(sorted(known)[1:MOST_NAMED])}" if len(known) > 1 else ""
         raise NotARecordingError(f"holds no frames that tactflow recorded; {there}{others}")
     return frames[0], frames[0].removesuffix("frames") + "references"
+
+
+def attachments(path: Path) -> dict[str, bytes]:
+    """Name -> bytes of the files that stand before the frames of a recording, as ours do; {} where none do.
+
+    Raises OSError if it cannot be read, NotARecordingError if it is no MCAP file.
+    """
+    found: dict[str, bytes] = {}
+    with path.open("rb") as file:
+        for record in intact_records(file):
+            if isinstance(record, Attachment):
+                found[record.name] = bytes(record.data)
+            elif isinstance(record, Message):
+                break
+    return found
 
 
 def read_summary(file: BinaryIO) -> Summary | None:

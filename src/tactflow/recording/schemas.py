@@ -5,7 +5,8 @@ The types of Foxglove are those of its package `foxglove-schemas-protobuf`.
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from typing import Any, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -13,10 +14,12 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from google.protobuf.message import Message  # type: ignore[import-untyped]
 from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
+from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
-from tactflow.message import Results
+from tactflow.message import Results, message_schema
 from tactflow.vision.types import Markers, MarkerStatus
 
 RESULT_TYPE = "tactflow.frame"
@@ -36,6 +39,28 @@ DOTS = {
     MarkerStatus.LOST: Color(r=1.0, g=0.1, b=0.1, a=1.0),
 }
 """Colours. Chosen by hand."""
+
+
+class ChannelType(NamedTuple):
+    """Of the messages of a channel. schema : how the type is written, and its bytes. packing : of each."""
+
+    name: str
+    schema: tuple[str, bytes]
+    packing: str
+
+
+def channel_types() -> dict[str, ChannelType]:
+    """What is in the channels for people: `image`, `annotations` and `results`."""
+    results = json.dumps(plain_schema(message_schema())).encode()
+    foxglove: dict[str, type[Message]] = {"image": CompressedImage, "annotations": ImageAnnotations}
+    return {
+        channel: ChannelType(
+            message.DESCRIPTOR.full_name,
+            ("protobuf", build_file_descriptor_set(message).SerializeToString()),
+            "protobuf",
+        )
+        for channel, message in foxglove.items()
+    } | {"results": ChannelType(RESULT_TYPE, ("jsonschema", results), "json")}
 
 
 def encode_picture(jpeg: bytes, sensor: str, nanoseconds: int) -> bytes:

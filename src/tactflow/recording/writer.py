@@ -10,15 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, cast
 
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import register_schema
 
 from tactflow.files import claim, make_folder, taken_away
 from tactflow.message import message_schema
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
-from tactflow.recording.schemas import RESULT_TYPE, plain_schema
+from tactflow.recording.schemas import channel_types
 
 NEVER = 1 << 62
 """Size at which a chunk would end by itself, bytes: they are ended by hand."""
@@ -55,12 +52,14 @@ class Entry:
 class About:
     """What a recording says about itself.
 
-    sensor : name. facts : metadata, such as versions. texts : attachments by name, in UTF-8.
+    sensor : name. facts : metadata, such as versions. texts : attachments by name, in UTF-8. arrays : others,
+    as the bytes of `.npz` files.
     """
 
     sensor: str
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
     texts: Mapping[str, str] = field(default_factory=dict[str, str])
+    arrays: Mapping[str, bytes] = field(default_factory=dict[str, bytes])
 
 
 class RecordingWriter:
@@ -120,22 +119,21 @@ class RecordingWriter:
     def _describe(self, about: About) -> None:
         writer, name = self._writer, about.sensor
         frame_type = writer.register_schema(TYPE_NAME, "protobuf", DESCRIPTOR)
-        picture_type = register_schema(writer, CompressedImage)
-        annotation_type = register_schema(writer, ImageAnnotations)
-        schema = message_schema()
-        result_type = writer.register_schema(
-            RESULT_TYPE, "jsonschema", json.dumps(plain_schema(schema)).encode()
-        )
         self._frames = writer.register_channel(f"/{name}/frames", "protobuf", frame_type)
         self._references = writer.register_channel(f"/{name}/references", "protobuf", frame_type)
-        self._results = writer.register_channel(f"/{name}/results", "json", result_type)
-        self._pictures = writer.register_channel(f"/{name}/image", "protobuf", picture_type)
-        self._annotations = writer.register_channel(f"/{name}/annotations", "protobuf", annotation_type)
+        self._others = {
+            channel: writer.register_channel(
+                f"/{name}/{channel}", kind.packing, writer.register_schema(kind.name, *kind.schema)
+            )
+            for channel, kind in channel_types().items()
+        }
         writer.add_metadata("tactflow", dict(about.facts))
-        texts = {"message.schema.json": json.dumps(schema, indent=1)} | dict(about.texts)
+        texts = {"message.schema.json": json.dumps(message_schema(), indent=1)} | dict(about.texts)
         for file, text in texts.items():
             kind = "application/json" if file.endswith(".json") else "application/yaml"
             writer.add_attachment(0, 0, file, kind, text.encode())
+        for file, data in about.arrays.items():
+            writer.add_attachment(0, 0, file, "application/octet-stream", data)
 
     def write(self, entry: Entry, time: int | None = None) -> None:
         """Add one frame and what belongs to it.
@@ -152,9 +150,9 @@ class RecordingWriter:
         frames = self._references if entry.reference else self._frames
         parts: Sequence[tuple[int, bytes | None]] = (
             (frames, entry.frame),
-            (self._results, entry.message),
-            (self._pictures, entry.picture),
-            (self._annotations, entry.annotations),
+            (self._others["results"], entry.message),
+            (self._others["image"], entry.picture),
+            (self._others["annotations"], entry.annotations),
         )
         for channel, data in parts:
             if data is not None:

@@ -120,9 +120,7 @@ def _open_container(spec: str, directory: Path | None, fps: float | None) -> Fra
         from tactflow.sources.mcap import Recording
 
         return Recording(spec, directory)
-    if suffix in (".mcap", ".bag", ".db3") or any(
-        (base / expanded(name) / "metadata.yaml").is_file() for base in bases
-    ):
+    if suffix in (".mcap", ".bag", ".db3") or any(_is_rosbag2(base / expanded(name)) for base in bases):
         from tactflow.sources.bags import Bag
 
         return Bag(spec, directory)
@@ -131,6 +129,15 @@ def _open_container(spec: str, directory: Path | None, fps: float | None) -> Fra
 
         return ArrayDataset(spec, directory, fps)
     return None
+
+
+def _is_rosbag2(folder: Path) -> bool:
+    """Whether ROS 2 recorded into this folder: others have a metadata.yaml too."""
+    try:
+        with (folder / "metadata.yaml").open("rb") as file:
+            return b"rosbag2_bagfile_information" in file.read(4096)
+    except OSError:
+        return False
 
 
 def _open_stream(spec: str, scheme: str, watch: Watch | None) -> FrameReader:

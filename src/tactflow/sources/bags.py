@@ -6,8 +6,6 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import BgrImage, Normaliser, find_path, log
 from tactflow.sources.messages import VideoDecoder, compressed_picture, kind_of, raw_picture, stamp_of
@@ -51,7 +49,7 @@ class Bag:
             self._frames = self._play(topic)
             self._first = next(self._frames, None)
             if self._first is None:
-                raise SourceError(f"{self._name}: there is no message of this topic")
+                raise SourceError(f"{self._name}: there is no picture in it")
         except SourceError:
             self._store.close()
             raise
@@ -79,7 +77,10 @@ class Bag:
             try:
                 image = picture(message)
                 taken = stamp_of(message) or written
-            except (AttributeError, TypeError, ValueError, StopIteration, cv2.error) as error:
+            except SourceError:
+                raise
+            except Exception as error:
+                # OpenCV, FFmpeg and fields that are not there each have errors of their own.
                 raise damaged(self._name, error) from error
             if image is None:
                 continue

@@ -33,7 +33,7 @@ class Place(NamedTuple):
 
 
 class LeRobotEpisode:
-    """The pictures of one camera in one episode; their times are those of the dataset.
+    """The pictures of one camera in one episode; frame i is taken at i / fps.
 
     Parameters
     ----------
@@ -95,16 +95,19 @@ class LeRobotEpisode:
     def _play(self) -> Generator[tuple[BgrImage, float], None, None]:
         import pyarrow.dataset as ds  # type: ignore[import-untyped]
 
-        columns = ["timestamp", *([self._camera] if self._stored == "image" else [])]
+        columns = ["frame_index", *([self._camera] if self._stored == "image" else [])]
+        # The column `timestamp` is the same, rounded to 32 bits.
+        rate = self.fps or 1.0
         wanted = ds.field("episode_index") == self._episode
         batches = ds.dataset(self._place.data).to_batches(columns=columns, filter=wanted, batch_size=16)
         rows = (row for batch in batches for row in batch.to_pylist())
         if self._stored == "image":
             for row in rows:
-                yield self._normalise(decode_image(row[self._camera]["bytes"], self._name)), row["timestamp"]
+                image = decode_image(row[self._camera]["bytes"], self._name)
+                yield self._normalise(image), row["frame_index"] / rate
             return
         for row, image in zip(rows, self._film(), strict=True):
-            yield self._normalise(image), row["timestamp"]
+            yield self._normalise(image), row["frame_index"] / rate
 
     def _film(self) -> Iterator[NDArray[np.uint8]]:
         """The pictures of the episode from its video, which may hold several episodes."""

@@ -128,6 +128,7 @@ class VideoDecoder:
             raise SourceError(f"{name}: {problem}")
         self._name = name
         self._codec: av.VideoCodecContext | None = None
+        self._begun = False
 
     def __call__(self, message: Any) -> NDArray[np.uint8] | None:
         """The picture of one piece, (H, W, 3) uint8 BGR; None as long as the video has not begun."""
@@ -141,7 +142,15 @@ class VideoDecoder:
             self._codec = cast("av.VideoCodecContext", av.CodecContext.create(codec, "r"))
             # With threads of its own, FFmpeg gives a picture only when it has several more.
             self._codec.thread_type = "NONE"
-        for frame in self._codec.decode(av.Packet(bytes(message.data))):
+        try:
+            frames = self._codec.decode(av.Packet(bytes(message.data)))
+        except av.error.InvalidDataError:
+            # A recording may begin between two pictures that stand alone.
+            if self._begun:
+                raise
+            return None
+        for frame in frames:
+            self._begun = True
             refuse_too_large(self._name, frame.width, frame.height)
             return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
         return None

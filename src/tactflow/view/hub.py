@@ -21,6 +21,7 @@ import orjson
 from tactflow.commands import Commands, RefusedError
 from tactflow.engine.control import Control
 from tactflow.engine.stats import Durations
+from tactflow.view.guided import Session
 
 log = logging.getLogger("tactflow")
 
@@ -114,6 +115,7 @@ class Hub:
     sensor : name of the sensor this run serves.
     neighbours : tells the ports of other sensors' pages by their names.
     again : publishes the last frame once more. Called in a thread of its own.
+    session : that the run is part of, if there is one.
     """
 
     def __init__(
@@ -122,6 +124,7 @@ class Hub:
         sensor: str,
         neighbours: Callable[[], Mapping[str, int]] = dict,
         again: Callable[[], None] = lambda: None,
+        session: Session | None = None,
     ) -> None:
         self.control = control
         self._run = Commands(control)
@@ -143,13 +146,15 @@ class Hub:
         self._sent = 0
         self._screen = Durations()
         self._end: str | None = None
-        self._commands: Mapping[str, Callable[[Any], Any]] = {
+        self._commands: dict[str, Callable[[Any], Any]] = {
             "pause": lambda value: self._run.pause(value is True),
             "step": lambda _: self._step(),
             "reference": lambda _: self._run.take_reference(),
             "record": lambda value: self._run.record(value is True),
             "stop": lambda _: self._run.stop(),
         }
+        if session is not None:
+            self._commands["undo"] = lambda _: session.undo()
 
     # -- from other threads -------------------------------------------------------------------------------
 

@@ -197,17 +197,15 @@ class Annotator:
         return relief(depth.heights, scale, self._deepest)
 
     def _bar(self, picture: NDArray[np.uint8], unit: float) -> None:
-        """Which colour is which height, in the lower right corner."""
+        """Which colour is which height, in the lower left corner."""
         width, height = (round(side * unit) for side in _BAR)
-        size = round(_TEXT * unit)
-        text = f"{self._deepest:g} mm"
-        wide, _ = self._letters.size(picture, text, size)
-        bottom, right = picture.shape[0] - round(6 * unit), picture.shape[1] - round(8 * unit) - wide
-        if right - width < 0 or bottom - height < 0:
+        left, bottom = round(6 * unit), picture.shape[0] - round(6 * unit)
+        if left + width >= picture.shape[1] or bottom - height < 0:
             return
-        picture[bottom - height : bottom, right - width : right] = colour_bar(width, height)
-        cv2.rectangle(picture, (right - width - 1, bottom - height - 1), (right, bottom), WHITE, 1)
-        self._letters.write(picture, text, (right + round(4 * unit), bottom), WHITE, size)
+        picture[bottom - height : bottom, left : left + width] = colour_bar(width, height)
+        cv2.rectangle(picture, (left - 1, bottom - height - 1), (left + width, bottom), WHITE, 1)
+        place = (left + width + round(4 * unit), bottom)
+        self._letters.write(picture, f"{self._deepest:g} mm", place, WHITE, round(_TEXT * unit))
 
     def _cut_out(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
         picture = np.zeros_like(image)

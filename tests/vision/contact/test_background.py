@@ -28,7 +28,7 @@ from tests.oracles.background import (
     plain_weigh_change,
 )
 from tests.oracles.components import plain_close_changes
-from tests.oracles.contact_outline import plain_sum_profile
+from tests.oracles.contact_outline import plain_border_depth
 from tests.oracles.continuation import plain_continue_outline
 from tests.oracles.illumination import plain_fit_robustly
 from tests.oracles.resolution import plain_halve_window, plain_raise_mask
@@ -44,7 +44,7 @@ ORACLES = (
     (background, "change_strength", plain_change_strength),
     (illumination, "fit_robustly", plain_fit_robustly),
     (components, "close_changes", plain_close_changes),
-    (contact_outline, "sum_profile", plain_sum_profile),
+    (contact_outline, "border_depth", plain_border_depth),
     (continuation, "continue_outline", plain_continue_outline),
     (resolution, "raise_mask", plain_raise_mask),
     (resolution, "halve_window", plain_halve_window),

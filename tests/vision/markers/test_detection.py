@@ -347,3 +347,11 @@ def test_a_real_gel_without_marks_is_recognised(shared_data: Path, name: str) ->
     video.release()
     with pytest.raises(NoMarkersError):
         detect_markers(np.asarray(image, np.uint8))
+
+
+def test_a_picture_that_was_changed_in_place_is_searched_anew() -> None:
+    picture = render((300, 400), grid(10, 8, 34.0, corner=(25, 30)), 4.6, noise=1.0)
+    before = detect_markers(picture)
+    assert detect_markers(picture.copy()) is before
+    picture[:60] = np.median(picture)
+    assert len(detect_markers(picture).centers) < len(before.centers)

@@ -10,20 +10,19 @@ from numpy.typing import NDArray
 
 from tactflow.stages.tracker import Tracker
 from tactflow.vision import compiled
-from tactflow.vision.markers import field, matching, spots, template, tracking
+from tactflow.vision.markers import field, matching, template, tracking
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.template import Alignment
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers
 from tests.oracles import field as plain_field
 from tests.oracles import matching as plain_matching
-from tests.oracles import spots as plain_spots
 from tests.oracles import template as plain_template
 from tests.oracles import tracking as plain_tracking
 from tests.oracles.plain import plain
 from tests.vision.dots import FloatArray, grid, render
 
-ORACLES = (plain_field, plain_matching, plain_spots, plain_template, plain_tracking)
+ORACLES = (plain_field, plain_matching, plain_template, plain_tracking)
 SIZE = (150, 170)
 PITCH = 24.0
 TRUTH = grid(7, 6, PITCH, corner=(14.3, 13.8), jitter=0.4)
@@ -69,11 +68,11 @@ def test_marks_are_judged_alike(seed: int) -> None:
 def test_the_stage_has_its_loops_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     loops = [
         loop
-        for module in (field, matching, spots, template, tracking)
+        for module in (field, matching, template, tracking)
         for loop in vars(module).values()
         if isinstance(loop, compiled.Kernel)
     ]
-    assert len(loops) == 8
+    assert len(loops) == 5
     for loop in loops:
         monkeypatch.setattr(loop, "_compiled", None)
     Tracker(Tracker.Params())

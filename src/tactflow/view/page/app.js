@@ -22,7 +22,7 @@ const LAYERS = [
   { id: "surface", label: "Surface", key: "8", colour: `linear-gradient(90deg, ${RAMP})`, off: true, offer: "surface" },
 ];
 // What is shown only where the run has it: the tile or button, and what of a frame it needs.
-const OFFERED = { unit: "scale", "layer-field": "field", "layer-surface": "surface", "tile-depth": "surface", "tile-force": "force", "tile-slip": "slip" };
+const OFFERED = { "tile-guide": "guide", unit: "scale", "layer-field": "field", "layer-surface": "surface", "tile-depth": "surface", "tile-force": "force", "tile-slip": "slip" };
 const RISES = [1, 3, 5, 10];
 
 const sensors = new Map();
@@ -134,6 +134,7 @@ function drawValues(s) {
   put($("tile-slip").dataset, "slipping", String(Boolean(message?.slip?.slipping)));
   set("deepest", message ? `${Number(message.deepest.toPrecision(1))} mm` : "");
   set("deepest-now", message?.contact?.depth_mm == null ? "no contact" : `${fixed(message.contact.depth_mm, 2)} mm deep`);
+  if (message?.guide) drawGuide(message.guide);
   const latency = message?.latency ?? -1;
   set("value-latency", latency < 0 ? "–" : fixed(latency, 1));
   for (const name of ["tracked", "inferred", "lost"]) set(`count-${name}`, message?.counts?.[name] ?? "–");
@@ -146,6 +147,16 @@ function drawValues(s) {
   if (total) put(bar, "value", message ? (message.seq + 1) / total : 0);
   if (message) $("picture").dataset.seq = message.seq;
   for (const id of PLOTS) $(id).dataset.points = message?.points ?? 0;
+}
+
+function drawGuide(guide) {
+  const [count, share, last, good] = words.guide(guide);
+  set("guide-count", count);
+  set("guide-now", guide.now);
+  set("guide-last", last);
+  put($("guide-last").dataset, "good", String(good));
+  put($("guide-progress"), "value", share);
+  put($("undo"), "disabled", guide.presses.length === 0 || link !== "open");
 }
 
 // The unit of lengths: millimetres only where the run knows them.
@@ -284,14 +295,14 @@ function refresh() {
     connecting: ["Connecting", "Looking for the run."],
     token: ["Token required", "Open the address that tactflow printed, or enter the token here."],
     disconnected: ["Disconnected", `The run does not answer. ${wait ? `Next attempt in ${wait} s.` : "Trying again …"}`],
-    ended: ["The run has ended", `${ENDS[state?.end] ?? state?.end ?? ""} This page comes back when a new run starts here.`],
+    ended: s?.last?.guide ? ["The presses are collected", "What is learned from them is told in the terminal."] : ["The run has ended", `${ENDS[state?.end] ?? state?.end ?? ""} This page comes back when a new run starts here.`],
     waiting: ["Waiting for frames", "The run is up; its source has not delivered a frame yet."],
     paused: ["Paused", "No frame was shown yet."],
     stalled: ["", ""],
     live: ["", ""],
   };
-  const words = { token: "token required", ended: "ended", stalled: `no frames for ${silent} s`, waiting: "waiting for frames" };
-  set("status-text", words[now] ?? now);
+  const labels = { token: "token required", ended: "ended", stalled: `no frames for ${silent} s`, waiting: "waiting for frames" };
+  set("status-text", labels[now] ?? now);
   const [title, text] = texts[now];
   set("empty-title", title);
   set("empty-text", text);
@@ -300,10 +311,10 @@ function refresh() {
   put(document.body.dataset, "empty", show ? (hasPicture ? "veil" : "blank") : "no");
   put($("token-form"), "hidden", now !== "token");
   put($("retry"), "hidden", now !== "disconnected");
-  put(document, "title", s && now === "live" ? `${s.name} – tactflow` : `${words[now] ?? now} – tactflow`);
+  put(document, "title", s && now === "live" ? `${s.name} – tactflow` : `${labels[now] ?? now} – tactflow`);
 
   set("source", state?.source.description ?? "–");
-  set("source-state", state ? [state.source.live ? "live" : "recording", (link === "open" && !state.end && state.source.state) || words[now] || (now === "live" ? "delivering frames" : now)].join(", ") : "");
+  set("source-state", state ? [state.source.live ? "live" : "recording", (link === "open" && !state.end && state.source.state) || labels[now] || (now === "live" ? "delivering frames" : now)].join(", ") : "");
   const open = link === "open" && state;
   for (const name of ["pause", "step", "reference", "record", "stop"]) {
     const reason = open ? state.refused[name] : "not connected";
@@ -311,6 +322,8 @@ function refresh() {
     put($(name), "title", reason ?? "");
   }
   press("pause", Boolean(state?.paused), "Resume", "Pause");
+  const guided = Boolean(s?.last?.guide);
+  put($("stop").querySelector(".label"), "textContent", guided ? "Finish" : "Stop");
   press("record", Boolean(state?.recording), "Stop recording", "Record");
   // An animation would have the browser draw the page anew at every refresh of the screen.
   put($("record").dataset, "beat", String(Number(Boolean(state?.recording)) && Math.floor(performance.now() / 500) % 2));
@@ -339,13 +352,14 @@ const actions = {
   reference: () => { command("reference"); note("the next frames become the reference"); },
   record: () => command("record", !sensors.get(current)?.state?.recording),
   stop: () => command("stop"),
+  undo: () => command("undo"),
 };
 let orderedUnit = null;
 function orderLayers() {
   orderedUnit = unit();
   order("layers", { layers, magnify: magnification, rise, unit: orderedUnit });
 }
-const keys = { " ": "pause", s: "step", n: "reference", r: "record", q: "stop" };
+const keys = { " ": "pause", s: "step", n: "reference", r: "record", q: "stop", backspace: "undo" };
 for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
 
 for (const layer of LAYERS) {

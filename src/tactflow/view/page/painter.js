@@ -159,7 +159,7 @@ function addFrame(s, header, heights) {
   const first = s.points.findIndex((point) => point.t >= message.t - SECONDS);
   if (first > 0) s.points.splice(0, first);
   if (s.header && header.epoch !== s.header.epoch) tell("note", { text: `new reference taken at frame ${message.seq}` });
-  const there = { scale: header.scale, field: header.field, surface: header.surface, force, slip };
+  const there = { scale: header.scale, field: header.field, surface: header.surface, guide: header.guide, force, slip };
   for (const [name, value] of Object.entries(there)) if (value) s.offers.add(name);
   Object.assign(s, { header, heights });
   const now = performance.now();
@@ -182,12 +182,12 @@ function summarise(s) {
   clearTimeout(s.timer);
   s.timer = 0;
   s.told = performance.now();
-  const { message: { seq, t, size, contact, flow, force, slip }, markers, latency_ms } = s.header;
+  const { message: { seq, t, size, contact, flow, force, slip }, markers, latency_ms, guide } = s.header;
   const count = (letter) => markers.status.split(letter).length - 1;
   tell("frames", {
     sensor: s.name,
     summary: {
-      seq, t, flow, force, slip,
+      seq, t, flow, force, slip, guide,
       counts: markers && { tracked: count("t"), inferred: count("i"), lost: count("l") },
       aspect: size[0] / size[1],
       contact: contact && { ...contact, hull: undefined },

@@ -54,12 +54,13 @@ export class Picture {
       c.fillRect(0, 0, width, height);
     }
     if (!this.header) return;
-    const { message, markers, field, scale } = this.header;
+    const { message, markers, field, scale, guide } = this.header;
     const sx = width / message.size[0];
     const sy = height / message.size[1];
     this.at = ([x, y]) => [(x + 0.5) * sx, (y + 0.5) * sy];
     this.unit = ratio * Math.max(1, Math.min(width, height) / ratio / 480);
     c.lineJoin = c.lineCap = "round";
+    if (guide) this.drawGuide(guide);
     if (layers.field && field?.origin) this.drawField(field);
     if (layers.arrows && markers) this.drawMarkers(markers);
     if (message.contact) {
@@ -158,6 +159,33 @@ export class Picture {
     this.context.fill(rim);
     this.context.fillStyle = this.colours.field;
     this.context.fill(body);
+  }
+
+  // Where presses were, and the part of the gel that wants the next one.
+  drawGuide({ presses, next: [row, column], lasts }) {
+    const { width, height } = this.canvas;
+    const c = this.context;
+    if (!lasts) {
+      c.fillStyle = "rgb(255 255 255 / .16)";
+      c.fillRect((column * width) / 3, (row * height) / 3, width / 3, height / 3);
+    }
+    const parts = new Path2D();
+    for (const share of [1 / 3, 2 / 3]) {
+      parts.moveTo(share * width, 0);
+      parts.lineTo(share * width, height);
+      parts.moveTo(0, share * height);
+      parts.lineTo(width, share * height);
+    }
+    c.strokeStyle = "rgb(255 255 255 / .35)";
+    c.lineWidth = this.unit;
+    c.stroke(parts);
+    for (const { center, radius, fault } of presses) {
+      const [x, y] = this.at(center);
+      const [edge] = this.at([center[0] + radius, center[1]]);
+      const round = new Path2D();
+      round.arc(x, y, edge - x, 0, 2 * Math.PI);
+      this.stroke(round, fault === null ? this.colours.ellipse : this.colours.mean, 1.5, fault === null ? [] : [3, 4]);
+    }
   }
 
   // A bar of 1, 2 or 5 times a power of ten of mm, about a fifth of the picture. pixels: of the canvas for 1 mm.

@@ -1,7 +1,7 @@
 // What the tiles say: numbers of the result message in words, each [number, what stands behind it].
 
 const MINUS = "−";
-export const fixed = (value, digits) => value.toFixed(digits).replace("-", MINUS);
+export const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", MINUS);
 export const grouped = (value) => Math.round(value).toLocaleString("en").replaceAll(",", "\u202f");
 const NONE = ["–", ""];
 
@@ -38,13 +38,23 @@ export function force({ force }) {
   if (!force) return NONE;
   const { value, stderr, in_range } = force;
   const along = ["x", "y"].flatMap((axis, i) => (value[i] === null ? [] : [`${axis} ${fixed(value[i], 2)}`]));
-  const doubt = in_range === false ? ["unlike the calibration's contacts"] : [];
-  return [fixed(value[2], 2), [`N${error(stderr[2], 2)}`, ...along, ...doubt].join(", ")];
+  // Of a contact unlike those of the calibration, the standard error does not hold.
+  const unit = in_range === false ? "N, outside the fit" : `N${error(stderr[2], 2)}`;
+  return [fixed(value[2], 2), [unit, ...along].join(", ")];
 }
 
 export function slip({ slip }) {
   if (!slip) return NONE;
   return [slip.slipping ? "slips" : "holds", `${Math.round(100 * slip.stick_ratio)}\u202f% of the contact sticks`];
+}
+
+// How a session of presses goes: [count, share, the last press, whether it is good].
+export function guide({ done, good, wanted, presses, lasts }) {
+  const count = `${done} of ${wanted} presses${good < done ? `, ${good} good` : ""}`;
+  const share = Math.min(1, done / wanted);
+  const last = presses[presses.length - 1];
+  if (!last || lasts) return [count, share, "", true];
+  return [count, share, `Press ${done}: ${last.fault ?? "good"}.`, last.fault === null];
 }
 
 const error = (stderr, digits) => (stderr == null ? "" : ` ± ${fixed(stderr, digits)}`);

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.contact.components import STRAY
 from tactflow.vision.contact.filling import SQUARE, close_gaps, fill, fill_pockets, is_solid, outlined
 
@@ -251,56 +251,61 @@ def _border_depth(depth: Float, strength: Float, hidden: Mask | None) -> float:
     """
     every = max(1, depth.size // ENOUGH_PIXELS)
     size = int((depth.shape[0] + depth.shape[1]) / BIN) + 2
-    count, total = np.zeros(size, np.int64), np.zeros(size)
-    sum_profile(depth, strength, _NOTHING if hidden is None else hidden, every, count, total)
-    known = np.flatnonzero(count >= MIN_BIN_PIXELS)
-    if known.size < 2:
-        return 0.5
-    # Of some thirty steps, numbers are quicker than arrays.
-    steps: list[float] = (total[known] / count[known]).tolist()
-    at: list[float] = ((known + 0.5) * BIN).tolist()
-    around = zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False)
-    profile = [before / 4 + here / 2 + after / 4 for before, here, after in around]
-    peak = _first_peak(profile)
-    border, top, skirt = (_crossing(profile, at, part * peak) for part in (BORDER, TOP, SKIRT))
     middle = float(cv2.minMaxLoc(depth)[1])
-    soft = top - skirt - SHARP_SKIRT * (middle - top) - SKIRT_BLUR
-    return min(border + SOFTNESS * max(soft, 0.0), DEEPEST * middle)
+    unseen = _NOTHING if hidden is None else hidden
+    return float(border_depth(depth, strength, unseen, every, middle, np.zeros((2, size))))
 
 
-def _first_peak(profile: list[float]) -> float:
-    """The largest value before the profile falls clearly for the first time."""
-    peak = profile[0]
-    for value in profile:
-        if value > peak:
-            peak = value
-        elif value < FALLEN * peak:
-            break
-    return peak
-
-
-def _crossing(profile: list[float], at: list[float], wanted: float) -> float:
+@helper
+def _crossing(profile: Double, at: Double, wanted: float) -> float:
     """Where, coming from outside, a profile first reaches a value."""
-    first = next(index for index, value in enumerate(profile) if value >= wanted)
+    first = 0
+    while profile[first] < wanted:
+        first += 1
     if first == 0:
-        return at[0]
+        return float(at[0])
     fraction = (wanted - profile[first - 1]) / (profile[first] - profile[first - 1])
-    return at[first - 1] + fraction * (at[first] - at[first - 1])
+    return float(at[first - 1] + fraction * (at[first] - at[first - 1]))
 
 
-@kernel("void(float32[:, ::1], float32[:, ::1], uint8[:, ::1], int64, int64[::1], float64[::1])")
-def sum_profile(
-    depth: Float, strength: Float, hidden: Mask, every: int, counts: NDArray[np.int64], sums: Double
-) -> None:
-    """Number and sum of the strengths in bins of depth, of one row in `every`; both are added to.
+@kernel("float64(float32[:, ::1], float32[:, ::1], uint8[:, ::1], int64, float64, float64[:, ::1])")
+def border_depth(
+    depth: Float, strength: Float, hidden: Mask, every: int, middle: float, bins: NDArray[np.float64]
+) -> float:
+    """What `_border_depth` finds, from one row in `every`.
 
-    hidden : not 0 where a pixel does not count; (0, 0) if all do.
+    hidden : not 0 where a pixel does not count; (0, 0) if all do. middle : the largest depth.
+    bins : (2, n), 0, changed: the number of pixels and the sum of their strengths in bins of depth.
     """
+    counts, sums = bins[0], bins[1]
     bins_per_pixel = np.float32(1 / BIN)
     for y in range(0, depth.shape[0], every):
         deep, strong = depth[y], strength[y]
         for x in range(depth.shape[1]):
             if deep[x] > 0 and (hidden.size == 0 or hidden[y, x] == 0):
-                at = int(deep[x] * bins_per_pixel)
-                counts[at] += 1
-                sums[at] += strong[x]
+                place = int(deep[x] * bins_per_pixel)
+                counts[place] += 1
+                sums[place] += strong[x]
+    # Bins with enough pixels, and where they are; they take the place of the others.
+    known = 0
+    for k in range(counts.size):
+        if counts[k] >= MIN_BIN_PIXELS:
+            sums[known] = sums[k] / counts[k]
+            counts[known] = (k + 0.5) * BIN
+            known += 1
+    if known < 2:
+        return 0.5
+    at, profile = counts[:known], np.empty(known)
+    for k in range(known):
+        before, after = sums[max(k - 1, 0)], sums[min(k + 1, known - 1)]
+        profile[k] = before / 4 + sums[k] / 2 + after / 4
+    # The largest value before the profile falls clearly for the first time.
+    peak = profile[0]
+    for k in range(known):
+        if profile[k] > peak:
+            peak = profile[k]
+        elif profile[k] < FALLEN * peak:
+            break
+    border, top = _crossing(profile, at, BORDER * peak), _crossing(profile, at, TOP * peak)
+    soft = top - _crossing(profile, at, SKIRT * peak) - SHARP_SKIRT * (middle - top) - SKIRT_BLUR
+    return min(border + SOFTNESS * max(soft, 0.0), DEEPEST * middle)

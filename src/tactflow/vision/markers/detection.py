@@ -190,8 +190,49 @@ def detect_markers(
     >>> found.polarity, found.centers.shape[1]
     ('dark', 2)
     """
-    gray, shortest = to_gray(image).astype(np.float32), min(image.shape[:2])
+    gray = to_gray(image).astype(np.float32)
     _require_options(dot_radius, polarity, valid, gray.shape)
+    last = next(iter(_LAST), None)
+    if last is not None and last.is_of(image, dot_radius, polarity, valid):
+        return last.found
+    found = _found_in(gray, dot_radius, polarity, valid)
+    _LAST[:] = [_Answer(image.copy(), dot_radius, polarity, None if valid is None else valid.copy(), found)]
+    return found
+
+
+class _Answer(NamedTuple):
+    """What was asked of `detect_markers`, and what it found."""
+
+    image: NDArray[np.uint8]
+    dot_radius: float | None
+    polarity: Polarity
+    valid: NDArray[np.uint8] | None
+    found: Detection
+
+    def is_of(
+        self,
+        image: NDArray[np.uint8],
+        dot_radius: float | None,
+        polarity: Polarity,
+        valid: NDArray[np.uint8] | None,
+    ) -> bool:
+        """Whether the same is asked again: to compare two pictures costs a thousandth of a search."""
+        if (dot_radius, polarity) != (self.dot_radius, self.polarity):
+            return False
+        if valid is None or self.valid is None:
+            return valid is self.valid and np.array_equal(image, self.image)
+        return np.array_equal(image, self.image) and np.array_equal(valid, self.valid)
+
+
+_LAST: Final[list[_Answer]] = []
+"""The last answer: two stages ask for the marks of each reference."""
+
+
+def _found_in(
+    gray: NDArray[np.float32], dot_radius: float | None, polarity: Polarity, valid: NDArray[np.uint8] | None
+) -> Detection:
+    """What `detect_markers` finds in a picture, (H, W) float32, grey levels."""
+    shortest = min(gray.shape)
     signs: tuple[Sign, ...] = ("dark", "bright") if polarity == "auto" else (polarity,)
     scales = {
         sign: {s: find_spots(gray, s, sign, valid) for s in sigmas(dot_radius, shortest)} for sign in signs

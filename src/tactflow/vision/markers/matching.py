@@ -11,7 +11,7 @@ belief propagation for early vision", IJCV 70 (2006).
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from tactflow.vision.compiled import helper, kernel
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
 
 MISSING_COST: Final = 1.0
 """Cost of a mark without a spot. Chosen by hand."""
@@ -110,22 +111,101 @@ def choose_spots(
     count = len(free)
     if count == 0 or len(spots) == 0:
         return np.full(count, -1, np.int64)
-    origin, displacement, expected, spots, strength = (
-        np.ascontiguousarray(array, np.float64) for array in (origin, displacement, expected, spots, strength)
-    )
-    edges, free = np.ascontiguousarray(edges, np.int64), np.ascontiguousarray(free, np.int64)
-    inliers, slot = np.ascontiguousarray(inliers, np.bool_), np.empty(len(origin), np.int64)
-    label, unary = np.empty((count, LABELS), np.int64), np.empty((count, LABELS + 1))
-    chosen = np.full(count, -1, np.int64)
-    labels = unary_costs(
-        origin, edges, free, inliers, displacement, expected, spots, strength, pitch, farthest,
-        slot, label, unary, chosen,
-    )  # fmt: skip
-    if labels < 0:
+    named = np.concatenate([edges.ravel(), free])
+    if named.min() < 0 or named.max() >= len(origin):
         raise IndexError(f"required marks 0 to {len(origin) - 1} in edges and free, got others")
-    if labels > 0:
-        propagate_beliefs(origin, edges, free, slot, spots, label, unary, labels, chosen)
+    slot: IntArray = np.full(len(origin), -1, np.int64)
+    slot[free] = np.arange(count)
+    origin, spots = (np.ascontiguousarray(array, np.float64) for array in (origin, spots))
+    edges, free = np.ascontiguousarray(edges, np.int64), np.ascontiguousarray(free, np.int64)
+    links = _Links(_complex(origin), edges, free, slot, np.asarray(inliers, np.bool_), _complex(displacement))
+    label, unary = _near_spots(_complex(expected), _complex(spots), strength, pitch, farthest)
+    chosen = _own_best(links, _complex(spots), label, unary)
+    if chosen is None:
+        chosen = np.empty(count, np.int64)
+        propagate_beliefs(origin, edges, free, slot, spots, label, unary, label.shape[1], chosen)
     return chosen
+
+
+class _Links(NamedTuple):
+    """Marks and their links, where points and displacements are complex numbers x + i y.
+
+    rest : (N,) complex128, marks in the reference, px. slot : (N,), the number of each mark among the free
+    ones, or -1. The others as in `choose_spots`.
+    """
+
+    rest: ComplexArray
+    edges: IntArray
+    free: IntArray
+    slot: IntArray
+    inliers: BoolArray
+    displacement: ComplexArray
+
+
+def _complex(points: FloatArray) -> ComplexArray:
+    """x + i y, which makes lengths and inner products of many pairs cheap."""
+    return np.asarray(points[..., 0] + 1j * points[..., 1], np.complex128)
+
+
+def _near_spots(
+    expected: ComplexArray, spots: ComplexArray, strength: FloatArray, pitch: float, farthest: float
+) -> tuple[IntArray, FloatArray]:
+    """The spots that each mark may choose, (n, L), the nearest first; and what they cost it, (n, L + 1), last
+    that of no spot. L is how many are in reach of a mark at most, no more than `LABELS`."""
+    away = np.abs(expected[:, :, None] - spots).min(axis=0)
+    nearest = np.argsort(away, axis=1, kind="stable")[:, :LABELS]
+    away = np.take_along_axis(away, nearest, axis=1)
+    labels = int((away <= farthest).sum(axis=1).max())
+    label, away = np.ascontiguousarray(nearest[:, :labels]), away[:, :labels]
+    unary = np.full((len(label), labels + 1), MISSING_COST)
+    cost = SURPRISE_COST * (away / pitch) ** 2 + FAINT_COST * np.maximum(1.0 - strength[label], 0.0)
+    unary[:, :labels] = np.where(away > farthest, FORBIDDEN_COST, cost)
+    return label, unary
+
+
+def _own_best(links: _Links, spots: ComplexArray, label: IntArray, unary: FloatArray) -> IntArray | None:
+    """What each mark chooses alone, if that is a smooth choice or there is none; else None.
+
+    label, unary : of `_near_spots`; the costs of links to inliers are added to `unary`.
+    """
+    count, labels = label.shape
+    if labels == 0:
+        return np.full(count, -1, np.int64)
+    moved = spots[label] - links.rest[links.free][:, None]
+    _add_links_to_inliers(links, moved, unary)
+    best, rows = np.argmin(unary, axis=1), np.arange(count)
+    if (best == labels).any():
+        return None
+    own: IntArray = label[rows, best]
+    return own if len(np.unique(own)) == count and _is_smooth(links, moved[rows, best]) else None
+
+
+def _add_links_to_inliers(links: _Links, moved: ComplexArray, unary: FloatArray) -> None:
+    """Add to `unary`, (n, L + 1), what the links to inliers cost, whose displacement is not a matter of
+    choice. moved : (n, L), displacement of each mark to each of its spots."""
+    slot, inliers = links.slot, links.inliers
+    one, other = links.edges.T
+    there, back = (slot[one] >= 0) & inliers[other], (slot[other] >= 0) & inliers[one]
+    mark = np.concatenate([slot[one][there], slot[other][back]])
+    anchor = np.concatenate([other[there], one[back]])
+    span = links.rest[anchor] - links.rest[links.free[mark]]
+    change = (links.displacement[anchor][:, None] - moved[mark]) / span[:, None]
+    squared = change.real**2 + change.imag**2
+    costs = np.full((len(mark), unary.shape[1]), MISSING_LINK_COST)
+    costs[:, :-1] = np.minimum(STRAIN_COST * squared, MOST_STRAIN_COST)
+    costs[:, :-1] += FOLD_COST * (change.real < FOLD_STRAIN)
+    np.add.at(unary, mark, costs)
+
+
+def _is_smooth(links: _Links, moved: ComplexArray) -> bool:
+    """Whether no link is strained if the free marks have moved so, (n,)."""
+    slot, rest = links.slot, links.rest
+    now, known = links.displacement.copy(), links.inliers.copy()
+    now[links.free], known[links.free] = moved, True
+    one, other = links.edges.T
+    linked = known[one] & known[other] & ((slot[one] >= 0) | (slot[other] >= 0))
+    one, other = one[linked], other[linked]
+    return bool((np.abs(now[other] - now[one]) < SMOOTH_STRAIN * np.abs(rest[other] - rest[one])).all())
 
 
 @helper
@@ -136,155 +216,6 @@ def link_cost(change_x: float, change_y: float, span_x: float, span_y: float, sc
     if (change_x * span_x + change_y * span_y) * scale < FOLD_STRAIN:
         cost += FOLD_COST
     return cost
-
-
-@helper
-def nearest_spots(
-    expected: FloatArray, spots: FloatArray, farthest: float, label: IntArray, away: FloatArray
-) -> int:
-    """The nearest spots of each mark into `label` (n, 8), nearest first, and their distances into `away`
-    (n, 8); returns how many of them are in reach of a mark, at most."""
-    most = min(LABELS, len(spots))
-    labels = 0
-    for n in range(len(label)):
-        filled = within = 0
-        for spot in range(len(spots)):
-            squared = np.inf
-            for k in range(len(expected)):
-                away_x, away_y = expected[k, n, 0] - spots[spot, 0], expected[k, n, 1] - spots[spot, 1]
-                squared = min(squared, away_x * away_x + away_y * away_y)
-            if filled == most and squared >= away[n, most - 1]:
-                continue
-            place = filled if filled < most else most - 1
-            while place > 0 and away[n, place - 1] > squared:
-                away[n, place], label[n, place] = away[n, place - 1], label[n, place - 1]
-                place -= 1
-            away[n, place], label[n, place] = squared, spot
-            filled = min(filled + 1, most)
-        for place in range(most):
-            away[n, place] = np.sqrt(away[n, place])
-            within += away[n, place] <= farthest
-        labels = max(labels, within)
-    return labels
-
-
-@helper
-def add_inlier_links(
-    origin: FloatArray,
-    edges: IntArray,
-    free: IntArray,
-    inliers: BoolArray,
-    displacement: FloatArray,
-    spots: FloatArray,
-    slot: IntArray,
-    label: IntArray,
-    labels: int,
-    unary: FloatArray,
-) -> None:
-    """Add to `unary` what the links to inliers cost, whose displacement is not a matter of choice."""
-    for one in range(2):
-        for e in range(len(edges)):
-            n, anchor = slot[edges[e, one]], edges[e, 1 - one]
-            if n < 0 or not inliers[anchor]:
-                continue
-            mark = free[n]
-            span_x, span_y = origin[anchor, 0] - origin[mark, 0], origin[anchor, 1] - origin[mark, 1]
-            scale = 1.0 / (span_x * span_x + span_y * span_y)
-            for k in range(labels):
-                change_x = displacement[anchor, 0] - (spots[label[n, k], 0] - origin[mark, 0])
-                change_y = displacement[anchor, 1] - (spots[label[n, k], 1] - origin[mark, 1])
-                unary[n, k] += link_cost(change_x, change_y, span_x, span_y, scale)
-            unary[n, labels] += MISSING_LINK_COST
-
-
-@helper
-def own_best_is_smooth(
-    origin: FloatArray,
-    edges: IntArray,
-    inliers: BoolArray,
-    displacement: FloatArray,
-    spots: FloatArray,
-    slot: IntArray,
-    label: IntArray,
-    labels: int,
-    unary: FloatArray,
-    chosen: IntArray,
-) -> bool:
-    """Whether the cheapest label of each mark, into `chosen`, is a spot of its own and strains no link."""
-    taken = np.zeros(len(spots), np.bool_)
-    for n in range(len(label)):
-        own = np.argmin(unary[n, : labels + 1])
-        if own == labels or taken[label[n, own]]:
-            return False
-        chosen[n] = label[n, own]
-        taken[label[n, own]] = True
-    for e in range(len(edges)):
-        one, other = edges[e, 0], edges[e, 1]
-        first, second = slot[one], slot[other]
-        if not ((first >= 0 or inliers[one]) and (second >= 0 or inliers[other])) or max(first, second) < 0:
-            continue
-        span_x, span_y = origin[other, 0] - origin[one, 0], origin[other, 1] - origin[one, 1]
-        change_x = displacement[other, 0] if second < 0 else spots[chosen[second], 0] - origin[other, 0]
-        change_y = displacement[other, 1] if second < 0 else spots[chosen[second], 1] - origin[other, 1]
-        change_x -= displacement[one, 0] if first < 0 else spots[chosen[first], 0] - origin[one, 0]
-        change_y -= displacement[one, 1] if first < 0 else spots[chosen[first], 1] - origin[one, 1]
-        if not np.hypot(change_x, change_y) < SMOOTH_STRAIN * np.hypot(span_x, span_y):
-            return False
-    return True
-
-
-@kernel(
-    "int64(float64[:, ::1], int64[:, ::1], int64[::1], boolean[::1], float64[:, ::1], float64[:, :, ::1],"
-    "float64[:, ::1], float64[::1], float64, float64, int64[::1], int64[:, ::1], float64[:, ::1], int64[::1])"
-)
-def unary_costs(
-    origin: FloatArray,
-    edges: IntArray,
-    free: IntArray,
-    inliers: BoolArray,
-    displacement: FloatArray,
-    expected: FloatArray,
-    spots: FloatArray,
-    strength: FloatArray,
-    pitch: float,
-    farthest: float,
-    slot: IntArray,
-    label: IntArray,
-    unary: FloatArray,
-    chosen: IntArray,
-) -> int:
-    """The first half of `choose_spots`: the spots that each mark may choose and what they cost it alone.
-
-    Into `slot` (N,), the number of each mark among the free ones or -1; `label` (n, 8), the nearest spots;
-    `unary` (n, 9), their costs, and last that of no spot. Returns the number of labels, or 0 where nothing is
-    left to do: nothing is in reach, or everybody's best, now in `chosen`, is smooth; or -1 where `edges` or
-    `free` name marks that there are not.
-    """
-    count = len(free)
-    for e in range(len(edges)):
-        if min(edges[e, 0], edges[e, 1]) < 0 or max(edges[e, 0], edges[e, 1]) >= len(origin):
-            return -1
-    slot[:] = -1
-    for n in range(count):
-        if free[n] < 0 or free[n] >= len(origin):
-            return -1
-        slot[free[n]] = n
-    away = np.empty((count, LABELS))
-    labels = nearest_spots(expected, spots, farthest, label, away)
-    if labels == 0:
-        return 0
-    for n in range(count):
-        for k in range(labels):
-            cost = away[n, k] / pitch
-            unary[n, k] = SURPRISE_COST * (cost * cost) + FAINT_COST * max(1.0 - strength[label[n, k]], 0.0)
-            if away[n, k] > farthest:
-                unary[n, k] = FORBIDDEN_COST
-        unary[n, labels] = MISSING_COST
-    add_inlier_links(origin, edges, free, inliers, displacement, spots, slot, label, labels, unary)
-    smooth = own_best_is_smooth(
-        origin, edges, inliers, displacement, spots, slot, label, labels, unary, chosen
-    )
-    return 0 if smooth else labels
 
 
 @helper
@@ -393,8 +324,11 @@ def propagate_beliefs(
     labels: int,
     chosen: IntArray,
 ) -> None:
-    """The second half of `choose_spots`, of what `unary_costs` gave: propagation and decision, into
-    `chosen`."""
+    """The second half of `choose_spots`: propagation and decision, into `chosen`.
+
+    slot : (N,), the number of each mark among the free ones, or -1. label : (n, labels), the spots that each
+    of these may choose. unary : (n, labels + 1), what they cost it alone, and last what no spot costs.
+    """
     count, states, links = len(free), labels + 1, 0
     for e in range(len(edges)):
         links += slot[edges[e, 0]] >= 0 and slot[edges[e, 1]] >= 0
@@ -402,7 +336,7 @@ def propagate_beliefs(
     pair = np.empty((2 * links, states, states))
     link_costs(origin, edges, slot, spots, label, source, target, pair)
     message, latest = np.zeros((2 * links, states)), np.empty((2 * links, states))
-    belief, total = unary[:, :states].copy(), np.empty((count, states))
+    belief, total = unary.copy(), np.empty((count, states))
     choice = np.empty(count, np.int64)
     for n in range(count):
         choice[n] = np.argmin(belief[n])

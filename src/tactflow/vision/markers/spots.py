@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.detection import Detection
 from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SCALE_RATIO
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 
 LARGEST_RADIUS: Final = 2.3
 """Radius of a mark, px, from which the frame is halved: less is needed to find it than to measure it. Chosen
@@ -31,9 +31,6 @@ MARGIN: Final = 3.0
 
 CELL: Final = 0.12
 """Side of the cells in which nearness is judged, pitches. Chosen by hand."""
-
-FIRST_CAPACITY: Final = 1024
-"""Peaks for which memory is made at first; where there are more, the search is made again. Chosen by hand."""
 
 
 class SpotFinder:
@@ -103,13 +100,24 @@ def find_peaks(response: Float32Array, least: float, reach: int) -> tuple[FloatA
     Returns (M, 2) float64, each the vertex of a parabola along each axis, at most half a pixel away, and the
     response (M,) float32.
     """
-    capacity = FIRST_CAPACITY
-    while True:
-        points, value = np.empty((capacity, 2)), np.empty(capacity, np.float32)
-        count = local_maxima(response, least, reach, points, value)
-        if count <= capacity:
-            return points[:count], value[:count]
-        capacity = count
+    highest = cv2.dilate(response, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    # Above `least` is the same as at least the next number in this precision.
+    highest = np.maximum(highest, np.nextafter(np.float32(least), np.float32(np.inf)))
+    peak = response >= highest
+    peak[[0, -1]] = False
+    peak[:, [0, -1]] = False
+    at = np.flatnonzero(peak)
+    width = response.shape[1]
+    rows, columns = np.divmod(at, width)
+    flat = response.ravel()
+    value = flat[at]
+    points = np.empty((len(at), 2))
+    for axis, (whole, step) in enumerate(((columns, 1), (rows, width))):
+        before, after = flat[at - step], flat[at + step]
+        bend = np.minimum(before + after - 2 * value, np.float32(-1e-6))
+        offset = 0.5 * (before - after) / bend
+        points[:, axis] = whole + np.minimum(np.maximum(offset, -0.5), 0.5)
+    return points, value
 
 
 class NearPoints:
@@ -133,70 +141,13 @@ class NearPoints:
         """(n,) bool, which points (n, 2) have one of the others (m, 2) in a disc, to a tenth of a pitch."""
         if len(points) == 0 or len(others) == 0:
             return np.zeros(len(points), bool)
-        found = np.empty(len(points), np.bool_)
-        near_others(points, others, 1 / self._cell, disc, np.zeros(self._shape, np.uint8), found)
-        return found
+        raster = np.zeros(self._shape, np.uint8)
+        raster[self._cells(others)] = 1
+        wide: NDArray[np.uint8] = np.asarray(cv2.dilate(raster, disc), np.uint8)
+        return np.asarray(wide[self._cells(points)], np.bool_)
 
-
-@kernel("int64(float32[:, ::1], float64, int64, float64[:, ::1], float32[::1])")
-def local_maxima(
-    response: Float32Array, least: float, reach: int, points: FloatArray, height: Float32Array
-) -> int:
-    """What `find_peaks` finds, into `points` and `height`; returns how many there are.
-
-    Only as many as there is room for are written.
-    """
-    count, rows, columns = 0, response.shape[0], response.shape[1]
-    half, flat, floor = np.float32(0.5), np.float32(-1e-6), np.float32(least)
-    for row in range(1, rows - 1):
-        for column in range(1, columns - 1):
-            value = response[row, column]
-            if not value > floor:
-                continue
-            highest = True
-            for y in range(max(row - reach, 0), min(row + reach + 1, rows)):
-                for x in range(max(column - reach, 0), min(column + reach + 1, columns)):
-                    highest = highest and not response[y, x] > value
-                if not highest:
-                    break
-            if not highest:
-                continue
-            if count < len(points):
-                before, after = response[row, column - 1], response[row, column + 1]
-                offset = half * (before - after) / min(before + after - (value + value), flat)
-                points[count, 0] = column + min(max(offset, -half), half)
-                before, after = response[row - 1, column], response[row + 1, column]
-                offset = half * (before - after) / min(before + after - (value + value), flat)
-                points[count, 1] = row + min(max(offset, -half), half)
-                height[count] = value
-            count += 1
-    return count
-
-
-@kernel("void(float64[:, ::1], float64[:, ::1], float64, uint8[:, ::1], uint8[:, ::1], boolean[::1])")
-def near_others(
-    points: FloatArray,
-    others: FloatArray,
-    scale: float,
-    disc: NDArray[np.uint8],
-    raster: NDArray[np.uint8],
-    found: BoolArray,
-) -> None:
-    """Which points have one of the others within the disc around their cell.
-
-    scale : cells per px. raster : zeros, is written over.
-    """
-    height, width = raster.shape
-    for n in range(len(others)):
-        column = min(max(int(others[n, 0] * scale + 0.5), 0), width - 1)
-        row = min(max(int(others[n, 1] * scale + 0.5), 0), height - 1)
-        raster[row, column] = 1
-    reach = disc.shape[0] // 2
-    for n in range(len(points)):
-        column = min(max(int(points[n, 0] * scale + 0.5), 0), width - 1)
-        row = min(max(int(points[n, 1] * scale + 0.5), 0), height - 1)
-        found[n] = False
-        for y in range(max(row - reach, 0), min(row + reach + 1, height)):
-            for x in range(max(column - reach, 0), min(column + reach + 1, width)):
-                if raster[y, x] and disc[y - row + reach, x - column + reach]:
-                    found[n] = True
+    def _cells(self, points: FloatArray) -> tuple[IntArray, IntArray]:
+        """Row and column of the cells that points (n, 2) lie in; those outside count to the border."""
+        limits = np.array(self._shape[::-1]) - 1
+        column, row = np.clip((points * (1 / self._cell) + 0.5).astype(np.intp), 0, limits).T
+        return row, column

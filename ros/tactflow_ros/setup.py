@@ -1,0 +1,24 @@
+"""Installs the package where ROS 2 looks for it."""
+
+from setuptools import setup
+
+NAME = "tactflow_ros"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Topics from a running tactflow",
+    license="MIT",
+    maintainer="tactflow developers",
+    maintainer_email="maintainers@tactflow.invalid",
+    packages=[NAME],
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", ["launch/tactflow.launch.py"]),
+        (f"share/{NAME}/config", ["config/tactflow.yaml"]),
+    ],
+    install_requires=["setuptools", "numpy", "pyzmq"],
+    zip_safe=True,
+    entry_points={"console_scripts": [f"bridge = {NAME}.__main__:main"]},
+)

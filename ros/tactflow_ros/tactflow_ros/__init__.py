@@ -1,0 +1,1 @@
+"""Topics from a running tactflow. Needs rclpy, numpy and pyzmq, and nothing of tactflow itself."""

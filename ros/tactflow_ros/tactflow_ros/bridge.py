@@ -1,0 +1,371 @@
+"""The node: what a running tactflow publishes over ZeroMQ, as topics.
+
+A lifecycle node for one sensor. `configure` checks the parameters and makes the topics, `activate` connects.
+Messages are published by the thread that receives them; the executor only has the service and a timer.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, PolygonStamped, PoseStamped, Vector3Stamped, WrenchStamped
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock as Steady
+from rclpy.clock import ClockType
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.logging import get_logger
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from tactflow_ros import messages
+from tactflow_ros.link import Link, LinkError, ask
+
+DEPTH = 10
+"""Messages of a topic that may wait for a subscriber."""
+ANSWER_SECONDS = 2.0
+"""How long the service waits for tactflow, s. Chosen by hand."""
+LIVE = 1e9
+"""Times above are those of a live source (Unix time); a recording counts from its beginning, s."""
+MOST_LOST = 0.5
+"""Share of lost markers above which /diagnostics warns. Chosen by hand."""
+
+PARAMETERS: dict[str, tuple[Any, str]] = {
+    "endpoint": ("tcp://127.0.0.1:5556", "where tactflow publishes: sinks.zmq.endpoint"),
+    "sensor": ("main", "name of the sensor in tactflow"),
+    "control": ("", "sinks.zmq.control, for the service ~/take_reference; empty: none"),
+    "keys": ("", "the subscriber's folder of tactflow keys new; empty: none are needed"),
+    "frame_id": ("tactile_optical_frame", "of the picture: x right, y down, z out of the gel"),
+    "parent_frame": ("", "what it is fixed to; empty: no transform is published"),
+    "translation": ([0.0, 0.0, 0.0], "of frame_id in parent_frame: x, y, z, m"),
+    "rotation": ([0.0, 0.0, 0.0, 1.0], "quaternion x, y, z, w"),
+    "reliability": ("best_effort", "of the topics: best_effort or reliable"),
+    "timeout": (2.0, "time without a message after which /diagnostics says so, s"),
+    "tactile": (False, "also publish /tactile: mean flow x, y in pixels, and slope"),
+    "publish_clock": (False, "also publish /clock, from the capture times of a recording"),
+    "autostart": (True, "configure and activate by itself"),
+}
+"""Parameter -> its default, and what it means."""
+
+Maker = Callable[[messages.Message, Any, messages.Unit], Any]
+
+GEOMETRY: dict[str, tuple[type, Maker]] = {
+    "contact": (PolygonStamped, messages.polygon),
+    "contact_pose": (PoseStamped, messages.pose),
+    "flow": (Vector3Stamped, messages.flow),
+    "markers": (PointCloud2, messages.markers),
+}
+"""Topic -> its type and what makes it; each in metres, and, as `NAME_pixels`, in pixels."""
+OTHERS = {
+    "touching": Bool,
+    "slipping": Bool,
+    "wrench": WrenchStamped,
+    "depth": Image,
+    "image/compressed": CompressedImage,
+}
+"""Topic -> its type, of those without lengths in two units."""
+ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
+"""What tactflow sends only to those who ask -> the topic that it is for."""
+
+
+class Counts:
+    """What /diagnostics tells, counted from one report to the next.
+
+    `note` and `report` may be called from two threads.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._since = time.monotonic()
+        self._received = 0
+        self._missing = 0
+        self._last_seq: int | None = None
+        self._latency_s: list[float] = []
+        self.last = self._since
+        self.any = False
+        self.lost_markers = math.nan
+
+    def note(self, message: messages.Message) -> None:
+        """Count a message."""
+        status = (message["markers"] or {}).get("status") or []
+        with self._lock:
+            self._received += 1
+            self.last, self.any = time.monotonic(), True
+            if self._last_seq is not None and message["seq"] > self._last_seq + 1:
+                self._missing += message["seq"] - self._last_seq - 1
+            self._last_seq = message["seq"]
+            if message["t"] > LIVE:
+                self._latency_s.append(time.time() - message["t"])
+            self.lost_markers = status.count("lost") / len(status) if status else math.nan
+
+    def report(self) -> dict[str, float]:
+        """The numbers since the last report."""
+        with self._lock:
+            now = time.monotonic()
+            latency = sorted(self._latency_s) or [math.nan]
+            numbers = {
+                "rate, Hz": self._received / max(now - self._since, 1e-9),
+                "frames missing": self._missing,
+                "latency since capture, median, ms": latency[len(latency) // 2] * 1e3,
+                "lost markers, share": self.lost_markers,
+            }
+            self._since, self._received, self._missing, self._latency_s = now, 0, 0, []
+        return numbers
+
+
+class Bridge(LifecycleNode):
+    """Topics, the service and the diagnostics of one sensor."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("tactflow", **options)
+        for name, (default, meaning) in PARAMETERS.items():
+            self.declare_parameter(name, default, ParameterDescriptor(description=meaning))
+        self._topics: dict[str, Any] = {}
+        self._others: list[Any] = []
+        self._link: Link | None = None
+        self._counts = Counts()
+        self._run: dict[str, Any] = {}
+        self._static: Any = None
+        self._told_replay = False
+        self.create_service(Trigger, "~/take_reference", self._take_reference)
+        # Also where simulated time stands still.
+        self.create_timer(1.0, self._look, clock=Steady(clock_type=ClockType.STEADY_TIME))
+
+    def value(self, name: str) -> Any:
+        """Of a parameter."""
+        return self.get_parameter(name).value
+
+    # -- life cycle ---------------------------------------------------------------------------------------
+
+    def on_configure(self, state: State) -> TransitionCallbackReturn:
+        """Check the parameters, make the topics."""
+        del state
+        try:
+            self._make_topics()
+            if self.value("parent_frame"):
+                self._publish_transform()
+        except (ValueError, ImportError) as error:
+            self.get_logger().error(str(error))
+            self._forget()
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: State) -> TransitionCallbackReturn:
+        """Connect to tactflow, which may be started before or after."""
+        endpoint, sensor = self.value("endpoint"), self.value("sensor")
+        self._counts, self._run = Counts(), {}
+        # Publishers first: the first message may come at once.
+        result = super().on_activate(state)
+        try:
+            self._link = Link(endpoint, sensor, self.value("keys"), self._received)
+        except LinkError as error:
+            self.get_logger().error(str(error))
+            super().on_deactivate(state)
+            return TransitionCallbackReturn.FAILURE
+        self.get_logger().info(f"sensor {sensor} from {endpoint}")
+        return result
+
+    def on_deactivate(self, state: State) -> TransitionCallbackReturn:
+        """Disconnect."""
+        self.disconnect()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
+        """Take the topics back."""
+        del state
+        self._forget()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
+        """As `on_cleanup`, from any state."""
+        self.disconnect()
+        return self.on_cleanup(state)
+
+    def disconnect(self) -> None:
+        """Receive no more. May be called twice."""
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+    def _forget(self) -> None:
+        for publisher in (*self._topics.values(), *self._others):
+            self.destroy_publisher(publisher)
+        self._topics, self._others, self._static = {}, [], None
+
+    def _make_topics(self) -> None:
+        word = self.value("reliability")
+        if word not in ("best_effort", "reliable"):
+            raise ValueError(f"reliability: required best_effort or reliable, got {word!r}")
+        reliability = QoSReliabilityPolicy[word.upper()]
+        qos = QoSProfile(depth=DEPTH, reliability=reliability, durability=QoSDurabilityPolicy.VOLATILE)
+        kinds = dict(OTHERS)
+        for name, (kind, _) in GEOMETRY.items():
+            kinds |= {name: kind, f"{name}_pixels": kind}
+        for name, kind in kinds.items():
+            self._topics[name] = self._publisher(kind, f"~/{name}", qos)
+        if self.value("tactile"):
+            self._topics["/tactile"] = self._publisher(Point, "/tactile", qos)
+        if self.value("publish_clock"):
+            self._topics["/clock"] = self._publisher(Clock, "/clock", qos)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DEPTH)
+        self._others.append(self._diagnostics)
+
+    def _publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
+        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._tell_mismatch(topic))
+        return self.create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
+
+    def _tell_mismatch(self, topic: str) -> None:
+        self.get_logger().warning(
+            f"{topic}: a subscriber asks for another quality of service and receives nothing; have it ask "
+            "for best_effort and volatile (qos_profile_sensor_data), or set the parameter reliability to "
+            "reliable"
+        )
+
+    def _publish_transform(self) -> None:
+        place = messages.transform(
+            self.value("frame_id"),
+            self.value("parent_frame"),
+            self.value("translation"),
+            self.value("rotation"),
+            self.get_clock().now().to_msg(),
+        )
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            raise ImportError("parent_frame needs tf2_msgs: apt install ros-$ROS_DISTRO-tf2-msgs") from None
+        qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+        self._static = self.create_publisher(TFMessage, "/tf_static", qos)
+        self._static.publish(TFMessage(transforms=[place]))
+        self._others.append(self._static)
+
+    # -- messages -----------------------------------------------------------------------------------------
+
+    def _received(self, name: str, message: messages.Message, data: bytes) -> None:
+        """What tactflow has sent; in the link's thread."""
+        frame_id = self.value("frame_id")
+        if name == "stats":
+            self._run = message
+        elif name == "tactflow_picture":
+            self._topics["image/compressed"].publish(messages.picture(message, data, frame_id))
+        elif name == "tactflow_depth":
+            self._topics["depth"].publish(messages.depth(message, data, frame_id))
+        else:
+            self._counts.note(message)
+            self._publish(message, messages.header(message, frame_id))
+
+    def _publish(self, message: messages.Message, head: Any) -> None:
+        self._tell_replay(message["t"])
+        self._offer("/clock", lambda: Clock(clock=head.stamp))
+        self._offer("touching", lambda: Bool(data=message["contact"] is not None))
+        slip = message.get("slip")
+        self._offer("slipping", lambda: None if slip is None else Bool(data=slip["slipping"]))
+        for unit in messages.units(message):
+            for name, (_, make) in GEOMETRY.items():
+                self._offer(name + unit.suffix, lambda make=make, unit=unit: make(message, head, unit))
+        self._offer("wrench", lambda: messages.wrench(message, head))
+        self._offer("/tactile", lambda: messages.tactile(message))
+
+    def _offer(self, topic: str, make: Callable[[], Any]) -> None:
+        """Publish what is made, if there is something, where somebody listens."""
+        publisher = self._topics.get(topic)
+        if publisher is not None and publisher.get_subscription_count():
+            made = make()
+            if made is not None:
+                publisher.publish(made)
+
+    def _tell_replay(self, t: float) -> None:
+        if t > LIVE or self._told_replay or self.value("use_sim_time"):
+            return
+        self._told_replay = True
+        self.get_logger().warning(
+            "this is a recording: its stamps count from its beginning, not from 1970; for nodes that compare "
+            "them with now, set use_sim_time everywhere and publish_clock here"
+        )
+
+    # -- service and diagnostics --------------------------------------------------------------------------
+
+    def _take_reference(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        del request
+        control = self.value("control")
+        if control:
+            response.success, response.message = ask(
+                control, "take_reference", self.value("keys"), ANSWER_SECONDS
+            )
+        else:
+            response.message = (
+                "the parameter control is not set; run tactflow with --set "
+                "sinks.zmq.control=tcp://127.0.0.1:5557 and set control to the same"
+            )
+        return response
+
+    def _look(self) -> None:
+        """Once a second: what is wanted, and how it is."""
+        link = self._link
+        if link is None:
+            return
+        link.want(name for name, topic in ON_DEMAND.items() if self._topics[topic].get_subscription_count())
+        level, words = self._condition(link)
+        numbers = self._counts.report() | {"damaged messages": link.damaged}
+        latency = self._run.get("latency_ms") or {}
+        numbers |= {
+            "frames dropped by the run": self._run.get("dropped", math.nan),
+            "latency of the run, p99, ms": latency.get("p99") or math.nan,
+        }
+        if level == DiagnosticStatus.OK and self._counts.lost_markers > MOST_LOST:
+            level, words = DiagnosticStatus.WARN, "most markers are lost: take a new reference"
+        status = DiagnosticStatus(
+            level=level,
+            name=f"tactflow: {self.value('sensor')}",
+            message=words,
+            hardware_id=self.value("endpoint"),
+            values=[KeyValue(key=key, value=f"{value:.6g}") for key, value in numbers.items()],
+        )
+        report = DiagnosticArray(status=[status])
+        report.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(report)
+
+    def _condition(self, link: Link) -> tuple[bytes, str]:
+        if link.refused is not None:
+            return DiagnosticStatus.ERROR, link.refused
+        silent = time.monotonic() - self._counts.last
+        if silent > self.value("timeout"):
+            since = f"for {silent:.0f} s" if self._counts.any else "since the start"
+            return DiagnosticStatus.STALE, (
+                f"no message {since}; is tactflow running and publishing there, and is its sensor called "
+                f"{self.value('sensor')}?"
+            )
+        return DiagnosticStatus.OK, "receiving"
+
+
+def main() -> int:
+    """Run the node until it is told to end."""
+    rclpy.init()
+    try:
+        node = Bridge()
+    except ParameterException as error:
+        get_logger("tactflow").error(f"{error}; a number with a point, as in 2.0, is a DOUBLE")
+        rclpy.try_shutdown()
+        return 1
+    try:
+        if node.value("autostart"):
+            done = TransitionCallbackReturn.SUCCESS
+            if node.trigger_configure() != done or node.trigger_activate() != done:
+                return 1
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.disconnect()
+        rclpy.try_shutdown()
+    return 0

@@ -1,0 +1,219 @@
+"""ROS messages from tactflow's: numbers in, messages out; nothing is sent here.
+
+tactflow tells pixels of the processed picture (x right, y down) and, with a calibration, `scale`, which makes
+millimetres of them. Here, lengths are metres (REP 103) or, in topics whose name ends in `_pixels`, pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import (
+    Point,
+    Point32,
+    PolygonStamped,
+    PoseStamped,
+    TransformStamped,
+    Vector3Stamped,
+    WrenchStamped,
+)
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
+from std_msgs.msg import Header
+
+Message = dict[str, Any]
+
+MM = 1e-3
+"""Metres in a millimetre."""
+NANOSECONDS = 1_000_000_000
+"""In a second."""
+
+STATUS = {"tracked": 0, "inferred": 1, "lost": 2}
+"""Number of each status of a marker in the cloud."""
+MARKER = np.dtype(
+    {
+        "names": ["x", "y", "z", "dx", "dy", "stderr", "status"],
+        "formats": ["<f4"] * 6 + ["u1"],
+        "itemsize": 28,
+    }
+)
+"""One point of the cloud of markers."""
+FIELDS = [
+    PointField(
+        name=name,
+        offset=MARKER.fields[name][1],
+        datatype=PointField.UINT8 if name == "status" else PointField.FLOAT32,
+        count=1,
+    )
+    for name in MARKER.names
+]
+
+
+class Unit(NamedTuple):
+    """How lengths are told.
+
+    per_pixel : along (x, y). origin : (x, y), px, where coordinates are 0. suffix : of topics' names.
+    """
+
+    per_pixel: tuple[float, float]
+    origin: tuple[float, float]
+    suffix: str
+
+    def places(self, points: Any) -> np.ndarray:
+        """(N, 2) places, from pixels."""
+        return (np.asarray(points, float).reshape(-1, 2) - self.origin) * self.per_pixel
+
+    def vectors(self, vectors: Any) -> np.ndarray:
+        """(N, 2) displacements, from pixels."""
+        return np.asarray(vectors, float).reshape(-1, 2) * self.per_pixel
+
+
+PIXELS = Unit((1.0, 1.0), (0.0, 0.0), "_pixels")
+
+
+def units(message: Message) -> list[Unit]:
+    """Pixels, and metres where the sensor is calibrated."""
+    scale = message.get("scale")
+    if scale is None:
+        return [PIXELS]
+    x, y = scale["mm_per_px"]
+    return [PIXELS, Unit((x * MM, y * MM), tuple(scale["origin"]), "")]
+
+
+def stamp(t: float) -> Time:
+    """Time of the capture, to the nanosecond that the number tells."""
+    # Unix times have no room for nanoseconds in one double.
+    nanoseconds = math.floor(t) * NANOSECONDS + round(t % 1 * NANOSECONDS)
+    return Time(sec=nanoseconds // NANOSECONDS, nanosec=nanoseconds % NANOSECONDS)
+
+
+def header(message: Message, frame_id: str) -> Header:
+    """Capture time and frame."""
+    return Header(stamp=stamp(message["t"]), frame_id=frame_id)
+
+
+def polygon(message: Message, head: Header, unit: Unit) -> PolygonStamped:
+    """The convex hull of the contact; without a contact, no points."""
+    contact = message["contact"]
+    result = PolygonStamped(header=head)
+    if contact is not None:
+        result.polygon.points = [Point32(x=x, y=y) for x, y in unit.places(contact["hull"]).tolist()]
+    return result
+
+
+def pose(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
+    """Centre of the contact; its x axis is the contact's direction (the frame's x where it has none)."""
+    contact = message["contact"]
+    if contact is None:
+        return None
+    result = PoseStamped(header=head)
+    place = result.pose.position
+    ((place.x, place.y),) = unit.places(contact["center"]).tolist()
+    # tactflow counts angles counter-clockwise as seen, the frame about z, which points into the picture.
+    angle = -math.radians(contact["angle"] or 0.0)
+    result.pose.orientation.z = math.sin(angle / 2)
+    result.pose.orientation.w = math.cos(angle / 2)
+    return result
+
+
+def flow(message: Message, head: Header, unit: Unit) -> Vector3Stamped | None:
+    """Mean displacement of the gel in contact."""
+    mean = message["flow"] and message["flow"]["mean"]
+    if mean is None:
+        return None
+    result = Vector3Stamped(header=head)
+    ((result.vector.x, result.vector.y),) = unit.vectors(mean).tolist()
+    return result
+
+
+def markers(message: Message, head: Header, unit: Unit) -> PointCloud2 | None:
+    """A point for each marker: x, y, z (0), dx, dy, stderr (NaN: unknown), status."""
+    told = message["markers"]
+    if told is None:
+        return None
+    count = len(told["status"])
+    cloud = np.zeros(count, MARKER)
+    place, origin = unit.places(told["position"]), unit.places(told["origin"])
+    cloud["x"], cloud["y"] = place.T
+    cloud["dx"], cloud["dy"] = (place - origin).T
+    errors = np.array(told.get("stderr") or [None] * count, float)
+    cloud["stderr"] = errors * math.sqrt(unit.per_pixel[0] * unit.per_pixel[1])
+    cloud["status"] = [STATUS.get(word, STATUS["lost"]) for word in told["status"]]
+    return PointCloud2(
+        header=head,
+        height=1,
+        width=count,
+        fields=FIELDS,
+        is_bigendian=False,
+        point_step=MARKER.itemsize,
+        row_step=MARKER.itemsize * count,
+        data=array("B", cloud.tobytes()),
+        is_dense=True,
+    )
+
+
+def wrench(message: Message, head: Header) -> WrenchStamped | None:
+    """The force that acts on the gel; a component that the calibration does not know is NaN."""
+    force = message.get("force")
+    if force is None:
+        return None
+    result = WrenchStamped(header=head)
+    x, y, pressed = (math.nan if part is None else float(part) for part in force["value"])
+    # Pressed in is against z, which points out of the gel.
+    result.wrench.force.x, result.wrench.force.y, result.wrench.force.z = x, y, -pressed
+    return result
+
+
+def tactile(message: Message) -> Point | None:
+    """The original script's message: mean flow x, y, px; slope. Only where there is a slope."""
+    contact, mean = message["contact"], message["flow"] and message["flow"]["mean"]
+    if contact is None or contact["slope"] is None:
+        return None
+    x, y = mean or (0.0, 0.0)
+    return Point(x=float(x), y=float(y), z=float(contact["slope"]))
+
+
+def picture(told: Message, data: bytes, frame_id: str) -> CompressedImage:
+    """The processed picture."""
+    return CompressedImage(header=header(told, frame_id), format="jpeg", data=array("B", data))
+
+
+def depth(told: Message, data: bytes, frame_id: str) -> Image:
+    """How far the gel is pushed in, m. data : (height, width) float32, little-endian, mm."""
+    width, height = told["size"]
+    metres = np.frombuffer(data, "<f4", width * height) * np.float32(MM)
+    return Image(
+        header=header(told, frame_id),
+        height=height,
+        width=width,
+        encoding="32FC1",
+        is_bigendian=0,
+        step=4 * width,
+        data=array("B", metres.tobytes()),
+    )
+
+
+def transform(
+    frame_id: str, parent: str, translation: Sequence[float], rotation: Sequence[float], now: Time
+) -> TransformStamped:
+    """Where the sensor's frame is. translation : x, y, z, m. rotation : quaternion x, y, z, w.
+
+    Raises
+    ------
+    ValueError : not three or four finite numbers, or a quaternion of zeros.
+    """
+    for name, values, count in (("translation", translation, 3), ("rotation", rotation, 4)):
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise ValueError(f"{name}: required {count} finite numbers, got {list(values)}")
+    length = math.hypot(*rotation)
+    if length == 0:
+        raise ValueError("rotation: required a quaternion x, y, z, w other than 0")
+    result = TransformStamped(header=Header(stamp=now, frame_id=parent), child_frame_id=frame_id)
+    to = result.transform
+    to.translation.x, to.translation.y, to.translation.z = map(float, translation)
+    to.rotation.x, to.rotation.y, to.rotation.z, to.rotation.w = (value / length for value in rotation)
+    return result

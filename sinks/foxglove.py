@@ -1,0 +1,143 @@
+"""Foxglove: live pictures, what was found on them, and results, for Foxglove to connect to."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from pydantic import Field, model_validator
+
+from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Tick
+from tactflow.extras import missing
+from tactflow.jpeg import encode_jpeg
+from tactflow.message import Results, encode_message
+from tactflow.view.address import is_loopback
+
+if TYPE_CHECKING:
+    from foxglove import Channel, Context
+    from foxglove.websocket import WebSocketServer
+
+log = logging.getLogger("tactflow")
+
+BACKLOG = 32
+"""Messages that may wait for each viewer. Chosen by hand."""
+
+
+class Foxglove(Sink):
+    """Serves the channels of a recording live: `/main/image`, `/main/annotations`, `/main/results`.
+
+    In Foxglove: *Open connection*, *Foxglove WebSocket*, `ws://localhost:8765`. What nobody looks at is not
+    encoded, and a viewer who is slow loses messages; the run never waits.
+    """
+
+    threaded = True
+    when_live = "latest"
+    observer = True
+
+    class Params(StageParams):
+        """Where to serve, and how good the pictures are."""
+
+        host: str = Field(
+            "127.0.0.1", min_length=1, description="address to listen at; 127.0.0.1 is this machine only"
+        )
+        port: int = Field(8765, ge=0, le=65535, description="0 picks a free one")
+        open_to_all: bool = Field(
+            False, description="serve other machines: everybody there may look, since Foxglove asks nobody"
+        )
+        quality: int = Field(
+            80, ge=1, le=100, description="of the JPEG pictures; higher is sharper and larger"
+        )
+
+        @model_validator(mode="after")
+        def _guarded(self) -> Foxglove.Params:
+            if not self.open_to_all and not is_loopback(self.host):
+                raise ValueError(
+                    f"{self.host} can be reached from other machines, and Foxglove's protocol knows no keys: "
+                    "set host to 127.0.0.1, or open_to_all: true to let everybody look"
+                )
+            return self
+
+    def __init__(self, params: Params, sensor: str = "main") -> None:
+        """Prepare; nothing is served yet. sensor : names the channels."""
+        super().__init__(params)
+        self.address = self.description = f"ws://{params.host}:{params.port}"
+        self._sensor = sensor
+        self._server: WebSocketServer | None = None
+        self._context: Context | None = None
+        self._channels: dict[str, Channel] = {}
+        self._sent = 0
+
+    def open(self) -> None:
+        """Begin to serve; afterwards `address` is the real one.
+
+        Raises
+        ------
+        StageError
+            If a package is missing, or the address is taken or none of this machine.
+        """
+        needed = ["foxglove", "mcap_protobuf", "foxglove_schemas_protobuf"]
+        problem = missing("live views in Foxglove", "foxglove", needed)
+        if problem is not None:
+            raise StageError(problem)
+        import foxglove
+
+        from tactflow.recording.schemas import channel_types
+
+        # Kept, for channels end with it.
+        self._context = context = foxglove.Context()
+        for name, kind in channel_types().items():
+            encoding, data = kind.schema
+            schema = foxglove.Schema(name=kind.name, encoding=encoding, data=data)
+            topic = f"/{self._sensor}/{name}"
+            self._channels[name] = foxglove.Channel(
+                topic, schema=schema, message_encoding=kind.packing, context=context
+            )
+        p = self.params
+        try:
+            self._server = foxglove.start_server(
+                name="tactflow", host=p.host, port=p.port, context=context, message_backlog_size=BACKLOG
+            )
+        except RuntimeError as error:
+            raise StageError(
+                f"{self.address} cannot be served: {error}; another program may listen there, such as "
+                "foxglove_bridge: end it, or choose another port (--set sinks.foxglove.port=8766)"
+            ) from error
+        self.address = self.description = f"ws://{p.host}:{self._server.port}"
+        log.info("foxglove: %s", self.address)
+
+    def wants(self) -> bool:
+        """Whether anybody looks at any channel. From any thread."""
+        return any(channel.has_sinks() for channel in list(self._channels.values()))
+
+    def counters(self) -> dict[str, int]:
+        """messages : sent so far."""
+        return {"messages": self._sent}
+
+    def write(self, tick: Tick, results: Results) -> None:
+        """Send what is looked at of one frame; never waits."""
+        from tactflow.recording.frames import nanoseconds
+        from tactflow.recording.schemas import encode_annotations, encode_picture
+
+        time = nanoseconds(tick.frame.t)
+        image = tick.frame.image if results.image is None else results.image
+        encoders = {
+            "image": lambda: encode_picture(encode_jpeg(image, self.params.quality), self._sensor, time),
+            "annotations": lambda: encode_annotations(results, time),
+            "results": lambda: encode_message(tick, results, detail=True),
+        }
+        for name, channel in self._channels.items():
+            if channel.has_sinks():
+                channel.log(encoders[name](), log_time=time)
+                self._sent += 1
+
+    def close(self) -> None:
+        """End the server; viewers see that the connection is gone."""
+        server, self._server = self._server, None
+        if server is not None:
+            server.stop()
+        for channel in self._channels.values():
+            channel.close()
+        self._channels = {}
+        self._context = None

@@ -1,0 +1,103 @@
+"""LeRobot camera: live pictures for LeRobot's camera of type `zmq`."""
+
+from __future__ import annotations
+
+import base64
+import logging
+
+import numpy as np
+import orjson
+import zmq
+from pydantic import Field, model_validator
+
+from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.frame import Tick
+from tactflow.jpeg import encode_jpeg
+from tactflow.ports import Image
+from tactflow.publisher import FloodError, Publisher, is_reachable
+
+log = logging.getLogger("tactflow")
+
+SEND_BUFFER = 1 << 18
+"""Kernel's buffer for each reader, bytes: some pictures. Chosen by hand."""
+
+
+class LerobotCamera(Sink):
+    """Publishes the processed picture as LeRobot's `ZMQCamera` reads it.
+
+    A message is JSON, `{"timestamps": {sensor: seconds}, "images": {sensor: JPEG in base64}}`. While nobody
+    reads, nothing is encoded. `in: {image: visualize.annotated}` sends another picture.
+    """
+
+    threaded = True
+    when_live = "latest"
+    observer = True
+
+    class Params(StageParams):
+        """Where to publish, and how good the pictures are."""
+
+        endpoint: str = Field(
+            "tcp://127.0.0.1:5555",
+            description="address to bind; LeRobot's camera knows no keys, so that others than this machine "
+            "take open_to_all",
+        )
+        open_to_all: bool = Field(False, description="publish to other machines: everybody there may look")
+        quality: int = Field(90, ge=1, le=100, description="of the JPEG; higher is sharper and larger")
+
+        @model_validator(mode="after")
+        def _guarded(self) -> LerobotCamera.Params:
+            if not self.open_to_all and is_reachable(self.endpoint):
+                raise ValueError(
+                    f"{self.endpoint} can be reached from other machines, and LeRobot's camera knows no "
+                    "keys: set endpoint to tcp://127.0.0.1:5555, or open_to_all: true to let everybody look"
+                )
+            return self
+
+    def __init__(self, params: Params, sensor: str = "main") -> None:
+        """Prepare; nothing is bound yet. sensor : LeRobot's `camera_name`."""
+        super().__init__(params)
+        self.endpoint = self.description = params.endpoint
+        self._sensor = sensor
+        self._publisher: Publisher | None = None
+        self._readers = 0
+        self._sent = 0
+
+    def open(self) -> None:
+        """Bind the socket. Raises StageError if the address is taken or cannot be bound."""
+        self._publisher = Publisher(self.params.endpoint, 1, SEND_BUFFER)
+        self.endpoint = self.description = self._publisher.endpoint
+        log.info("pictures for LeRobot on %s", self.endpoint)
+
+    def counters(self) -> dict[str, int]:
+        """pictures : sent so far."""
+        return {"pictures": self._sent}
+
+    def write(self, tick: Tick, image: Image) -> None:
+        """Send one picture to whoever reads; never waits."""
+        publisher = self._publisher
+        if publisher is None or not self._is_read(publisher):
+            return
+        # LeRobot takes what it decodes for red, green, blue, whereas a JPEG is decoded to blue, green, red.
+        swapped = np.ascontiguousarray(image[:, :, ::-1])
+        jpeg = encode_jpeg(swapped, self.params.quality)
+        images = {self._sensor: base64.b64encode(jpeg).decode()}
+        message = {"timestamps": {self._sensor: tick.frame.t}, "images": images}
+        publisher.socket.send(orjson.dumps(message), zmq.NOBLOCK)
+        self._sent += 1
+
+    def close(self) -> None:
+        """Free the address."""
+        publisher, self._publisher = self._publisher, None
+        if publisher is not None:
+            publisher.close(0)
+
+    def _is_read(self, publisher: Publisher) -> bool:
+        """Whether anybody has subscribed."""
+        try:
+            while (event := publisher.next_event()) is not None:
+                self._readers += 1 if event[:1] == b"\x01" else -1
+        except FloodError as error:
+            log.warning("lerobot_camera: %s on %s; all readers are disconnected", error, self.endpoint)
+            publisher.renew()
+            self._readers = 0
+        return self._readers > 0

@@ -1,0 +1,108 @@
+"""How a session goes in which a ball is pressed: which presses are good, and where the next one is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.calibration.presses import Press
+
+LIGHT: Final = 0.5
+"""Radius of a contact over the usual one, below which a press is called light. Chosen by hand."""
+ROUND: Final = 1.7
+"""Longer over shorter axis of a contact, from which on it is not called a ball's. Chosen by hand: presses of
+a ball on a real gel (mini_ball) reach 1.57."""
+PARTS: Final = 3
+"""Columns and rows of parts of the gel that should each have presses. Chosen by hand."""
+_ROWS: Final = ("upper", "middle", "lower")
+_COLUMNS: Final = ("left", "centre", "right")
+_FIRST: Final = ((1, 1), (0, 0), (2, 2), (0, 2), (2, 0), (0, 1), (2, 1), (1, 0), (1, 2))
+"""The parts in the order in which they are asked for."""
+_DEPTHS: Final = ("firmly", "lightly", "half as deep")
+"""How to press where there are none, one, two presses: a calibration wants several depths."""
+
+
+def fault(press: Press, usual: float) -> str | None:
+    """What is wrong with a press, and what to do; None if it is good.
+
+    usual : radius of contacts, px.
+
+    >>> mask = np.zeros((60, 60), np.uint8)
+    >>> fault(Press(1, np.zeros((60, 60, 3), np.uint8), mask, mask > 0, (5.0, 30.0), 9.0), 9.0)
+    'cut off by the border of the picture at (5, 30); press further inside'
+    """
+    height, width = press.mask.shape
+    x, y = press.center
+    if press.radius < LIGHT * usual:
+        return f"light, radius {press.radius:.0f} px where {usual:.0f} px is usual; press harder"
+    if min(x, y, width - 1 - x, height - 1 - y) < press.radius:
+        return f"cut off by the border of the picture at ({x:.0f}, {y:.0f}); press further inside"
+    if _elongation(press.mask) > ROUND:
+        return "not round; press the ball straight, and nothing else"
+    return None
+
+
+def part(press: Press) -> tuple[int, int]:
+    """(row, column) of the part of the gel that a press lies in."""
+    height, width = press.mask.shape
+    return int(PARTS * press.center[1] / height), int(PARTS * press.center[0] / width)
+
+
+def part_name(row: int, column: int) -> str:
+    """What a part of the gel is called.
+
+    >>> part_name(0, 2)
+    'upper right'
+    """
+    return f"{_ROWS[row]} {_COLUMNS[column]}"
+
+
+def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str, Any]:
+    """What was done and what to do now, as the live page takes it.
+
+    lasts : whether the last press is not over. wanted : so many presses.
+
+    Returns
+    -------
+    now : what to do, in words. done, good, wanted : numbers of presses. next : (row, column) of the part of
+    the gel that has the fewest good ones. lasts. presses : center and radius of each, px, and fault, see
+    above; None if it is good.
+
+    >>> progress([], False, 20)["now"]
+    'Press the ball firmly at the middle centre.'
+    """
+    usual = float(np.median([press.radius for press in presses])) if presses else 0.0
+    faults = [fault(press, usual) for press in presses]
+    done = len(presses) - lasts
+    good = [press for press, wrong in zip(presses[:done], faults[:done], strict=True) if wrong is None]
+    there = [part(press) for press in good]
+    row, column = min(_FIRST, key=there.count)
+    now = f"Press the ball {_DEPTHS[there.count((row, column)) % 3]} at the {part_name(row, column)}."
+    if lasts:
+        now = "Lift the ball."
+    elif done >= wanted:
+        now = "These are enough presses."
+    return {
+        "now": now,
+        "done": done,
+        "good": len(good),
+        "wanted": wanted,
+        "next": (row, column),
+        "lasts": lasts,
+        "presses": [
+            {"center": press.center, "radius": press.radius, "fault": wrong}
+            for press, wrong in zip(presses, faults, strict=True)
+        ],
+    }
+
+
+def _elongation(mask: NDArray[np.uint8]) -> float:
+    """Longer over shorter axis of a region (H, W) uint8, not 0 inside; 0 of nothing."""
+    moments = cv2.moments(mask, binaryImage=True)
+    across, both, down = moments["mu20"], moments["mu11"], moments["mu02"]
+    apart = float(np.hypot(across - down, 2 * both))
+    return float(np.sqrt((across + down + apart) / max(across + down - apart, 1e-9)))

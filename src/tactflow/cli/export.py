@@ -1,0 +1,88 @@
+"""`tactflow export`: make a dataset of recordings."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from pathlib import Path
+
+from tactflow.engine.errors import ConfigError, StageError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `export`."""
+    parser.add_argument("format", choices=("lerobot",), help="a LeRobot dataset, layout v3.0")
+    parser.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="RECORDING",
+        help="each becomes an episode: whatever --source of `tactflow run` takes that ends",
+    )
+    parser.add_argument(
+        "--out", required=True, type=Path, metavar="DATASET", help="folder; must not be there"
+    )
+    parser.add_argument(
+        "--pipeline", metavar="PIPELINE", help="what finds contact and flow (default: as `tactflow run`)"
+    )
+    parser.add_argument("--fps", type=int, help="of the dataset (default: that of the first recording)")
+    parser.add_argument(
+        "--task", default="touch", help="what is done, in words: LeRobot keeps it (default: touch)"
+    )
+    parser.add_argument(
+        "--pictures",
+        choices=("video", "png"),
+        default="video",
+        help="video: H.264, small, loses a little (default); png: every bit",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the dataset; returns the exit code.
+
+    Raises
+    ------
+    ConfigError : the folder is there already, or the rate is none. Nothing was written.
+    TactflowError : as `tactflow run`; nothing is left behind.
+    """
+    from tactflow.lerobot import DatasetWriter
+    from tactflow.streaming import stream
+
+    if args.out.exists():
+        raise ConfigError(f"--out: {args.out} is already there; give another folder")
+    if args.fps is not None and args.fps < 1:
+        raise ConfigError(f"--fps: required at least 1, got {args.fps}")
+    fps = args.fps or _rate(args.recordings[0])
+    unfinished = args.out.with_name(f".unfinished-{args.out.name}")
+    writer = DatasetWriter(unfinished, fps, args.task, film=args.pictures == "video")
+    settings: dict[str, object] = {"sinks": {}}
+    shutil.rmtree(unfinished, ignore_errors=True)
+    recording = ""
+    try:
+        for recording in args.recordings:
+            frames = writer.add(stream(args.pipeline, source=recording, settings=settings, images=True))
+            print(f"{recording}: {frames} frames", file=sys.stderr)
+        writer.finish()
+        unfinished.replace(args.out)
+    except StageError as error:
+        raise StageError(f"{recording}: {error}") from error
+    except OSError as error:
+        raise StageError(f"{args.out}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    print(f"{args.out}: {len(args.recordings)} episodes at {fps} fps", file=sys.stderr)
+    return 0
+
+
+def _rate(recording: str) -> int:
+    """Frames per second of a recording, whole."""
+    from tactflow.sources import open_source
+
+    source = open_source(recording)
+    rate, live = source.fps, source.live
+    source.close()
+    if live:
+        raise ConfigError(f"{recording}: required a recording, not a camera or a stream")
+    if rate is None:
+        raise ConfigError(f"{recording}: does not say how many frames come in a second; give --fps")
+    return max(round(rate), 1)

@@ -1,0 +1,34 @@
+"""Pictures as JPEG, for people."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """A JPEG file.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8, BGR, or (H, W) grey levels.
+    quality : 1 to 100; higher is sharper and larger.
+
+    Raises
+    ------
+    ValueError
+        If JPEG cannot hold the image: it is empty, or longer than 65500 pixels.
+
+    Examples
+    --------
+    >>> encode_jpeg(np.zeros((4, 6, 3), np.uint8), 80)[:2].hex()
+    'ffd8'
+    """
+    try:
+        done, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))
+    except cv2.error:
+        done = False
+    if not done:
+        raise ValueError(f"required an image that JPEG can hold, got {image.shape} {image.dtype}")
+    return jpeg.tobytes()

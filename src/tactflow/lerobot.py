@@ -1,0 +1,299 @@
+"""Writes LeRobot datasets (layout v3.0): pictures, contact and flow at a constant rate.
+
+The layout is described at https://huggingface.co/docs/lerobot/lerobot-dataset-v3. Each recording is an
+episode, in files of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow import __version__
+from tactflow.engine.errors import StageError
+from tactflow.extras import missing
+from tactflow.streaming import Result
+
+if TYPE_CHECKING:
+    import av
+
+VERSION = "v3.0"
+"""Of the layout, as LeRobot compares it."""
+CONTACT, FLOW = "observation.tactile.contact", "observation.tactile.flow"
+NAMES = {CONTACT: ["touching", "x", "y", "area", "angle"], FLOW: ["known", "dx", "dy"]}
+"""Features and the names of their numbers. All are 0 where the first is 0."""
+WHOLE = ("frame_index", "episode_index", "index", "task_index")
+"""Columns of whole numbers that every dataset has, beside `timestamp`."""
+CHUNK = 1000
+"""Files in one folder, as LeRobot has it."""
+QUALITY = {"crf": "18", "g": "2", "preset": "veryfast"}
+"""Of the video: nearly nothing is lost to see, and every other picture stands alone, for reading at random.
+Chosen by hand."""
+SAMPLED = 10
+"""Every so many pictures are looked at for their statistics. Chosen by hand."""
+
+
+class DatasetWriter:
+    """Writes one dataset.
+
+    folder : must not be there. fps : of the dataset, frames per second. task : what is done, in words.
+    film : whether pictures are kept as H.264 video, which loses a little; else as PNG, without loss.
+
+    Raises
+    ------
+    StageError : a package is missing.
+    """
+
+    def __init__(self, folder: Path, fps: int, task: str, *, film: bool = True) -> None:
+        problem = missing("LeRobot datasets", "lerobot", ["pyarrow", "av"])
+        if problem is not None:
+            raise StageError(problem)
+        self._folder, self._fps, self._task, self._film = folder, fps, task, film
+        self._episodes: list[dict[str, Any]] = []
+        self._frames = 0
+        self._camera = ""
+        self._shape: tuple[int, ...] = ()
+        self._numbers: dict[str, list[NDArray[np.float64]]] = {name: [] for name in NAMES}
+        self._pixels: list[NDArray[np.float64]] = []
+
+    def add(self, results: Iterable[Result]) -> int:
+        """Write one episode; the number of its frames.
+
+        results : of one sensor, with pictures.
+
+        Raises
+        ------
+        StageError : the sensor or the size of its pictures is not that of the episodes before, or there is no
+            picture. OSError : the files cannot be written.
+        """
+        episode = len(self._episodes)
+        place = f"chunk-{episode // CHUNK:03d}/file-{episode % CHUNK:03d}"
+        rows: list[dict[str, Any]] = []
+        film: _Film | None = None
+        try:
+            for index, result in enumerate(at_rate(results, self._fps)):
+                image = self._checked(result)
+                if self._film and film is None:
+                    film = _Film(self._folder / "videos" / self._camera / f"{place}.mp4", self._fps, image)
+                rows.append(self._row(result, image, index, episode))
+                if film is not None:
+                    film.write(image)
+        finally:
+            if film is not None:
+                film.close()
+        if not rows:
+            raise StageError("there is no frame in it")
+        self._write_rows(rows, self._folder / "data" / f"{place}.parquet")
+        self._episodes.append(self._episode(episode, len(rows)))
+        self._frames += len(rows)
+        return len(rows)
+
+    def finish(self) -> None:
+        """Write what the dataset says about itself."""
+        import pyarrow as pa  # type: ignore[import-untyped]
+
+        meta = self._folder / "meta"
+        _write(pa.Table.from_pylist(self._episodes), meta / "episodes" / "chunk-000" / "file-000.parquet")
+        # LeRobot finds a task by the index of a pandas table; this says which column that is.
+        types = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
+        columns = [
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
+            for name, (kind, stored) in types.items()
+        ]
+        pandas = {"index_columns": ["task"], "columns": columns, "column_indexes": []}
+        tasks = pa.table({"task_index": [0], "task": [self._task]})
+        _write(tasks.replace_schema_metadata({"pandas": json.dumps(pandas)}), meta / "tasks.parquet")
+        (meta / "info.json").write_text(json.dumps(self._info(), indent=4))
+        (meta / "stats.json").write_text(json.dumps(self._statistics(), indent=4))
+
+    def _checked(self, result: Result) -> NDArray[np.uint8]:
+        """The picture, if it goes with the others."""
+        image = result.image
+        if image is None:
+            raise StageError("the pipeline makes no picture: it needs a stage preprocess")
+        camera = f"observation.images.{result.sensor}"
+        if not self._camera:
+            self._camera, self._shape = camera, image.shape
+        if (camera, image.shape) != (self._camera, self._shape):
+            raise StageError(
+                f"{camera} with pictures of {image.shape[1]} x {image.shape[0]} pixels; those before are "
+                f"{self._camera}, {self._shape[1]} x {self._shape[0]}: make two datasets"
+            )
+        if self._film and (image.shape[0] % 2 or image.shape[1] % 2):
+            raise StageError(
+                f"pictures of {image.shape[1]} x {image.shape[0]} pixels: a video needs even numbers; "
+                "give --pictures png"
+            )
+        return image
+
+    def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
+        row: dict[str, Any] = dict(_numbers(result))
+        for name, values in self._numbers.items():
+            values.append(np.array(row[name]))
+        if index % SAMPLED == 0:
+            # Mean, mean square, least and largest of blue, green, red.
+            pixels = image.reshape(-1, 3) / 255.0
+            self._pixels.append(
+                np.array([pixels.mean(0), (pixels**2).mean(0), pixels.min(0), pixels.max(0)])[:, ::-1]
+            )
+        if not self._film:
+            row[self._camera] = {"bytes": cv2.imencode(".png", image)[1].tobytes(), "path": None}
+        whole = (index, episode, self._frames + index, 0)
+        return row | {"timestamp": index / self._fps} | dict(zip(WHOLE, whole, strict=True))
+
+    def _write_rows(self, rows: list[dict[str, Any]], path: Path) -> None:
+        import pyarrow as pa
+
+        fields = [pa.field(name, pa.list_(pa.float32(), len(names))) for name, names in NAMES.items()]
+        if not self._film:
+            fields.append(pa.field(self._camera, pa.struct([("bytes", pa.binary()), ("path", pa.string())])))
+        fields += [pa.field("timestamp", pa.float32()), *(pa.field(name, pa.int64()) for name in WHOLE)]
+        _write(pa.Table.from_pylist(rows, pa.schema(fields)), path)
+
+    def _episode(self, episode: int, frames: int) -> dict[str, Any]:
+        place = {"chunk_index": episode // CHUNK, "file_index": episode % CHUNK}
+        row: dict[str, Any] = {
+            "episode_index": episode,
+            "tasks": [self._task],
+            "length": frames,
+            "dataset_from_index": self._frames,
+            "dataset_to_index": self._frames + frames,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+        row |= {f"data/{key}": value for key, value in place.items()}
+        if self._film:
+            video = place | {"from_timestamp": 0.0, "to_timestamp": frames / self._fps}
+            row |= {f"videos/{self._camera}/{key}": value for key, value in video.items()}
+        return row
+
+    def _info(self) -> dict[str, Any]:
+        camera: dict[str, Any] = {
+            "dtype": "video" if self._film else "image",
+            "shape": list(self._shape),
+            "names": ["height", "width", "channels"],
+        }
+        if self._film:
+            camera["info"] = {
+                "video.height": self._shape[0],
+                "video.width": self._shape[1],
+                "video.codec": "h264",
+                "video.pix_fmt": "yuv420p",
+                "video.is_depth_map": False,
+                "video.fps": self._fps,
+                "video.channels": 3,
+                "has_audio": False,
+            }
+        features: dict[str, Any] = {self._camera: camera}
+        for name, names in NAMES.items():
+            features[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
+        features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+        features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in WHOLE}
+        return {
+            "codebase_version": VERSION,
+            "robot_type": None,
+            "tactflow_version": __version__,
+            "total_episodes": len(self._episodes),
+            "total_frames": self._frames,
+            "total_tasks": 1,
+            "chunks_size": CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": self._fps,
+            "splits": {"train": f"0:{len(self._episodes)}"},
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+            if self._film
+            else None,
+            "features": features,
+        }
+
+    def _statistics(self) -> Mapping[str, Any]:
+        """What training normalises by: of each number, and of each colour (in [0, 1], red first)."""
+        found: dict[str, Any] = {}
+        for name, rows in self._numbers.items():
+            values = np.array(rows)
+            moments = {
+                "min": values.min(0),
+                "max": values.max(0),
+                "mean": values.mean(0),
+                "std": values.std(0),
+            }
+            found[name] = {key: one.tolist() for key, one in moments.items()} | {"count": [len(values)]}
+        pixels = np.array(self._pixels)
+        mean = pixels[:, 0].mean(0)
+        spread = np.sqrt(np.maximum(pixels[:, 1].mean(0) - mean**2, 0))
+        colours = {"min": pixels[:, 2].min(0), "max": pixels[:, 3].max(0), "mean": mean, "std": spread}
+        found[self._camera] = {key: one.reshape(3, 1, 1).tolist() for key, one in colours.items()}
+        found[self._camera]["count"] = [len(pixels)]
+        return found
+
+
+def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
+    """For each multiple of 1 / fps since the first result, the result whose time is nearest.
+
+    >>> from types import SimpleNamespace
+    >>> times = [5.0, 5.02, 5.21, 5.3]
+    >>> [one.t for one in at_rate((SimpleNamespace(t=t) for t in times), 10)]
+    [5.0, 5.02, 5.21, 5.3]
+    """
+    before: Result | None = None
+    begin, index = 0.0, 0
+    for result in results:
+        if before is None:
+            before, begin = result, result.t
+        # Halves go to the earlier one.
+        while begin + index / fps < (before.t + result.t) / 2:
+            yield before
+            index += 1
+        before = result
+    if before is not None and index <= round((before.t - begin) * fps):
+        yield before
+
+
+def _numbers(result: Result) -> Iterator[tuple[str, list[float]]]:
+    contact, mean = result.contact, None if result.flow is None else result.flow.mean
+    if contact is None:
+        yield CONTACT, [0.0] * len(NAMES[CONTACT])
+    else:
+        angle = 0.0 if contact.angle is None else math.radians(contact.angle)
+        yield CONTACT, [1.0, *contact.center, contact.area, angle]
+    yield FLOW, [0.0, 0.0, 0.0] if mean is None else [1.0, *mean]
+
+
+class _Film:
+    """A video that grows picture by picture."""
+
+    def __init__(self, path: Path, fps: int, image: NDArray[np.uint8]) -> None:
+        import av
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = av.open(str(path), "w")
+        self._stream: av.VideoStream = self._file.add_stream("libx264", rate=fps, options=QUALITY)
+        self._stream.height, self._stream.width = image.shape[:2]
+        self._stream.pix_fmt = "yuv420p"
+
+    def write(self, image: NDArray[np.uint8]) -> None:
+        """Add one picture, (H, W, 3) uint8 BGR."""
+        import av
+
+        self._file.mux(self._stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._file.mux(self._stream.encode(None))
+        self._file.close()
+
+
+def _write(table: Any, path: Path) -> None:
+    import pyarrow.parquet as pq  # type: ignore[import-untyped]
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table, path)

@@ -1,0 +1,103 @@
+"""A Dask cluster as an engine; what happens to its processes, `python -m tests.load.batch cluster` shows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tactflow.batch import cluster
+from tactflow.batch.cluster import DaskCluster
+from tactflow.batch.task import Outcome, Task
+from tactflow.engine.errors import ConfigError, StageError
+from tests.batch.test_local import tasks
+
+distributed = pytest.importorskip("distributed", reason="needs Dask: pip install 'tactflow[dask]'")
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+
+def toy(task: Task) -> Outcome:
+    """Stands in for a pipeline."""
+    if task.recording.name == "broken":
+        raise ValueError("no such thing")
+    return Outcome(task.recording.source, task.recording.name, "done")
+
+
+@pytest.fixture
+def scheduler() -> Iterator[Any]:
+    """A cluster in this process."""
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=50
+    ) as made:
+        yield made
+
+
+def test_every_task_comes_back_also_one_whose_work_raises(scheduler: Any, tmp_path: Path) -> None:
+    engine = DaskCluster(scheduler.scheduler_address, work=toy)
+    assert engine.window == 2
+    outcomes: dict[str, Outcome] = {}
+    try:
+        for task in tasks(tmp_path, "a", "broken", "b"):
+            engine.submit(task)
+        deadline = time.monotonic() + 100
+        while len(outcomes) < 3:
+            assert time.monotonic() < deadline
+            outcomes |= {outcome.name: outcome for outcome in engine.finished(1.0)}
+    finally:
+        engine.close(kill=False)
+    assert {name: outcome.status for name, outcome in outcomes.items()} == {
+        **{"a": "done", "b": "done", "broken": "failed"}
+    }
+    assert outcomes["broken"].error == "on a worker: ValueError: no such thing"
+
+
+def test_nobody_who_answers_is_a_mistake_of_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.3)
+    with pytest.raises(ConfigError, match="nobody answers who understands"):
+        DaskCluster("tcp://127.0.0.1:9")
+    with pytest.raises(ConfigError, match="nobody answers who understands"):
+        DaskCluster("no address")
+
+
+def test_a_cluster_of_other_versions_is_refused_before_anything_is_begun(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Client:
+        def __init__(self, *_: object, **__: object) -> None:
+            self.closed = False
+
+        def get_versions(self, check: bool) -> None:
+            assert check
+            raise ValueError("Mismatched versions found: msgpack")
+
+        def close(self) -> None:
+            self.closed = True
+
+    monkeypatch.setattr(cluster, "_distributed", lambda: SimpleNamespace(Client=Client))
+    with pytest.raises(ConfigError, match="other versions than here: Mismatched versions found: msgpack"):
+        DaskCluster("tcp://127.0.0.1:8786")
+
+
+def test_a_scheduler_that_goes_is_said(
+    scheduler: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
+    engine = DaskCluster(scheduler.scheduler_address, work=toy)
+
+    def until_it_is_noticed() -> None:
+        for task in tasks(tmp_path, "a"):
+            engine.submit(task)
+        deadline = time.monotonic() + 100
+        while time.monotonic() < deadline:
+            engine.finished(0.5)
+
+    try:
+        scheduler.close()
+        with pytest.raises(StageError, match="is gone, with 1 recordings under way"):
+            until_it_is_noticed()
+    finally:
+        engine.close(kill=True)

@@ -1,0 +1,81 @@
+"""A live session that is broken off loses no press, and goes on only where it still fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tactflow.calibration.keeping import KeptPresses
+from tactflow.calibration.presses import Press, _Collect
+from tactflow.engine.contract import StageParams
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.frame import Frame, Tick
+from tactflow.vision.geometry import PixelMapping
+from tactflow.vision.types import Contact
+
+GEL = np.full((40, 60, 3), 100, np.uint8)
+MASK = np.zeros((40, 60), np.uint8)
+MAPPING = PixelMapping.identity((60, 40))
+PRESS = Press(7, GEL, MASK, MASK > 0, (20.0, 30.0), 5.0)
+
+
+def test_presses_that_are_kept_are_there_again_without_those_that_were_undone(tmp_path: Path) -> None:
+    kept = KeptPresses(tmp_path / "main.presses")
+    presses = [replace(PRESS, seq=number) for number in range(3)]
+    for count in range(1, 4):
+        kept.sync(presses[:count])
+    kept.sync([presses[0], presses[2]])
+    again = KeptPresses(tmp_path / "main.presses")
+    assert [press.seq for press in again.presses] == [0, 2]
+    again.sync([*again.presses, replace(PRESS, seq=9)])
+    last = KeptPresses(tmp_path / "main.presses").presses
+    assert [press.seq for press in last] == [0, 2, 9]
+    assert (last[0].center, last[0].radius) == (PRESS.center, PRESS.radius)
+    assert np.array_equal(last[0].image, GEL)
+    again.clear()
+    assert not KeptPresses(tmp_path / "main.presses").presses
+
+
+def test_a_session_does_not_go_on_with_another_light_or_other_frames(tmp_path: Path) -> None:
+    kept = KeptPresses(tmp_path / "main.presses")
+    kept.check(GEL, MAPPING)
+    kept.check(GEL + 1, MAPPING)
+    with pytest.raises(ConfigError, match=r"differs by 20 % .* --fresh"):
+        kept.check(GEL + 20, MAPPING)
+    with pytest.raises(ConfigError, match="had another preprocess"):
+        kept.check(np.ascontiguousarray(GEL[:20]), PixelMapping.identity((60, 20)))
+
+
+def test_a_kept_press_that_is_damaged_is_named(tmp_path: Path) -> None:
+    (tmp_path / "press-0001.npz").write_bytes(b"PK no")
+    with pytest.raises(ConfigError, match=r"press-0001\.npz: cannot be read"):
+        KeptPresses(tmp_path)
+
+
+class LiveSink(_Collect):
+    """The sink of `find_presses`, at a live source, with nobody who guides."""
+
+    report = staticmethod(lambda _frames, _presses, _lasts: False)
+
+
+def test_a_live_session_begins_with_the_presses_of_the_one_before(tmp_path: Path) -> None:
+    live: Any = SimpleNamespace(source=SimpleNamespace(live=True))
+    touched = MASK.copy()
+    touched[10:20, 10:20] = 255
+    contact = Contact(100.0, (14.5, 14.5), None, None, np.zeros((0, 2)), None)
+    counts = []
+    for _ in range(2):
+        sink = LiveSink(StageParams(), live)
+        sink.keeper = lambda: KeptPresses(tmp_path / "main.presses")
+        sink.open()
+        for seq in range(9):
+            now = contact if seq % 3 == 1 else None
+            tick = Tick(Frame("main", seq, seq / 60, GEL, reference=seq == 0))
+            sink.write(tick, GEL, now, touched, None, None, MAPPING)
+        counts.append(len(sink.presses))
+    assert counts == [3, 6]

@@ -1,0 +1,111 @@
+"""`tactflow export lerobot`: what it writes is read back, also by LeRobot itself where that is installed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tactflow
+from tactflow.cli.main import main
+from tactflow.sources import open_source
+
+pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
+pytest.importorskip("av", reason="the extra lerobot is not installed")
+
+import pyarrow.parquet as pq
+
+KEY = "observation.images.main"
+SPECS = ["sim:press?frames=40&noise=0", "sim:press?frames=30"]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("export") / "press"
+    options = ["--out", str(out), "--task", "press", "--pipeline", "markerless"]
+    assert main(["export", "lerobot", *SPECS, *options]) == 0
+    return out
+
+
+def test_each_recording_is_an_episode_with_its_contacts(dataset: Path) -> None:
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", 60, 70)
+    for episode, spec in enumerate(SPECS):
+        results = list(tactflow.stream("markerless", source=spec, settings={"sinks": {}}, images=True))
+        rows = pq.read_table(dataset / f"data/chunk-000/file-00{episode}.parquet").to_pylist()
+        assert [row["frame_index"] for row in rows] == list(range(len(results)))
+        assert [row["index"] for row in rows] == list(range(40 * episode, 40 * episode + len(results)))
+        for row, result in zip(rows, results, strict=True):
+            contact = row["observation.tactile.contact"]
+            assert contact[0] == (result.contact is not None)
+            if result.contact is not None:
+                assert np.allclose(contact[1:4], [*result.contact.center, result.contact.area])
+        reader = open_source(f"lerobot:{dataset}?camera={KEY}&episode={episode}")
+        frames = list(iter(reader.read, None))
+        reader.close()
+        assert [t for _, t in frames] == [index / 60 for index in range(len(results))]
+        # A video loses some of the colour.
+        errors = [
+            np.abs(image - 1.0 * result.image).mean()
+            for (image, _), result in zip(frames, results, strict=True)
+        ]
+        assert max(errors) < 4
+
+
+def test_statistics_are_those_of_the_numbers(dataset: Path) -> None:
+    stats = json.loads((dataset / "meta" / "stats.json").read_text())
+    rows = pq.read_table(dataset / "data")["observation.tactile.contact"].to_pylist()
+    assert np.allclose(stats["observation.tactile.contact"]["mean"], np.mean(rows, 0), rtol=1e-5)
+    assert np.allclose(stats["observation.tactile.contact"]["std"], np.std(rows, 0), rtol=1e-5)
+    assert np.shape(stats[KEY]["mean"]) == (3, 1, 1)
+
+
+OPENED = """
+import sys
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+dataset = LeRobotDataset("tactflow/press", root=sys.argv[1], video_backend="pyav")
+item = dataset[45]
+print(dataset.num_episodes, dataset.num_frames, dataset.fps, item["task"], tuple(item[sys.argv[2]].shape),
+    tuple(item["observation.tactile.contact"].shape), int(item["episode_index"]), sep="; ")
+"""
+
+
+def test_lerobot_opens_it(dataset: Path) -> None:
+    # Not in the environment of the tests: LeRobot takes other versions of numpy and OpenCV, and torch.
+    python = os.environ.get("LEROBOT_PYTHON")
+    if python is None:
+        pytest.skip("LEROBOT_PYTHON does not name the Python of an environment in which LeRobot is")
+    command = [python, "-W", "ignore", "-c", OPENED, str(dataset), KEY]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "2; 70; 60; press; (3, 400, 300); (5,); 1"
+
+
+def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = tmp_path / "data", tmp_path / "press"
+    data.mkdir()
+    first, small, odd = (str(data / name) for name in ("first.npy", "small.npy", "odd.npy"))
+    for path, width in ((first, 64), (small, 32), (odd, 62)):
+        np.save(path, np.zeros((3, 48, width, 3), np.uint8))
+    for arguments, code, said in (
+        ([first, "no-such.mcap"], 4, "no-such.mcap: no such file"),
+        (
+            [first, small],
+            3,
+            "small.npy: observation.images.main with pictures of 24 x 16 pixels; those before",
+        ),
+        ([odd], 3, "a video needs even numbers; give --pictures png"),
+        ([first, "--fps", "0"], 2, "--fps: required at least 1"),
+        ([str(tmp_path / "none.npy")], 4, "no such file"),
+    ):
+        assert main(["export", "lerobot", *arguments, "--out", str(out), "--pipeline", "markerless"]) == code
+        assert said in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == [data]
+    out.mkdir()
+    assert main(["export", "lerobot", first, "--out", str(out)]) == 2
+    assert "is already there" in capsys.readouterr().err

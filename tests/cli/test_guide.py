@@ -1,0 +1,62 @@
+"""What is said while a ball is pressed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactflow.calibration.presses import Press
+from tactflow.cli.guide import Guide, judged
+
+GEL = np.zeros((90, 90, 3), np.uint8)
+MASK = np.zeros((90, 90), np.uint8)
+
+
+def press(x: float, y: float, radius: float = 10.0) -> Press:
+    return Press(0, GEL, MASK, MASK > 0, (x, y), radius)
+
+
+def test_a_press_is_good_or_light_or_cut_off() -> None:
+    presses = [press(45, 45), press(20, 20), press(20, 70, radius=4), press(5, 45)]
+    assert judged(presses[:1], 0).startswith("good, radius 10 px; nothing yet at the upper left")
+    assert judged(presses, 2) == "light, radius 4 px where 10 px is usual; press harder (u: undo)"
+    assert judged(presses, 3).startswith("cut off by the border of the picture at (5, 45)")
+    everywhere = [press(15 + 30 * column, 15 + 30 * row) for row in range(3) for column in range(3)]
+    assert judged(everywhere, 0) == "good, radius 10 px; all parts of the gel have one"
+
+
+def test_the_last_press_is_undone_and_the_session_ended_by_what_is_typed() -> None:
+    said: list[str] = []
+    typed: list[str] = []
+
+    def take() -> list[str]:
+        taken = typed.copy()
+        typed.clear()
+        return taken
+
+    guide = Guide(3, said.append, take)
+    presses: list[Press] = []
+    assert not guide(1, presses, False)
+    presses.append(press(45, 45))
+    assert not guide(2, presses, True)
+    assert not said
+    assert not guide(3, presses, False)
+    assert said[-1].startswith("press 1 of 3: good")
+    typed.append("u")
+    presses.append(press(20, 20))
+    assert not guide(4, presses, True)
+    # That which lasts stays; the one before it is gone.
+    assert [one.center for one in presses] == [(20, 20)]
+    assert said[-1] == "press 1 is undone; press again"
+    typed.append("q")
+    assert guide(5, presses, False)
+    presses += [press(70, 20), press(70, 70)]
+    assert guide(6, presses, False)
+
+
+def test_a_session_that_goes_on_says_where_it_stands() -> None:
+    said: list[str] = []
+    Guide(3, said.append)(1, [press(45, 45)], False)
+    assert said == [
+        "going on with 1 presses of before; nothing yet at the upper left, upper centre, upper right, "
+        "middle left, ..."
+    ]
