@@ -55,8 +55,8 @@ class Force(Stage):
         if not force.in_range and not self._warned:
             self._warned = True
             logger.warning(
-                "force: %.2f N is of a larger contact than those the calibration was fitted to (%.2f to "
-                "%.2f N); its standard error does not hold (said once)",
+                "force: %.2f N is of a larger contact, or one with more shear, than those the calibration "
+                "was fitted to (%.2f to %.2f N); its standard error does not hold (said once)",
                 force.value[2],
                 *known.press.range,
             )

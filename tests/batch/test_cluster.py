@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -60,6 +61,25 @@ def test_nobody_who_answers_is_a_mistake_of_the_command_line(monkeypatch: pytest
         DaskCluster("tcp://127.0.0.1:9")
     with pytest.raises(ConfigError, match="nobody answers who understands"):
         DaskCluster("no address")
+
+
+def test_a_cluster_of_other_versions_is_refused_before_anything_is_begun(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Client:
+        def __init__(self, *_: object, **__: object) -> None:
+            self.closed = False
+
+        def get_versions(self, check: bool) -> None:
+            assert check
+            raise ValueError("Mismatched versions found: msgpack")
+
+        def close(self) -> None:
+            self.closed = True
+
+    monkeypatch.setattr(cluster, "_distributed", lambda: SimpleNamespace(Client=Client))
+    with pytest.raises(ConfigError, match="other versions than here: Mismatched versions found: msgpack"):
+        DaskCluster("tcp://127.0.0.1:8786")
 
 
 def test_a_scheduler_that_goes_is_said(

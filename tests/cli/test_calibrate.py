@@ -61,6 +61,9 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     told = capsys.readouterr().err
     assert "heights are not known" not in told
     assert "the gauge's x axis lies -90 degrees" in told
+    today = ["check", *force[1:]]
+    assert calibrate(*today) == 0
+    assert "N RMS from the gauge today; when it was made" in capsys.readouterr().out
     assert calibrate(*force) == 2
     assert "has a force already" in capsys.readouterr().err
     spec = "ball?frames=60&shear=0.6&seed=3"

@@ -233,6 +233,20 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
     return Fit(entry.model_copy(update={"drag": learned if learned.r2 > 0 else None}), turned, mirrored)
 
 
+def try_force(entry: ForceEntry, name: str, watched: Watched, reference: Reference) -> float:
+    """RMS error of the force z in another recording, N.
+
+    Raises ConfigError if the reference is of another recording, or heights are known in one of the two only.
+    """
+    if watched.press.keys() != entry.press.stiffness.keys():
+        raise ConfigError(
+            f"{name}: heights are known here and not in the calibration, or the other way round"
+        )
+    one = align(name, watched, reference, entry.change_at_rest)
+    stiffness = np.array([entry.press.stiffness[feature] for feature in watched.press])
+    return float(np.sqrt(np.mean((one.press @ stiffness - one.force[:, 2]) ** 2)))
+
+
 def _groups(aligned: Sequence[Aligned], left_out: str) -> NDArray[np.intp]:
     """(n,) int: what is left out together."""
     if left_out == "recording":

@@ -123,10 +123,12 @@ def run(args: argparse.Namespace) -> int:
         call = _Call(args, folder, scratch, ledger, recordings)
         stack.enter_context(ending_handled(call.stopping.count))
         results = [call.run(request) for request in requests]
-        paths = call.write_reports(requests[0], results[0])
+        # Before the table is written, which a full disk may not take.
+        call.say("\n".join(_closing(results)))
+        page = call.write_reports(requests[0], results[0])
         if len(requests) > 1:
-            paths.append(call.compare(requests, results))
-        call.say("\n".join(_closing(results, paths)))
+            page = call.compare(requests, results)
+        call.say(f"look at {page}")
     return _code(results, call.stopping)
 
 
@@ -178,17 +180,17 @@ class _Call:
                 shown=display.shown,
             )
 
-    def write_reports(self, request: PipelineRequest, result: Result) -> list[Path]:
-        """The table and the page, of all parts; returns their paths."""
+    def write_reports(self, request: PipelineRequest, result: Result) -> Path:
+        """The table and the page, of all parts; returns the path of the page."""
         outcomes = result.outcomes
         if self._args.shard != (1, 1):
             known = self._folder.known(request.digest)
             others = {source: o for source, o in known.items() if o.pipeline == request.digest}
             outcomes = others | outcomes
         rows = [Row(recording, outcomes.get(recording.source)) for recording in self._recordings]
-        runs = write_runs(self._folder.path, rows, self._args.format)
+        write_runs(self._folder.path, rows, self._args.format)
         title = f"{Path(request.file).stem}: {len(rows)} recordings"
-        return [runs, write_page(self._folder, rows, title, _facts(rows))]
+        return write_page(self._folder, rows, title, _facts(rows))
 
     def compare(self, requests: Sequence[PipelineRequest], results: Sequence[Result]) -> Path:
         """Say and write how the results of two pipelines differ; returns the path of the page."""
@@ -270,7 +272,7 @@ def _facts(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def _closing(results: Sequence[Result], paths: Sequence[Path]) -> list[str]:
+def _closing(results: Sequence[Result]) -> list[str]:
     """The summary at the end."""
     outcomes = [outcome for result in results for outcome in result.outcomes.values()]
     failed = [outcome for result in results for outcome in result.failed]
@@ -282,8 +284,8 @@ def _closing(results: Sequence[Result], paths: Sequence[Path]) -> list[str]:
     lines += [f"ended early: {result.ended}" for result in results if result.ended is not None]
     lines += [f"  {o.status}: {o.name}: {in_short(o)}" for o in failed[:_FAILED_SHOWN]]
     if len(failed) > _FAILED_SHOWN:
-        lines.append(f"  and {len(failed) - _FAILED_SHOWN} more, see {paths[0]}")
-    return [*lines, f"look at {paths[-1]}"]
+        lines.append(f"  and {len(failed) - _FAILED_SHOWN} more; the table of runs has all")
+    return lines
 
 
 def _code(results: Sequence[Result], stopping: Stopping) -> int:

@@ -17,7 +17,7 @@ from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
 from tactflow.calibration.presses import Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
-from tactflow.cli.calibrate_force import add_force, add_force_arguments
+from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_force
 from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.cli.notes import notes_on
@@ -187,6 +187,8 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
         print(f"{len(session.presses)} presses today: {_photometric_words(now)}")
         print(f"when it was made: {_photometric_words(then.model_dump())}")
         fits = fits and now["normal_error"] <= WORSE * then.normal_error
+    if args.csv is not None:
+        fits = check_force(args, path, pipeline, WORSE) and fits
     print("it still fits" if fits else "it has drifted; calibrate anew")
     return 0 if fits else 3
 

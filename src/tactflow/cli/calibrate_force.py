@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tactflow.api import load
 from tactflow.calibration.file import Calibration, LinearForceEntry
-from tactflow.calibration.force import Fit, Watched, fit_force, watch
+from tactflow.calibration.force import Fit, Watched, fit_force, try_force, watch
 from tactflow.calibration.reference import Reference, read_reference
 from tactflow.engine.errors import ConfigError
 from tactflow.files import expanded
@@ -21,7 +21,8 @@ def add_force_arguments(parser: argparse.ArgumentParser) -> None:
         "--csv",
         type=Path,
         metavar="FILE",
-        help="for force: what the gauge said, where it does not lie beside the recording; columns t (s) or "
+        help="for force, and to check it: what the gauge said, where it does not lie beside the recording; "
+        "columns t (s) or "
         "frame, fz (N), and fx and fy if there are",
     )
     parser.add_argument(
@@ -60,6 +61,21 @@ def add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> int
     replace(calibration, force=fit.entry).save(path)
     _say(f"{path} has the force now")
     return 0
+
+
+def check_force(args: argparse.Namespace, path: Path, pipeline: str | None, worse: float) -> bool:
+    """Print how right the force of a calibration is today; whether its error has not grown `worse` times.
+
+    Raises ConfigError as `add_force` does.
+    """
+    entry = Calibration.load(path).force
+    if entry is None:
+        raise ConfigError(f"calibrate check: {path} has no force that --csv could be compared with")
+    reference = _read(args.csv, args.offset)
+    loaded = load(pipeline, source=args.source, sensor=args.sensor, settings={"calibration": None})
+    now = try_force(entry, args.csv.name, watch(loaded, path), reference)
+    print(f"force: {now:.2f} N RMS from the gauge today; when it was made: {entry.press.rmse:.2f} N")
+    return now <= worse * entry.press.rmse
 
 
 def recordings_with_csv(source: str) -> list[tuple[str, Path]]:
@@ -117,9 +133,10 @@ def _words(fit: Fit, references: dict[str, Reference]) -> list[str]:
 
 def _quality(part: LinearForceEntry, left_out: str) -> str:
     absolute, relative = part.error
+    many = "recordings" if left_out == "recording" else "presses"
     return (
         f"RMS error {part.rmse:.2f} N of {part.range[0]:.1f} to {part.range[1]:.1f} N, "
-        f"{100 * part.r2:.0f} % of the variance explained, by {left_out}s that the fit has not seen; "
+        f"{100 * part.r2:.0f} % of the variance explained, by {many} that the fit has not seen; "
         f"standard error {absolute:.2f} N and {100 * relative:.0f} % of the force"
     )
 

@@ -1,0 +1,78 @@
+"""Stage `force`."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry
+from tactflow.engine.contract import StageParams
+from tactflow.engine.frame import Absent
+from tactflow.stages.force import Force
+from tactflow.vision.types import Contact, Depth, Flow, Scale
+
+SCALE = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0))
+GEL = np.full((24, 32, 3), 90, np.uint8)
+CONTACT = Contact(400.0, (10.0, 10.0), None, None, np.zeros((0, 2)), None)
+DEPTH = Depth(np.zeros((24, 32), np.float32), 0.5, 0.02, 3.0, 0.2, 1.5)
+FIT = {"error": [0.1, 0.05], "range": [0.2, 6.0], "rmse": 0.2, "r2": 0.9}
+BY_DEPTH = LinearForceEntry(
+    stiffness={"volume": 2.0, "area": 0.5}, greatest={"volume": 2, "area": 9.0}, **FIT
+)  # type: ignore[arg-type]
+BY_CHANGE = LinearForceEntry(
+    stiffness={"change": 0.1, "area": 0.5}, greatest={"change": 90, "area": 9.0}, **FIT
+)  # type: ignore[arg-type]
+DRAG = LinearForceEntry(stiffness={"shear_by_area": 0.5}, greatest={"shear_by_area": 4.0}, **FIT)  # type: ignore[arg-type]
+
+
+def stage(folder: Path, press: LinearForceEntry, drag: LinearForceEntry | None = None) -> Force:
+    """The stage with a calibration that knows such a force."""
+    force = ForceEntry(
+        press=press, drag=drag, change_at_rest=2.0, recordings={"a": 0.0}, presses=9, left_out="press"
+    )
+    look, corners = np.full((12, 16, 3), 90, np.float32), np.zeros((4, 2))
+    made = Calibration("main", "a.mcap", (32, 24), (32, 24), corners, look, SCALE, "pitch", force=force)
+    made.save(folder / "main.yaml")
+    return Force(StageParams(), folder / "main.yaml")
+
+
+def test_the_force_is_linear_in_what_is_seen_with_its_error(tmp_path: Path) -> None:
+    found = stage(tmp_path, BY_DEPTH, DRAG).process(CONTACT, SCALE, GEL, GEL, DEPTH, Flow((3.0, -1.0), 4))
+    assert not isinstance(found, Absent)
+    # 400 px^2 are 4 mm^2; the volume that counts is the one in the contact.
+    assert found.value == pytest.approx((0.5 * 0.3 * 4, -0.5 * 0.1 * 4, 2 * 1.5 + 0.5 * 4))
+    assert found.stderr == pytest.approx((np.hypot(0.1, 0.03), np.hypot(0.1, 0.01), np.hypot(0.1, 0.25)))
+    assert found.in_range
+    still = stage(tmp_path, BY_DEPTH, DRAG).process(CONTACT, SCALE, GEL, GEL, DEPTH, Flow(None, 0))
+    assert not isinstance(still, Absent)
+    assert still.value[:2] == still.stderr[:2] == (None, None)
+
+
+def test_without_heights_the_change_of_the_light_stands_for_them(tmp_path: Path) -> None:
+    found = stage(tmp_path, BY_CHANGE).process(CONTACT, SCALE, GEL + np.uint8(1), GEL)
+    assert not isinstance(found, Absent)
+    # 24 x 32 x 3 grey levels on 0.01 mm^2 each, less what is there at rest.
+    assert found.value[2] == pytest.approx(0.1 * (23.04 - 2) + 0.5 * 4)
+
+
+def test_nothing_is_said_without_a_calibration_or_without_the_heights_it_needs(tmp_path: Path) -> None:
+    assert Force(StageParams()).process(CONTACT, SCALE, GEL, GEL) == Absent("no_calibration")
+    assert stage(tmp_path, BY_DEPTH).process(CONTACT, SCALE, GEL, GEL) == Absent("no_depth")
+
+
+def test_a_contact_beyond_the_fit_is_told_and_warned_of_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    force, deep = stage(tmp_path, BY_DEPTH), replace(DEPTH, pressed=2.5)
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        for _ in range(3):
+            found = force.process(CONTACT, SCALE, GEL, GEL, deep)
+            assert not isinstance(found, Absent)
+            assert not found.in_range
+    (record,) = caplog.records
+    assert "7.00 N is of a larger contact" in record.getMessage()
+    assert "0.20 to 6.00 N" in record.getMessage()
