@@ -33,11 +33,13 @@ from tactflow.batch.summary import Summary, with_looker
 from tactflow.batch.task import Format, Outcome, PipelineRequest, Report, Task, result_name
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.graph import Mark, Pipeline
 from tactflow.engine.run import Progress
 
 DEADLY = 2
 """Workers that a recording may kill before it is set aside."""
+_SRC = Mark("SRC", 0, 0)
+"""Where the source stands: not in the pipeline file, which is not to blame for it."""
 _MOST_NOTES = 5
 """Warnings that are kept of one recording. Chosen by hand."""
 
@@ -220,7 +222,7 @@ def reading(pipeline: Pipeline, recording: Recording) -> Pipeline:
         "stages": stages,
         "sinks": {n.component.name: {} for n in pipeline.sinks},
     }
-    nodes = {**pipeline.nodes, source.id: replace(source, params=source.params.changed(**wanted))}
+    nodes = {**pipeline.nodes, source.id: replace(source, params=source.params.changed(**wanted), mark=_SRC)}
     return replace(pipeline, nodes=nodes, settings=settings)
 
 
