@@ -115,6 +115,8 @@ def test_a_printed_target_gives_the_scale(
     [
         (["--from", "sim:idle?frames=3"], "one of --pitch MM and --area"),
         (["markerless", "--from", "sim:unmarked?frames=3", "--pitch", "2"], "found 0"),
+        # No page in this pipeline: it gets one.
+        (["markerless", "--from", "sim:unmarked?frames=3", "--pitch", "2", "--view"], "view: http://"),
         (["--from", "sim:idle?frames=3", "--pitch", "2", "--ball-radius", "2"], "nothing touched the gel"),
         (["--from", "sim:idle?frames=3", "--pitch", "2", "--out", "a.txt"], "ends in .yaml"),
         (["--from", "sim:idle?frames=3", "--area", "0", "20"], "falls"),

@@ -6,11 +6,12 @@ import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from rich.console import Console
 
-from tactflow.api import load
+from tactflow.api import Settings, load
 from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_picture
 from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
@@ -123,7 +124,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         kept.clear()
     guide = Guide(args.presses, _say, typed_lines())
     with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
-        session = find_presses(loaded, guide, kept, _page(loaded, guide) if args.view else None)
+        session = find_presses(loaded, guide, kept, _page(args, pipeline, guide) if args.view else None)
     try:
         calibration = _learned(args, loaded, session)
     except ConfigError as error:
@@ -192,12 +193,14 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     return 0 if fits else 3
 
 
-def _load(args: argparse.Namespace, pipeline: str | None) -> Pipeline:
+def _load(
+    args: argparse.Namespace, pipeline: str | None, settings: Settings = MappingProxyType({})
+) -> Pipeline:
     return load(
         pipeline,
         source=args.source,
         sensor=args.sensor,
-        settings={"calibration": None},
+        settings={"calibration": None, **settings},
         realtime=args.realtime,
     )
 
@@ -224,13 +227,15 @@ def _given(args: argparse.Namespace) -> str:
     return f"pitch of {args.pitch:g} mm" if args.pitch else f"area of {args.area[0]:g} x {args.area[1]:g} mm"
 
 
-def _page(loaded: Pipeline, guide: Guide) -> dict[str, Node]:
-    """The live page as the pipeline sets it, made to guide."""
-    for id_, node in loaded.nodes.items():
-        if issubclass(node.component.cls, Guiding):
-            component = replace(node.component, cls=node.component.cls.through(guide))
-            return {id_: replace(node, component=component)}
-    raise ConfigError("calibrate --view: required a pipeline with the sink view; add `view: {}` to its sinks")
+def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[str, Node]:
+    """The live page as the pipeline sets it, or as it is by itself, made to guide."""
+    choices: tuple[Settings, ...] = ({}, {"sinks.view": {}})
+    for settings in choices:
+        for id_, node in _load(args, pipeline, settings).nodes.items():
+            if issubclass(node.component.cls, Guiding):
+                component = replace(node.component, cls=node.component.cls.through(guide))
+                return {id_: replace(node, component=component)}
+    raise AssertionError("the sink view guides")
 
 
 def _scale_words(scale: Scale) -> str:
