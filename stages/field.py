@@ -9,6 +9,8 @@ import numpy as np
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Image
+from tactflow.vision import compiled
+from tactflow.vision.flow import region
 from tactflow.vision.flow.displacement_field import FEWEST, DisplacementField, FieldModel
 from tactflow.vision.types import Markers
 
@@ -26,6 +28,7 @@ class Field(Stage):
 
     def __init__(self, params: StageParams) -> None:
         super().__init__(params)
+        compiled.load(region)
         self._model: FieldModel | None = None
         self._size = (0, 0)
 

@@ -18,8 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
-from tactflow.vision.flow import region
 from tactflow.vision.flow.inside import check_mask
 from tactflow.vision.flow.region import sample_region, sum_pairs, sum_region
 from tactflow.vision.markers.family import pitch_of
@@ -185,7 +183,6 @@ class FieldModel:
         """(rows, columns, N), the kernel between cells and markers."""
         down, across = np.mgrid[:rows, 1 - columns : columns] * self.grid.spacing
         self._between = matern(np.hypot(down, across) / self._length)
-        compiled.load(region)
 
     def _kernel(self, points: FloatArray) -> FloatArray:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
