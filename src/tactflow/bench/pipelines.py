@@ -61,12 +61,14 @@ class Worst:
 
 
 @dataclass(slots=True)
-class _Score:
+class PipelineScore:
+    """What a pipeline said about a scene, against the truth; `worst` keeps its worst frame, if given."""
+
     contact: ContactScore = field(default_factory=ContactScore)
     markers: MarkerScore = field(default_factory=MarkerScore)
     flow: FlowScore = field(default_factory=FlowScore)
     limit: float | None = None
-    worst: Worst = field(default_factory=Worst)
+    worst: Worst | None = None
 
     def add(self, outcome: Outcome, rendered: Rendered) -> str:
         """Judge one frame; returns whether it shows a contact, as a kind of time."""
@@ -79,7 +81,7 @@ class _Score:
             mapping = PixelMapping.identity((width, height))
         truth = rendered.truths(mapping)[index]
         deep = rendered.deep(index)
-        if deep and truth.touching:
+        if self.worst is not None and deep and truth.touching:
             self.worst.see(outcome, truth)
         if self.contact.detected(outcome.contact is not None, truth, deep):
             assert outcome.contact is not None
@@ -93,6 +95,7 @@ class _Score:
         return "contact" if truth.touching else "idle"
 
     def errors(self) -> dict[str, float]:
+        """Quantity -> value."""
         return {**self.contact.errors(), **self.markers.errors(), **self.flow.errors()}
 
 
@@ -235,7 +238,7 @@ def measure_pipelines(
     rendered : the scene. folder : for scratch files.
     step : called after each frame. worst : called with each pipeline's name and worst frame.
     """
-    scores = {name: _Score() for name in pipelines}
+    scores = {name: PipelineScore(worst=Worst()) for name in pipelines}
     repeats = OriginalRepeats()
 
     def see(name: str, outcome: Outcome) -> str:
@@ -252,7 +255,7 @@ def measure_pipelines(
         measurement.failure = failures.get(name)
         if measurement.failure is None:
             measurement.errors = scores[name].errors()
-            worst(name, scores[name].worst)
+            worst(name, scores[name].worst or Worst())
             limit = scores[name].limit
             if limit is not None:
                 measurement.limits["displacement_rms"] = limit

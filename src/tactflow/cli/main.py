@@ -38,6 +38,7 @@ COMMANDS = {
     "calibrate": "make the calibration file of a sensor, or see whether it still fits",
     "detect": "find the marks of a gel and show what was found and why, in one picture",
     "doctor": "what is wrong with a sensor's pictures, what it does to the errors, and what to change",
+    "tune": "find the cheapest pipeline within an error budget, for one sensor, from a recording of it",
     "cameras": "list the cameras that are plugged in, with names that stay the same",
     "sim": "write a simulated recording and its ground truth",
     "schema": "print the JSON Schema of the result message or of a pipeline file",

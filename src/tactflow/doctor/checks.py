@@ -82,8 +82,6 @@ BLUR_WIDTHS: Final = Bounds(0.005, 0.01)
 much at 4 px of 800. The fault is chosen by hand."""
 NOISE_LEVELS: Final = Bounds(7.0, 16.0)
 """Noise, grey levels."""
-NOISE_PAIRS: Final = 8
-"""Pairs of frames that noise is measured in. Chosen by hand: each has hundreds of tiles."""
 JPEG_STEPS: Final = Bounds(18.0, 55.0)
 """Step of JPEG, grey levels: qualities of about 30 and 10."""
 BAND_SHARES: Final = Bounds(0.015, 0.025)
@@ -110,9 +108,6 @@ DRIFT: Final = Bounds(0.15, 1.0)
 simulated gel, and 0.05 px is what this check itself may be off by. Chosen by hand."""
 DELAY: Final = Bounds(0.1, 0.3)
 """Age of a frame when it is read, s. Chosen by hand: three and nine frames at 30 a second."""
-CLOSED: Final = Bounds(0.6, 0.4, falling=True)
-"""Share of the parallelograms of neighbouring dots that close: 0.8 and more in grids, 0.45 and more among
-painted dots, 0.3 at random (measured)."""
 MISSING: Final = Bounds(0.15, 0.4)
 """Share of a grid's places without a dot. Chosen by hand: real grids have up to 0.13, also in perspective."""
 FLICKER: Final = 0.06
@@ -309,11 +304,7 @@ def _focus(seen: Observation) -> Finding:
 
 
 def _noise(seen: Observation) -> Finding:
-    pairs = seen.pairs[:: max(1, len(seen.pairs) // NOISE_PAIRS)]
-    own = [measures.spatial_noise(pair.image) for pair in pairs]
-    apart = [measures.temporal_noise(p.image, p.after) for p in pairs if p.after is not None]
-    # Each has something else on top: texture, or motion.
-    noise = min(float(np.median(values)) for values in (own, apart) if values)
+    noise = measures.noise_of(seen.pairs)
     return _told(
         Finding(
             "noise",
@@ -404,11 +395,11 @@ def _dots(seen: Observation) -> Finding:
     return _told(
         Finding(
             "dots",
-            _worse(CLOSED.verdict(found.closed), MISSING.verdict(found.missing)),
+            MISSING.verdict(found.missing),
             f"{says}, {100 * found.missing:.0f} % missing, contrast {found.contrast:.0f} grey levels",
             float(found.found),
             "",
-            "where a dot is missing, motion is guessed from its neighbours; what is no dot moves wrongly",
+            "where a dot is missing, motion is guessed from its neighbours",
             "look at tactflow detect SRC --picture FILE; give polarity and dot, print worn dots anew",
         )
     )

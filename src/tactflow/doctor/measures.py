@@ -21,6 +21,8 @@ TILE: Final = 16
 """Side of the tiles that noise is measured in, px. Chosen by hand."""
 CALM: Final = 25.0
 """Percentile of the tiles that is taken for the noise: what moves or is textured fills the others."""
+NOISE_PAIRS: Final = 8
+"""Pairs of frames that noise is measured in. Chosen by hand: each has hundreds of tiles."""
 BLOCK: Final = 8
 """Side of the blocks of JPEG, px."""
 SATURATED: Final = 254
@@ -53,6 +55,8 @@ BEAT: Final = 0.5
 0.2 at most without JPEG, 0.8 and more with it."""
 TABLE: Final = 11.5
 """Step of the coarsest waves at quality 50: the mean of 11 and 12, ITU-T T.81, table K.1."""
+REGULAR: Final = 0.7
+"""Share of parallelograms that close from which on a grid is regular; 0.8 and more in grids. By hand."""
 WINDOW: Final = 31
 """Side of the window in which a point is followed, px. Chosen by hand."""
 RETURN: Final = 0.3
@@ -95,6 +99,26 @@ def spatial_noise(image: Image) -> float:
     """
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     return _calm_deviation(np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel), np.float32)) / 6.0
+
+
+class Pair(NamedTuple):
+    """Two frames in a row.
+
+    number : of the first. image : (H, W, 3) uint8. after : the next frame, None at the end.
+    """
+
+    number: int
+    image: Image
+    after: Image | None
+
+
+def noise_of(pairs: Sequence[Pair]) -> float:
+    """Standard deviation of the noise of a frame, grey levels: the smaller of what is seen within frames and
+    between them, since each has something else on top, texture or motion."""
+    some = pairs[:: max(1, len(pairs) // NOISE_PAIRS)]
+    own = [spatial_noise(pair.image) for pair in some]
+    apart = [temporal_noise(pair.image, pair.after) for pair in some if pair.after is not None]
+    return min(float(np.median(values)) for values in (own, apart) if values)
 
 
 def _calm_deviation(values: NDArray[np.float32]) -> float:
@@ -272,7 +296,8 @@ def lattice(found: Detection, gray: Gray) -> Lattice:
     expected = corners(found.centers, found.edges)
     closed = 0.0 if found.chosen is None else found.chosen.lattice
     missing = 0.0
-    if len(expected.points):
+    # Where the grid is irregular, nobody knows where a dot would be.
+    if len(expected.points) and closed >= REGULAR:
         hull = cv2.convexHull(found.centers.astype(np.float32))
         inside = np.array(
             [cv2.pointPolygonTest(hull, (float(x), float(y)), False) > 0 for x, y in expected.points]

@@ -1,0 +1,144 @@
+"""`tactflow tune`: the cheapest pipeline within an error budget, or the most exact one within a time."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import re
+import sys
+import tempfile
+from pathlib import Path
+
+import orjson
+
+from tactflow.cli.printable import printable
+from tactflow.config.shipped import find_pipeline
+from tactflow.engine.errors import ConfigError, StageError
+
+UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
+"""Unit of `--budget` -> seconds."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `tune`."""
+    parser.add_argument(
+        "pipeline",
+        nargs="?",
+        metavar="PIPELINE",
+        help="what to start from; default: ./pipeline.yaml, else the packaged one that fits the gel",
+    )
+    parser.add_argument(
+        "--source",
+        required=True,
+        metavar="RECORDING",
+        help="of the sensor: untouched at first, then some presses; as 'tactflow run --source', not live",
+    )
+    parser.add_argument("--max-error", type=_positive, metavar="PX", help="of the camera's picture")
+    parser.add_argument("--max-ms", type=_positive, metavar="MS", help="CPU time of a frame with contact")
+    parser.add_argument(
+        "--error",
+        default="any",
+        choices=("any", "center", "dots", "flow"),
+        help="which error counts: contact's centre, displacement of dots, mean flow; default: the largest",
+    )
+    parser.add_argument(
+        "--budget", type=_seconds, default=120.0, metavar="TIME", help="as 90s, 2min (default)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="the same errors again; not the times"
+    )
+    parser.add_argument("--sensor", metavar="NAME", help="which one of several in the pipeline file")
+    parser.add_argument(
+        "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
+    )
+    parser.add_argument("--html", type=Path, metavar="FILE", help="default: beside --out, ending in .html")
+    parser.add_argument("--overwrite", action="store_true", help="replace these files if they are there")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Search, print and write; returns 0, or 3 if no pipeline keeps the budgets.
+
+    Raises
+    ------
+    ConfigError, SourceError
+        If the options are wrong, or the recording cannot be used.
+    """
+    page: Path = args.html or args.out.with_suffix(".html")
+    _check_files(args.out, page, args.overwrite)
+    # Imported here: the simulator and the bench take their time.
+    from tactflow.tune import report
+    from tactflow.tune.recording import take
+    from tactflow.tune.search import DEFAULT, Goal, Search, impossible
+    from tactflow.tune.space import Candidate
+
+    logging.getLogger("tactflow").setLevel(logging.ERROR)
+    with tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
+        folder = Path(name)
+        file = find_pipeline(args.pipeline)
+        recording = take(args.source, Candidate(DEFAULT).load(file, args.sensor), folder)
+        if args.pipeline is None and recording.seen.dots is None:
+            file = find_pipeline("markerless")
+            _say(f"no dots are found: starting from {file.name}")
+        search = Search(
+            file,
+            Goal(args.error, args.max_error, args.max_ms),
+            sensor=args.sensor,
+            original=find_pipeline("classic"),
+            seconds=args.budget,
+            seed=args.seed,
+            say=_say,
+        )
+        tuned = search.run(recording, folder)
+    if args.json:
+        print(orjson.dumps(report.as_json(tuned), option=orjson.OPT_NON_STR_KEYS).decode())
+    else:
+        print(printable("\n".join(report.lines(tuned))))
+    _write(page, report.html(tuned))
+    if tuned.chosen is None:
+        _say(impossible(tuned))
+        return StageError.exit_code
+    _write(args.out, report.pipeline_text(tuned, file, args.out))
+    _say(f"{args.out} and {page} are written; try: tactflow run {args.out} --source {args.source}")
+    return 0
+
+
+def _check_files(out: Path, page: Path, overwrite: bool) -> None:
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"--out: required a file whose name ends in .yaml, got {out}")
+    for option, path in (("--out", out), ("--html", page)):
+        if not path.absolute().parent.is_dir():
+            raise ConfigError(f"{option}: there is no folder {path.absolute().parent}")
+        if path.is_dir():
+            raise ConfigError(f"{option}: {path} is a folder; required a file")
+        if path.exists() and not overwrite:
+            raise ConfigError(f"{option}: {path} is already there; give --overwrite to replace it")
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StageError(f"{path}: {error.strerror or error}") from error
+
+
+def _say(words: str) -> None:
+    print(printable(words), file=sys.stderr)
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"required a number above 0, got {text!r}")
+    return value
+
+
+def _seconds(text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-z]*)", text.strip())
+    if match is None or match[2] not in UNITS or float(match[1]) <= 0:
+        raise argparse.ArgumentTypeError(f"required a time such as 90s, 2min or 1h, got {text!r}")
+    return float(match[1]) * UNITS[match[2]]

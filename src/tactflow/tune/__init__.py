@@ -1,0 +1,1 @@
+"""The cheapest pipeline within an error budget, for one sensor: `tactflow tune`."""

@@ -1,0 +1,338 @@
+"""Successive halving: many candidates on a few frames, fewer on more, the last ones on the recording, too.
+
+References
+----------
+K. Jamieson and A. Talwalkar, "Non-stochastic best arm identification and hyperparameter optimization",
+AISTATS 2016.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from tactflow.bench.scenes import Case
+from tactflow.bench.timing import CopyUnit
+from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.engine.graph import Pipeline
+from tactflow.tune import checks
+from tactflow.tune.measure import ANY, ERRORS, Found, judge, mark_unsound, on_sensor, set_time
+from tactflow.tune.recording import Recording
+from tactflow.tune.sensor import Fitted, Look, fit
+from tactflow.tune.space import Candidate, candidates, refinements
+
+ROUNDS: Final = (
+    (Case("press", 24),),
+    (Case("press", 48), Case("cable", 40, "bend=20")),
+    (Case("press", 120), Case("slide", 60), Case("cable", 40)),
+)
+"""Simulated recordings of each round; every round has another seed. Chosen by hand: a contact; two kinds of
+contact; several depths and places, and a drag."""
+KEPT: Final = (1.0, 0.4, 0.4)
+"""Share of the candidates of a round that goes on to the next but one. The front goes on in any case."""
+FINALISTS: Final = 6
+"""Candidates of the last round, at most. Chosen by hand."""
+ALLOWED: Final = 1.5
+"""Without a budget: the cheapest whose error is at most so many times the least. Chosen by hand."""
+DEFAULT: Final = "as given"
+"""Name of the pipeline as the user gave it."""
+ORIGINAL: Final = "original script"
+"""Name of the original script's pipeline."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is asked for.
+
+    kind : of `ERRORS`. max_error : px of the camera's picture, or None. max_ms : ms a frame, or None.
+    """
+
+    kind: str = ANY
+    max_error: float | None = None
+    max_ms: float | None = None
+
+    def order(self, found: Sequence[Found]) -> list[Found]:
+        """The best first: what keeps the budgets before what does not; then time, or error if it is limited
+        by time; then the other one."""
+        bound = self.bound(found)
+
+        def key(one: Found) -> tuple[float, ...]:
+            error, ms = one.of(self.kind), one.ms.value
+            if not one.usable or not math.isfinite(error):
+                return (3.0, error, ms)
+            if self.max_ms is not None and self.max_error is None:
+                return (0.0, error, ms) if ms <= self.max_ms else (1.0, ms, error)
+            if error > bound:
+                return (1.0, error, ms)
+            slow = self.max_ms is not None and ms > self.max_ms
+            return (0.5 if slow else 0.0, ms, error)
+
+        return sorted(found, key=key)
+
+    def bound(self, found: Sequence[Found]) -> float:
+        """The error that is allowed, px."""
+        if self.max_error is not None:
+            return self.max_error
+        known = [one.of(self.kind) for one in found if one.usable]
+        return ALLOWED * min(known, default=math.inf)
+
+
+@dataclass
+class Tuned:
+    """The outcome.
+
+    recording, look, goal : what was tuned for. found : everything of the last rounds, the best first, with
+    the pipeline as given and the original script. front : names of those that no other beats in both time
+    and error. chosen : the candidate, or None where none keeps the budgets. tried : how many candidates.
+    words : what was decided on the way. rounds : candidates, frames of each round. settings : of all tried.
+    """
+
+    recording: Recording
+    look: Look
+    goal: Goal
+    found: list[Found]
+    front: list[str]
+    chosen: Candidate | None
+    tried: int
+    words: list[str] = field(default_factory=list[str])
+    rounds: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
+
+
+class Search:
+    """One search.
+
+    Parameters
+    ----------
+    file : the user's pipeline. sensor : which of several, or None. original : the
+    original script's pipeline, for comparison. goal : what is asked for.
+    seconds : the budget. seed : of the simulated recordings and the intervals. refine : whether the chosen
+    one is tried with changes. say : told what happens.
+    """
+
+    def __init__(
+        self,
+        file: Path,
+        goal: Goal,
+        *,
+        sensor: str | None = None,
+        original: Path | None = None,
+        seconds: float = 120.0,
+        seed: int = 0,
+        refine: bool = True,
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._file, self._sensor, self._goal, self._original = file, sensor, goal, original
+        self._end = time.monotonic() + seconds
+        self._seed, self._refine, self._say = seed, refine, say
+        self._unit = CopyUnit()
+        self._words: list[str] = []
+        self._rounds: list[tuple[int, int]] = []
+        self._known: dict[str, Candidate] = {}
+
+    def run(self, recording: Recording, folder: Path) -> Tuned:
+        """Search.
+
+        recording : what is tuned for. folder : for temporary files.
+
+        Raises
+        ------
+        SourceError
+            If no candidate finds the contacts of the simulated sensor.
+        """
+        base = Candidate(DEFAULT).load(self._file, self._sensor)
+        look = fit(recording)
+        self._say(f"simulated sensor: {look.words()}")
+        dots = recording.seen.dots
+        many = candidates(base, recording.size, None if dots is None else dots.pitch)
+        self._known = {candidate.name: candidate for candidate in (Candidate(DEFAULT), *many)}
+        found = self._halve(list(self._known.values()), look, folder)
+        if not any(one.usable and math.isfinite(one.of(self._goal.kind)) for one in found):
+            raise SourceError(_nothing(found, self._goal))
+        found = self._on_recording(found, recording, folder)
+        chosen = self._choice(found)
+        if chosen is not None and self._refine:
+            chosen, found = self._refined(chosen, base, found, recording, look, folder)
+        names = front(found, self._goal.kind)
+        found = [*found, *self._script(look, folder)]
+        return Tuned(
+            *(recording, look, self._goal, self._goal.order(found), names, chosen, len(many)),
+            words=self._words,
+            rounds=self._rounds,
+        )
+
+    def _halve(self, running: list[Candidate], look: Look, folder: Path) -> list[Found]:
+        """All rounds on the simulator; what is known of the last one's candidates."""
+        last: list[Found] = []
+        for number, cases in enumerate(ROUNDS):
+            started = time.monotonic()
+            frames = sum(case.frames for case in cases)
+            self._say(f"round {number + 1}: {len(running)} candidates, {frames} frames")
+            fresh = self._judged(running, cases, look, folder, self._seed + 100 * number)
+            mark_unsound(fresh)
+            self._rounds.append((len(running), max((one.frames for one in fresh), default=0)))
+            last = fresh
+            if number + 1 == len(ROUNDS):
+                break
+            share = (time.monotonic() - started) / max(1, len(running) * frames)
+            running = self._kept(fresh, number, share)
+            if time.monotonic() > self._end:
+                self._words.append(f"the budget was over after round {number + 1} of {len(ROUNDS)}")
+                names = {candidate.name for candidate in running[:FINALISTS]}
+                return [one for one in fresh if one.name in names]
+        return last
+
+    def _judged(
+        self, running: Iterable[Candidate], cases: Sequence[Case], look: Look, folder: Path, seed: int
+    ) -> list[Found]:
+        pipelines: dict[str, Pipeline] = {}
+        failed: list[Found] = []
+        for candidate in running:
+            try:
+                pipelines[candidate.name] = on_sensor(candidate.load(self._file, self._sensor))
+            except ConfigError as error:
+                failed.append(Found(candidate.name, failure=str(error)))
+        rendered = [Fitted(look, case, folder, seed + index) for index, case in enumerate(cases)]
+        try:
+            late = lambda: time.monotonic() > self._end  # noqa: E731  (a name for one expression)
+            made = judge(pipelines, rendered, folder, self._unit, self._seed, late)
+        finally:
+            for one in rendered:
+                one.path.unlink(missing_ok=True)
+        return [*made.values(), *failed]
+
+    def _kept(self, found: list[Found], number: int, share: float) -> list[Candidate]:
+        """Who goes on: the pipeline as given, the front, and the best by the goal."""
+        frames = sum(case.frames for case in ROUNDS[number + 1])
+        left = max(0.0, self._end - time.monotonic())
+        room = int(left / 2 / max(share * frames, 1e-6))
+        want = max(3, min(math.ceil(KEPT[number + 1] * len(found)), max(3, room)))
+        if number + 2 == len(ROUNDS):
+            want = min(want, FINALISTS)
+        ordered = [one for one in self._goal.order(found) if one.failure is None]
+        best = [one.name for one in ordered if one.usable][:want]
+        best += [name for name in front(found, self._goal.kind) if name not in best][: FINALISTS // 2]
+        first = next(iter(self._known))
+        # The most expensive one is what the others are compared with.
+        dearest = next(
+            (name for name in list(self._known)[1:] if any(o.name == name for o in ordered)), first
+        )
+        names = dict.fromkeys([first, dearest, *best])
+        return [self._known[name] for name in names if any(one.name == name for one in ordered)]
+
+    def _on_recording(self, found: list[Found], recording: Recording, folder: Path) -> list[Found]:
+        """Times on the recording instead of the simulator's, and the checks without truth."""
+        good = [one for one in found if one.failure is None]
+        dearest = list(self._known)[1:]
+        good.sort(key=lambda one: dearest.index(one.name) if one.name in dearest else len(dearest))
+        self._say(f"the recording: {len(good)} candidates, {recording.frames} frames, forward and backward")
+        pipelines = {one.name: self._known[one.name].load(self._file, self._sensor) for one in good}
+        compared, times, failures = checks.run(pipelines, recording, folder, self._unit)
+        for one in good:
+            one.failure = failures.get(one.name)
+            one.checks = compared.get(one.name, {})
+            if one.name in times and one.failure is None:
+                set_time(one, times[one.name], self._seed)
+        return found
+
+    def _script(self, look: Look, folder: Path) -> list[Found]:
+        """The original script, for comparison: its time and error on one simulated press."""
+        if self._original is None or time.monotonic() > self._end:
+            return []
+        self._say("the original script")
+        pipeline = Candidate(ORIGINAL, (("stages.preprocess.rotate", 0),)).load(self._original)
+        rendered = Fitted(look, ROUNDS[0][0], folder, self._seed)
+        try:
+            made = judge({ORIGINAL: on_sensor(pipeline)}, [rendered], folder, self._unit, self._seed)
+        finally:
+            rendered.path.unlink(missing_ok=True)
+        return list(made.values())
+
+    def _choice(self, found: list[Found]) -> Candidate | None:
+        """The best that keeps the budgets for sure, else the best that seems to."""
+        goal = self._goal
+        bound = goal.bound(found)
+        ordered = [one for one in goal.order(found) if one.usable and math.isfinite(one.of(goal.kind))]
+        fits = [
+            one
+            for one in ordered
+            if (goal.max_ms is None or one.ms.value <= goal.max_ms)
+            and ((goal.max_ms is not None and goal.max_error is None) or one.of(goal.kind) <= bound)
+        ]
+        sure = [one for one in fits if one.error[goal.kind].high <= bound]
+        if fits and not sure and goal.max_error is not None:
+            self._words.append("the budget lies within the interval of the chosen pipeline's error")
+        picked = sure if sure and goal.max_error is not None else fits
+        return self._known[picked[0].name] if picked else None
+
+    def _refined(
+        self,
+        chosen: Candidate,
+        base: Pipeline,
+        found: list[Found],
+        recording: Recording,
+        look: Look,
+        folder: Path,
+    ) -> tuple[Candidate, list[Found]]:
+        """One change at a time on the chosen one: kept where it is cheaper and no worse, or more exact."""
+        if time.monotonic() > self._end:
+            self._words.append("no time was left to try the probe's settings and more reference frames")
+            return chosen, found
+        tried = refinements(base, chosen)
+        for candidate in (chosen, *tried):
+            self._known[candidate.name] = candidate
+        self._say(f"refinements: {', '.join(c.name.removeprefix(chosen.name + ', ') for c in tried)}")
+        again = self._judged([chosen, *tried], ROUNDS[1], look, folder, self._seed + 500)
+        mark_unsound(again)
+        again = self._on_recording(again, recording, folder)
+        by_name = {one.name: one for one in again}
+        before = by_name[chosen.name]
+        best = chosen
+        for candidate in tried:
+            one = by_name[candidate.name]
+            if one.usable and _better(one, before, self._goal):
+                best, before = candidate, one
+        if best is chosen:
+            return chosen, found
+        self._words.append(f"refined: {best.name.removeprefix(chosen.name + ', ')}")
+        return best, [*found, by_name[best.name]]
+
+
+def _better(one: Found, before: Found, goal: Goal) -> bool:
+    """Whether a refinement is worth it: a tenth less time on the whole recording at no more error, or a tenth
+    less error at no more time."""
+    error, was = one.of(goal.kind), before.of(goal.kind)
+    cheaper = one.mean_ms < 0.9 * before.mean_ms and error <= 1.02 * was
+    return cheaper or (error < 0.9 * was and one.mean_ms <= 1.02 * before.mean_ms)
+
+
+def front(found: Sequence[Found], kind: str) -> list[str]:
+    """Names of the usable ones that no other beats in both time and error, by rising time."""
+    names: list[str] = []
+    least = math.inf
+    for one in sorted(found, key=lambda f: (f.ms.value, f.of(kind))):
+        if one.usable and one.of(kind) < least:
+            least = one.of(kind)
+            names.append(one.name)
+    return names
+
+
+def _nothing(found: Sequence[Found], goal: Goal) -> str:
+    reasons = [one.failure or one.unsound for one in found if one.failure or one.unsound]
+    why = f": {reasons[0]}" if reasons else f": none has a {ERRORS[goal.kind]}"
+    return f"no pipeline works on the simulated sensor{why}; see tactflow doctor, and tactflow detect"
+
+
+def impossible(tuned: Tuned) -> str:
+    """What can be had where the budgets cannot be kept."""
+    kind = tuned.goal.kind
+    usable = [one for one in tuned.found if one.usable and math.isfinite(one.of(kind))]
+    exact = min(usable, key=lambda one: one.of(kind))
+    fast = min(usable, key=lambda one: one.ms.value)
+    return (
+        f"no pipeline keeps the budget. Possible: {exact.of(kind):.3g} px in {exact.ms.value:.3g} ms "
+        f"({exact.name}), or {fast.ms.value:.3g} ms with {fast.of(kind):.3g} px ({fast.name})"
+    )

@@ -1,0 +1,170 @@
+"""`tune` chooses the cheapest pipeline that keeps the budget, and says what it cannot do."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+import tactflow
+from tactflow.bench.scenes import Case
+from tactflow.bench.timing import CopyUnit
+from tactflow.cli.main import main
+from tactflow.config.shipped import find_pipeline
+from tactflow.tune import report, search
+from tactflow.tune.measure import ANY, Found, Interval, judge, mark_unsound, on_sensor
+from tactflow.tune.recording import Recording, take
+from tactflow.tune.search import DEFAULT, Goal, Search, Tuned, front, impossible
+from tactflow.tune.sensor import Fitted, Look, fit
+from tactflow.tune.space import Axis, Candidate, candidates
+
+SMALL = Look((320, 240), "markers=10x8", 2.0, 0.0, 0, (1.0, 1.0, 1.0), 1.0)
+
+
+def found(name: str, ms: float, error: float, **more: object) -> Found:
+    interval = Interval(error, 0.9 * error, 1.1 * error)
+    one = Found(name, {"center": interval, ANY: interval}, ms=Interval(ms, ms, ms), mean_ms=ms)
+    for key, value in more.items():
+        setattr(one, key, value)
+    return one
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A recording of a small sensor, taken for the default pipeline."""
+    folder = tmp_path_factory.mktemp("recorded")
+    path = Fitted(SMALL, Case("press", 30), folder, 3).path
+    return take(str(path), tactflow.load("default"), folder)
+
+
+def test_the_simulated_sensor_looks_like_the_recorded_one(recorded: Recording) -> None:
+    look = fit(recorded)
+    # The default pipeline turns the picture; the simulator's frames stay as wide as high as they were.
+    assert look.size == (320, 240)
+    assert look.noise == pytest.approx(SMALL.noise, rel=0.1)
+    settings = dict(part.split("=") for part in look.query.split("&"))
+    assert float(settings["pitch"]) == pytest.approx(69.0, rel=0.03)
+    assert settings["polarity"] == "dark"
+    assert settings["light"] == "photometric"
+    assert look.contrast == pytest.approx(1.0, abs=0.1)
+    assert look.levels == pytest.approx((1.0, 1.0, 1.0), abs=0.05)
+
+
+def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
+    recorded: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flow = Axis("field", {"field": {}, "mean": {"stages.field": None, "stages.flow_in_mask.method": "mean"}})
+    monkeypatch.setattr("tactflow.tune.space.AXES", (flow,))
+    monkeypatch.setattr(search, "ROUNDS", ((Case("press", 24),),))
+    file, budget = find_pipeline("default"), 1.5
+    tuned = Search(file, Goal(max_error=budget), seed=1, refine=False).run(recorded, tmp_path)
+    assert tuned.chosen is not None
+    many = candidates(Candidate(DEFAULT).load(file), recorded.size, None)
+    truth = judge(
+        {one.name: on_sensor(one.load(file)) for one in many},
+        [Fitted(SMALL, Case("press", 24), tmp_path, 50)],
+        tmp_path,
+        CopyUnit(),
+        0,
+    )
+    mark_unsound(list(truth.values()))
+    # The mean over the dots is cheaper than the field, and far off: the budget forbids it.
+    assert tuned.chosen.name in ("field", DEFAULT)
+    assert truth["field"].of(ANY) <= budget < truth["mean"].of(ANY)
+    (chosen,) = [one for one in tuned.found if one.name == tuned.chosen.name]
+    assert {"backward", "odd_even", "agreement", "distance"} <= set(chosen.checks)
+    assert chosen.checks["backward"] < 0.2
+    text = report.pipeline_text(tuned, file, tmp_path / "tuned.yaml")
+    (tmp_path / "tuned.yaml").write_text(text)
+    assert "field" in tactflow.load(tmp_path / "tuned.yaml").nodes
+    assert f"{chosen.ms.value:.2f}" in text
+    assert report.html(tuned).count("<circle") == sum(not one.failure for one in tuned.found)
+
+
+def test_errors_are_the_same_with_the_same_seed(tmp_path: Path) -> None:
+    pipeline = on_sensor(tactflow.load("default"))
+    errors = []
+    for _ in range(2):
+        rendered = [Fitted(SMALL, Case("press", 16), tmp_path, 5)]
+        errors.append(judge({"one": pipeline}, rendered, tmp_path, CopyUnit(), 5)["one"].error)
+    assert errors[0] == errors[1]
+
+
+def test_the_order_follows_the_goal() -> None:
+    many = [
+        found("slow", 9, 0.1),
+        found("fast", 1, 2.0),
+        found("middle", 3, 0.5),
+        found("wrong", 0.5, 0.1, unsound="% of dots lost: 50 (best 0)"),
+        found("fails", 0.1, 0.1, failure="tracker failed"),
+    ]
+    assert [one.name for one in Goal(max_error=1.0).order(many)][:3] == ["middle", "slow", "fast"]
+    assert [one.name for one in Goal(max_ms=4.0).order(many)][:3] == ["middle", "fast", "slow"]
+    # Without a budget: the cheapest of those that are nearly as exact as the best.
+    assert Goal().order(many)[0].name == "slow"
+    assert front(many, ANY) == ["fast", "middle", "slow"]
+
+
+def test_an_impossible_budget_tells_what_is_possible(recorded: Recording) -> None:
+    many = [found("exact", 9, 0.1), found("fast", 1, 2.0)]
+    tuned = Tuned(recorded, SMALL, Goal(max_error=0.01), many, [], None, 2)
+    assert impossible(tuned).endswith("Possible: 0.1 px in 9 ms (exact), or 1 ms with 2 px (fast)")
+
+
+def test_a_pipeline_that_misses_contacts_is_not_sound() -> None:
+    many = [found("good", 1, 1.0), found("bad", 1, 0.1), found("unknown", 1, math.inf)]
+    many[0].quantities = {"missed_half_depth": 0.0}
+    many[1].quantities = {"missed_half_depth": 40.0}
+    mark_unsound(many)
+    assert [one.usable for one in many] == [True, False, True]
+    assert "40 (best 0)" in many[1].unsound
+
+
+def test_what_is_changed_stands_in_the_file_and_removed_stages_are_gone(
+    recorded: Recording, tmp_path: Path
+) -> None:
+    settings = (("stages.preprocess.downsample", 4), ("stages.fusion", None), ("skipping", False))
+    chosen = Candidate("chosen", settings)
+    tuned = Tuned(recorded, SMALL, Goal(), [found("chosen", 1, 1)], ["chosen"], chosen, 1)
+    text = report.pipeline_text(tuned, find_pipeline("default"), tmp_path / "tuned.yaml")
+    assert "# stages.preprocess.downsample: 4, in place of 2" in text
+    assert "# stages.fusion: removed" in text
+    document = yaml.safe_load(text)
+    assert document["stages"]["preprocess"]["downsample"] == 4
+    assert "fusion" not in document["stages"]
+    assert document["skipping"] is False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["--source", "still"], 4, "nothing touches the gel in its 24 first frames"),
+        (["--source", "short"], 4, "5 frames are too few"),
+        (["--source", "nowhere.avi"], 4, "no such file"),
+        (["--source", "still", "--budget", "soon"], 2, "required a time such as 90s"),
+        (["--source", "still", "--max-error", "-1"], 2, "required a number above 0"),
+        (["--source", "still", "--out", "tuned.txt"], 2, "ends in .yaml"),
+        (["--source", "still", "--out", "there.yaml"], 2, "already there"),
+    ],
+)
+def test_what_cannot_be_tuned_is_said(
+    arguments: list[str],
+    code: int,
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.yaml").touch()
+    for name, count in (("still", 24), ("short", 5)):
+        (tmp_path / name).mkdir()
+        for index in range(count):
+            gel = np.full((60, 80, 3), 120, np.uint8)
+            cv2.imwrite(str(tmp_path / name / f"{index:02}.png"), gel)
+    assert main(["tune", "markerless", *arguments]) == code
+    assert says in capsys.readouterr().err
