@@ -34,7 +34,7 @@ SENSORS = {
     "bright dots": ("default", Look((800, 600), "markers=10x8&polarity=bright", 2.0, 0.0, 0, WHITE, 1.0)),
 }
 """Name -> the pipeline that tune starts from, and the sensor."""
-JUDGED = (Case("press", 48), Case("slide", 24), Case("cable", 16))
+JUDGED = (Case("press", 56), Case("slide", 32))
 """Recordings on which everything is judged with its truth: the contacts that tune judges by, made anew."""
 ALLOWED = 1.5
 """The budget, in least true errors."""
