@@ -30,8 +30,8 @@ ROUNDS: Final = (
     (Case("press", 48), Case("slide", 40)),
     (Case("press", 140), Case("slide", 80)),
 )
-"""Simulated recordings of each round; every round has another seed. Chosen by hand: a contact; a press and a
-drag; several depths and places. No cable: lightly pressed, its ends are seen or not, whatever the pipeline."""
+"""Simulated recordings of each round; every round has another seed. By hand: a contact; a press and a drag;
+several depths and places. No cable: lightly pressed, its ends are seen or not, whatever the pipeline."""
 KEPT: Final = (1.0, 0.4, 0.4)
 """Share of the candidates of a round that goes on to the next but one. The front goes on in any case."""
 FINALISTS: Final = 6
