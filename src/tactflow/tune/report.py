@@ -23,7 +23,7 @@ MARGINS: Final = (70, 24, 20, 50)
 """Left, right, top and bottom margin, px."""
 ROOM: Final = 1.25
 """Factor by which the logarithmic axes reach beyond the points."""
-TICKS: Final = (1.0, 2.0, 5.0)
+TICKS: Final = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
 """Values of a decade that the axes show."""
 
 
@@ -258,7 +258,7 @@ def _dot(tuned: Tuned, one: Found, across: _Axis, up: _Axis) -> Iterator[str]:
     title = f"{one.name}: {one.ms.value:.2f} ms, {error.value:.3f} px"
     yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{color}"><title>{escape(title)}</title></circle>'
     if _is_chosen(tuned, one) or special:
-        yield _text(x + 9, y - 7, one.name, "start")
+        yield _text(x + 9, y - 7 if _is_chosen(tuned, one) else y + 17, one.name, "start")
 
 
 def _rule(x0: float, y0: float, x1: float, y1: float, color: str, dash: str = "") -> str:

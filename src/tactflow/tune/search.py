@@ -243,7 +243,7 @@ class Search:
 
     def _script(self, look: Look, folder: Path) -> list[Found]:
         """The original script, for comparison: its time and error on one simulated press."""
-        if self._original is None or time.monotonic() > self._end:
+        if self._original is None:
             return []
         self._say("the original script")
         pipeline = Candidate(ORIGINAL, (("stages.preprocess.rotate", 0),)).load(self._original)
