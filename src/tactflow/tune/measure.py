@@ -38,6 +38,8 @@ SOUND: Final = {
 or of dots; and for the outline, in overlap with the truth. Chosen by hand."""
 BLOCK: Final = 10
 """Frames in a row that are drawn together for an interval: neighbours share a contact. Chosen by hand."""
+LEAST_BLOCKS: Final = 5
+"""Blocks that an interval is drawn from, at least, where there are so many frames. Chosen by hand."""
 DRAWS: Final = 200
 """Draws of the bootstrap. Chosen by hand: ends of a 90 % interval are then right to a tenth of its width."""
 INTERVAL: Final = (5.0, 95.0)
@@ -188,7 +190,7 @@ def set_time(found: Found, times: Mapping[str, Samples], seed: int) -> None:
 def _interval(values: NDArray[np.float64], seed: int, power: float) -> Interval:
     """Mean of values (N,) to a power, rooted, and its interval by a bootstrap of blocks of frames."""
     raised = values**power
-    blocks = np.array_split(raised, max(1, len(raised) // BLOCK))
+    blocks = np.array_split(raised, min(len(raised), max(LEAST_BLOCKS, len(raised) // BLOCK)))
     sums, counts = np.array([block.sum() for block in blocks]), np.array([len(block) for block in blocks])
     drawn = np.random.default_rng([seed, 0x6572]).integers(0, len(blocks), (DRAWS, len(blocks)))
     means = (sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)) ** (1 / power)
