@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -14,6 +15,12 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 # Tests start hundreds of processes; without files of byte code each would compile every module anew (0.3 s).
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# Who runs the tests in the background of a script ignores Ctrl-C, and programs inherit what is ignored; those
+# that tests start shall not.
+for number in (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if sys.platform != "win32" else [])):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 MOST_WORKERS = 4
 """Processes that run tests at most: many tests watch a run in real time and need a processor then."""
