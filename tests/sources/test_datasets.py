@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +149,9 @@ def write_lerobot(root: Path, images: NDArray[np.uint8], version: str, dtype: st
                 for image in shown:
                     file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
                 file.mux(stream.encode(None))
+            if sys.platform == "linux":
+                # Where the user is root, this encoder makes the calling thread a real-time one.
+                os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     if v3:
         key = f"videos/{KEY}"
         episodes = [
