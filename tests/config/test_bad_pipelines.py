@@ -658,6 +658,7 @@ def load_or_refuse(path: Path) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_no_mutation_of_the_shipped_pipeline_ends_in_a_traceback(tmp_path: Path) -> None:
     path = tmp_path / "mutant.yaml"
     outcomes = []

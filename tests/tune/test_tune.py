@@ -54,6 +54,7 @@ def test_the_simulated_sensor_looks_like_the_recorded_one(recorded: Recording) -
     assert look.levels == pytest.approx((1.0, 1.0, 1.0), abs=0.05)
 
 
+@pytest.mark.slow
 def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     recorded: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

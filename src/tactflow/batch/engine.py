@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from tactflow.batch.task import Outcome, Status, Task
+from tactflow.clock import SYSTEM
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def died(task: Task, status: Status, why: str) -> Outcome:
         status,
         error=why,
         pipeline=task.pipeline.digest,
-        started=time.time(),
+        started=SYSTEM.unix(),
     )
 
 

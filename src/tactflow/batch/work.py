@@ -9,7 +9,6 @@ import logging
 import math
 import os
 import socket
-import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -31,6 +30,7 @@ from tactflow.batch.keys import (
 from tactflow.batch.recordings import Recording
 from tactflow.batch.summary import Summary, with_looker
 from tactflow.batch.task import Format, Outcome, PipelineRequest, Report, Task, result_name
+from tactflow.clock import SYSTEM
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
 from tactflow.engine.graph import Mark, Pipeline
@@ -49,13 +49,13 @@ def work(task: Task, report: Report = lambda _done, _total: None) -> Outcome:
 
     report : told how far it is. Never raises a TactflowError: what is wrong is in the outcome.
     """
-    began = time.time()
+    began = SYSTEM.now()
     blank = Outcome(
         task.recording.source,
         task.recording.name,
         "failed",
         pipeline=task.pipeline.digest,
-        started=began,
+        started=SYSTEM.unix(),
         worker=f"{socket.gethostname()}:{os.getpid()}",
         versions=versions(),
     )
@@ -73,7 +73,7 @@ def work(task: Task, report: Report = lambda _done, _total: None) -> Outcome:
         place = traceback.extract_tb(error.__traceback__)[-1]
         what = f"{type(error).__name__}: {error} ({place.filename}:{place.lineno})"
         outcome = replace(blank, error=what, disk_full=_is_disk_full(error))
-    return replace(outcome, seconds=0.0 if outcome.reused else time.time() - began)
+    return replace(outcome, seconds=0.0 if outcome.reused else SYSTEM.now() - began)
 
 
 @contextmanager

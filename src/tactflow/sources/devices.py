@@ -137,7 +137,7 @@ class Camera:
         if self._capture is None or sys.platform != "linux":
             return None
         stamped = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-        delay = time.clock_gettime(time.CLOCK_MONOTONIC) - stamped
+        delay = time.monotonic() - stamped
         return delay if stamped > 0 and 0 <= delay < self.READ_TIMEOUT else None
 
     def close(self) -> None:
