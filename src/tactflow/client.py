@@ -13,15 +13,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import orjson
 import zmq
 
 from tactflow.clock import SYSTEM, Clock
-from tactflow.files import expanded
-from tactflow.keys import WrongKeysError, secure_subscriber
+from tactflow.connection import Connection
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Where tactflow publishes unless its pipeline says otherwise."""
@@ -43,9 +41,6 @@ and is heard no more, before memory is taken for it. Chosen by hand."""
 MOST_SENSORS = 1000
 """Sensors whose gaps are counted, so that invented names take no memory. Chosen by hand."""
 
-REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-"""After these, ZeroMQ does not try again."""
-
 STATISTICS = b"tactflow.stats"
 """Topic of a run's statistics, which no sensor may be called after."""
 
@@ -54,7 +49,7 @@ REQUIRED = frozenset(["schema", "sensor", "seq", "t", "contact", "flow", "marker
 """Keys that every result message has."""
 
 
-class Subscriber:
+class Subscriber(Connection):
     """Receives result messages (`tactflow.frame/1`) as dicts; a context manager and an iterator.
 
     Belongs to one thread at a time. Connecting does not wait: it does not matter whether tactflow is started
@@ -101,46 +96,25 @@ class Subscriber:
         backlog: int = 10_000,
         keys: str | Path | None = None,
     ) -> None:
-        self.endpoint = endpoint
         self._clock = clock
         self.timeout = timeout
         self.lost = 0
         self.received = 0
         self.malformed = 0
         self._sensor = sensor
-        self._has_keys = keys is not None
         self._last_seq: dict[str, int] = {}
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.SUB)
-        self._socket.linger = 0
-        self._socket.setsockopt(zmq.RECONNECT_IVL, FIRST_RETRY_MS)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, LAST_RETRY_MS)
-        # A publisher that has lost its power says no goodbye; without a sign of life it is sought again.
-        self._socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
-        self._socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3 * HEARTBEAT_MS)
-        if latest:
-            self._socket.setsockopt(zmq.CONFLATE, 1)
-        else:
-            self._socket.setsockopt(zmq.RCVHWM, backlog)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_MESSAGE)
-        # The space ends the topic: `main` is not to receive `main2`.
-        self._socket.subscribe(b"tactflow." if sensor is None else f"tactflow.{sensor} ".encode())
-        self._refused = self._socket.get_monitor_socket(REFUSALS)
-        self._poller = zmq.Poller()
-        self._poller.register(self._socket, zmq.POLLIN)
-        self._poller.register(self._refused, zmq.POLLIN)
-        try:
-            if keys is not None:
-                secure_subscriber(self._socket, expanded(str(keys)))
-            self._socket.connect(endpoint)
-        except WrongKeysError:
-            self.close()
-            raise
-        except zmq.ZMQError as error:
-            self.close()
-            raise ValueError(
-                f"required an address such as {DEFAULT_ENDPOINT}, got {endpoint!r}: {error.strerror}"
-            ) from None
+        kept: dict[int, int | bytes] = {zmq.CONFLATE: 1} if latest else {zmq.RCVHWM: backlog}
+        options = kept | {
+            zmq.RECONNECT_IVL: FIRST_RETRY_MS,
+            zmq.RECONNECT_IVL_MAX: LAST_RETRY_MS,
+            # A publisher that has lost its power says no goodbye; without a sign of life it is sought again.
+            zmq.HEARTBEAT_IVL: HEARTBEAT_MS,
+            zmq.HEARTBEAT_TIMEOUT: 3 * HEARTBEAT_MS,
+            zmq.MAXMSGSIZE: LONGEST_MESSAGE,
+            # The space ends the topic: `main` is not to receive `main2`.
+            zmq.SUBSCRIBE: b"tactflow." if sensor is None else f"tactflow.{sensor} ".encode(),
+        }
+        super().__init__(zmq.SUB, endpoint, options, keys, DEFAULT_ENDPOINT)
 
     def receive(self) -> dict[str, Any]:
         """The next message; waits for it. What is no result message is passed over and counted.
@@ -164,10 +138,7 @@ class Subscriber:
         deadline = None if self.timeout is None else self._clock.now() + self.timeout
         while True:
             left = math.inf if deadline is None else deadline - self._clock.now()
-            ready = dict(self._poller.poll(max(math.ceil(min(left, LONGEST_WAIT) * 1000), 0)))
-            if self._refused in ready:
-                raise PermissionError(self._refusal())
-            if not ready:
+            if not self._wait(min(left, LONGEST_WAIT)):
                 if left <= LONGEST_WAIT:
                     raise TimeoutError(self._silence())
                 continue
@@ -186,11 +157,6 @@ class Subscriber:
         known = ", and are these keys for it" if self._has_keys else ""
         return f"{what}; {hint}{named}{known}?"
 
-    def _refusal(self) -> str:
-        if self._has_keys:
-            return f"{self.endpoint} does not admit these keys"
-        return f"{self.endpoint} asks for keys, which tactflow keys new makes, or is no tactflow"
-
     def _count(self, sensor: str, seq: int) -> None:
         last = self._last_seq.get(sensor)
         # A smaller number than before means that tactflow was started again.
@@ -198,25 +164,6 @@ class Subscriber:
             self.lost += seq - last - 1
         if last is not None or len(self._last_seq) < MOST_SENSORS:
             self._last_seq[sensor] = seq
-
-    def close(self) -> None:
-        """Disconnect. May be called twice."""
-        if not self._socket.closed:
-            self._socket.disable_monitor()
-        self._refused.close(0)
-        self._socket.close()
-        self._context.term()
-
-    def __enter__(self) -> Subscriber:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         while True:

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import orjson
 import zmq
 
-from tactflow.client import REFUSALS
-from tactflow.files import expanded
-from tactflow.keys import WrongKeysError, secure_subscriber
+from tactflow.connection import Connection
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5557"
 """Where `tactflow control` looks for a run that takes commands."""
@@ -26,7 +23,7 @@ LONGEST_ANSWER = 1 << 20
 Answer = dict[str, Any]
 
 
-class RemoteControl:
+class RemoteControl(Connection):
     """Controls a run in another process; a context manager. Belongs to one thread at a time.
 
     Each method waits for the answer of the run and returns it: `message`, what was done, in words; `state`
@@ -63,32 +60,14 @@ class RemoteControl:
     ) -> None:
         if not 0 < timeout < math.inf:
             raise ValueError(f"timeout: required a number of seconds above 0, got {timeout}")
-        self.endpoint = endpoint
         self.timeout = timeout
-        self._has_keys = keys is not None
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.REQ)
-        self._socket.linger = 0
-        # After a timeout another command may be sent, and a late answer is not taken for its.
-        self._socket.setsockopt(zmq.REQ_RELAXED, 1)
-        self._socket.setsockopt(zmq.REQ_CORRELATE, 1)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_ANSWER)
-        self._refused = self._socket.get_monitor_socket(REFUSALS)
-        self._poller = zmq.Poller()
-        self._poller.register(self._socket, zmq.POLLIN)
-        self._poller.register(self._refused, zmq.POLLIN)
-        try:
-            if keys is not None:
-                secure_subscriber(self._socket, expanded(str(keys)))
-            self._socket.connect(endpoint)
-        except WrongKeysError:
-            self.close()
-            raise
-        except zmq.ZMQError as error:
-            self.close()
-            raise ValueError(
-                f"required an address such as {DEFAULT_ENDPOINT}, got {endpoint!r}: {error.strerror}"
-            ) from None
+        options: dict[int, int | bytes] = {
+            # After a timeout another command may be sent, and a late answer is not taken for its.
+            zmq.REQ_RELAXED: 1,
+            zmq.REQ_CORRELATE: 1,
+            zmq.MAXMSGSIZE: LONGEST_ANSWER,
+        }
+        super().__init__(zmq.REQ, endpoint, options, keys, DEFAULT_ENDPOINT)
 
     def ping(self) -> Answer:
         """Whether the run is there."""
@@ -121,11 +100,7 @@ class RemoteControl:
     def ask(self, command: str) -> Answer:
         """Send a command by its name, and wait for the answer."""
         self._socket.send(orjson.dumps({"do": command}), zmq.NOBLOCK)
-        ready = dict(self._poller.poll(math.ceil(self.timeout * 1000)))
-        if self._refused in ready:
-            what = "does not admit these keys" if self._has_keys else "asks for keys, or is no tactflow"
-            raise PermissionError(f"{self.endpoint} {what}")
-        if not ready:
+        if not self._wait(self.timeout):
             known = ", and are these keys for it" if self._has_keys else ""
             raise TimeoutError(
                 f"no answer from {self.endpoint} within {self.timeout:g} s; is tactflow running with "
@@ -139,22 +114,3 @@ class RemoteControl:
         if not done:
             raise RuntimeError(str(message))
         return answer
-
-    def close(self) -> None:
-        """Disconnect. May be called twice."""
-        if not self._socket.closed:
-            self._socket.disable_monitor()
-        self._refused.close(0)
-        self._socket.close()
-        self._context.term()
-
-    def __enter__(self) -> RemoteControl:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
