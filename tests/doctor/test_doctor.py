@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -120,8 +121,8 @@ def test_a_camera_whose_driver_stamps_tells_how_old_its_frames_are(monkeypatch: 
 
     camera = Camera.__new__(Camera)
     camera._capture = Capture()  # type: ignore[assignment]
-    monkeypatch.setattr("tactflow.sources.devices.time.clock_gettime", lambda _: 10.0)
-    monkeypatch.setattr("tactflow.sources.devices.sys.platform", "linux")
+    monkeypatch.setattr("tactflow.sources.devices.time", SimpleNamespace(monotonic=lambda: 10.0))
+    monkeypatch.setattr("tactflow.sources.devices.sys", SimpleNamespace(platform="linux"))
     assert camera.delay() == pytest.approx(0.05)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ from tactflow.bench.skipping import Pipelines, compare_all, print_comparisons
 from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
 from tactflow.bench.timing import CopyUnit
+from tactflow.cli.notes import without_notes
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
         scenes=frozenset(args.scene) if args.scene else None,
         pictures=args.pictures,
     )
-    with _quiet_log(), _progress_bar() as progress:
+    with without_notes(), _progress_bar() as progress:
         result = run_bench(plan, progress)
     print_result(result, Console(file=sys.stdout, highlight=False))
     _write(args, result)
@@ -157,7 +157,7 @@ def _skipping(given: list[str], frames: int, data: Path | None) -> int:
         load_pipeline(find_pipeline("pipelines/wedge.yaml")),
     )
     copies = CopyUnit()
-    with _quiet_log(), _progress_bar() as progress:
+    with without_notes(), _progress_bar() as progress:
         found = list(compare_all(pipelines, frames, data, copies, progress))
     print_comparisons(found, copies, Console(file=sys.stdout, highlight=False, width=240))
     for one in found:
@@ -169,7 +169,7 @@ def _skipping(given: list[str], frames: int, data: Path | None) -> int:
 def _stress(given: list[str], frames: int) -> int:
     """Run the long stress, print its blocks and what crept."""
     pipeline = load_pipeline(find_pipeline(given[0] if given else f"pipelines/{DEFAULT}.yaml"))
-    with _quiet_log(), _progress_bar() as progress:
+    with without_notes(), _progress_bar() as progress:
         drift = measure_drift(pipeline, frames, progress)
     table = Table("frames", "marker error", "lost", "CPU a frame", "memory", box=None)
     for row in drift.rows():
@@ -237,18 +237,6 @@ def _report(worse: list[Regression], path: Path | None) -> None:
     print(f"tactflow: {len(worse)} results got worse than in {path}:", file=sys.stderr)
     for regression in worse:
         print(f"  {regression}", file=sys.stderr)
-
-
-@contextmanager
-def _quiet_log() -> Iterator[None]:
-    """Keep notes of the pipelines off the screen: each would appear once per scene."""
-    logger = logging.getLogger("tactflow")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 @contextmanager

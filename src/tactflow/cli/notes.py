@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -25,11 +25,27 @@ def notes_on(console: Console) -> Iterator[None]:
         handler.setFormatter(logging.Formatter("tactflow: %(levelname)s: %(message)s"))
     handler.addFilter(_without_control_characters)
     logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
+    try:
+        with _from_level(logging.INFO):
+            yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def without_notes() -> AbstractContextManager[None]:
+    """Keep notes and warnings of pipelines that run many times off the screen; errors still show."""
+    return _from_level(logging.ERROR)
+
+
+@contextmanager
+def _from_level(level: int) -> Iterator[None]:
+    logger = logging.getLogger("tactflow")
+    before = logger.level
+    logger.setLevel(level)
     try:
         yield
     finally:
-        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 def _without_control_characters(record: logging.LogRecord) -> bool:

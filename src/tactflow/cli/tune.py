@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import math
 import re
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import orjson
 
+from tactflow.cli.notes import without_notes
 from tactflow.cli.printable import printable
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
@@ -73,8 +73,7 @@ def run(args: argparse.Namespace) -> int:
     from tactflow.tune.search import DEFAULT, Goal, Search, impossible
     from tactflow.tune.space import Candidate
 
-    logging.getLogger("tactflow").setLevel(logging.ERROR)
-    with tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
+    with without_notes(), tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
         folder = Path(name)
         file = find_pipeline(args.pipeline)
         recording = take(args.source, Candidate(DEFAULT).load(file, args.sensor), folder)
