@@ -170,6 +170,7 @@ def take_turns(
     see: Callable[[str, Outcome], str],
     step: Callable[[], None],
     block: int = BLOCK,
+    late: Callable[[], bool] = lambda: False,
 ) -> tuple[Times, dict[str, str]]:
     """Run pipelines in turns of a few frames until all recordings are over.
 
@@ -179,6 +180,7 @@ def take_turns(
     folder : for the JSON lines.
     see : called with (name, outcome) for each frame, after its turn; returns the kind of frame its time
         belongs to. step : called once per frame, when all have done it. block : frames in a turn.
+    late : asked when all have had their turn; if it is, they get no other one.
 
     Returns
     -------
@@ -215,6 +217,8 @@ def take_turns(
                         times.samples[name].setdefault(kind, Samples()).add(outcome.cpu, outcome.wall)
                 for _ in range(longest):
                     step()
+                if late():
+                    break
             times.stages = {name: lockstep.stages_ms() for name, lockstep in running.items()}
         finally:
             for lockstep in running.values():

@@ -7,6 +7,7 @@ import math
 import re
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import orjson
@@ -65,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
     ConfigError, SourceError
         If the options are wrong, or the recording cannot be used.
     """
+    began = time.monotonic()
     page: Path = args.html or args.out.with_suffix(".html")
     _check_files(args.out, page, args.overwrite)
     # Imported here: the simulator and the bench take their time.
@@ -85,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
             Goal(args.error, args.max_error, args.max_ms),
             sensor=args.sensor,
             original=find_pipeline("classic"),
-            seconds=args.budget,
+            seconds=args.budget - (time.monotonic() - began),
             seed=args.seed,
             say=_say,
         )
