@@ -162,8 +162,8 @@ def markdown(
         yield f"| `{kernel.__name__}` | {code} | {cells} | {compile_times[name]:.2f} |"
     yield f"| all {len(kernels())} | | | | | {sum(compile_times.values()):.1f} |"
     yield ""
-    yield f"First use: `tactflow warmup` took {warm_up:.1f} s for the default pipeline, imports included and no"
-    yield f"kernel on disk, on {os.cpu_count()} processors, for which {load:.1f} other processes waited on average."
+    yield f"First use: `tactflow warmup` took {warm_up:.1f} s for the default pipeline, imports included and"
+    yield f"nothing on disk, on {os.cpu_count()} processors, with a load of {load:.1f} by others."
 
 
 def main() -> None:
