@@ -59,6 +59,11 @@ class Foxglove(Sink):
                 )
             return self
 
+    @classmethod
+    def binds(cls, params: Foxglove.Params) -> dict[str, str]:
+        """Where it serves."""
+        return {"port": f"ws://{params.host}:{params.port}"} if params.port else {}
+
     def __init__(self, params: Params, sensor: str = "main") -> None:
         """Prepare; nothing is served yet. sensor : names the channels."""
         super().__init__(params)

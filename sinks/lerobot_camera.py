@@ -14,7 +14,7 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.frame import Tick
 from tactflow.jpeg import encode_jpeg
 from tactflow.ports import Image
-from tactflow.publisher import FloodError, Publisher, is_reachable
+from tactflow.publisher import FloodError, Publisher, is_reachable, picks_a_port
 
 log = logging.getLogger("tactflow")
 
@@ -52,6 +52,11 @@ class LerobotCamera(Sink):
                     "keys: set endpoint to tcp://127.0.0.1:5555, or open_to_all: true to let everybody look"
                 )
             return self
+
+    @classmethod
+    def binds(cls, params: LerobotCamera.Params) -> dict[str, str]:
+        """Its endpoint: LeRobot's camera reads one sensor there."""
+        return {} if picks_a_port(params.endpoint) else {"endpoint": params.endpoint}
 
     def __init__(self, params: Params, sensor: str = "main") -> None:
         """Prepare; nothing is bound yet. sensor : LeRobot's `camera_name`."""

@@ -21,7 +21,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.rate import RateLimit
 from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
-from tactflow.publisher import FloodError, Publisher, is_reachable
+from tactflow.publisher import FloodError, Publisher, is_reachable, picks_a_port
 
 log = logging.getLogger("tactflow")
 
@@ -182,6 +182,11 @@ class Zmq(Sink):
         self._closing = threading.Event()
         self._stats_thread: threading.Thread | None = None
         self._commands: ControlSocket | None = None
+
+    @classmethod
+    def binds(cls, params: Zmq.Params) -> dict[str, str]:
+        """The address at which it takes commands; several sensors share only the one of the results."""
+        return {} if params.control is None or picks_a_port(params.control) else {"control": params.control}
 
     @classmethod
     def publishes(cls, params: Zmq.Params) -> Publication:

@@ -167,7 +167,7 @@ def test_the_command_keeps_keys_that_are_there(tmp_path: Path, capsys: pytest.Ca
     assert main(["keys", "new", "laptop", "--folder", str(folder)]) == 0
     assert f"--set sinks.zmq.keys={folder / 'publisher'}" in capsys.readouterr().out
     before = (folder / "publisher" / "publisher.key_secret").read_bytes()
-    assert main(["keys", "new", "phone", "--folder", str(folder)]) == 0
+    assert main(["keys", "new", "--folder", str(folder), "phone"]) == 0
     assert (folder / "publisher" / "publisher.key_secret").read_bytes() == before
     assert main(["keys", "new", "laptop", "--folder", str(folder)]) == 2
     assert main(["keys", "new", "../x", "--folder", str(folder)]) == 2

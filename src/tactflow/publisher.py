@@ -195,6 +195,15 @@ def is_reachable(endpoint: str) -> bool:
     return not (scheme == "tcp" and (is_loopback(host) or host in LOOPBACK_INTERFACES))
 
 
+def picks_a_port(endpoint: str) -> bool:
+    """Whether an address leaves its port to the system.
+
+    >>> picks_a_port("tcp://127.0.0.1:*"), picks_a_port("tcp://127.0.0.1:5556"), picks_a_port("ipc:///tmp/a")
+    (True, False, False)
+    """
+    return endpoint.startswith("tcp://") and endpoint.endswith((":*", ":0"))
+
+
 def _refuse_taken_path(endpoint: str, hint: str) -> None:
     """ZeroMQ deletes whatever stands at the path of an ipc address, even one that somebody listens at."""
     path = Path(endpoint.removeprefix("ipc://"))

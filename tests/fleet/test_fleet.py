@@ -390,6 +390,12 @@ def test_one_signal_ends_all_sensors_well(folder: Path, number: int) -> None:
             ["--set", "sinks.jsonl_2={use: jsonl, path: same.jsonl}"],
             "left and right would both write same.jsonl",
         ),
+        (
+            GRAPH,
+            ["--set", "sinks.zmq={control: 'tcp://127.0.0.1:5557'}"],
+            "left and right would both listen at tcp://127.0.0.1:5557; "
+            "give right its own, as sensors.right.sinks.zmq.control",
+        ),
         *[
             (GRAPH, [option, path], f"{option} {path}: required a file, not a folder")
             for option in ("--jsonl", "--stats", "--trace")

@@ -11,11 +11,12 @@ from tactflow.keys import WrongKeysError, make_keys
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `keys`."""
-    parser.add_argument("action", choices=("new",), help="new: make keys for a subscriber")
-    parser.add_argument(
+    actions = parser.add_subparsers(dest="action", required=True)
+    new = actions.add_parser("new", help="make keys for a subscriber")
+    new.add_argument(
         "name", nargs="?", default="subscriber", metavar="NAME", help="of the subscriber; default: subscriber"
     )
-    parser.add_argument(
+    new.add_argument(
         "--folder",
         type=Path,
         default=Path("keys"),

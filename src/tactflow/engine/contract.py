@@ -230,6 +230,14 @@ class Sink(Part):
         return kept
 
     @classmethod
+    def binds(cls, params: Any) -> Mapping[str, str]:  # noqa: ARG003 (for sinks that listen)
+        """The addresses that it takes for itself alone: parameter -> address; not those of `publishes`.
+
+        Several sensors with one address are refused. An address whose port is free to choose is none.
+        """
+        return {}
+
+    @classmethod
     def publishes(cls, params: Any) -> Publication | None:  # noqa: ARG003 (for sinks that publish)
         """Where it publishes messages over ZeroMQ that a relay of several sensors can pass on, or None."""
         return None

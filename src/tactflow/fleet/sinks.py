@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -90,9 +90,9 @@ def added(node: Node) -> str:
 
 
 def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
-    """One message for each sink that would write where another sensor's does, or publish there otherwise.
+    """One message for each sink that would write or listen where another sensor's does.
 
-    pipelines : sensor -> its pipeline.
+    pipelines : sensor -> its pipeline. Results may be published at one address, if by the same keys.
     """
     problems = [
         f"{node.mark}  sinks.{node.id}.keys: required the same for all sensors that publish at {one.address}"
@@ -100,18 +100,26 @@ def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
         for _, node in one.sinks
         if (publication := sink_class(node).publishes(node.params)) and publication.keys != one.keys
     ]
-    seen: dict[Path, str] = {}
+    seen: dict[str, str] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
-            for output in written_files(node, node.params):
-                other = seen.setdefault(output.path, sensor)
+            for parameter, does, advice in _taken(node, sensor):
+                other = seen.setdefault(does, sensor)
                 if other != sensor:
                     place = f"{node.mark}  " if node.mark.line else f"{node.mark}: "
-                    problems.append(
-                        f"{place}sinks.{node.id}.{output.parameter}: {other} and {sensor} would both write "
-                        f"{output.path}; put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
-                    )
+                    where = f"{place}sinks.{node.id}.{parameter}"
+                    problems.append(f"{where}: {other} and {sensor} would both {does}; {advice}")
     return problems
+
+
+def _taken(node: Node, sensor: str) -> Iterator[tuple[str, str, str]]:
+    """What a sink takes for itself alone: (parameter, "write FILE" or "listen at ADDRESS", advice)."""
+    for output in written_files(node, node.params):
+        advice = f"put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
+        yield output.parameter, f"write {output.path}", advice
+    for parameter, address in sink_class(node).binds(node.params).items():
+        advice = f"give {sensor} its own, as sensors.{sensor}.sinks.{node.id}.{parameter}"
+        yield parameter, f"listen at {address}", advice
 
 
 class Shared(NamedTuple):

@@ -45,6 +45,8 @@ ONE_SIZE: Final = 1.1 * SIGMA_STEP
 CROWDED: Final = 0.37
 """Radius of a mark over the distance of the nearest other, at most: so its surroundings hold no other. Chosen
 on sts_torque160."""
+LEAST_RADIUS: Final = 0.5
+"""Of a mark, px: none is smaller than a pixel, not even of two that are found at one place."""
 
 LONE_PITCH: Final = 8.0
 """Pitch of a single mark, in radii. Chosen by hand."""
@@ -275,7 +277,7 @@ def _detection(gray: NDArray[np.float32], best: Family, marks: Spots, others: li
     ratio = np.maximum(marks.radius / radius, radius / marks.radius)
     radii = np.where(ratio < ONE_SIZE, radius, marks.radius)
     if len(radii) > 1:
-        room = CROWDED * nearest(marks.points, 1)[0][:, 0]
+        room = np.maximum(CROWDED * nearest(marks.points, 1)[0][:, 0], LEAST_RADIUS)
         steps = np.ceil(np.log(radii / room) / np.log(SIGMA_STEP))
         radii = radii / SIGMA_STEP ** np.maximum(steps, 0)
     centers = np.array(marks.points)
