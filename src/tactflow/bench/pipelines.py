@@ -177,10 +177,9 @@ def take_turns(
     Parameters
     ----------
     pipelines : name -> pipeline, each with its recording.
-    folder : for the JSON lines.
+    folder : for the JSON lines. late : asked when all have had a turn; if it is, that was the last one.
     see : called with (name, outcome) for each frame, after its turn; returns the kind of frame its time
         belongs to. step : called once per frame, when all have done it. block : frames in a turn.
-    late : asked when all have had their turn; if it is, they get no other one.
 
     Returns
     -------
