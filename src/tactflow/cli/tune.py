@@ -6,6 +6,7 @@ import argparse
 import math
 import re
 import tempfile
+import time
 from pathlib import Path
 
 import orjson
@@ -64,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
     ConfigError, SourceError
         If the options are wrong, or the recording cannot be used.
     """
+    began = time.monotonic()
     page: Path = args.html or args.out.with_suffix(".html")
     _check_files(args.out, page, args.overwrite)
     # Imported here: the simulator and the bench take their time.
@@ -84,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
             Goal(args.error, args.max_error, args.max_ms),
             sensor=args.sensor,
             original=find_pipeline("classic"),
-            seconds=args.budget,
+            seconds=args.budget - (time.monotonic() - began),
             seed=args.seed,
             say=say,
         )
