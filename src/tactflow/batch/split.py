@@ -18,7 +18,7 @@ from tactflow.batch.keys import result_key
 from tactflow.batch.parts import OVERLAP, cut
 from tactflow.batch.summary import MOST_PICTURES, Curve, Point
 from tactflow.batch.task import Outcome, Task, decoded
-from tactflow.batch.work import commit, is_disk_full, moved_to_place, pipeline_for, scratch_name
+from tactflow.batch.work import commit, is_disk_full, kept_pipeline_for, moved_to_place, scratch_name
 from tactflow.engine.errors import SourceError, StageError, TactflowError
 
 
@@ -49,7 +49,7 @@ class Splitting:
 
     def submit(self, task: Task) -> None:
         """See `Engine.submit`."""
-        pipeline, _ = pipeline_for(replace(task.pipeline, digest="", versions=()), task.format)
+        pipeline, _ = kept_pipeline_for(task.pipeline, task.format)
         parts = [replace(task, part=part) for part in cut(task.recording, pipeline, task.pipeline.split)]
         if parts:
             self._wholes[task.recording.source] = _Whole(task, parts)

@@ -115,8 +115,8 @@ def _result(task: Task, blank: Outcome, report: Report) -> Outcome:
         return _part(task, replace(blank, input=before, input_digest=read), report)
     key = result_key(read, task.pipeline.digest)
     folder = Folder(Path(task.folder))
-    there = folder.outcome_of(key)
-    if there is not None and folder.is_whole(there, verify=task.verify):
+    there = folder.outcome_of(key, verify=task.verify)
+    if there is not None:
         return replace(there.of(task.recording), input=before, reused=True, started=blank.started)
     found = replace(blank, key=key, input=before, input_digest=read)
     unfinished = Path(task.scratch, f"{os.getpid()}-{scratch_name(task)}")
@@ -202,7 +202,6 @@ def commit(task: Task, outcome: Outcome, told: Mapping[str, Any]) -> None:
             unfinished.unlink()
 
 
-@functools.lru_cache(maxsize=4)
 def pipeline_for(request: PipelineRequest, format_: Format) -> tuple[Pipeline, str]:
     """The pipeline with one sink, that of the results, and its digest.
 
@@ -227,10 +226,16 @@ def pipeline_for(request: PipelineRequest, format_: Format) -> tuple[Pipeline, s
     return pipeline, digest
 
 
+kept_pipeline_for = functools.lru_cache(maxsize=4)(pipeline_for)
+"""The same for many recordings: the digest in the request tells of a file that has changed."""
+
+
 def _for_recording(task: Task, path: Path) -> Pipeline:
     """The pipeline that reads this recording and writes to this path."""
-    pipeline, digest = pipeline_for(replace(task.pipeline, digest="", versions=()), task.format)
+    pipeline, digest = kept_pipeline_for(task.pipeline, task.format)
     if digest != task.pipeline.digest:
+        # The right file may come late.
+        kept_pipeline_for.cache_clear()
         here, there = versions(), dict(task.pipeline.versions)
         other = [
             f"{name} {here.get(name)} instead of {there[name]}"
