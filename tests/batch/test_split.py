@@ -28,6 +28,7 @@ def test_parts_of_a_pipeline_without_memory_are_together_what_the_whole_is(batch
     assert (parts.frames, parts.touching, parts.contacts) == (80, 78, 1)
     assert (whole.frames, whole.touching, whole.contacts) == (80, 78, 1)
     assert parts.key != whole.key
+    assert parts.seconds > 0
     assert "cut into 3 parts" in parts.notes[0]
     results = [batch.folder.results / str(outcome.result) for outcome in (whole, parts)]
     assert results[0].read_bytes() == results[1].read_bytes()

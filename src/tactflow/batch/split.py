@@ -90,7 +90,7 @@ def _joined(whole: _Whole) -> Outcome:
         if bad is not None:
             return bad
         told = [orjson.loads(place.with_suffix(".json").read_bytes()) for place in places]
-        outcome = _together(task, told)
+        outcome = replace(_together(task, told), seconds=sum(one.seconds for one in whole.ended))
         there = Folder(Path(task.folder)).outcome_of(outcome.key)
         if there is not None:
             return replace(there.of(task.recording), input=outcome.input, reused=True)
@@ -128,7 +128,6 @@ def _together(task: Task, told: Sequence[Mapping[str, Any]]) -> Outcome:
         contacts=sum(part.contacts for part in parts) - lasting,
         touching=sum(part.touching for part in parts),
         largest=max(part.largest for part in parts),
-        seconds=sum(part.seconds for part in parts),
         notes=(note, *dict.fromkeys(text for part in parts for text in part.notes)),
     )
 

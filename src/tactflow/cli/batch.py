@@ -64,6 +64,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="override one value of the pipeline file; repeatable",
     )
     parser.add_argument("--sensor", metavar="NAME", help="which one of a pipeline with several sensors")
+    _add_division(parser)
+    parser.add_argument(
+        "--verify",
+        action="store_true",
+        help="read all recordings and results instead of trusting that what has the same size and time of "
+        "change is the same",
+    )
+    parser.add_argument(
+        "--compare",
+        metavar="OTHER",
+        help="run this pipeline over the same recordings too, and tell how the numbers differ and in which "
+        "frames most; --set changes the first pipeline alone",
+    )
+    parser.add_argument("--fail-fast", action="store_true", help="begin nothing more once a recording fails")
+    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
+
+
+def _add_division(parser: argparse.ArgumentParser) -> None:
+    """Declare on what the work is done, and in which parts."""
     parser.add_argument(
         "--workers", type=positive, metavar="N", help="processes on this machine (default: one a processor)"
     )
@@ -91,20 +110,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="cut recordings into parts of 60s, 5min, ... that are worked on side by side; their numbers "
         "differ a little, and --compare tells by how much: with it, only the first pipeline is cut",
     )
-    parser.add_argument(
-        "--verify",
-        action="store_true",
-        help="read all recordings and results instead of trusting that what has the same size and time of "
-        "change is the same",
-    )
-    parser.add_argument(
-        "--compare",
-        metavar="OTHER",
-        help="run this pipeline over the same recordings too, and tell how the numbers differ and in which "
-        "frames most; --set changes the first pipeline alone",
-    )
-    parser.add_argument("--fail-fast", action="store_true", help="begin nothing more once a recording fails")
-    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
 
 
 def run(args: argparse.Namespace) -> int:
