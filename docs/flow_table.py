@@ -1,12 +1,12 @@
-"""The table of flow.md: how well the mean flow of the gel in a contact is known.
+"""The tables of flow.md: how well the mean flow of the gel in a contact is known, and how much of it sticks.
 
-    python docs/flow_table.py
-
-runs the default pipeline on the nominal scenes and prints the table. Takes about three minutes.
+python docs/flow_table.py          runs the default pipeline on the nominal scenes; three minutes
+python docs/flow_table.py stick    the stick ratio, from true outlines; half a minute
 """
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,15 +17,23 @@ from numpy.typing import NDArray
 
 from tactflow.bench import metrics
 from tactflow.bench.lockstep import LockstepPipeline, Outcome
+from tactflow.bench.motion import seen_markers
 from tactflow.bench.pipelines import on_recording
 from tactflow.bench.scenes import FULL, NOMINAL, Rendered, render_all
 from tactflow.bench.score import FlowScore
 from tactflow.config.load import load_pipeline
-from tactflow.sim import Truth
-from tactflow.vision.flow import FieldModel, flow_in_mask, flow_of_field
+from tactflow.sim import Truth, open_scene
+from tactflow.vision.flow import FieldModel, SlipTest, flow_in_mask, flow_of_field
+from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 PIPELINE = Path(__file__).resolve().parents[1] / "pipeline.yaml"
+STICKING = ("press", "bright", "box", "twist", "two", "cable", "roll")
+"""Scenes in which nothing slips."""
+SLIPPING = ("stick_slip", "stick_slip?markers=16x12", "stick_slip?markers=26x20")
+SEEDS = (11, 12)
+LEAST = 0.1
+"""Stick ratio below which a contact is about to slide as a whole."""
 
 
 @dataclass
@@ -82,12 +90,48 @@ def measure(rendered: Rendered) -> Row:
     return row
 
 
+def stick_ratios(spec: str) -> NDArray[np.float64]:
+    """(n, 2): true and found share of the contact that sticks, of frames in which it is `LEAST` at least."""
+    scene, test, rng = open_scene(spec), SlipTest(), np.random.default_rng(1)
+    preprocess = Preprocessor((800, 600), rotate=90, downsample=2)
+    model = FieldModel(scene.truth(0, preprocess).origin, preprocess.mapping.size)
+    ratios = []
+    for index in range(len(scene)):
+        truth = scene.truth(index, preprocess)
+        markers = seen_markers(truth, rng)
+        gel = model(markers)
+        if not truth.touching or gel is None:
+            test.reset()
+            continue
+        mask: NDArray[np.uint8] = np.uint8(255) * truth.contact_mask
+        slip = test(gel, mask, flow_of_field(gel, markers, mask))
+        if slip is not None and (truth.stick_ratio or 0.0) >= LEAST:
+            ratios.append((truth.stick_ratio, slip.stick_ratio))
+    return np.array(ratios)
+
+
+def print_stick_ratios() -> None:
+    """The table of the stick ratio."""
+    for name in (*STICKING, *SLIPPING):
+        separator = "&" if "?" in name else "?"
+        true, found = np.concatenate([stick_ratios(f"{name}{separator}seed={seed}") for seed in SEEDS]).T
+        lowest = _number(metrics.percentile(found.tolist(), 10), 2)
+        print(
+            f"| {name} | {len(true)} | {true.mean():.2f} | {found.mean():.2f} | {lowest} "
+            f"| {np.sqrt(np.mean((found - true) ** 2)):.2f} |",
+            flush=True,
+        )
+
+
 def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 if __name__ == "__main__":
     cv2.setNumThreads(1)
+    if sys.argv[1:] == ["stick"]:
+        print_stick_ratios()
+        sys.exit()
     with tempfile.TemporaryDirectory() as folder:
         for recording in render_all(tuple(case for case in FULL if case.label in NOMINAL), Path(folder)):
             print(measure(recording).text(recording.case.label), flush=True)

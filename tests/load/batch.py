@@ -1,11 +1,13 @@
 """What a batch costs, and what survives: processes, a Dask cluster, growing work, kill -9.
 
-    python -m tests.load.batch speed --recordings 200 --data ../shared/data
-    python -m tests.load.batch cluster --recordings 200
-    python -m tests.load.batch growth --counts 10 100 1000
-    python -m tests.load.batch resume --kills 10
+    python -m tests.load.batch speed
+    python -m tests.load.batch speed --data ../shared/data    # real recordings instead
+    python -m tests.load.batch cluster
+    python -m tests.load.batch growth
+    python -m tests.load.batch resume
 
-Each prints the table that stands in docs/batch.md. Everything is written below a temporary folder.
+Each takes two to four minutes on two quiet cores, tells what it has done on stderr, and prints the table that
+stands in docs/batch.md. Everything is written below a temporary folder. `--recordings` makes it shorter.
 """
 
 from __future__ import annotations
@@ -16,7 +18,6 @@ import json
 import os
 import random
 import signal
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -26,17 +27,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-FRAMES = 60
-"""Of each simulated recording."""
+import numpy as np
+
+FRAMES = 12
+"""Of each simulated recording: opening it and writing three tables then takes half of the time."""
+LOOPED = 0.25
+"""Part of the recordings that the plain loop does too: it has nothing that differs from one to the next."""
 TICKS = os.sysconf("SC_CLK_TCK")
 """Units of processor time in a second, as the system counts it."""
-SOONEST = 0.4
-"""Part of an undisturbed batch after which its process is killed at the latest, so that most kills find work
-under way."""
+LATEST = 0.25
+"""Part of an undisturbed batch after which its process is killed at the latest, so that ten kills find work
+left."""
+WORKERS_END = 1.0
+"""Time in which the workers of a killed process have noticed that they are alone, s."""
 LIGHT = """
 stages:
   capture: {source: "sim:idle", settle: 0}
-  preprocess: {rotate: 0, downsample: 8}
+  preprocess: {rotate: 0}
   difference: {in: {unmarked: preprocess.image}, method: colour}
   hull: {when: touching}
 sinks: {}
@@ -61,8 +68,8 @@ class Call:
     code: int
 
 
-def watch(command: Sequence[str]) -> Call:
-    """Run a command to its end."""
+def watch(command: Sequence[str], what: str) -> Call:
+    """Run a command to its end, and tell on stderr how long that took."""
     began = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     processor = memory = 0.0
@@ -76,7 +83,14 @@ def watch(command: Sequence[str]) -> Call:
         memory = max(memory, float(peak[0].split()[1]) / 1024 if peak else 0.0)
         processor = max(processor, (int(stat[11]) + int(stat[12])) / TICKS)
         time.sleep(0.05)
-    return Call(time.perf_counter() - began, processor, memory, process.returncode)
+    call = Call(time.perf_counter() - began, processor, memory, process.returncode)
+    tell(f"{what}: {call.wall:.1f} s, exit code {call.code}")
+    return call
+
+
+def tell(words: str) -> None:
+    """Say how far it is."""
+    print(words, file=sys.stderr, flush=True)
 
 
 def batch(pipeline: str, sources: Path, out: Path, *options: str) -> list[str]:
@@ -85,11 +99,21 @@ def batch(pipeline: str, sources: Path, out: Path, *options: str) -> list[str]:
     return [*start, "--quiet", *options]
 
 
-def simulated(folder: Path, count: int, frames: int = FRAMES) -> Path:
+def simulated(folder: Path, seeds: Sequence[int], frames: int = FRAMES) -> Path:
     """A list of simulated recordings."""
-    path = folder / f"sim-{count}.txt"
-    path.write_text("".join(f"sim:press?frames={frames}&seed={seed}\n" for seed in range(count)))
+    path = folder / f"sim-{seeds[0]}-{len(seeds)}.txt"
+    path.write_text("".join(f"sim:press?frames={frames}&seed={seed}\n" for seed in seeds))
     return path
+
+
+def tiny(folder: Path, count: int) -> Path:
+    """A folder of recordings of two frames of 80 x 60 px, no two of them the same."""
+    recordings = folder / f"tiny-{count}"
+    recordings.mkdir()
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        np.save(recordings / f"{number}.npy", rng.integers(90, 110, (2, 60, 80, 3), np.uint8))
+    return recordings
 
 
 def results(out: Path) -> dict[str, str]:
@@ -105,28 +129,36 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
 
 
 def speed(args: argparse.Namespace, folder: Path) -> None:
-    """One process against several, in turn, and the same work in a plain loop."""
-    kinds = {"simulated": simulated(folder, args.recordings)}
-    if args.data is not None:
-        kinds["real"] = args.data
-    rows = []
-    for kind, sources in kinds.items():
-        walls: dict[str, list[float]] = {}
-        for turn in range(args.turns):
-            if kind == "simulated":
-                call = watch([sys.executable, "-c", LOOP, str(sources), str(folder / f"loop-{turn}")])
-                walls.setdefault("plain loop", []).append(call.wall)
-            for workers in ("1", "2"):
-                out = folder / f"{kind}-{workers}-{turn}"
-                call = watch(batch("default", sources, out, "--workers", workers))
-                walls.setdefault(f"{workers} workers", []).append(call.wall)
-        tried = (folder / f"{kind}-1-0" / "ledger" / "1-of-1.jsonl").read_bytes().split(b"\n")
-        count = sum(1 for line in tried if line)
-        one = statistics.median(walls["1 workers"])
-        for name, seen in walls.items():
-            wall = statistics.median(seen)
-            rows.append([kind, count, name, f"{wall:.1f}", f"{1000 * wall / count:.0f}", f"{one / wall:.2f}"])
-    table(["recordings", "number", "by", "wall, s", "a recording, ms", "times as fast"], rows)
+    """One process against two, in turns on one half of the recordings and then on the other."""
+    if args.data is None:
+        halves = [range(args.recordings // 2), range(args.recordings // 2, args.recordings)]
+        parts = [simulated(folder, half) for half in halves]
+    else:
+        parts = [args.data]
+    walls = {"1 worker": 0.0, "2 workers": 0.0}
+    counts, same = 0, True
+    for number, part in enumerate(parts):
+        outs = []
+        for name in walls:
+            out = folder / f"{number}-{name}"
+            call = watch(batch("default", part, out, "--workers", name[0]), f"part {number + 1}, {name}")
+            walls[name] += call.wall
+            outs.append(results(out))
+        counts += sum(1 for line in (out / "ledger" / "1-of-1.jsonl").read_bytes().split(b"\n") if line)
+        same = same and outs[0] == outs[1]
+    rows = [by(name, counts, wall, walls["1 worker"] / counts) for name, wall in walls.items()]
+    if args.data is None:
+        few = range(max(1, int(LOOPED * args.recordings)))
+        loop = [sys.executable, "-c", LOOP, str(simulated(folder, few)), str(folder / "loop")]
+        wall = watch(loop, "the first ones in a plain loop").wall
+        rows.insert(0, by("plain loop", len(few), wall, walls["1 worker"] / counts))
+    table(["by", "recordings", "wall, s", "a recording, ms", "times as fast as 1 worker"], rows)
+    print(f"one worker and two: results equal to the bit: {'yes' if same else 'no'}")
+
+
+def by(name: str, count: int, wall: float, one: float) -> list[object]:
+    """A row of `speed`. one : s that a recording takes with one worker."""
+    return [name, count, f"{wall:.1f}", f"{1000 * wall / count:.0f}", f"{one * count / wall:.2f}"]
 
 
 @contextmanager
@@ -152,28 +184,27 @@ def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]
 
 
 def on_cluster(args: argparse.Namespace, folder: Path) -> None:
-    """Serial, processes and a Dask cluster of which one worker is killed: the same bytes."""
-    sources = simulated(folder, args.recordings)
-    rows, seen = [], []
-    for name, options in (("1 process", ["--workers", "1"]), ("2 processes", ["--workers", "2"])):
-        call = watch(batch("default", sources, folder / name, *options))
-        rows.append([name, f"{call.wall:.1f}", call.code])
-        seen.append(results(folder / name))
+    """Processes, and a Dask cluster of which one worker is killed: the same bytes."""
+    sources = simulated(folder, range(args.recordings))
+    call = watch(batch("default", sources, folder / "local", "--workers", "2"), "2 processes")
+    first = results(folder / "local")
+    rows: list[list[object]] = [["2 processes", f"{call.wall:.1f}", call.code, len(first), "yes"]]
     for name, deadly in (("Dask, 2 workers", False), ("Dask, 1 of 2 workers killed", True)):
         out = folder / name
         with cluster(folder / f"cluster-{deadly}") as (address, processes):
+            tell(f"a cluster is there, {name}")
             began = time.perf_counter()
             process = subprocess.Popen(batch("default", sources, out, "--scheduler", address))
             while deadly and process.poll() is None:
                 if len(list(out.glob("records/*"))) >= args.recordings // 3:
                     processes[-1].send_signal(signal.SIGKILL)
+                    tell("a worker is killed")
                     break
                 time.sleep(0.05)
-            code = process.wait()
-            rows.append([name, f"{time.perf_counter() - began:.1f}", code])
-        seen.append(results(out))
-    for row, found in zip(rows, seen, strict=True):
-        row += [len(found), "yes" if found == seen[0] else "no"]
+            code, wall = process.wait(), time.perf_counter() - began
+            tell(f"{name}: {wall:.1f} s, exit code {code}")
+        found = results(out)
+        rows.append([name, f"{wall:.1f}", code, len(found), "yes" if found == first else "no"])
     table(["by", "wall, s", "exit code", "files", "equal to the bit"], rows)
 
 
@@ -183,24 +214,13 @@ def growth(args: argparse.Namespace, folder: Path) -> None:
     pipeline.write_text(LIGHT)
     rows = []
     for count in args.counts:
-        sources, out = simulated(folder, count, frames=2), folder / f"out-{count}"
-        first = watch(batch(str(pipeline), sources, out, "--workers", "2"))
-        again = watch(batch(str(pipeline), sources, out, "--workers", "2"))
+        sources, out = tiny(folder, count), folder / f"out-{count}"
+        command = batch(str(pipeline), sources, out, "--workers", "2")
+        calls = [watch(command, f"{count} recordings"), watch(command, f"{count} recordings again")]
         sizes = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
         files = sum(1 for path in out.rglob("*") if path.is_file())
-        rows.append(
-            [
-                count,
-                f"{first.wall:.1f}",
-                f"{first.processor:.1f}",
-                f"{first.memory:.0f}",
-                f"{again.wall:.1f}",
-                f"{again.processor:.1f}",
-                f"{again.memory:.0f}",
-                files,
-                f"{sizes / 1e6:.1f}",
-            ]
-        )
+        cells = [f"{v:.{d}f}" for c in calls for v, d in ((c.wall, 1), (c.processor, 1), (c.memory, 0))]
+        rows.append([count, *cells, files, f"{sizes / 1e6:.1f}"])
     heads = ["recordings", "wall, s", "coordinator, CPU-s", "MB", "second call: wall, s", "CPU-s", "MB"]
     table([*heads, "files", "MB written"], rows)
 
@@ -209,30 +229,32 @@ def resume(args: argparse.Namespace, folder: Path) -> None:
     """Kill the coordinator at random moments: what is complete is never done again, and nothing is lost."""
     pipeline = folder / "light.yaml"
     pipeline.write_text(LIGHT)
-    sources, out = simulated(folder, args.recordings, frames=20), folder / "out"
+    sources, out = tiny(folder, args.recordings), folder / "out"
+    command = batch(str(pipeline), sources, out, "--workers", "2")
     chance = random.Random(args.seed)
-    undisturbed = watch(batch(str(pipeline), sources, folder / "undisturbed", "--workers", "2"))
+    plain = watch(batch(str(pipeline), sources, folder / "undisturbed", "--workers", "2"), "undisturbed")
     complete: dict[str, int] = {}
     rows, done_twice = [], 0
     for kill in range(args.kills + 1):
-        process = subprocess.Popen(batch(str(pipeline), sources, out, "--workers", "2"))
+        process = subprocess.Popen(command)
+        moment = "not"
         if kill < args.kills:
-            wait = chance.uniform(0.0, SOONEST * undisturbed.wall)
+            wait = chance.uniform(0.0, LATEST * plain.wall)
+            moment = f"{wait:.1f}"
             time.sleep(wait)
             process.kill()
         code = process.wait()
-        # Its workers notice that they are alone.
-        time.sleep(1.0)
+        time.sleep(WORKERS_END)
         now = {path.name: path.stat().st_ino for path in out.glob("records/*.json")}
         again = sum(now.get(name) != inode for name, inode in complete.items())
         done_twice += again
-        moment = f"{wait:.1f}" if kill < args.kills else "not"
         left = len(list(out.glob("unfinished/*/*")))
         rows.append([kill + 1, moment, code, len(now) - len(complete), again, left])
+        tell(f"call {kill + 1}, killed after {moment} s: {len(now)} of {args.recordings} done")
         complete = now
     table(["call", "killed after, s", "exit code", "new results", "done again", "unfinished files"], rows)
-    same = results(out) == results(folder / "undisturbed")
-    print(f"{len(complete)} of {args.recordings} done, {done_twice} twice; as if undisturbed: {same}")
+    same = "yes" if results(out) == results(folder / "undisturbed") else "no"
+    print(f"{len(complete)} of {args.recordings} done, {done_twice} twice; equal to the undisturbed: {same}")
 
 
 def main() -> None:
@@ -241,13 +263,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("what", choices=("speed", "cluster", "growth", "resume"))
-    parser.add_argument("--recordings", type=int, default=200)
-    parser.add_argument("--data", type=Path, help="a folder of real recordings, for speed")
-    parser.add_argument("--turns", type=int, default=2, help="of speed: A B A B")
+    parser.add_argument("--recordings", type=int, help="default: 200, of resume 600 tiny ones")
+    parser.add_argument("--data", type=Path, help="of speed: a folder of real recordings")
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 100, 1000])
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
+    args.recordings = args.recordings or (600 if args.what == "resume" else 200)
     with tempfile.TemporaryDirectory(prefix="tactflow-batch-") as folder:
         {"speed": speed, "cluster": on_cluster, "growth": growth, "resume": resume}[args.what](
             args, Path(folder)

@@ -86,6 +86,20 @@ def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     assert report.html(tuned).count("<circle") == sum(not one.failure for one in tuned.found)
 
 
+def test_a_budget_that_is_over_ends_the_search_after_the_first_round(
+    recorded: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.tune.space.AXES", (Axis("fusion", {"fusion": {}}),))
+    monkeypatch.setattr(search, "ROUNDS", ((Case("press", 16),), (Case("press", 20),)))
+    tuned = Search(find_pipeline("default"), Goal(), seconds=1e-6).run(recorded, tmp_path)
+    assert tuned.rounds == [(2, 16)]
+    assert tuned.chosen is not None
+    assert "the budget was over after round 1 of 2" in tuned.words
+    # The recording was not shown any more: the times are of the simulated one.
+    assert not any(one.checks for one in tuned.found)
+    assert all(one.ms.value > 0 for one in tuned.found)
+
+
 def test_errors_are_the_same_with_the_same_seed(tmp_path: Path) -> None:
     pipeline = on_sensor(tactflow.load("default"))
     errors = []

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from html import escape
 from importlib.resources import files
 from itertools import chain, groupby, islice
@@ -17,6 +15,7 @@ from tactflow.batch.folder import Folder
 from tactflow.batch.runs import Row
 from tactflow.batch.task import Outcome
 from tactflow.engine.errors import StageError
+from tactflow.files import completed
 
 MOST_ROWS = 1000
 """Recordings that the page shows, those that failed first: it has some 20 kB for each. Chosen by hand: a
@@ -79,16 +78,11 @@ def replaced(path: Path, parts: Iterable[str]) -> Path:
     ------
     StageError : it cannot be written.
     """
-    unfinished = path.with_name(f".{os.getpid()}-{path.name}")
     try:
-        with unfinished.open("w", encoding="utf-8") as file:
+        with completed(path) as partial, partial.open("w", encoding="utf-8") as file:
             file.writelines(parts)
-        unfinished.replace(path)
     except OSError as error:
         raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink()
     return path
 
 

@@ -49,8 +49,10 @@ def _percent(part: int, whole: int) -> float:
 
 def _distances(a: FloatArray, b: FloatArray) -> NDArray[np.float64]:
     """(N, M) float64, distance of every row of `a` to every row of `b`, px."""
-    difference = np.asarray(a, dtype=np.float64)[:, None, :] - np.asarray(b, dtype=np.float64)[None, :, :]
-    return np.asarray(np.sqrt(np.sum(difference**2, axis=2)))
+    # By columns: a sum over pairs of numbers takes eight times as long.
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    dx, dy = np.subtract.outer(a[:, 0], b[:, 0]), np.subtract.outer(a[:, 1], b[:, 1])
+    return np.asarray(np.sqrt(dx * dx + dy * dy))
 
 
 def grid_pitch(points: FloatArray) -> float:

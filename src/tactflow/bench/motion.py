@@ -110,7 +110,7 @@ def _measured(scene: Scene, measurement: Measurement, unit: CopyUnit) -> Measure
                 true, said = [], []
             test.reset()
             continue
-        markers = _seen(truth, rng)
+        markers = seen_markers(truth, rng)
         unit.take()
         found = timed(partial(model, markers), samples)
         if found is None:
@@ -127,7 +127,8 @@ def _measured(scene: Scene, measurement: Measurement, unit: CopyUnit) -> Measure
     return measurement
 
 
-def _seen(truth: Truth, rng: np.random.Generator) -> Markers:
+def seen_markers(truth: Truth, rng: np.random.Generator) -> Markers:
+    """The dots that can be seen, as a good tracker would tell them."""
     status = np.where(truth.visible, MarkerStatus.TRACKED, MarkerStatus.LOST).astype(np.uint8)
     position = truth.position + rng.normal(0, NOISE, truth.position.shape)
     return Markers(truth.origin, position, status, np.full(len(status), NOISE))

@@ -170,13 +170,14 @@ def take_turns(
     see: Callable[[str, Outcome], str],
     step: Callable[[], None],
     block: int = BLOCK,
+    late: Callable[[], bool] = lambda: False,
 ) -> tuple[Times, dict[str, str]]:
     """Run pipelines in turns of a few frames until all recordings are over.
 
     Parameters
     ----------
     pipelines : name -> pipeline, each with its recording.
-    folder : for the JSON lines.
+    folder : for the JSON lines. late : asked when all have had a turn; if it is, that was the last one.
     see : called with (name, outcome) for each frame, after its turn; returns the kind of frame its time
         belongs to. step : called once per frame, when all have done it. block : frames in a turn.
 
@@ -215,6 +216,8 @@ def take_turns(
                         times.samples[name].setdefault(kind, Samples()).add(outcome.cpu, outcome.wall)
                 for _ in range(longest):
                     step()
+                if late():
+                    break
             times.stages = {name: lockstep.stages_ms() for name, lockstep in running.items()}
         finally:
             for lockstep in running.values():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from tactflow.bench.lockstep import Outcome
 from tactflow.bench.pipelines import on_recording, take_turns
 from tactflow.bench.timing import CopyUnit, Samples
+from tactflow.doctor.checks import STEADY
 from tactflow.engine.graph import Pipeline
 from tactflow.tune.recording import HEAD, Recording
 from tactflow.vision.types import MarkerStatus
 
-STEADY: Final = 0.35
-"""95th percentile of the dots' displacement, px of the camera's picture, up to which nothing touches the gel:
-the bound by which the recordings of franka_mini were labelled."""
 WORDS: Final = {
     "backward": "dots, forward against backward in time, RMS px",
     "odd_even": "dots, all frames against every second, RMS px",
@@ -65,17 +63,23 @@ def orders(frames: int) -> dict[str, list[int]]:
 
 
 def run(
-    pipelines: Mapping[str, Pipeline], recording: Recording, folder: Path, unit: CopyUnit
+    pipelines: Mapping[str, Pipeline],
+    recording: Recording,
+    folder: Path,
+    unit: CopyUnit,
+    late: Callable[[], bool] = lambda: False,
 ) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, Samples]], dict[str, str]]:
     """Show the recording to pipelines in several orders.
 
     Parameters
     ----------
     pipelines : name -> pipeline; the first is the most expensive one, from which distances are taken.
+    late : whether it is time to stop; what was shown until then is compared.
 
     Returns
     -------
-    checks : name -> check -> value. times : name -> kind -> samples, of the order of the recording.
+    checks : name -> check -> value. times : name -> kind -> samples, of the order of the recording; empty if
+    it was not shown to its end.
     failures : name -> why.
     """
     frames = np.load(recording.path, mmap_mode="r")
@@ -83,6 +87,8 @@ def run(
     times: dict[str, dict[str, Samples]] = {}
     failures: dict[str, str] = {}
     for order, numbers in orders(recording.frames).items():
+        if late():
+            break
         path = recording.path if order == "forward" else folder / f"{order}.npy"
         if order != "forward":
             np.save(path, frames[numbers])
@@ -93,13 +99,15 @@ def run(
             return seen[name].setdefault(order, _Seen()).add(numbers[outcome.frame.seq], outcome)
 
         ready = {n: on_recording(p, path) for n, p in pipelines.items() if n not in failures}
-        found, failed = take_turns(ready, folder, unit, see, lambda: None)
+        found, failed = take_turns(ready, folder, unit, see, lambda: None, late=late)
         failures.update(failed)
         if order == "forward":
-            times = found.samples
+            whole = any(len(one["forward"].centers) == len(numbers) for one in seen.values() if one)
+            times = found.samples if whole else {}
         else:
             path.unlink()
     good = [name for name in pipelines if name not in failures]
+    good = [name for name in good if "forward" in seen[name]]
     dearest = seen[good[0]]["forward"] if good else _Seen()
     return {name: _compared(seen[name], dearest) for name in good}, times, failures
 
@@ -108,8 +116,7 @@ def _compared(seen: Mapping[str, _Seen], dearest: _Seen) -> dict[str, float]:
     """The checks of one pipeline."""
     forward = seen["forward"]
     found: dict[str, Any] = {
-        "backward": _apart(forward, seen["backward"]),
-        "odd_even": _apart(forward, seen["odd_even"]),
+        order: _apart(forward, seen.get(order, _Seen())) for order in ("backward", "odd_even")
     }
     rest = [number for number in _at_rest(dearest) if number in forward.centers]
     later = [number for number in rest if number >= len(forward.centers) // 2 and number in forward.dots]

@@ -116,13 +116,14 @@ def judge(
 ) -> dict[str, Found]:
     """Errors, and times, of pipelines on simulated recordings, in turns.
 
-    late : whether it is time to stop; asked between recordings, the first of which is always judged.
+    late : whether it is time to stop. The first recording is judged in any case, and to its end.
     """
     kept = {name: _Kept() for name in pipelines}
     failures: dict[str, str] = {}
     for number, rendered in enumerate(recordings):
         if number and late():
             break
+        ends = late if number else lambda: False
 
         def see(name: str, outcome: Outcome, rendered: Rendered = rendered) -> str:
             height, width = outcome.frame.image.shape[:2]
@@ -138,7 +139,7 @@ def judge(
             for name, pipeline in pipelines.items()
             if name not in failures
         }
-        times, failed = take_turns(ready, folder, unit, see, lambda: None)
+        times, failed = take_turns(ready, folder, unit, see, lambda: None, late=ends)
         failures.update(failed)
         for name, samples in times.samples.items():
             _add(kept[name].times, samples)

@@ -36,6 +36,8 @@ KEPT: Final = (1.0, 0.4, 0.4)
 """Share of the candidates of a round that goes on to the next but one. The front goes on in any case."""
 FINALISTS: Final = 6
 """Candidates of the last round, at most. Chosen by hand."""
+FEWEST: Final = 3
+"""Candidates with which a round is begun, at least. Chosen by hand."""
 ALLOWED: Final = 1.5
 """Without a budget: the cheapest whose error is at most so many times the least. Chosen by hand."""
 LIKELY: Final = 0.5
@@ -112,8 +114,9 @@ class Search:
     ----------
     file : the user's pipeline. sensor : which of several, or None. original : the
     original script's pipeline, for comparison. goal : what is asked for.
-    seconds : the budget. seed : of the simulated recordings and the intervals. refine : whether the chosen
-    one is tried with changes. say : told what happens.
+    seconds : the budget. Finished in any case are the first round, a simulated recording that is under way,
+    and a turn of all candidates on the recording. seed : of the simulated recordings and the intervals.
+    refine : whether the chosen one is tried with changes. say : told what happens.
     """
 
     def __init__(
@@ -135,6 +138,7 @@ class Search:
         self._words: list[str] = []
         self._rounds: list[tuple[int, int]] = []
         self._known: dict[str, Candidate] = {}
+        self._pace = 0.0
 
     def run(self, recording: Recording, folder: Path) -> Tuned:
         """Search.
@@ -152,6 +156,7 @@ class Search:
         dots = recording.seen.dots
         many = candidates(base, recording.size, None if dots is None else dots.pitch)
         self._known = {candidate.name: candidate for candidate in (Candidate(DEFAULT), *many)}
+        script = self._script(look, folder)
         found = self._halve(list(self._known.values()), look, folder)
         if not any(one.usable and math.isfinite(one.of(self._goal.kind)) for one in found):
             raise SourceError(_nothing(found, self._goal))
@@ -160,33 +165,47 @@ class Search:
         if chosen is not None and self._refine:
             chosen, found = self._refined(chosen, base, found, recording, look, folder)
         names = front(found, self._goal.kind)
-        found = [*found, *self._script(look, folder)]
+        found += script
         return Tuned(
             *(recording, look, self._goal, self._goal.order(found), names, chosen, len(many)),
             words=self._words,
             rounds=self._rounds,
         )
 
+    @property
+    def _left(self) -> float:
+        """Seconds of the budget that are left, 0 when it is over."""
+        return max(0.0, self._end - time.monotonic())
+
+    def _late(self) -> bool:
+        return not self._left
+
+    def _room(self, frames: int, share: float) -> int:
+        """How many candidates can see so many frames in a share of the time that is left."""
+        return int(share * self._left / max(self._pace * frames, 1e-6))
+
     def _halve(self, running: list[Candidate], look: Look, folder: Path) -> list[Found]:
         """All rounds on the simulator; what is known of the last one's candidates."""
-        last: list[Found] = []
+        found: list[Found] = []
         for number, cases in enumerate(ROUNDS):
             started = time.monotonic()
             frames = sum(case.frames for case in cases)
             self._say(f"round {number + 1}: {len(running)} candidates, {frames} frames")
-            fresh = self._judged(running, cases, look, folder, self._seed + 100 * number)
-            mark_unsound(fresh)
-            self._rounds.append((len(running), max((one.frames for one in fresh), default=0)))
-            last = fresh
+            found = self._judged(running, cases, look, folder, self._seed + 100 * number)
+            mark_unsound(found)
+            seen = max((one.frames for one in found), default=0)
+            self._rounds.append((len(running), seen))
+            self._pace = (time.monotonic() - started) / max(1, len(running) * seen)
             if number + 1 == len(ROUNDS):
                 break
-            share = (time.monotonic() - started) / max(1, len(running) * frames)
-            running = self._kept(fresh, number, share)
-            if time.monotonic() > self._end:
+            # Half of the time is for what comes after the next round.
+            room = self._room(sum(case.frames for case in ROUNDS[number + 1]), 0.5)
+            if room < FEWEST:
                 self._words.append(f"the budget was over after round {number + 1} of {len(ROUNDS)}")
-                names = {candidate.name for candidate in running[:FINALISTS]}
-                return [one for one in fresh if one.name in names]
-        return last
+                names = {candidate.name for candidate in self._kept(found, number, FINALISTS)}
+                return [one for one in found if one.name in names]
+            running = self._kept(found, number, room)
+        return found
 
     def _judged(
         self, running: Iterable[Candidate], cases: Sequence[Case], look: Look, folder: Path, seed: int
@@ -200,19 +219,15 @@ class Search:
                 failed.append(Found(candidate.name, failure=str(error)))
         rendered = [Fitted(look, case, folder, seed + index) for index, case in enumerate(cases)]
         try:
-            late = lambda: time.monotonic() > self._end  # noqa: E731  (a name for one expression)
-            made = judge(pipelines, rendered, folder, self._unit, self._seed, late)
+            made = judge(pipelines, rendered, folder, self._unit, self._seed, self._late)
         finally:
             for one in rendered:
                 one.path.unlink(missing_ok=True)
         return [*made.values(), *failed]
 
-    def _kept(self, found: list[Found], number: int, share: float) -> list[Candidate]:
-        """Who goes on: the pipeline as given, the front, and the best by the goal."""
-        frames = sum(case.frames for case in ROUNDS[number + 1])
-        left = max(0.0, self._end - time.monotonic())
-        room = int(left / 2 / max(share * frames, 1e-6))
-        want = max(3, min(math.ceil(KEPT[number + 1] * len(found)), max(3, room)))
+    def _kept(self, found: list[Found], number: int, room: int) -> list[Candidate]:
+        """Who goes on, `room` at most: the pipeline as given, the best by the goal, and the front."""
+        want = max(FEWEST, math.ceil(KEPT[number + 1] * len(found)))
         if number + 2 == len(ROUNDS):
             want = min(want, FINALISTS)
         ordered = [one for one in self._goal.order(found) if one.failure is None]
@@ -224,16 +239,23 @@ class Search:
             (name for name in list(self._known)[1:] if any(o.name == name for o in ordered)), first
         )
         names = dict.fromkeys([first, dearest, *best])
-        return [self._known[name] for name in names if any(one.name == name for one in ordered)]
+        there = {one.name for one in ordered}
+        return [self._known[name] for name in names if name in there][:room]
 
     def _on_recording(self, found: list[Found], recording: Recording, folder: Path) -> list[Found]:
         """Times on the recording instead of the simulator's, and the checks without truth."""
         good = [one for one in found if one.failure is None]
+        if self._room(recording.frames, 1.0) < len(good):
+            self._words.append("no time was left for the recording: times are of the simulated one")
+            return found
         dearest = list(self._known)[1:]
         good.sort(key=lambda one: dearest.index(one.name) if one.name in dearest else len(dearest))
         self._say(f"the recording: {len(good)} candidates, {recording.frames} frames, forward and backward")
         pipelines = {one.name: self._known[one.name].load(self._file, self._sensor) for one in good}
-        compared, times, failures = checks.run(pipelines, recording, folder, self._unit)
+        compared, times, failures = checks.run(pipelines, recording, folder, self._unit, self._late)
+        if self._late():
+            told = "some checks on the recording are missing" if times else "times are of the simulated one"
+            self._words.append(f"the budget was over while the recording was shown: {told}")
         for one in good:
             one.failure = failures.get(one.name)
             one.checks = compared.get(one.name, {})
@@ -283,16 +305,19 @@ class Search:
         folder: Path,
     ) -> tuple[Candidate, list[Found]]:
         """One change at a time on the chosen one: kept where it is cheaper and no worse, or more exact."""
-        if time.monotonic() > self._end:
+        tried = refinements(base, chosen)
+        shown = sum(len(order) for order in checks.orders(recording.frames).values())
+        if self._room(sum(case.frames for case in ROUNDS[1]) + shown, 1.0) <= len(tried):
             self._words.append("no time was left to try the probe's settings and more reference frames")
             return chosen, found
-        tried = refinements(base, chosen)
         for candidate in (chosen, *tried):
             self._known[candidate.name] = candidate
         self._say(f"refinements: {', '.join(c.name.removeprefix(chosen.name + ', ') for c in tried)}")
         again = self._judged([chosen, *tried], ROUNDS[1], look, folder, self._seed + 500)
         mark_unsound(again)
         again = self._on_recording(again, recording, folder)
+        if self._late():
+            return chosen, found
         by_name = {one.name: one for one in again}
         before = by_name[chosen.name]
         best = chosen

@@ -54,6 +54,14 @@ def test_what_presses_or_turns_and_sticks_or_rolls_does_not_slip(spec: str) -> N
     assert not any(told)
 
 
+@pytest.mark.parametrize("spec", ["twist?frames=140&seed=11", "box?frames=80"])
+def test_a_flat_contact_that_turns_or_is_pressed_harder_sticks_as_a_whole(spec: str) -> None:
+    told = [slip.stick_ratio for *_, slip in judged(spec, range(14, 74, 2))]
+    assert len(told) > 15
+    assert np.mean(told) > 0.93
+    assert min(told) > 0.8
+
+
 def test_the_stick_ratio_falls_from_the_edge_of_the_contact_inwards() -> None:
     told = [
         (true, slip.stick_ratio)

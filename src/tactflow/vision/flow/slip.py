@@ -36,9 +36,12 @@ CORE: Final = 0.5
 """Part of the contact, around its middle, from which the motion of what sticks is first taken. Chosen by
 hand: slip begins at the edge."""
 LAG: Final = 0.06
-"""How far gel may stay behind the motion of what sticks, relative to it. Chosen on the simulator."""
+"""How far gel may stay behind the motion of what sticks, relative to its RMS. Chosen on the simulator."""
 UNSURE: Final = 6.0
 """Standard errors of the field's markers that gel may stay behind at least."""
+ASIDE: Final = 2.0
+"""How far gel may stay behind, relative to the RMS of how far it departs sideways: a press that spreads the
+gel does both alike, slip only the first. Chosen on the simulator."""
 _ROUNDS: Final = 4
 """Fits to the part that sticks, each to what the last one found to stick. Chosen by hand."""
 
@@ -177,16 +180,21 @@ def stick_ratio(
     for _ in range(_ROUNDS):
         if not sticks.any():
             return 0.0
-        rigid = _affine(away, way, share * sticks)
-        behind = np.hypot(*(way - rigid).T)
-        motion = math.hypot(*np.average(way, axis=0, weights=share * sticks))
-        sticks = behind <= max(UNSURE * noise, LAG * motion)
+        affine, rigid = _fitted(away, way, share * sticks)
+        length = np.maximum(np.hypot(*rigid.T), 1e-9)
+        left = affine - way
+        behind = (left * rigid).sum(axis=1) / length
+        aside = (left[:, 0] * rigid[:, 1] - left[:, 1] * rigid[:, 0]) / length
+        motion, spread = (math.sqrt(np.average(part**2, weights=share)) for part in (length, aside))
+        sticks = np.abs(behind) <= max(UNSURE * noise, LAG * motion, ASIDE * spread)
     return float(share[sticks].sum() / share.sum())
 
 
-def _affine(away: FloatArray, way: FloatArray, weight: FloatArray) -> FloatArray:
-    """(n, 2): the affine motion, of points (n, 2), nearest to displacements (n, 2)."""
+def _fitted(away: FloatArray, way: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n, 2): the affine motion, of points (n, 2), nearest to displacements (n, 2); its rigid part."""
     basis = np.column_stack([np.ones(len(away)), away])
     weighted = basis * weight[:, None]
     ridge = np.diag([1e-9, 1.0, 1.0])
-    return np.asarray(basis @ np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ way))
+    motion = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ way)
+    turn = (motion[1, 1] - motion[2, 0]) / 2
+    return basis @ motion, motion[0] + turn * away[:, ::-1] * np.array([-1.0, 1.0])
