@@ -14,7 +14,7 @@ EVERYWHERE = np.ones((30, 30), np.bool_)
 
 
 def bowl(wide: float, high: float, lights: list[list[float]]) -> Float:
-    """(3, 60, 60) change where an elliptic paraboloid is pressed in; lights : (3, 2), answer to each slope."""
+    """(3, 60, 60) change where a paraboloid is pressed in; lights : (3, 2), answer to each slope."""
     y, x = np.mgrid[:60, :60].astype(np.float32) - 29.5
     inside = (x / wide) ** 2 + (y / high) ** 2 < 1
     slopes = np.stack([x / wide**2, y / high**2]) * inside * (10 * min(wide, high))
