@@ -154,8 +154,8 @@ def _level(change: WindowChange, bridge: float, hidden: Mask | None) -> tuple[Fl
     cap = GLOSS * _typical(
         change.strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
     )
-    # Half the time of `np.minimum`, and of `np.maximum` below.
-    strength = np.asarray(cv2.min(change.strength, cap), np.float32)
+    # Half the time of `np.minimum`.
+    strength = np.clip(change.strength, np.float32(0), np.float32(cap))
     tone = np.float32(cap / 3**0.5)
     brightness = np.clip(change.brightness, -tone, tone)
     if EVEN * cv2.norm(brightness, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
@@ -187,12 +187,12 @@ def _largest_nearby(values: Float) -> Float:
     largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
     largest = largest[reach:, reach:][: coarse[1], : coarse[0]]
     largest = cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(cv2.max(largest, FAINT * peak), np.float32)
+    return np.clip(largest, np.float32(FAINT * peak), np.float32(np.inf))
 
 
 def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
     """Level set of a contact that has brightened or darkened as a whole, whichever is stronger."""
-    brighter = np.maximum(brightness, np.float32(0))
+    brighter = np.clip(brightness, np.float32(0), np.float32(np.inf))
     darker = brighter - brightness
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         brightness, darker = -brightness, brighter
