@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.contact import ContactDetector
 from tactflow.vision.contact.contact_outline import contact_level
-from tactflow.vision.contact.filling import fill
+from tactflow.vision.contact.filling import fill, outlined
 from tests.oracles.contact_outline import change_of
 
 Float = NDArray[np.float32]
@@ -160,6 +160,22 @@ def test_holes_and_pockets_at_the_border_are_filled_and_bays_are_not() -> None:
     hook = np.zeros((60, 80), np.uint8)
     hook[10:50, 10:13] = hook[10:13, 10:60] = hook[47:50, 10:60] = 1
     assert np.array_equal(fill(hook), hook)
+
+
+@pytest.mark.parametrize("density", [0.3, 0.5, 0.6])
+def test_holes_are_filled_as_by_filling_the_outlines_of_all_parts(density: float) -> None:
+    # Rings within rings in noise, which has parts that touch the border.
+    noise = np.random.default_rng(int(10 * density)).random((60, 80)) < density
+    mask = noise.astype(np.uint8)
+    for radius in (25, 18, 10):
+        cv2.circle(mask, (40, 30), radius, 0, 4)
+        cv2.circle(mask, (40, 30), radius, 1, 1)
+    before = mask.copy()
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    expected = cv2.fillPoly(np.zeros_like(mask), outlines, (1.0,))
+    assert (expected != mask).any()
+    assert np.array_equal(outlined(mask, None), expected)
+    assert np.array_equal(mask, before)
 
 
 def test_masks_are_left_as_they_are() -> None:
