@@ -24,7 +24,6 @@ from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.doctor import Finding, examine, observe
 from tactflow.sim import open_scene
-from tactflow.sources import open_source
 
 Image = NDArray[np.uint8]
 Fault = Callable[[Image, float], Image]
@@ -154,15 +153,6 @@ def simulated(scene: str) -> list[Image]:
     """Presses, and a rest at the end."""
     opened = open_scene(f"{scene}?frames={2 * FRAMES}")
     return [opened.frame(index) for index in range(2 * FRAMES)]
-
-
-def recorded(path: str) -> list[Image]:
-    """The frames of a recording, up to 200."""
-    reader, frames = open_source(path), []
-    while (frame := reader.read()) is not None and len(frames) < 200:
-        frames.append(frame[0])
-    reader.close()
-    return frames
 
 
 def real(data: Path) -> Iterator[str]:

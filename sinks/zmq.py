@@ -309,17 +309,22 @@ class Zmq(Sink):
     def _read_subscriptions(self) -> None:
         if self._publisher is None or self._socket is None:
             return
+        changed = False
         try:
             for _ in range(EVENTS_AT_ONCE):
                 event = self._publisher.next_event()
                 if event is None:
                     break
+                changed = True
                 if event[:1] == b"\x01" and self._is_kept(event[1:]):
                     self._subscriptions.add(event[1:])
                 elif event[:1] == b"\x00":
                     self._subscriptions.discard(event[1:])
         except FloodError as error:
             self._begin_anew(error)
+            changed = True
+        if not changed:
+            return
         self._asked = frozenset(name for name in self._extras if self._asks_for(name))
         self._wanted = bool(self._asked) or any(map(self._asks_for_results, self._subscriptions))
         self._stats_wanted = any(map(_asks_for_statistics, self._subscriptions))

@@ -229,6 +229,23 @@ def test_an_address_that_is_taken_is_named_with_what_to_do(bare: ControlSocket) 
     sink.close()
 
 
+def test_a_late_answer_to_an_earlier_command_is_none_to_the_next() -> None:
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as run:
+        run.linger = 0
+        port = run.bind_to_random_port("tcp://127.0.0.1")
+        with RemoteControl(f"tcp://127.0.0.1:{port}", timeout=0.2) as control:
+            with pytest.raises(TimeoutError):
+                control.ping()
+            asked = run.recv_multipart()
+            late = threading.Timer(
+                0.1, run.send_multipart, [[*asked[:-1], b'{"ok": true, "message": "late"}']]
+            )
+            late.start()
+            with pytest.raises(TimeoutError):
+                control.ping()
+            late.join()
+
+
 def test_the_command_says_what_happened_and_what_did_not(
     bare: ControlSocket, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

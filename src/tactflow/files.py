@@ -6,9 +6,11 @@ import errno
 import io
 import os
 import re
+import shutil
 import stat
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TextIO
 
@@ -52,6 +54,27 @@ def next_name(path: Path) -> Path:
             found = pattern.fullmatch(name)
             taken = max(taken, int(found[1]) if found else 0)
     return path.with_name(f"{path.stem}-{taken + 1:03d}{path.suffix}")
+
+
+@contextmanager
+def completed(path: Path) -> Iterator[Path]:
+    """A place to write a file or a folder to, moved to `path` if all went well and removed if not.
+
+    Its name begins with a dot and ends as that of `path` does. Folders above are made. Raises OSError.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        if path.is_dir():
+            shutil.rmtree(path)
+        os.replace(partial, path)
+    finally:
+        if partial.is_dir():
+            shutil.rmtree(partial, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                partial.unlink()
 
 
 def taken_away(path: Path, ours: os.stat_result) -> str | None:

@@ -6,6 +6,7 @@ is rounded.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, NamedTuple
@@ -450,8 +451,9 @@ class _NoDefaults(GenerateJsonSchema):
         return self.generate_inner(schema["schema"])
 
 
+@functools.cache
 def message_schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of the result message.
+    """JSON Schema (draft 2020-12) of the result message; made once, not to be changed.
 
     `field`, and what is marked (detail) or (calibrated), is optional.
     """

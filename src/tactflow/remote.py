@@ -7,6 +7,8 @@ Nothing here needs OpenCV or the rest of tactflow: over plain ZeroMQ, a REQ sock
 from __future__ import annotations
 
 import math
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -100,14 +102,21 @@ class RemoteControl(Connection):
     def ask(self, command: str) -> Answer:
         """Send a command by its name, and wait for the answer."""
         self._socket.send(orjson.dumps({"do": command}), zmq.NOBLOCK)
-        if not self._wait(self.timeout):
-            known = ", and are these keys for it" if self._has_keys else ""
-            raise TimeoutError(
-                f"no answer from {self.endpoint} within {self.timeout:g} s; is tactflow running with "
-                f"sinks.zmq.control set to it{known}?"
-            )
+        end = time.monotonic() + self.timeout
+        while self._wait(end - time.monotonic()):
+            # A late answer to an earlier command wakes us, and is dropped by the socket.
+            with suppress(zmq.Again):
+                return self._understood(self._socket.recv(zmq.NOBLOCK))
+        known = ", and are these keys for it" if self._has_keys else ""
+        raise TimeoutError(
+            f"no answer from {self.endpoint} within {self.timeout:g} s; is tactflow running with "
+            f"sinks.zmq.control set to it{known}?"
+        )
+
+    def _understood(self, received: bytes) -> Answer:
+        """The answer that was received; RuntimeError if it says no, or is none."""
         try:
-            answer: Answer = orjson.loads(self._socket.recv())
+            answer: Answer = orjson.loads(received)
             done, message = answer["ok"], answer["message"]
         except (ValueError, TypeError, KeyError):
             raise RuntimeError(f"{self.endpoint} does not answer as tactflow does") from None

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.api import Settings, load, make_runner
-from tactflow.engine.conformance import component
+from tactflow.engine.conformance import own_sink
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Mark, Node, Pipeline
+from tactflow.engine.graph import Pipeline
 from tactflow.engine.link import Link
 from tactflow.engine.run import Runner
 from tactflow.ports import ContactMask, Image
@@ -206,9 +206,6 @@ def _locked(value: Any) -> Any:
 
 def _with_hand(pipeline: Pipeline, link: Link[Result], *, images: bool, sinks: bool) -> Pipeline:
     """The pipeline with a sink for the loop, and with or without its own."""
-    values: dict[str, Any] = {"link": link, "images": images, "__annotations__": {}}
-    hand = component(type("Hand", (_Hand,), values), _SINK, "tactflow.stream", ())
     kept = {id_: node for id_, node in pipeline.nodes.items() if sinks or node.component.kind != "sink"}
-    inputs = {port.name: pipeline.last_output(port.name) for port in hand.ports.inputs}
-    kept[_SINK] = Node(_SINK, hand, StageParams(), inputs, Mark("tactflow.stream", 0, 0))
+    kept[_SINK] = own_sink(pipeline, _Hand, _SINK, "tactflow.stream", link=link, images=images)
     return replace(pipeline, nodes=kept)

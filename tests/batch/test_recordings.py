@@ -40,6 +40,12 @@ def test_a_pattern_stands_for_what_matches_and_pictures_are_one_recording(data: 
     assert one.path == data / "pictures"
 
 
+def test_options_behind_a_pattern_hold_for_all_that_match(data: Path) -> None:
+    found = find_recordings(["b/*.npy?fps=30"])
+    assert [one.source for one in found] == [f"{data}/b/press-{number}.npy?fps=30" for number in (2, 10)]
+    assert names("b/p*-?.npy") == ["press-2.npy"]
+
+
 def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (data / "b" / "list.txt").write_text("# today\npress-2.npy  # the first\n\nsim:press?seed=3\n../x.dat\n")
     monkeypatch.chdir("/")

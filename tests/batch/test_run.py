@@ -9,7 +9,6 @@ from pathlib import Path
 import orjson
 import pytest
 
-from tactflow.batch import work
 from tactflow.engine.errors import ConfigError
 from tactflow.sinks.jsonl import Jsonl
 from tests.batch.doubles import Batch, recording
@@ -155,6 +154,5 @@ def test_code_beside_the_pipeline_belongs_to_what_a_result_is_kept_under(batch: 
     batch.file.write_text(text.replace("  difference", "  dim: {use: ./dim.py}\n  difference"))
     batch()
     code.write_text(code.read_text().replace("// 2", "// 3"))
-    work.pipeline_for.cache_clear()
     batch()
     assert batch.plan.changed == 3

@@ -104,6 +104,14 @@ def test_a_clock_that_is_ahead_and_a_gauge_that_is_turned_are_noticed() -> None:
     assert fit.entry.drag.stiffness == pytest.approx(plain.stiffness, rel=0.02)
 
 
+def test_a_gauge_with_one_axis_that_writes_zeros_for_the_others_gives_no_drag() -> None:
+    watched, references = sessions(range(3))
+    upright = {name: replace(one, force=one.force * (0, 0, 1)) for name, one in references.items()}
+    fit = fit_force(watched, upright)
+    assert fit.entry.drag is None
+    assert fit.entry.press == fit_force(watched, references).entry.press
+
+
 def test_hysteresis_is_the_gap_between_pressing_and_letting_go() -> None:
     watched, references = sessions(range(3))
     assert (fit_force(watched, references).entry.press.hysteresis or 0) < 0.05

@@ -52,9 +52,15 @@ def test_a_session_does_not_go_on_with_another_light_or_other_frames(tmp_path: P
 
 
 def test_a_kept_press_that_is_damaged_is_named(tmp_path: Path) -> None:
-    (tmp_path / "press-0001.npz").write_bytes(b"PK no")
-    with pytest.raises(ConfigError, match=r"press-0001\.npz: cannot be read"):
-        KeptPresses(tmp_path)
+    for damaged in (b"PK no", b"PK\x03\x04 cut short", b""):
+        (tmp_path / "press-0001.npz").write_bytes(damaged)
+        with pytest.raises(ConfigError, match=r"press-0001\.npz: cannot be read"):
+            KeptPresses(tmp_path)
+    (tmp_path / "press-0001.npz").unlink()
+    kept = KeptPresses(tmp_path)
+    (tmp_path / "untouched.npz").write_bytes(b"PK\x03\x04 cut short")
+    with pytest.raises(ConfigError, match=r"untouched\.npz: cannot be read"):
+        kept.check(GEL, MAPPING)
 
 
 class LiveSink(_Collect):

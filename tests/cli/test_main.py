@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -91,6 +92,18 @@ def test_help_imports_neither_opencv_nor_numpy() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )
     assert done.stdout.splitlines()[-1] == "set()"
+
+
+def test_a_command_has_its_garbage_collected_but_not_looked_for_in_what_was_imported() -> None:
+    frozen = gc.get_freeze_count()
+    gc.disable()
+    try:
+        assert main(["pipelines"]) == 0
+        assert gc.isenabled()
+        assert gc.get_freeze_count() > frozen
+    finally:
+        gc.enable()
+        gc.unfreeze()
 
 
 def test_a_reader_that_leaves_early_causes_no_complaint() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -68,10 +68,3 @@ def died(task: Task, status: Status, why: str) -> Outcome:
         pipeline=task.pipeline.digest,
         started=SYSTEM.unix(),
     )
-
-
-ThreadLimits = Mapping[str, str]
-ONE_THREAD: ThreadLimits = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
-"""Environment of a worker: as many workers as processors, so one thread for each library."""

@@ -103,11 +103,11 @@ class Folder:
             return None
         return found
 
-    def outcome_of(self, key: str) -> Outcome | None:
-        """The outcome of a key for which there is a complete result."""
+    def outcome_of(self, key: str, *, verify: bool = False) -> Outcome | None:
+        """The outcome of a key for which there is a complete result. verify : as in `is_whole`."""
         record = self.record(key)
         outcome = None if record is None else decoded(orjson.dumps(record.get("outcome")))
-        return outcome if outcome is not None and self.is_whole(outcome) else None
+        return outcome if outcome is not None and self.is_whole(outcome, verify=verify) else None
 
     def is_whole(self, outcome: Outcome, *, verify: bool = False) -> bool:
         """Whether the result that an outcome tells of is there as it was written.

@@ -65,6 +65,12 @@ def digest_of(path: Path) -> str:
     return whole.hexdigest()
 
 
+@functools.lru_cache(maxsize=4)
+def _content(path: Path, _now: Fingerprint) -> str:
+    """Digest of a file or folder; read once for all recordings in it."""
+    return digest_of(path)
+
+
 def input_digest(recording: Recording) -> str:
     """SHA-256 of a recording and of how it is opened; of the simulated sensor, that of its description.
 
@@ -77,12 +83,12 @@ def input_digest(recording: Recording) -> str:
     """
     path, options = recording.path, recording.source
     try:
-        content = "" if path is None else digest_of(path)
+        content = "" if path is None else _content(path, fingerprint(path))
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
     if path is not None:
         # Where it lies does not matter.
-        options = options.removeprefix(str(path))
+        options = options.replace(str(path), "", 1)
     return hashlib.sha256(f"{content}{options}".encode(errors="surrogateescape")).hexdigest()
 
 

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from tactflow.batch.engine import ONE_THREAD, Headway
+from tactflow.batch.engine import Headway
 from tactflow.batch.task import Outcome, Report, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import StageError
@@ -29,6 +29,12 @@ REPORT_EVERY = 0.25
 """Time between two words of a worker on how far it is, s. Chosen by hand."""
 MOST_IDLE_DEATHS = 3
 """Workers that die in a row without a recording, after which no more are started. Chosen by hand."""
+
+
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+"""Environment of a worker: as many workers as processors, so one thread for each library."""
 
 
 class _Worker:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from html import escape
 from importlib.resources import files
 from itertools import chain, groupby, islice
@@ -17,6 +15,7 @@ from tactflow.batch.folder import Folder
 from tactflow.batch.runs import Row
 from tactflow.batch.task import Outcome
 from tactflow.engine.errors import StageError
+from tactflow.files import completed
 
 MOST_ROWS = 1000
 """Recordings that the page shows, those that failed first: it has some 20 kB for each. Chosen by hand: a
@@ -61,15 +60,18 @@ def write_page(folder: Folder, rows: Sequence[Row], title: str, facts: Iterable[
         "facts": "\n".join(f"<p>{escape(line)}</p>" for line in lines),
         "columns": heads,
     }
-    head, foot = filled_in("index.html", values).split("<!-- rows -->\n")
+    head, foot = filled_in("index.html", values, scripts=True).split("<!-- rows -->\n")
     return replaced(folder.path / "index.html", chain([head], (_row(folder, row) for row in shown), [foot]))
 
 
-def filled_in(name: str, values: Mapping[str, str]) -> str:
-    """A page of this package with values, in HTML, in it."""
+def filled_in(name: str, values: Mapping[str, str], *, scripts: bool) -> str:
+    """A page of this package with values, in HTML, in it. scripts : whether it has one."""
     room = files("tactflow.batch")
-    style = room.joinpath("page.css").read_text(encoding="utf-8")
-    return Template(room.joinpath(name).read_text(encoding="utf-8")).substitute(values, style=style)
+    style, head, rest = (
+        room.joinpath(n).read_text(encoding="utf-8") for n in ("page.css", "head.html", name)
+    )
+    allowed = "'unsafe-inline'" if scripts else "'none'"
+    return Template(head + rest).substitute(values, style=style, script=allowed)
 
 
 def replaced(path: Path, parts: Iterable[str]) -> Path:
@@ -79,16 +81,11 @@ def replaced(path: Path, parts: Iterable[str]) -> Path:
     ------
     StageError : it cannot be written.
     """
-    unfinished = path.with_name(f".{os.getpid()}-{path.name}")
     try:
-        with unfinished.open("w", encoding="utf-8") as file:
+        with completed(path) as partial, partial.open("w", encoding="utf-8") as file:
             file.writelines(parts)
-        unfinished.replace(path)
     except OSError as error:
         raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink()
     return path
 
 

@@ -13,6 +13,7 @@ from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.files import expanded
 from tactflow.sources.base import find_path
 from tactflow.sources.files import IMAGE_SUFFIXES, natural_key
+from tactflow.sources.lerobot import SCHEME
 
 FILE_SUFFIXES = frozenset(
     [
@@ -36,8 +37,6 @@ FILE_SUFFIXES = frozenset(
 """Files of a folder that are taken for recordings; one that is named is taken whatever it is called."""
 FOLDERS = frozenset([".zarr"])
 """Folders that are taken for one recording."""
-LEROBOT = "lerobot:"
-"""How the name of an episode of a LeRobot dataset begins."""
 LISTS = frozenset([".txt", ".list"])
 """Files that name recordings, one a line."""
 _SHOWN = 10
@@ -60,7 +59,7 @@ class Recording:
         """The file, or the folder, also of a pattern; None for the simulated sensor."""
         if self.source.startswith("sim:"):
             return None
-        path = Path(self.source.removeprefix(LEROBOT).partition("?")[0])
+        path = Path(self.source.removeprefix(SCHEME).partition("?")[0])
         while "*" in path.name or "[" in path.name:
             path = path.parent
         return path
@@ -108,10 +107,12 @@ def _named(word: str, directory: Path | None, mistakes: list[str]) -> Iterator[s
     if word.isdecimal() or word.startswith("/dev/") or re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", word):
         mistakes.append(f"{word}: is live; a batch takes recordings. `tactflow record` makes one")
         return
-    kind, word = (LEROBOT, word.removeprefix(LEROBOT)) if word.startswith(LEROBOT) else ("", word)
+    kind, word = (SCHEME, word.removeprefix(SCHEME)) if word.startswith(SCHEME) else ("", word)
     plain, mark, options = word.partition("?")
+    # In a pattern `?` stands for any character, unless options follow it.
     if glob.has_magic(plain):
-        yield from _matching(word, directory)
+        pattern, tail = (plain, mark + options) if "=" in options else (word, "")
+        yield from (kind + found + tail for found in _matching(pattern, directory))
         return
     path = find_path(plain, directory)
     if path.suffix.lower() in LISTS and path.is_file():

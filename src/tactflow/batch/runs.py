@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from tactflow.batch.recordings import Recording
 from tactflow.batch.task import Format, Outcome
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.extras import missing
+from tactflow.files import completed
 
 _ROWS = 10_000
 """Rows that are written at once. Chosen by hand: some 10 MB."""
@@ -103,15 +102,11 @@ def write_runs(folder: Path, rows: Iterable[Row], format_: Format) -> Path:
     StageError : it cannot be written.
     """
     path = folder / f"runs.{format_}"
-    unfinished = folder / f".runs-{os.getpid()}.{format_}"
     try:
-        (_write_parquet if format_ == "parquet" else _write_lines)(unfinished, rows)
-        unfinished.replace(path)
+        with completed(path) as partial:
+            (_write_parquet if format_ == "parquet" else _write_lines)(partial, rows)
     except OSError as error:
         raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink()
     return path
 
 

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.engine.conformance import component
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.conformance import own_sink
+from tactflow.engine.contract import Sink
 from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Mark, Node, Pipeline
+from tactflow.engine.graph import Pipeline
+from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results
 from tactflow.vision.draw import Annotator
 
@@ -156,9 +157,9 @@ def picture_of(raw: NDArray[np.uint8], results: Results, side: int = PICTURE_SID
     annotator = Annotator(text=False)
     drawn = annotator(image, contact=results.contact, flow=results.flow, markers=results.markers)
     scale = min(1.0, side / max(drawn.shape[:2]))
-    small = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return base64.b64encode(encoded.tobytes()).decode()
+    resized = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = np.asarray(resized, np.uint8)
+    return base64.b64encode(encode_jpeg(small, _QUALITY)).decode()
 
 
 class _LookOn(Sink):
@@ -172,8 +173,5 @@ class _LookOn(Sink):
 
 def with_looker(pipeline: Pipeline, looker: Looker) -> Pipeline:
     """The pipeline with a sink that lets somebody look on."""
-    values: dict[str, Any] = {"looker": looker, "__annotations__": {}}
-    sink = component(type("LookOn", (_LookOn,), values), _SINK, "tactflow.batch", ())
-    inputs = {port.name: pipeline.last_output(port.name) for port in sink.ports.inputs}
-    node = Node(_SINK, sink, StageParams(), inputs, Mark("tactflow.batch", 0, 0))
+    node = own_sink(pipeline, _LookOn, _SINK, "tactflow.batch", looker=looker)
     return replace(pipeline, nodes={**pipeline.nodes, _SINK: node})

@@ -101,8 +101,8 @@ def _result(task: Task, blank: Outcome, report: Report) -> Outcome:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
     key = result_key(read, task.pipeline.digest)
     folder = Folder(Path(task.folder))
-    there = folder.outcome_of(key)
-    if there is not None and folder.is_whole(there, verify=task.verify):
+    there = folder.outcome_of(key, verify=task.verify)
+    if there is not None:
         return replace(there.of(task.recording), input=before, reused=True, started=blank.started)
     found = replace(blank, key=key, input=before, input_digest=read)
     found, summary = _run(task, found, report)
@@ -166,7 +166,6 @@ def _commit(task: Task, folder: Folder, outcome: Outcome, summary: Summary) -> N
             unfinished.unlink()
 
 
-@functools.lru_cache(maxsize=4)
 def pipeline_for(request: PipelineRequest, format_: Format) -> tuple[Pipeline, str]:
     """The pipeline with one sink, that of the results, and its digest.
 
@@ -188,10 +187,16 @@ def pipeline_for(request: PipelineRequest, format_: Format) -> tuple[Pipeline, s
     return pipeline, pipeline_digest(pipeline)
 
 
+kept_pipeline_for = functools.lru_cache(maxsize=4)(pipeline_for)
+"""The same for many recordings: the digest in the request tells of a file that has changed."""
+
+
 def _for_recording(task: Task, path: Path) -> Pipeline:
     """The pipeline that reads this recording and writes to this path."""
-    pipeline, digest = pipeline_for(replace(task.pipeline, digest="", versions=()), task.format)
+    pipeline, digest = kept_pipeline_for(task.pipeline, task.format)
     if digest != task.pipeline.digest:
+        # The right file may come late.
+        kept_pipeline_for.cache_clear()
         here, there = versions(), dict(task.pipeline.versions)
         other = [
             f"{name} {here.get(name)} instead of {there[name]}"

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactflow.api import make_runner
-from tactflow.engine.conformance import component
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.conformance import own_sink
+from tactflow.engine.contract import Sink
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Mark, Node, Pipeline
+from tactflow.engine.graph import Node, Pipeline
 from tactflow.signals import ending_handled
 
 _COLLECT: Final = "tactflow.calibrate"
@@ -41,8 +41,8 @@ def collect(
     ConfigError : a needed port is missing. TactflowError : a stage or the source failed.
     """
     attributes: dict[str, Any] = {name: staticmethod(value) for name, value in values.items()}
-    made = component(type(sink.__name__, (sink,), attributes), _COLLECT, "tactflow calibrate", ())
-    inputs = {port.name: pipeline.last_output(port.name) for port in made.ports.inputs}
+    node = own_sink(pipeline, sink, _COLLECT, "tactflow calibrate", **attributes)
+    inputs = dict(node.inputs)
     # Of a gel without markers the picture itself is without them.
     if "unmarked" in inputs:
         inputs["unmarked"] = inputs["unmarked"] or pipeline.last_output("image")
@@ -51,7 +51,7 @@ def collect(
             raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
     kept = {id_: node for id_, node in pipeline.nodes.items() if node.component.kind != "sink"}
     kept.update(watchers or {})
-    kept[_COLLECT] = Node(_COLLECT, made, StageParams(), inputs, Mark(_COLLECT, 0, 0))
+    kept[_COLLECT] = replace(node, inputs=inputs)
     runner = make_runner(replace(pipeline, nodes=kept, skipping=False, calibration=calibration))
     with ending_handled(lambda _number, _frame: runner.stop()):
         failure = runner.run().failure

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Tick
 from tactflow.engine.graph import Pipeline
 from tactflow.ports import Unmarked, Untouched
-from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, seen, total_change
+from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, Seen, seen, total_change
 from tactflow.vision.types import Contact, Depth, Flow, Scale
 
 Double = NDArray[np.float64]
@@ -60,11 +60,11 @@ class Watched:
 
 
 class _Moment(NamedTuple):
+    """A frame. found : what is seen of the contact, None without one. change : see `ForceModel`."""
+
     seq: int
     t: float
-    contact: Contact | None
-    depth: Depth | None
-    flow: Flow | None
+    found: Seen | None
     change: float
 
 
@@ -74,7 +74,6 @@ class _Watch(Sink):
     def __init__(self, params: Any) -> None:
         super().__init__(params)
         self.moments: list[_Moment] = []
-        self.scale: Scale | None = None
 
     def write(
         self,
@@ -87,10 +86,9 @@ class _Watch(Sink):
         flow: Flow | None,
     ) -> None:
         """Look at one frame."""
-        self.scale = scale
-        flat = None if depth is None else replace(depth, heights=np.zeros((0, 0), np.float32))
         change = scale.area(total_change(unmarked, untouched))
-        self.moments.append(_Moment(tick.frame.seq, tick.frame.t, contact, flat, flow, change))
+        found = None if contact is None else seen(contact, scale, depth, change, flow)
+        self.moments.append(_Moment(tick.frame.seq, tick.frame.t, found, change))
 
 
 def watch(pipeline: Pipeline, calibration: Path) -> Watched:
@@ -109,21 +107,20 @@ def watch(pipeline: Pipeline, calibration: Path) -> Watched:
     needed = {"contact": "hull", "untouched": "untouched", "scale": "scale"}
     watched: Any = collect(pipeline, _Watch, {}, needed, calibration)
     moments: list[_Moment] = watched.moments
-    scale: Scale | None = watched.scale
-    if scale is None:
+    if not moments:
         raise ConfigError("calibrate force: the source has no frames")
-    at_rest = float(np.median([m.change for m in moments if m.contact is None] or [0.0]))
-    touched = np.array([moment.contact is not None for moment in moments])
-    names = BY_DEPTH if any(moment.depth is not None for moment in moments) else BY_CHANGE
+    at_rest = float(np.median([m.change for m in moments if m.found is None] or [0.0]))
+    touched = np.array([moment.found is not None for moment in moments])
+    by_depth = any(moment.found is not None and "volume" in moment.found.press for moment in moments)
+    names = BY_DEPTH if by_depth else BY_CHANGE
     press = {name: np.zeros(len(moments)) for name in names}
     drag = {name: np.full(len(moments), complex(math.nan, math.nan)) for name in BY_SHEAR}
     for i, moment in enumerate(moments):
-        if moment.contact is None:
+        if moment.found is None:
             continue
-        found = seen(moment.contact, scale, moment.depth, moment.change, moment.flow)
         for name, values in press.items():
-            values[i] = found.press.get(name, 0.0)
-        for name, (x, y) in found.drag.items():
+            values[i] = moment.found.press.get(name, 0.0)
+        for name, (x, y) in moment.found.drag.items():
             drag[name][i] = complex(x, y)
     frames, times = (np.array([getattr(moment, name) for moment in moments], float) for name in ("seq", "t"))
     return Watched(frames, times, press, drag, touched, at_rest)
@@ -196,22 +193,23 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
         raise ConfigError("calibrate force: heights are known in some of the recordings only")
     at_rest = float(np.median([one.change_at_rest for one in watched.values()]))
     aligned = [align(name, watched[name], references[name], at_rest) for name in watched]
-    presses = sum(int(one.presses.max(initial=-1)) + 1 for one in aligned)
+    numbered = _numbered(aligned)
+    presses = int(numbered.max()) + 1
     if presses < FEWEST_PRESSES:
         raise ConfigError(
             f"calibrate force: required {FEWEST_PRESSES} presses or more (ten are better, by all that the "
             f"sensor will meet), found {presses} in {len(aligned)} recordings"
         )
-    left_out = "recording" if len(aligned) >= FEWEST_RECORDINGS else "press"
-    groups = _groups(aligned, left_out)
+    left_out: Literal["recording", "press"] = "recording" if len(aligned) >= FEWEST_RECORDINGS else "press"
+    groups = numbered if left_out == "press" else _recordings(aligned)
     force = np.concatenate([one.force for one in aligned])
     press = np.concatenate([one.press for one in aligned])
     entry = ForceEntry(
-        press=_learn(next(iter(names)), press, force[:, 2], groups, _numbered(aligned)),
+        press=_learn(next(iter(names)), press, force[:, 2], groups, numbered),
         change_at_rest=at_rest,
         recordings={one.name: one.offset for one in aligned},
         presses=presses,
-        left_out="recording" if left_out == "recording" else "press",
+        left_out=left_out,
     )
     if not all(references[name].sideways for name in watched):
         return Fit(entry, None, False)
@@ -247,16 +245,14 @@ def try_force(entry: ForceEntry, name: str, watched: Watched, reference: Referen
     return float(np.sqrt(np.mean((one.press @ stiffness - one.force[:, 2]) ** 2)))
 
 
-def _groups(aligned: Sequence[Aligned], left_out: str) -> NDArray[np.intp]:
-    """(n,) int: what is left out together."""
-    if left_out == "recording":
-        return np.repeat(np.arange(len(aligned)), [len(one.press) for one in aligned])
-    return _numbered(aligned)
+def _recordings(aligned: Sequence[Aligned]) -> NDArray[np.intp]:
+    """(n,) int: the recording that each frame belongs to."""
+    return np.repeat(np.arange(len(aligned)), [len(one.press) for one in aligned])
 
 
 def _numbered(aligned: Sequence[Aligned]) -> NDArray[np.intp]:
     """(n,) int: the press that each frame belongs to, counted through all recordings."""
-    first = np.cumsum([0, *(int(one.presses.max(initial=-1)) + 1 for one in aligned)])
+    first = np.cumsum([0, *(int(one.presses.max()) + 1 for one in aligned)])
     return np.concatenate([one.presses + start for one, start in zip(aligned, first, strict=False)])
 
 
@@ -281,7 +277,7 @@ def _learn(
         error=list(_error(left, unseen)),
         range=[float(force.min()), float(force.max())],
         rmse=float(np.sqrt(np.mean(left**2))),
-        r2=1 - float(left @ left) / spread,
+        r2=1 - float(left @ left) / spread if spread else 0.0,
         hysteresis=None if presses is None else _hysteresis(features @ fitted, force, presses),
     )
 

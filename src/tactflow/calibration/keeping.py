@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tactflow.calibration.file import raw_corners
 from tactflow.calibration.presses import Press
 from tactflow.engine.errors import ConfigError
+from tactflow.files import completed
 from tactflow.vision.geometry import PixelMapping
 
 SAME: Final = 0.03
@@ -34,8 +35,8 @@ class KeptPresses:
         try:
             for path in sorted(folder.glob("press-*.npz")):
                 self._saved.append((_read(path), path))
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            raise ConfigError(f"{path}: cannot be read: {error}; remove it") from None
+        except Exception as error:
+            raise _unreadable(path, error) from None
 
     @property
     def presses(self) -> list[Press]:
@@ -48,12 +49,14 @@ class KeptPresses:
         Raises ConfigError, with what differs.
         """
         path, corners = self.folder / "untouched.npz", raw_corners(mapping)
-        self.folder.mkdir(parents=True, exist_ok=True)
         if not path.exists():
-            np.savez_compressed(path, untouched=untouched, corners=corners)
+            _save(path, untouched=untouched, corners=corners)
             return
-        with np.load(path, allow_pickle=False) as before:
-            then, where = before["untouched"], before["corners"]
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as before:
+                then, where = before["untouched"], before["corners"]
+        except Exception as error:
+            raise _unreadable(path, error) from None
         remedy = f"begin anew with --fresh, which forgets the {len(self._saved)} presses in {self.folder}"
         if then.shape != untouched.shape or np.abs(where - corners).max() > 1:
             raise ConfigError(f"calibrate: the session of before had another preprocess; {remedy}")
@@ -76,7 +79,15 @@ class KeptPresses:
             if id(press) not in saved:
                 number = int(self._saved[-1][1].stem[6:]) + 1 if self._saved else 1
                 self._saved.append((press, self.folder / f"press-{number:04d}.npz"))
-                _write(*self._saved[-1])
+                _save(
+                    self._saved[-1][1],
+                    seq=press.seq,
+                    image=press.image,
+                    mask=press.mask,
+                    hidden=press.hidden,
+                    center=press.center,
+                    radius=press.radius,
+                )
 
     def clear(self) -> None:
         """Forget all of them."""
@@ -84,25 +95,18 @@ class KeptPresses:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _write(press: Press, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Whole or not at all: the name is given last.
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        np.savez_compressed(
-            file,
-            seq=press.seq,
-            image=press.image,
-            mask=press.mask,
-            hidden=press.hidden,
-            center=press.center,
-            radius=press.radius,
-        )
-    partial.replace(path)
+def _save(path: Path, **arrays: Any) -> None:
+    with completed(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def _unreadable(path: Path, error: Exception) -> ConfigError:
+    """What ZIP and numpy raise about damaged data is many things."""
+    return ConfigError(f"{path}: cannot be read: {error}; remove it")
 
 
 def _read(path: Path) -> Press:
-    with np.load(path, allow_pickle=False) as said:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as said:
         x, y = said["center"].tolist()
         return Press(
             int(said["seq"]), said["image"], said["mask"], said["hidden"], (x, y), float(said["radius"])

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import os
 import re
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -25,8 +22,9 @@ from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.run import Result, Stopping, make_plan, resolved, run_batch
 from tactflow.batch.runs import Row, require_pyarrow, write_runs
 from tactflow.batch.task import Format, PipelineRequest, Task
-from tactflow.batch.work import pipeline_for, reading
+from tactflow.batch.work import kept_pipeline_for, reading
 from tactflow.cli.batch_progress import batch_display, in_short
+from tactflow.cli.options import positive
 from tactflow.cli.printable import printable
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
@@ -34,6 +32,7 @@ from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import INTERRUPTED
 from tactflow.signals import ending_handled
+from tactflow.vision.compiled import processors
 
 _FAILED_SHOWN = 20
 """Recordings that failed, told at the end by name. Chosen by hand: they fit on a screen."""
@@ -65,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sensor", metavar="NAME", help="which one of a pipeline with several sensors")
     parser.add_argument(
-        "--workers", type=_positive, metavar="N", help="processes on this machine (default: one a processor)"
+        "--workers", type=positive, metavar="N", help="processes on this machine (default: one a processor)"
     )
     parser.add_argument(
         "--scheduler",
@@ -204,7 +203,7 @@ class _Call:
 
 def _opened(request: PipelineRequest, format_: Format, recording: Recording) -> Pipeline:
     """A pipeline that reads a recording."""
-    pipeline, _ = pipeline_for(replace(request, digest="", versions=()), format_)
+    pipeline, _ = kept_pipeline_for(request, format_)
     return reading(pipeline, recording)
 
 
@@ -247,16 +246,9 @@ def _overrides(args: argparse.Namespace, file: Path) -> list[str]:
 
 
 def _engine(args: argparse.Namespace) -> Engine:
-    workers = args.workers or _processors()
+    workers = args.workers or processors()
     address = args.scheduler or args.dask
     return LocalProcesses(workers) if address is None else DaskCluster(address, workers)
-
-
-def _processors() -> int:
-    """Processors that this process may use."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _facts(rows: Sequence[Row]) -> list[str]:
@@ -293,13 +285,6 @@ def _code(results: Sequence[Result], stopping: Stopping) -> int:
     if stopping.signals and undone:
         return INTERRUPTED
     return StageError.exit_code if undone or any(result.failed for result in results) else 0
-
-
-def _positive(text: str) -> int:
-    value = int(text) if text.isdecimal() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"required a whole number from 1, got {text!r}")
-    return value
 
 
 def _shard(text: str) -> tuple[int, int]:

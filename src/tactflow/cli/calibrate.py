@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -20,7 +19,7 @@ from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
 from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_force
 from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
-from tactflow.cli.notes import notes_on
+from tactflow.cli.notes import notes_on, say
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.view.guided import Guiding
@@ -114,7 +113,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     if out.exists() and not args.overwrite:
         raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
     if args.ball_radius is not None:
-        _say(
+        say(
             "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
             f"all over the gel and to several depths. {args.presses} presses will do. Type u and Enter to "
             "undo the last one, q and Enter or Ctrl-C to end earlier; what was pressed is kept."
@@ -122,7 +121,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     kept = KeptPresses(out.with_suffix(".presses"))
     if args.fresh:
         kept.clear()
-    guide = Guide(args.presses, _say, typed_lines())
+    guide = Guide(args.presses, say, typed_lines())
     with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
         session = find_presses(loaded, guide, kept, _page(args, pipeline, guide) if args.view else None)
     try:
@@ -138,23 +137,23 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     if len(kept.presses) >= args.presses:
         kept.clear()
     elif kept.presses:
-        _say(f"to go on to {args.presses} presses, run the command again with --overwrite")
-    _say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
+        say(f"to go on to {args.presses} presses, run the command again with --overwrite")
+    say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
     return 0
 
 
 def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Calibration:
     """What a session gives. Raises ConfigError if that is no calibration."""
     scale = _scale(args, loaded, session)
-    _say(f"scale: {_scale_words(scale)}")
+    say(f"scale: {_scale_words(scale)}")
     found = None
     if args.ball_radius is not None:
-        _say(f"{len(session.presses)} presses; learning from them ...")
+        say(f"{len(session.presses)} presses; learning from them ...")
         found = fit_photometry(session, scale, args.ball_radius)
         for press, kept, misfit in zip(session.presses, found.kept, found.misfit, strict=True):
             if not kept:
-                _say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
-        _say(_photometric_words(found.found.model_dump()))
+                say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
+        say(_photometric_words(found.found.model_dump()))
     return Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
@@ -171,7 +170,7 @@ def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Ca
 
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
-    session = find_presses(_load(args, pipeline), Guide(args.presses, _say))
+    session = find_presses(_load(args, pipeline), Guide(args.presses, say))
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
         print(f"does not fit: {misfit}")
@@ -188,7 +187,7 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
         print(f"when it was made: {_photometric_words(then.model_dump())}")
         fits = fits and now["normal_error"] <= WORSE * then.normal_error
     if args.csv is not None:
-        fits = check_force(args, path, pipeline, WORSE) and fits
+        fits = check_force(args, path, calibration.force, pipeline, WORSE) and fits
     print("it still fits" if fits else "it has drifted; calibrate anew")
     return 0 if fits else 3
 
@@ -250,7 +249,3 @@ def _photometric_words(errors: dict[str, float]) -> str:
         f"{100 * errors['radius_error']:+.1f} %, heights {errors['sphere_rms']:.3f} mm RMS from it, standard "
         f"error of the depth {100 * errors['depth_stderr']:.0f} %"
     )
-
-
-def _say(words: str) -> None:
-    print(words, file=sys.stderr)

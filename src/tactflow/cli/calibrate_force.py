@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 from tactflow.api import load
-from tactflow.calibration.file import Calibration, LinearForceEntry
+from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry
 from tactflow.calibration.force import Fit, Watched, fit_force, try_force, watch
 from tactflow.calibration.reference import Reference, read_reference
+from tactflow.cli.notes import say
 from tactflow.engine.errors import ConfigError
 from tactflow.files import expanded
 
@@ -54,21 +54,24 @@ def add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> int
         loaded = load(pipeline, source=source, sensor=args.sensor, settings=settings)
         watched[source] = watch(loaded, path)
         seen = watched[source]
-        _say(f"{source}: {len(seen.times)} frames, {seen.touched.sum()} of them with contact")
+        say(f"{source}: {len(seen.times)} frames, {seen.touched.sum()} of them with contact")
     fit = fit_force(watched, references)
     for words in _words(fit, references):
-        _say(words)
+        say(words)
     replace(calibration, force=fit.entry).save(path)
-    _say(f"{path} has the force now")
+    say(f"{path} has the force now")
     return 0
 
 
-def check_force(args: argparse.Namespace, path: Path, pipeline: str | None, worse: float) -> bool:
+def check_force(
+    args: argparse.Namespace, path: Path, entry: ForceEntry | None, pipeline: str | None, worse: float
+) -> bool:
     """Print how right the force of a calibration is today; whether its error has not grown `worse` times.
+
+    path, entry : the calibration's file, and its force.
 
     Raises ConfigError as `add_force` does.
     """
-    entry = Calibration.load(path).force
     if entry is None:
         raise ConfigError(f"calibrate check: {path} has no force that --csv could be compared with")
     reference = _read(args.csv, args.offset)
@@ -139,7 +142,3 @@ def _quality(part: LinearForceEntry, left_out: str) -> str:
         f"{100 * part.r2:.0f} % of the variance explained, by {many} that the fit has not seen; "
         f"standard error {absolute:.2f} N and {100 * relative:.0f} % of the force"
     )
-
-
-def _say(words: str) -> None:
-    print(words, file=sys.stderr)

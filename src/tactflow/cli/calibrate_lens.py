@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from tactflow.api import load
 from tactflow.calibration.collecting import collect
 from tactflow.calibration.target import BENT, Target, find_target, fit_lens, scale_from_target
+from tactflow.cli.notes import say
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
@@ -72,7 +72,7 @@ def target_scale(args: argparse.Namespace, loaded: Pipeline) -> Scale:
         raise ConfigError(_none_found(target, args.target))
     scale, bent = scale_from_target(points, target, (first.image.shape[1], first.image.shape[0]))
     if bent > BENT:
-        _say(
+        say(
             f"the target is off a plane grid by {100 * bent:.1f} % of its pitch: one scale is not right for "
             "all of the picture; give preprocess the undistort and homography of `tactflow calibrate lens`"
         )
@@ -92,7 +92,7 @@ def print_lens(args: argparse.Namespace, words: Sequence[str]) -> int:
         found = fit_lens(views, target, size)
     except ValueError as problem:
         raise ConfigError(f"calibrate {problem}") from None
-    _say(
+    say(
         f"{len(views)} pictures: {found.rms:.2f} px RMS; focal lengths to {found.stderr[0]:.1f} and "
         f"{found.stderr[1]:.1f} px, centre to {found.stderr[2]:.1f} and {found.stderr[3]:.1f} px. For the "
         "parameters of preprocess:"
@@ -132,7 +132,3 @@ def _none_found(target: Target, source: str) -> str:
         f"calibrate: {source} does not show {target.columns} x {target.rows} {kind}; all of the target must "
         "be in the picture, and --grid counts " + ("dots" if target.dots else "corners between four squares")
     )
-
-
-def _say(words: str) -> None:
-    print(words, file=sys.stderr)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import gc
 import importlib
 import os
 import re
@@ -80,6 +81,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the program with these arguments; returns its exit code."""
     try:
         args = _parse(argv)
+        _collect_garbage()
         return int(args.run(args))
     except TactflowError as error:
         print(printable(f"tactflow: {error}"), file=sys.stderr)
@@ -123,6 +125,13 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     if unknown:
         _refuse(args.parser, unknown)
     return args
+
+
+def _collect_garbage() -> None:
+    """Have Python look for garbage, if `entry` has put that off, but not in what is imported by now."""
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
 
 
 def _refuse(command: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:

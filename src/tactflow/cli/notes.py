@@ -13,6 +13,11 @@ from rich.logging import RichHandler
 from tactflow.cli.printable import printable
 
 
+def say(words: str) -> None:
+    """Tell the user something that is no result: on standard error, safe for a terminal."""
+    print(printable(words), file=sys.stderr)
+
+
 @contextmanager
 def notes_on(console: Console) -> Iterator[None]:
     """Show notes and warnings while the context lasts. console : of standard error."""

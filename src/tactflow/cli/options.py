@@ -60,3 +60,11 @@ def load_with_stats(args: argparse.Namespace) -> tuple[Pipeline, Plan, Mapping[s
     """As `load_plan`, and the content of the statistics file, or None."""
     statistics = None if args.stats is None else read_statistics(Path(args.stats))
     return (*load_plan(args), statistics)
+
+
+def positive(text: str) -> int:
+    """A type of argparse: a whole number from 1."""
+    value = int(text) if text.isdecimal() else 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"required a whole number from 1, got {text!r}")
+    return value

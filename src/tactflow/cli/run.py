@@ -20,7 +20,7 @@ from rich.console import Console
 from tactflow.api import make_runner
 from tactflow.cli.notes import notes_on
 from tactflow.cli.opencv import warn_of_conflict
-from tactflow.cli.options import add_pipeline
+from tactflow.cli.options import add_pipeline, positive
 from tactflow.cli.printable import printable
 from tactflow.cli.progress import progress_display, summary, with_statistics
 from tactflow.config.load import load_pipeline, sensor_names
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jsonl", metavar="PATH", help="also write one result message a frame ('-': standard output)"
     )
-    parser.add_argument("--max-frames", type=_positive, metavar="N", help="stop after N frames")
+    parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")
     parser.add_argument(
         "--realtime",
         action="store_true",
@@ -237,13 +237,6 @@ def _stop_at_end_of_input(runner: Runner) -> None:
         while os.read(sys.stdin.fileno(), 4096):
             pass
     runner.stop("signal")
-
-
-def _positive(text: str) -> int:
-    value = int(text) if text.isdecimal() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"required a whole number from 1, got {text!r}")
-    return value
 
 
 def _seconds(text: str) -> float:

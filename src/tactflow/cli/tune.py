@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 import re
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import orjson
 
-from tactflow.cli.notes import without_notes
+from tactflow.cli.notes import say, without_notes
 from tactflow.cli.printable import printable
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
@@ -81,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         recording = take(args.source, Candidate(DEFAULT).load(file, args.sensor), folder)
         if args.pipeline is None and recording.seen.dots is None:
             file = find_pipeline("markerless")
-            _say(f"no dots are found: starting from {file.name}")
+            say(f"no dots are found: starting from {file.name}")
         search = Search(
             file,
             Goal(args.error, args.max_error, args.max_ms),
@@ -89,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
             original=find_pipeline("classic"),
             seconds=args.budget - (time.monotonic() - began),
             seed=args.seed,
-            say=_say,
+            say=say,
         )
         tuned = search.run(recording, folder)
     if args.json:
@@ -98,10 +97,10 @@ def run(args: argparse.Namespace) -> int:
         print(printable("\n".join(report.lines(tuned))))
     _write(page, report.html(tuned))
     if tuned.chosen is None:
-        _say(impossible(tuned))
+        say(impossible(tuned))
         return StageError.exit_code
     _write(args.out, report.pipeline_text(tuned, file, args.out))
-    _say(f"{args.out} and {page} are written; try: tactflow run {args.out} --source {args.source}")
+    say(f"{args.out} and {page} are written; try: tactflow run {args.out} --source {args.source}")
     return 0
 
 
@@ -122,10 +121,6 @@ def _write(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise StageError(f"{path}: {error.strerror or error}") from error
-
-
-def _say(words: str) -> None:
-    print(printable(words), file=sys.stderr)
 
 
 def _positive(text: str) -> float:

@@ -305,10 +305,8 @@ def lattice(found: Detection, gray: Gray) -> Lattice:
         places = expected.points[inside]
         if len(places):
             away = np.hypot(*(places[:, None] - found.centers).transpose(2, 0, 1)).min(axis=1)
-            empty = places[away > found.pitch / 2]
-            missing = _distinct(empty, found.pitch / 2) / (
-                len(found.centers) + _distinct(empty, found.pitch / 2)
-            )
+            gone = _distinct(places[away > found.pitch / 2], found.pitch / 2)
+            missing = gone / (len(found.centers) + gone)
     return Lattice(len(found.centers), closed, missing, _contrast(found, gray))
 
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.doctor.measures import REGULAR, Exposure, Gray, Image, Pair, exposure, grey
+from tactflow.doctor.measures import REGULAR, Exposure, Gray, Image, Pair, exposure, grey, jpeg_step
 from tactflow.engine.errors import SourceError
 from tactflow.sources import StampedReader, open_source
 from tactflow.sources.base import FrameReader
@@ -60,6 +60,13 @@ class Observation:
     def exposures(self) -> list[Exposure]:
         """How the kept frames are exposed."""
         return [exposure(pair.image) for pair in self.pairs]
+
+    @cached_property
+    def jpeg_step(self) -> float | None:
+        """Step of JPEG's coarsest quantisation, grey levels, where half of the frames or more show one."""
+        looked = self.grays[::4]
+        steps = [step for gray in looked if (step := jpeg_step(gray)) is not None]
+        return float(np.median(steps)) if steps and 2 * len(steps) >= len(looked) else None
 
     @cached_property
     def typical(self) -> Gray:

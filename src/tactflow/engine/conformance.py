@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 from tactflow.engine.contract import Memory, Part, Sink, Source, Stage, StageParams, WhenLive
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Component, Kind
+from tactflow.engine.graph import Component, Kind, Mark, Node, Pipeline
 from tactflow.engine.ports import read_ports
 
 BASES: dict[Kind, type[Part]] = {"source": Source, "stage": Stage, "sink": Sink}
@@ -64,6 +64,16 @@ def component(cls: type[Any], name: str, origin: str, reserved: Collection[str])
         raise _broken(cls, problems[0], *problems[1:])
     memory: Memory = getattr(cls, "memory", "pure")
     return Component(name, kind, cls, cls.Params, read_ports(cls, METHODS[kind]), memory, origin)
+
+
+def own_sink(pipeline: Pipeline, cls: type[Sink], id_: str, origin: str, **values: Any) -> Node:
+    """A sink of the program itself, for the end of a pipeline: each input is the last output of its name.
+
+    values : attributes of its class, by which it reaches who made it. origin : as in `Component`.
+    """
+    found = component(type(cls.__name__, (cls,), values | {"__annotations__": {}}), id_, origin, ())
+    inputs = {port.name: pipeline.last_output(port.name) for port in found.ports.inputs}
+    return Node(id_, found, StageParams(), inputs, Mark(origin, 0, 0))
 
 
 def build(cls: type[Any], params: StageParams, offered: Mapping[str, Any]) -> Part:

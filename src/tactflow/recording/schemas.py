@@ -5,6 +5,7 @@ The types of Foxglove are those of its package `foxglove-schemas-protobuf`.
 
 from __future__ import annotations
 
+import functools
 import json
 from typing import Any, NamedTuple
 
@@ -49,6 +50,7 @@ class ChannelType(NamedTuple):
     packing: str
 
 
+@functools.cache
 def channel_types() -> dict[str, ChannelType]:
     """What is in the channels for people: `image`, `annotations` and `results`."""
     results = json.dumps(plain_schema(message_schema())).encode()

@@ -1,19 +1,16 @@
 """Writing a scene to disk: the frames without loss, and the truth beside them.
 
 Frames are rendered and written one at a time. A file appears under its name only when it is complete; until
-then its name ends in `.partial`.
+then its name begins with a dot.
 """
 
 from __future__ import annotations
 
 import csv
 import json
-import os
-import shutil
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.files import completed
 from tactflow.sim.scenes import Scene
 
 VIDEO_SUFFIXES = (".avi", ".mkv")
@@ -47,7 +45,7 @@ def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) 
     NotLosslessError : the video codec of this machine is not lossless.
     """
     kind = frames_kind(path)
-    with _completed(path) as partial:
+    with completed(path) as partial:
         if kind == "npy":
             _write_npy(scene, partial, report)
         elif kind == "video":
@@ -71,7 +69,7 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
     suffix = path.suffix.lower()
     if suffix not in TRUTH_SUFFIXES:
         raise ValueError(f"required the truth as {' or '.join(TRUTH_SUFFIXES)}, got {path.name!r}")
-    with _completed(path) as partial:
+    with completed(path) as partial:
         {".jsonl": _write_jsonl, ".npz": _write_npz, ".csv": _write_forces}[suffix](scene, partial, report)
 
 
@@ -85,23 +83,6 @@ def frames_kind(path: Path) -> str:
     if not suffix or path.is_dir():
         return "folder"
     raise ValueError(f"required frames as .npy, {', '.join(VIDEO_SUFFIXES)} or a folder, got {path.name!r}")
-
-
-@contextmanager
-def _completed(path: Path) -> Iterator[Path]:
-    """A place to write to, moved to `path` if all went well and removed if not."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")
-    try:
-        yield partial
-        if path.is_dir():
-            shutil.rmtree(path)
-        os.replace(partial, path)
-    finally:
-        if partial.is_dir():
-            shutil.rmtree(partial, ignore_errors=True)
-        else:
-            partial.unlink(missing_ok=True)
 
 
 def _write_npy(scene: Scene, path: Path, report: Report) -> None:

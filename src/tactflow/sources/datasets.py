@@ -65,15 +65,15 @@ class ArrayDataset:
             self._times: NDArray[Any] | None = None
             if "times" in settings:
                 self._times = self._read_times(_chosen(spec, settings["times"], arrays, "times"))
+            self._swaps = settings.get("order") == "rgb"
+            self._rate = fps or DEFAULT_FPS
+            self.fps: float | None = None if self._times is not None else self._rate
+            self._normalise = Normaliser(self._name)
+            self._frames = enumerate(_pieces(frames))
+            self._first = self._next()
         except BaseException:
             self._release()
             raise
-        self._swaps = settings.get("order") == "rgb"
-        self._rate = fps or DEFAULT_FPS
-        self.fps: float | None = None if self._times is not None else self._rate
-        self._normalise = Normaliser(self._name)
-        self._frames = enumerate(_pieces(frames))
-        self._first = self._next()
         self.size = self._normalise.size
         self.description = f"{spec}, {self.total} frames"
 

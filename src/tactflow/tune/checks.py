@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from tactflow.bench.lockstep import Outcome
 from tactflow.bench.pipelines import on_recording, take_turns
 from tactflow.bench.timing import CopyUnit, Samples
+from tactflow.doctor.checks import STEADY
 from tactflow.engine.graph import Pipeline
 from tactflow.tune.recording import HEAD, Recording
 from tactflow.vision.types import MarkerStatus
 
-STEADY: Final = 0.35
-"""95th percentile of the dots' displacement, px of the camera's picture, up to which nothing touches the gel:
-the bound by which the recordings of franka_mini were labelled."""
 WORDS: Final = {
     "backward": "dots, forward against backward in time, RMS px",
     "odd_even": "dots, all frames against every second, RMS px",

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.doctor.measures import Pair
+from tactflow.doctor.measures import DIM, Pair
 from tactflow.doctor.observation import KEPT, Observation
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame
@@ -39,15 +39,14 @@ class Recording:
     """Part of a recording.
 
     source : how it was named. path : its frames, a `.npy` file. frames : how many. seen : what the doctor's
-    measures need, of the pictures before they shrink. size : (width, height) of those, px. touched : index of
-    the frame in which most has changed.
+    measures need, of the pictures before they shrink. size : (width, height) of those, px. changes : how far
+    the light of each kept frame is from the first, relative.
     """
 
     source: str
     path: Path
     frames: int
     size: tuple[int, int]
-    touched: int
     seen: Observation
     changes: list[float] = field(default_factory=list[float])
 
@@ -74,7 +73,7 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
         )
     start = max(HEAD, min(touched - MOST_USED // 2, len(changes) - MOST_USED + HEAD))
     wanted = [*range(HEAD), *range(start, min(len(changes), start + MOST_USED - HEAD))]
-    return _copy(source, wanted, wanted.index(touched), changes, pipeline, folder)
+    return _copy(source, wanted, changes, pipeline, folder)
 
 
 def _changes(source: str) -> list[float]:
@@ -106,14 +105,14 @@ def _small(image: Image) -> NDArray[np.float32]:
 
 
 def _change(first: NDArray[np.float32], now: NDArray[np.float32]) -> float:
-    ratio = np.where(first > 25, now / np.maximum(first, 25), 1.0)
+    ratio = np.where(first > DIM, now / np.maximum(first, DIM), 1.0)
     ratio = ratio / np.maximum(np.median(ratio, axis=(0, 1)), 0.1)
     smooth = cv2.blur(np.abs(ratio - 1.0).max(axis=2).astype(np.float32), (7, 7))
     return float(smooth.max())
 
 
 def _copy(
-    source: str, wanted: list[int], touched: int, changes: list[float], pipeline: Pipeline, folder: Path
+    source: str, wanted: list[int], changes: list[float], pipeline: Pipeline, folder: Path
 ) -> Recording:
     path = folder / "recording.npy"
     straight = geometry(pipeline)
@@ -148,7 +147,7 @@ def _copy(
     seen = Observation(source, reader.description, False, times=np.array(times), frames=place, pairs=pairs)
     height, width = pairs[0].image.shape[:2]
     used = [changes[index] for index in wanted]
-    return Recording(source, path, len(wanted), (width, height), touched, seen, used)
+    return Recording(source, path, len(wanted), (width, height), seen, used)
 
 
 def geometry(pipeline: Pipeline) -> Any:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tactflow.bench.scenes import Case, Rendered
 from tactflow.doctor import measures
+from tactflow.jpeg import encode_jpeg
 from tactflow.sim import Truth, open_scene
 from tactflow.sim.scenes import SIZE
 from tactflow.tune.recording import Recording, change_between
@@ -91,12 +92,11 @@ def fit(recording: Recording) -> Look:
     own = Fitted.draw(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0)
     levels = tuple(float(v) for v in _levels(seen.pairs[0].image) / np.maximum(_levels(own), 1.0))
     if dots is not None:
-        contrast = _contrast_ratio(recording, plain, levels)
-    steps = [step for gray in seen.grays[::4] if (step := measures.jpeg_step(gray)) is not None]
-    jpeg = round(measures.jpeg_quality(float(np.median(steps)))) if steps else 0
+        contrast = _contrast_ratio(recording, own, levels)
+    jpeg = 0 if seen.jpeg_step is None else round(measures.jpeg_quality(seen.jpeg_step))
     blur = measures.blur(seen.typical) or 0.0
     extra = math.sqrt(max(blur**2 - (OWN_BLUR * scale) ** 2, 0.0))
-    query = f"{plain.query}&depth={_depth(recording, plain)}"
+    query = f"{plain.query}&depth={_depth(recording, plain, own)}"
     noise = _noise_before(recording, jpeg) if jpeg else measures.noise_of(seen.pairs)
     found = levels[0], levels[1], levels[2]
     return Look(size, query, round(noise, 2), round(extra, 2), jpeg, found, round(contrast, 2))
@@ -122,7 +122,7 @@ def compressed(light: NDArray[Any], jpeg: int) -> Image:
     image = np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
     if not jpeg:
         return image
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, jpeg])[1]
+    data = np.frombuffer(encode_jpeg(image, jpeg), np.uint8)
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
 
@@ -132,11 +132,10 @@ def _levels(image: Image) -> NDArray[np.float64]:
     return np.asarray(np.median(gel, axis=0) if len(gel) else np.ones(3), np.float64)
 
 
-def _contrast_ratio(recording: Recording, plain: Look, levels: tuple[float, ...]) -> float:
-    """Contrast of the dots, relative to that of the simulator's dots under as much light."""
+def _contrast_ratio(recording: Recording, own: Image, levels: tuple[float, ...]) -> float:
+    """Contrast of the dots, relative to that of the simulator's dots (`own`) under as much light."""
     seen = recording.seen
     assert seen.dots is not None
-    own = Fitted.draw(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0)
     own = np.clip(own * np.array(levels), 0, 255).astype(np.uint8)
     try:
         dots = detect_markers(own)
@@ -171,14 +170,17 @@ def _extremes(recording: Recording) -> tuple[NDArray[np.float32], NDArray[np.flo
     return small[0], small[1]
 
 
-def _depth(recording: Recording, plain: Look) -> float:
-    """Depth of the simulated press whose light changes as much as that of the recording."""
+def _depth(recording: Recording, plain: Look, own: Image) -> float:
+    """Depth of the simulated press whose light changes as much as that of the recording.
+
+    own : the simulated gel before it is touched.
+    """
     wanted = max(recording.changes)
     found = {}
     for depth in DEPTHS:
         scene = open_scene(f"press?{plain.query}&frames=60&noise=0&depth={depth}")
         deepest = max(range(60), key=lambda index: max((p.depth for p in scene.presses(index)), default=0.0))
-        found[depth] = change_between(Fitted.draw(plain, scene, 0), Fitted.draw(plain, scene, deepest))
+        found[depth] = change_between(own, Fitted.draw(plain, scene, deepest))
     return min(found, key=lambda depth: abs(math.log(max(found[depth], 1e-3) / wanted)))
 
 

@@ -353,15 +353,19 @@ def _code_length(function: Callable[..., Any]) -> int:
     )
 
 
+def processors() -> int:
+    """Processors that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _start_workers(kernels: Sequence[Kernel[..., Any]]) -> list[subprocess.Popen[str]]:
     """Processes that compile these kernels, too; each takes those that no other has claimed."""
     # There are no claims on Windows. The executable of a frozen program is the program, not Python.
     alone = sys.platform == "win32" or not sys.executable or getattr(sys, "frozen", False)
     if alone or len(kernels) < _LEAST_SHARED:
         return []
-    processors = os.cpu_count() or 1
-    if sys.platform == "linux":
-        processors = len(os.sched_getaffinity(0))
     order = {"path": sys.path, "kernels": [(kernel.plain.__module__, kernel.name) for kernel in kernels]}
     return [
         subprocess.Popen(
@@ -375,7 +379,7 @@ def _start_workers(kernels: Sequence[Kernel[..., Any]]) -> list[subprocess.Popen
             # Ctrl-C does not reach it: this process ends it.
             start_new_session=True,
         )
-        for _ in range(min(processors, _MOST_PROCESSES) - 1)
+        for _ in range(min(processors(), _MOST_PROCESSES) - 1)
     ]
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.contact import ContactDetector
 from tactflow.vision.contact.contact_outline import contact_level
-from tactflow.vision.contact.filling import fill
+from tactflow.vision.contact.filling import fill, outlined
 from tests.oracles.contact_outline import change_of
 
 Float = NDArray[np.float32]
@@ -162,6 +162,22 @@ def test_holes_and_pockets_at_the_border_are_filled_and_bays_are_not() -> None:
     assert np.array_equal(fill(hook), hook)
 
 
+@pytest.mark.parametrize("density", [0.3, 0.5, 0.6])
+def test_holes_are_filled_as_by_filling_the_outlines_of_all_parts(density: float) -> None:
+    # Rings within rings in noise, which has parts that touch the border.
+    noise = np.random.default_rng(int(10 * density)).random((60, 80)) < density
+    mask = noise.astype(np.uint8)
+    for radius in (25, 18, 10):
+        cv2.circle(mask, (40, 30), radius, 0, 4)
+        cv2.circle(mask, (40, 30), radius, 1, 1)
+    before = mask.copy()
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    expected = cv2.fillPoly(np.zeros_like(mask), outlines, (1.0,))
+    assert (expected != mask).any()
+    assert np.array_equal(outlined(mask, None), expected)
+    assert np.array_equal(mask, before)
+
+
 def test_masks_are_left_as_they_are() -> None:
     painted, hidden = without_markers(tilted(disc()), [(79.5, 49.5)])
     inside = (np.linalg.norm(painted, axis=2) > 0.02).astype(np.uint8)
@@ -207,3 +223,13 @@ def test_a_faint_band_of_light_through_a_contact_does_not_move_its_outline() -> 
     band = np.zeros_like(ball)
     band[:, 56:72] = 0.2 * np.linalg.norm(ball, axis=2).max() / 3**0.5
     assert overlap(found(ball + band), found(ball)) > 0.95
+
+
+def test_a_wrinkle_beside_a_dented_contact_is_not_joined_to_it() -> None:
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    dent = (np.abs(columns - 49.5) < 5) & (rows > 62)
+    ball = tilted(disc(22), ring=12.0)
+    dented = ball * np.where(dent, np.float32(0.1), np.float32(1))[..., None]
+    wrinkled = dented.copy()
+    wrinkled[80:82, 38:62] += np.float32(0.25) * ball.max()
+    assert overlap(found(wrinkled), found(dented)) > 0.98

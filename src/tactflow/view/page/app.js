@@ -7,7 +7,8 @@ import * as words from "./words.js";
 const { fixed, grouped } = words;
 const $ = (id) => document.getElementById(id);
 const STALL_SECONDS = 2;
-const MAGNIFICATIONS = [1, 3, 5, 10];
+// How many times as long or high as they are, arrows and the surface can be drawn.
+const FACTORS = [1, 3, 5, 10];
 const PLOTS = ["area", "angle", "flow", "latency", "depth", "force", "slip"].map((name) => `plot-${name}`);
 const CANVASES = ["picture", "surface", ...PLOTS];
 const COLOURS = ["tracked", "inferred", "lost", "field", "hull", "axis", "ellipse", "mean", "series-a", "series-b", "series-c", "grid", "quiet", "panel", "well"];
@@ -23,7 +24,6 @@ const LAYERS = [
 ];
 // What is shown only where the run has it: the tile or button, and what of a frame it needs.
 const OFFERED = { "tile-guide": "guide", unit: "scale", "layer-field": "field", "layer-surface": "surface", "tile-depth": "surface", "tile-force": "force", "tile-slip": "slip" };
-const RISES = [1, 3, 5, 10];
 
 const sensors = new Map();
 const layers = Object.fromEntries(LAYERS.map((layer) => [layer.id, !layer.off]));
@@ -400,11 +400,11 @@ function addFactor(id, key, title, factors, text, choose) {
   return button;
 }
 $("layers").append(
-  addFactor("magnify", "x", "How much longer arrows are than the displacement they show", MAGNIFICATIONS, "Arrows", (factor) => { magnification = factor; }),
+  addFactor("magnify", "x", "How much longer arrows are than the displacement they show", FACTORS, "Arrows", (factor) => { magnification = factor; }),
   $("unit"),
 );
 $("surface-tools").prepend(
-  addFactor("rise", "z", "How much higher the surface is shown than it is", RISES, "Heights", (factor) => { rise = factor; }),
+  addFactor("rise", "z", "How much higher the surface is shown than it is", FACTORS, "Heights", (factor) => { rise = factor; }),
 );
 document.querySelector("#ramp i").style.background = `linear-gradient(90deg, ${RAMP})`;
 keys.u = "unit";

@@ -66,7 +66,11 @@ const orders = {
     for (const plot of Object.values(plots)) plot.choose(unit);
     const before = String(shows);
     shows = ["field", "surface"].filter((name) => layers[name]);
-    if (String(shows) !== before) connection.send({ show: shows });
+    if (String(shows) !== before) {
+      connection.send({ show: shows });
+      // Another page may have had the heights sent: while the run is paused, no frame comes that would show them.
+      if (current !== null) showSurface(sensor(current));
+    }
   },
   turn({ dx, dy }) {
     surface.turn(dx, dy);
@@ -172,6 +176,10 @@ function addFrame(s, header, heights) {
 
 function showFrame(s) {
   picture.show(s.bitmap, s.header);
+  showSurface(s);
+}
+
+function showSurface(s) {
   // The colours' scale is that of the plot, which rarely changes.
   if (shows.includes("surface")) surface.show(s.header, s.heights, plots["plot-depth"].limits(s.points)[1]);
 }

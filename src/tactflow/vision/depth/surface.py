@@ -182,7 +182,7 @@ class Surface:
         steepest = None if self._errors is None else self._errors.steepest
         if steepest is None:
             return slope, 0.0
-        length = np.hypot(slope[0], slope[1])
+        length = cv2.magnitude(slope[0], slope[1])
         total = float(length.sum())
         return slope, float(length[flat > (STEEP * steepest) ** 2].sum()) / total if total else 0.0
 

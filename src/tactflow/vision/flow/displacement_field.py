@@ -171,7 +171,6 @@ class FieldModel:
         self.origin = np.array(origin, np.float64)
         self.pitch = max(pitch_of(self.origin), 1.0)
         self.grid = _grid(size, self.pitch)
-        self.points = self.grid.points
         self._length = LENGTH * self.pitch
         kernel = self._kernel(self.origin)
         self.inverse: FloatArray = np.asarray(
@@ -179,7 +178,7 @@ class FieldModel:
         )
         self.diagonal = np.diagonal(self.inverse).copy()
         rows, columns = self.grid.shape
-        self.to_markers = self._kernel(self.points.reshape(-1, 2)).reshape(rows, columns, -1)
+        self.to_markers = self._kernel(self.grid.points.reshape(-1, 2)).reshape(rows, columns, -1)
         """(rows, columns, N), the kernel between cells and markers."""
         down, across = np.mgrid[:rows, 1 - columns : columns] * self.grid.spacing
         self._between = matern(np.hypot(down, across) / self._length)

@@ -101,9 +101,7 @@ def find_peaks(response: Float32Array, least: float, reach: int) -> tuple[FloatA
     response (M,) float32.
     """
     highest = cv2.dilate(response, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-    # Above `least` is the same as at least the next number in this precision.
-    highest = np.maximum(highest, np.nextafter(np.float32(least), np.float32(np.inf)))
-    peak = response >= highest
+    peak = (response >= highest) & (response > np.float32(least))
     peak[[0, -1]] = False
     peak[:, [0, -1]] = False
     at = np.flatnonzero(peak)
