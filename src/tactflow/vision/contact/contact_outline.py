@@ -215,14 +215,23 @@ def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float,
     changed = (local > OUTER).view(np.uint8)
     filled = fill_pockets(outlined(changed, hidden))
     solid = is_solid(filled)
+    specks = None
     if not solid:
-        ring = changed if hidden is None else np.asarray(cv2.bitwise_and(changed | hidden, filled), np.uint8)
+        # A wrinkle or what is left of a marker is no far side of the contact, to which a gap is closed.
+        kept = _without_specks(filled.astype(np.float32), strength)
+        specks, filled = kept < 0, (kept > 0).view(np.uint8)
+        ring = changed if hidden is None else changed | hidden
+        ring = np.asarray(cv2.bitwise_and(ring, filled), np.uint8)
         reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
         filled = fill(close_gaps(ring, reach) | filled)
     if cv2.countNonZero(filled) == filled.size:
         return np.ones_like(strength), None
     depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
-    parts = depth if solid else _without_specks(depth, strength)
+    parts = depth
+    if specks is not None:
+        parts = _without_specks(depth, strength)
+        if specks.any():
+            parts = np.where(specks & (parts <= 0), np.float32(-1), parts)
     level = np.asarray(parts - np.float32(_border_depth(parts, local, hidden)), np.float32)
     if parts is depth:
         return level if solid else _without_specks(level, strength), None
