@@ -28,7 +28,7 @@ run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
 
 test: lint types
-	$(PY) -m pytest -m "not slow" --numprocesses auto --dist loadfile
+	$(PY) -m pytest -m "not slow" --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
 soak: $(VENV)/.installed-test

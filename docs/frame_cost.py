@@ -1,6 +1,6 @@
 """What a frame costs: the section of tuning.md on the cost of a frame, and its picture.
 
-    python docs/frame_cost.py                     writes the section and docs/frame-cost.svg; two minutes
+    python docs/frame_cost.py                     writes the section and docs/frame-cost.svg; three minutes
     python docs/frame_cost.py --against DIR       this tree and another one, in turns (A B A B); three minutes
     python docs/frame_cost.py --against DIR --neighbour    the same, beside a program that copies memory
 
@@ -10,6 +10,8 @@ DIR is a clone of the project with a `.venv` of its own. Wants a machine that is
 from __future__ import annotations
 
 import argparse
+import ast
+import inspect
 import json
 import random
 import re
@@ -17,24 +19,28 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import CodeType, FrameType
 from typing import Any
 
 import numpy as np
 
 from tactflow.bench.lockstep import LockstepPipeline
-from tactflow.bench.pipelines import on_recording
+from tactflow.bench.pipelines import growth, on_recording
+from tactflow.bench.run import GROWTH_FRAMES
+from tactflow.bench.scenes import Case, Rendered
 from tactflow.bench.timing import BLOCK, CopyUnit, quiet
 from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Frame
 from tactflow.engine.node import RunningNode
 from tactflow.sim import open_scene
-from tactflow.vision.compiled import Kernel
+from tactflow.vision.compiled import Helper, Kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, PICTURE = ROOT / "docs" / "tuning.md", ROOT / "docs" / "frame-cost.svg"
@@ -101,6 +107,117 @@ class Watch:
             RunningNode.__call__, Kernel.__call__ = node, kernel  # type: ignore[method-assign]
 
 
+CHOICES = frozenset({"min", "max", "abs", "round", "rint", "sqrt", "exp", "floor", "hypot"})
+"""Functions in compiled loops that count as one operation each."""
+
+
+class Operations:
+    """Counts the operations of compiled loops, which it runs as plain Python beside the compiled ones.
+
+    An operation is an addition, a product, a comparison, a choice or a root, not for an index. Those of NumPy
+    and OpenCV are not counted.
+
+    counted : stage -> operations in one frame.
+    """
+
+    def __init__(self) -> None:
+        self.counted: Counter[str] = Counter()
+        self._lines: dict[CodeType, dict[int, int]] = {}
+        self._found = 0
+
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Count within the block, which takes a thousand times as long."""
+        node, kernel = RunningNode.__call__, Kernel.__call__
+
+        def call(this: RunningNode, inputs: Sequence[Any], tick: Any) -> Sequence[Any]:
+            self._found = 0
+            outputs = node(this, inputs, tick)
+            self.counted[this.id] = self._found
+            return outputs
+
+        def loop(this: Kernel[..., Any], *args: Any) -> Any:
+            copies = [value.copy() if isinstance(value, np.ndarray) else value for value in args]
+            before = sys.gettrace()
+            sys.settrace(self._enter)
+            try:
+                # Sums of small integers overflow here, where numba's are wider.
+                with np.errstate(all="ignore"):
+                    this.plain(*copies)
+            finally:
+                sys.settrace(before)
+            return kernel(this, *args)
+
+        RunningNode.__call__, Kernel.__call__ = call, loop  # type: ignore[method-assign, assignment]
+        try:
+            yield
+        finally:
+            RunningNode.__call__, Kernel.__call__ = node, kernel  # type: ignore[method-assign]
+
+    def _enter(self, frame: FrameType, _event: str, _: Any) -> Any:
+        """Trace function: what to do with a function that begins."""
+        code = frame.f_code
+        if "tactflow" not in code.co_filename or code is Helper.__call__.__code__:
+            return None
+        if code not in self._lines:
+            self._lines[code] = operations_by_line(code)
+        lines = self._lines[code]
+
+        def line(frame: FrameType, event: str, _: Any) -> Any:
+            if event == "line":
+                self._found += lines.get(frame.f_lineno, 0)
+            return line
+
+        return line
+
+
+def operations_by_line(code: CodeType) -> dict[int, int]:
+    """Line of a function -> operations in it, apart from those for an index or the bounds of a loop."""
+    source, first = inspect.getsourcelines(code)
+    found: Counter[int] = Counter()
+
+    def visit(node: ast.AST) -> None:
+        if isinstance(node, ast.BinOp | ast.AugAssign | ast.Compare | ast.IfExp):
+            found[node.lineno + first - 1] += 1
+        elif isinstance(node, ast.Call):
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            found[node.lineno + first - 1] += name in CHOICES
+        passed = {"slice", "decorator_list", "args"} if isinstance(node, ast.FunctionDef) else {"slice"}
+        if isinstance(node, ast.For):
+            passed = {"iter"}
+        for name, value in ast.iter_fields(node):
+            for child in value if isinstance(value, list) else [value]:
+                if name not in passed and isinstance(child, ast.AST):
+                    visit(child)
+
+    visit(ast.parse(textwrap.dedent("".join(source))))
+    return found
+
+
+def operations(folder: Path) -> Counter[str]:
+    """Stage -> operations of its compiled loops in the deepest frame of `press`."""
+    pipeline = on_recording(load_pipeline(ROOT / "pipeline.yaml"), recording("press", folder))
+    run = LockstepPipeline(pipeline, folder / "out.jsonl")
+    for _ in range(FRAMES // 2):
+        run.step()
+    counter = Operations()
+    with counter.installed():
+        run.step()
+    run.close()
+    return counter.counted
+
+
+def additions_per_second() -> float:
+    """How many bytes the machine adds in a second, from and to its second cache: no type is faster."""
+    first, second, third = np.ones((3, 1 << 17), np.uint8)
+    times = []
+    for _ in range(2000):
+        began = time.perf_counter()
+        np.add(first, second, out=third)
+        times.append(time.perf_counter() - began)
+    return first.size / statistics.median(times)
+
+
 def _bytes(values: Sequence[Any]) -> int:
     """Bytes of the arrays among these values, each once; a frame counts only where no picture is given."""
     arrays = {id(value): value.nbytes for value in values if isinstance(value, np.ndarray)}
@@ -149,6 +266,7 @@ def write_page() -> None:
     moved: dict[str, int] = {}
     lines: list[str] = []
     with tempfile.TemporaryDirectory() as name:
+        worked = operations(Path(name))
         for scene in SCENES:
             stages: dict[str, list[float]] = defaultdict(list)
             best: dict[str, float] = {}
@@ -166,7 +284,14 @@ def write_page() -> None:
                 f"{kind} {ms:.2f} ms, {ms / unit.copy_ms:.1f} copies" for kind, ms in best.items()
             )
             lines.append(f"- `{scene}`: {told}.")
-    text = "\n".join([_intro(unit), *lines, "", _stages(rows, moved, unit), "", _imports()])
+        pipeline = load_pipeline(ROOT / "pipeline.yaml")
+        grown = growth(pipeline, Rendered(Case("press", GROWTH_FRAMES), Path(name)), Path(name), unit)
+    assert grown is not None
+    lines.append(f"- `press` at 1600 x 1200 with 560 dots: {grown:.2f} times as long as at 800 x 600.")
+    rate = additions_per_second()
+    roofline = f"The machine adds {rate / 1e9:.0f} billion bytes a second from its second cache.\n"
+    table = _stages(rows, moved, worked, unit, rate)
+    text = "\n".join([_intro(unit), *lines, "", roofline, table, "", _imports()])
     page = PAGE.read_text(encoding="utf-8")
     before, _, rest = page.partition(BEGIN)
     _, _, after = rest.partition(END)
@@ -182,10 +307,17 @@ def _intro(unit: CopyUnit) -> str:
     )
 
 
-def _stages(rows: dict[str, dict[str, list[float]]], moved: dict[str, int], unit: CopyUnit) -> str:
+def _stages(
+    rows: dict[str, dict[str, list[float]]],
+    moved: dict[str, int],
+    worked: Counter[str],
+    unit: CopyUnit,
+    rate: float,
+) -> str:
+    times = " | ".join(f"`{scene}`, ms" for scene in rows)
     header = [
-        "| stage | " + " | ".join(f"`{scene}`, ms" for scene in rows) + " | moves, MB | bound, ms | times |",
-        "| --- |" + " --- |" * (len(rows) + 3),
+        f"| stage | {times} | moves, MB | operations, millions | bound, ms | times |",
+        "| --- |" + " --- |" * (len(rows) + 4),
     ]
     body = []
     for name in rows["press"]:
@@ -194,8 +326,9 @@ def _stages(rows: dict[str, dict[str, list[float]]], moved: dict[str, int], unit
         own = [
             statistics.median(stages[name]) if name in stages else float("nan") for stages in rows.values()
         ]
-        bound = moved[name] / (2 * RAW_BYTES) * unit.copy_ms
-        cells = [f"`{name}`", *(f"{ms:.3f}" for ms in own), f"{moved[name] / 1e6:.2f}", f"{bound:.3f}"]
+        bound = max(moved[name] / (2 * RAW_BYTES) * unit.copy_ms, 1e3 * worked[name] / rate)
+        cells = [f"`{name}`", *(f"{ms:.3f}" for ms in own), f"{moved[name] / 1e6:.2f}"]
+        cells += [f"{worked[name] / 1e6:.2f}" if worked[name] else "-", f"{bound:.3f}"]
         body.append("| " + " | ".join([*cells, f"{own[0] / bound:.1f}" if bound > 0 else "-"]) + " |")
     return "\n".join(header + body)
 

@@ -25,6 +25,21 @@ for number in (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if sys.platform 
 MOST_WORKERS = 4
 """Processes that run tests at most: many tests watch a run in real time and need a processor then."""
 
+LONG_FILES = (
+    "bench/test_run.py",
+    "browser/test_view_page.py",
+    "fleet/test_fleet.py",
+    "test_main_job.py",
+    "sources/test_streams.py",
+    "test_install.py",
+    "bench/test_skipping.py",
+    "cli/test_calibrate.py",
+    "cli/test_record.py",
+    "vision/test_compiled.py",
+)
+"""The files of tests that take longest, from a minute down to ten seconds. They begin first, so that no
+process is left alone with one at the end."""
+
 # How fast examples are made, and run, is the machine's business.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
@@ -33,6 +48,12 @@ settings.load_profile("any machine")
 def pytest_xdist_auto_num_workers() -> int:
     """One process more than there are processors: tests that start programs mostly wait."""
     return min((os.cpu_count() or 1) + 1, MOST_WORKERS)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first, the others in the order in which they were found."""
+    places = {REPOSITORY / "tests" / name: place for place, name in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
 
 
 @pytest.fixture(scope="session")

@@ -18,28 +18,16 @@ import pytest
 import yaml
 import zmq
 
+from tactflow.cli.main import main
 from tactflow.message import message_schema
 from tests.clock import PATIENCE, until
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SHIPPED = yaml.safe_load((REPOSITORY / "pipeline.yaml").read_text())
+PIPELINE = REPOSITORY / "pipeline.yaml"
+SHIPPED = yaml.safe_load(PIPELINE.read_text())
 WITHOUT = {name: ("--set", f"sinks.{name}=null") for name in SHIPPED["sinks"]}
 NO_SINKS = tuple(word for words in WITHOUT.values() for word in words)
 ONLY_ZMQ = tuple(word for name, words in WITHOUT.items() if name != "zmq" for word in words)
-
-
-def tactflow(
-    *arguments: str, cwd: Path = REPOSITORY, timeout: float = 100
-) -> subprocess.CompletedProcess[str]:
-    """Run the program to its end."""
-    return subprocess.run(
-        [sys.executable, "-m", "tactflow", *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-    )
 
 
 def messages(text: str) -> list[dict[str, Any]]:
@@ -66,7 +54,15 @@ def free_endpoint() -> str:
 
 
 def test_the_main_job_gives_one_valid_message_a_frame_and_nothing_else_on_standard_output() -> None:
-    done = tactflow("run", "pipeline.yaml", *NO_SINKS, "--source", "sim:press?frames=60", "--jsonl", "-")
+    words = ("pipeline.yaml", *NO_SINKS, "--source", "sim:press?frames=60", "--jsonl", "-")
+    done = subprocess.run(
+        [sys.executable, "-m", "tactflow", "run", *words],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     rows = messages(done.stdout)
     validator = jsonschema.Draft202012Validator(message_schema())
@@ -86,18 +82,9 @@ def test_real_rolls_give_a_valid_message_a_frame_with_every_marker_found(
     shared_data: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.jsonl"
-    done = tactflow(
-        *(
-            "run",
-            "pipelines/wedge.yaml",
-            "--set",
-            "sinks.zmq=null",
-            "--source",
-            str(shared_data / "wedge_roll"),
-        ),
-        *("--jsonl", str(out), "--quiet"),
-    )
-    assert done.returncode == 0, done.stderr
+    pipeline, source = str(REPOSITORY / "pipelines" / "wedge.yaml"), str(shared_data / "wedge_roll")
+    words = ("--set", "sinks.zmq=null", "--source", source, "--jsonl", str(out), "--quiet")
+    assert main(["run", pipeline, *words]) == 0
     rows = messages(out.read_text())
     validator = jsonschema.Draft202012Validator(message_schema())
     for row in rows:
@@ -117,7 +104,12 @@ def test_a_subscriber_in_another_process_gets_every_message_of_a_run(
     with subprocess.Popen(
         [
             *(sys.executable, "-m", "tactflow", "run", "pipeline.yaml", *ONLY_ZMQ, "--quiet"),
-            *("--set", f"sinks.zmq.endpoint={endpoint}", "--set", "sinks.zmq.wait_for_subscriber=20"),
+            *(
+                "--set",
+                f"sinks.zmq.endpoint={endpoint}",
+                "--set",
+                f"sinks.zmq.wait_for_subscriber={PATIENCE}",
+            ),
             *("--set", "sinks.zmq.backlog=50", "--source", "sim:press?frames=50", "--stats", str(stats)),
         ],
         cwd=REPOSITORY,
@@ -140,23 +132,23 @@ def test_a_subscriber_that_never_reads_loses_messages_and_costs_no_frame(
     subscriber.rcvhwm = 1
     subscriber.connect(endpoint)
     out, stats = tmp_path / "out.jsonl", tmp_path / "stats.json"
-    done = tactflow(
-        *("run", *ONLY_ZMQ, "--set", f"sinks.zmq.endpoint={endpoint}", "--quiet", "--jsonl", str(out)),
-        *("--set", "sinks.zmq.wait_for_subscriber=20", "--source", "sim:press?frames=150"),
-        *("--stats", str(stats)),
-    )
-    assert done.returncode == 0, done.stderr
+    words = [
+        *("run", str(PIPELINE), *ONLY_ZMQ, "--set", f"sinks.zmq.endpoint={endpoint}", "--quiet"),
+        *("--set", f"sinks.zmq.wait_for_subscriber={PATIENCE}", "--source", "sim:press?frames=150"),
+        *("--jsonl", str(out), "--stats", str(stats)),
+    ]
+    assert main(words) == 0
     assert len(messages(out.read_text())) == 150
     assert json.loads(stats.read_text())["sinks"]["zmq"]["runs"] == 150
 
 
 def test_nothing_is_serialised_while_nobody_subscribes(tmp_path: Path) -> None:
     stats = tmp_path / "stats.json"
-    done = tactflow(
-        *("run", *ONLY_ZMQ, "--set", f"sinks.zmq.endpoint={free_endpoint()}", "--quiet"),
+    words = [
+        *("run", str(PIPELINE), *ONLY_ZMQ, "--set", f"sinks.zmq.endpoint={free_endpoint()}", "--quiet"),
         *("--source", "sim:press?frames=20", "--stats", str(stats)),
-    )
-    assert done.returncode == 0, done.stderr
+    ]
+    assert main(words) == 0
     read = json.loads(stats.read_text())
     assert read["sinks"]["zmq"]["counters"]["serialised"] == 0
     assert read["stages"]["hull"]["runs"] == 0, "nobody asked for the contact"
@@ -261,40 +253,37 @@ def test_a_second_signal_ends_at_once_with_130(tmp_path: Path) -> None:
     ],
 )
 def test_a_user_mistake_ends_with_its_code_and_advice(
-    arguments: list[str], code: int, words: str, tmp_path: Path
+    arguments: list[str],
+    code: int,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     extra = [*NO_SINKS] if arguments[0] == "run" and "missing.yaml" not in arguments else []
-    done = tactflow(*arguments, *extra, cwd=tmp_path)
-    assert done.returncode == code, done.stderr
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
-    assert done.stdout == ""
+    found = main([*arguments, *extra])
+    out, errors = capfd.readouterr()
+    assert found == code, errors
+    assert words in errors
+    assert "Traceback" not in errors
+    assert out == ""
 
 
-def test_an_existing_result_is_not_overwritten(tmp_path: Path) -> None:
+def test_an_existing_result_is_not_overwritten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "out.jsonl").write_text("precious\n")
-    done = tactflow("run", *NO_SINKS, "--jsonl", "out.jsonl", "--max-frames", "3", cwd=tmp_path)
-    assert done.returncode == 3
-    assert "overwrite" in done.stderr
+    assert main(["run", *NO_SINKS, "--jsonl", "out.jsonl", "--max-frames", "3"]) == 3
+    assert "overwrite" in capsys.readouterr().err
     assert (tmp_path / "out.jsonl").read_text() == "precious\n"
 
 
-def test_realtime_plays_a_recording_at_its_own_pace(tmp_path: Path) -> None:
-    done = tactflow(
-        *(
-            "run",
-            *NO_SINKS,
-            "--source",
-            "sim:idle?frames=30",
-            "--realtime",
-            "--stats",
-            "s.json",
-            "--jsonl",
-            "o.jsonl",
-        ),
-        cwd=tmp_path,
-    )
-    assert done.returncode == 0, done.stderr
+def test_realtime_plays_a_recording_at_its_own_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = ("--source", "sim:idle?frames=30", "--realtime")
+    assert main(["run", *NO_SINKS, *source, "--stats", "s.json", "--jsonl", "o.jsonl"]) == 0
     stats = json.loads((tmp_path / "s.json").read_text())
     assert stats["frames"] + stats["dropped"] == 30
     assert stats["wall_s"] >= 29 / 60, "30 frames at 60 Hz last 29 intervals"

@@ -10,8 +10,10 @@ from pathlib import Path
 import orjson
 import pytest
 import yaml
+import zmq
 
 from tactflow.cli.main import main
+from tests.clock import PATIENCE
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 README = (REPOSITORY / "README.md").read_text()
@@ -30,20 +32,22 @@ def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("by", ["file", "option"])
-def test_a_stage_in_a_loose_file_replaces_a_built_in_one(by: str, tmp_path: Path) -> None:
+def test_a_stage_in_a_loose_file_replaces_a_built_in_one(
+    by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "bright.py").write_text(block("# bright.py"))
     pipeline = yaml.safe_load((REPOSITORY / "pipeline.yaml").read_text())
     change = yaml.safe_load(block("  difference: {use:"))
-    options = ["--source", "sim:press?frames=60&light=bright", "--quiet", "--jsonl", "-"]
+    options = ["--source", "sim:press?frames=60&light=bright", "--quiet", "--jsonl", "out.jsonl"]
     if by == "file":
         pipeline["stages"].update(change)
         pipeline["sinks"] = {}
         (tmp_path / "pipeline.yaml").write_text(yaml.safe_dump(pipeline, sort_keys=False))
     else:
         options += ["--set", "sinks={}", "--set", 'stages.difference={use: "./bright.py:Bright"}']
-    done = run("-m", "tactflow", "run", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    rows = [orjson.loads(line) for line in done.stdout.splitlines()]
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", *options]) == 0
+    rows = [orjson.loads(line) for line in Path("out.jsonl").read_text().splitlines()]
     assert len(rows) == 60
     assert any(row["contact"] for row in rows)
 
@@ -54,20 +58,24 @@ def test_the_notebook_example_finds_the_dots(tmp_path: Path) -> None:
     assert done.stdout.startswith("80 dots of radius"), done.stderr
 
 
-def test_every_command_and_file_that_the_readme_names_is_there() -> None:
+def test_every_command_and_file_that_the_readme_names_is_there(capsys: pytest.CaptureFixture[str]) -> None:
     for command in set(re.findall(r"`tactflow (\w+)", README)):
         assert main([command, "--help"]) == 0, command
     for link in re.findall(r"\]\(([^)#:]+)\)", README):
         assert (REPOSITORY / link).exists(), link
     stages = set(re.findall(r"^\| `(\w+)` \|.*\|.*\|$", README, re.M))
-    listed = run("-m", "tactflow", "stages", cwd=REPOSITORY).stdout
+    capsys.readouterr()
+    assert main(["stages"]) == 0
+    listed = capsys.readouterr().out
     assert {"capture", "hull", "smooth"} <= stages
     for stage in stages:
         assert stage in listed
 
 
 def test_the_subscriber_example_prints_results(tmp_path: Path) -> None:
-    code = block("# subscriber.py").replace("5556", "5593")
+    with zmq.Context() as context, context.socket(zmq.REP) as finder:
+        port = str(finder.bind_to_random_port("tcp://127.0.0.1"))
+    code = block("# subscriber.py").replace("5556", port)
     (tmp_path / "subscriber.py").write_text(code)
     with subprocess.Popen(
         [sys.executable, "-u", "subscriber.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True
@@ -75,8 +83,8 @@ def test_the_subscriber_example_prints_results(tmp_path: Path) -> None:
         try:
             done = run(
                 *("-m", "tactflow", "run", "--set", "sinks.jsonl=null", "--source", "sim:press?frames=60"),
-                *("--set", "sinks.zmq.endpoint=tcp://127.0.0.1:5593", "--quiet"),
-                *("--set", "sinks.zmq.wait_for_subscriber=20"),
+                *("--set", f"sinks.zmq.endpoint=tcp://127.0.0.1:{port}", "--quiet"),
+                *("--set", f"sinks.zmq.wait_for_subscriber={PATIENCE}"),
                 cwd=tmp_path,
             )
             assert done.returncode == 0, done.stderr

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from tactflow.batch.engine import Headway
+from tactflow.batch.engine import Engine, Headway
 from tactflow.batch.folder import Folder, Ledger
-from tactflow.batch.recordings import find_recordings
+from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.run import Plan, Result, Stopping, make_plan, resolved, run_batch
 from tactflow.batch.split import Splitting
-from tactflow.batch.task import Format, Outcome, Task
+from tactflow.batch.task import Format, Outcome, PipelineRequest, Task
 from tactflow.batch.work import work
+from tests.clock import PATIENCE
 
 PIPELINE = """
 stages:
@@ -50,6 +52,29 @@ class InTurn:
 
     def close(self, *, kill: bool) -> None:
         self.killed = kill
+
+
+def tasks(folder: Path, *names: str) -> list[Task]:
+    """Tasks for a toy in place of a pipeline, which does what their names say."""
+    request = PipelineRequest("", (), None)
+    return [
+        Task(Recording(f"sim:{name}", name), request, "jsonl", str(folder), str(folder)) for name in names
+    ]
+
+
+def outcomes_of(engine: Engine, tasks: Sequence[Task]) -> dict[str, Outcome]:
+    """What an engine makes of tasks, by their names; it is closed then."""
+    outcomes: dict[str, Outcome] = {}
+    try:
+        for task in tasks:
+            engine.submit(task)
+        deadline = time.monotonic() + PATIENCE
+        while len(outcomes) < len(tasks):
+            assert time.monotonic() < deadline
+            outcomes |= {outcome.name: outcome for outcome in engine.finished(1.0)}
+    finally:
+        engine.close(kill=True)
+    return outcomes
 
 
 def recording(path: Path, *, brightness: int = 200, frames: int = 6) -> Path:

@@ -14,7 +14,7 @@ from tactflow.batch import cluster
 from tactflow.batch.cluster import DaskCluster
 from tactflow.batch.task import Outcome, Task
 from tactflow.engine.errors import ConfigError, StageError
-from tests.batch.test_local import tasks
+from tests.batch.doubles import outcomes_of, tasks
 
 distributed = pytest.importorskip("distributed", reason="needs Dask: pip install 'tactflow[dask]'")
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -39,16 +39,7 @@ def scheduler() -> Iterator[Any]:
 def test_every_task_comes_back_also_one_whose_work_raises(scheduler: Any, tmp_path: Path) -> None:
     engine = DaskCluster(scheduler.scheduler_address, work=toy)
     assert engine.window == 2
-    outcomes: dict[str, Outcome] = {}
-    try:
-        for task in tasks(tmp_path, "a", "broken", "b"):
-            engine.submit(task)
-        deadline = time.monotonic() + 100
-        while len(outcomes) < 3:
-            assert time.monotonic() < deadline
-            outcomes |= {outcome.name: outcome for outcome in engine.finished(1.0)}
-    finally:
-        engine.close(kill=False)
+    outcomes = outcomes_of(engine, tasks(tmp_path, "a", "broken", "b"))
     assert {name: outcome.status for name, outcome in outcomes.items()} == {
         **{"a": "done", "b": "done", "broken": "failed"}
     }

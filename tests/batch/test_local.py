@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from tactflow.batch.local import LocalProcesses
-from tactflow.batch.recordings import Recording
-from tactflow.batch.task import Outcome, PipelineRequest, Report, Task
+from tactflow.batch.task import Outcome, Report, Task
 from tactflow.batch.work import DEADLY, attempt
+from tests.batch.doubles import outcomes_of, tasks
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills processes by signals")
 
@@ -30,25 +29,9 @@ def toy(task: Task, report: Report) -> Outcome:
     return done
 
 
-def tasks(folder: Path, *names: str) -> list[Task]:
-    request = PipelineRequest("", (), None)
-    return [
-        Task(Recording(f"sim:{name}", name), request, "jsonl", str(folder), str(folder)) for name in names
-    ]
-
-
 def test_a_killed_worker_is_replaced_and_what_kills_two_is_set_aside(tmp_path: Path) -> None:
     engine = LocalProcesses(2, work=toy)
-    outcomes: dict[str, Outcome] = {}
-    try:
-        for task in tasks(tmp_path, "a", "deadly", "unlucky", "b"):
-            engine.submit(task)
-        deadline = time.monotonic() + 100
-        while len(outcomes) < 4:
-            assert time.monotonic() < deadline
-            outcomes |= {outcome.name: outcome for outcome in engine.finished(1.0)}
-    finally:
-        engine.close(kill=True)
+    outcomes = outcomes_of(engine, tasks(tmp_path, "a", "deadly", "unlucky", "b"))
     assert {name: outcome.status for name, outcome in outcomes.items()} == {
         **{"a": "done", "b": "done", "unlucky": "done", "deadly": "set aside"}
     }

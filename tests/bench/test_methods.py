@@ -6,7 +6,7 @@ from typing import Literal
 import pytest
 from pydantic import Field
 
-from tactflow.bench.methods import alternatives, measure_methods, methods_of
+from tactflow.bench.methods import alternatives, methods_of
 from tactflow.bench.scenes import (
     FULL,
     FULL_STAGES,
@@ -17,7 +17,6 @@ from tactflow.bench.scenes import (
     Case,
     Rendered,
 )
-from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.contract import StageParams
@@ -100,17 +99,3 @@ def test_half_depth_is_where_the_indenter_says_so(tmp_path: Path) -> None:
     assert any(deep)
     assert not any(d and not t for d, t in zip(deep, touching, strict=True))
     assert sum(deep) < sum(touching)
-
-
-def test_every_method_gets_a_time_and_the_errors_of_its_stage(
-    pipelines: dict[str, Pipeline], tmp_path: Path
-) -> None:
-    rendered = Rendered(Case("bright_cable", 9), tmp_path)
-    found = measure_methods(pipelines, rendered, CopyUnit(), lambda: None)
-    by_key = {m.key: m for m in found}
-    assert not [m.failure for m in found if m.failure]
-    assert by_key["inpaint/telea/bright_cable"].faster["contact"] == 1
-    assert by_key["inpaint/telea/bright_cable"].errors["inpaint_mae"] > 0
-    assert by_key["hull/default/bright_cable"].errors["center_error"] == pytest.approx(0, abs=1e-9)
-    assert {"tracker", "hull", "inpaint", "marker_mask", "difference"} <= {m.group for m in found}
-    assert all(m.copies for m in found)

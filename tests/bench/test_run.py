@@ -7,11 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from tactflow.bench.compare import against
 from tactflow.bench.pipelines import ORIGINAL
 from tactflow.bench.results import Measurement, Result
 from tactflow.bench.run import Plan, run_bench
-from tactflow.bench.scenes import FULL, TROUBLES, Case
+from tactflow.bench.scenes import FULL, QUICK, TROUBLES, Case
 from tactflow.bench.targets import judge
+from tactflow.cli.bench import packaged_files
 from tactflow.cli.main import main
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -19,20 +21,39 @@ from tactflow.engine.errors import ConfigError
 FILES = {name: find_pipeline(name) for name in ("default", "classic")}
 
 
+# The run takes a minute on a quiet machine, twenty on one with a lot of other work.
+pytestmark = pytest.mark.timeout(1200)
+
+BASELINE = Path(__file__).with_name("baseline_quick.json")
+
+
 @pytest.fixture(scope="module")
-def result() -> Result:
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the run puts its pictures."""
+    return tmp_path_factory.mktemp("bench") / "pictures"
+
+
+@pytest.fixture(scope="module")
+def result(pictures: Path) -> Result:
+    """The quick run, made once as it takes long, with two gels more: a bare and a blotched one."""
     plan = Plan(
-        FILES,
+        packaged_files(),
         quick=True,
         memory=False,
-        cases=(Case("bright_cable", 14), Case("unmarked", 6), Case("speckle", 2, "speckle=0.01")),
-        stage_cases=(Case("press", 4),),
+        pictures=pictures,
+        cases=(*QUICK, Case("unmarked", 6), Case("speckle", 2, "speckle=0.01")),
     )
     steps: list[tuple[int, int]] = []
     made = run_bench(plan, lambda _what, done, total: steps.append((done, total)))
     assert steps == sorted(steps)
     assert steps[-1][0] == steps[-1][1]
     return made
+
+
+def test_no_error_of_the_quick_bench_got_worse_than_the_stored_one(result: Result) -> None:
+    """After a change that is meant to move errors, store them anew: `bench --quick --write-baseline FILE`."""
+    assert [m.failure for m in result.measurements if m.failure] == []
+    assert [str(regression) for regression in against(result, BASELINE)] == []
 
 
 def test_every_pipeline_is_measured_on_every_scene_with_markers(result: Result) -> None:
@@ -152,20 +173,24 @@ def test_the_command_writes_results_and_fails_when_something_got_worse(
     assert "pipeline/default/bright_cable: marker displacement error" in capsys.readouterr().err
 
 
-def test_pictures_show_the_worst_frame_of_every_pipeline(tmp_path: Path) -> None:
-    plan = Plan(
-        FILES,
-        quick=True,
-        memory=False,
-        pictures=tmp_path / "pictures",
-        cases=(Case("bright_cable", 8),),
-        stage_cases=(Case("press", 2),),
-    )
-    run_bench(plan)
-    names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
-    assert names == ["bright_cable-classic.png", "bright_cable-default.png"]
-    picture = cv2.imread(str(tmp_path / "pictures" / names[0]))
+@pytest.mark.usefixtures("result")
+def test_pictures_show_the_worst_frame_of_every_pipeline(pictures: Path) -> None:
+    names = sorted(path.name for path in pictures.iterdir())
+    seen = {"bright_cable": "default", "jumps": "default", "press": "default", "unmarked": "markerless"}
+    assert names == [f"{scene}-{name}.png" for scene in seen for name in ("classic", seen[scene])]
+    picture = cv2.imread(str(pictures / names[0]))
     assert picture is not None
     assert picture.shape == (2 * 400 + 24, 2 * 300, 3)
     # The truth's outline is drawn in green.
     assert np.any(np.all(picture == (80, 220, 60), axis=2))
+
+
+def test_every_method_gets_a_time_and_the_errors_of_its_stage(result: Result) -> None:
+    found = [m for m in result.measurements if m.group != "pipeline"]
+    by_key = {m.key: m for m in found}
+    assert not [m.failure for m in found if m.failure]
+    assert by_key["inpaint/telea/bright_cable"].faster["contact"] == 1
+    assert by_key["inpaint/telea/bright_cable"].errors["inpaint_mae"] > 0
+    assert by_key["hull/default/bright_cable"].errors["center_error"] == pytest.approx(0, abs=1e-9)
+    assert {"tracker", "hull", "inpaint", "marker_mask", "difference"} <= {m.group for m in found}
+    assert all(m.copies for m in found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
+import re
 import signal
 import subprocess
 import sys
@@ -54,20 +54,70 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_each_sensor_runs_the_graph_with_its_own_changes(folder: Path) -> None:
-    done = run("--stats", "stats.json", cwd=folder)
+NOISY = """
+import sys
+
+from tactflow.stages.capture import Capture
+
+
+class Noisy(Capture):
+    def open(self) -> None:
+        sys.stderr.buffer.write(b"no text: \\xff\\n")
+        print("and more", file=sys.stderr, flush=True)
+        super().open()
+"""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
+    """A run of both sensors from its start to its end, for many tests: its folder, and its standard error."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "noisy.py").write_text(NOISY)
+    (folder / "select.py").write_text("open('taken', 'w').close()\n")
+    text = GRAPH.replace(
+        'capture: {source: "sim:press', "capture: {use: './noisy.py:Noisy', source: \"sim:press"
+    )
+    (folder / "pipeline.yaml").write_text(text)
+    options = ("--stats", "stats.json", "--jsonl", "o-{sensor}.jsonl")
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "tactflow", "run", *options],
+        cwd=folder,
+        capture_output=True,
+        timeout=100,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
+    return folder, done.stderr
+
+
+def test_each_sensor_runs_the_graph_with_its_own_changes(whole: tuple[Path, bytes]) -> None:
+    folder, errors = whole
     left, right = rows(folder / "out-left.jsonl"), rows(folder / "out-right.jsonl")
     assert [len(left), len(right)] == [40, 30]
     assert {row["sensor"] for row in left} == {"left"}
     assert left[0]["size"] == [600, 800]
     assert right[0]["size"] == [800, 600]
     assert json.loads((folder / "stats-left.json").read_text())["frames"] == 40
-    assert "[left] 40 frames" in done.stderr
+    assert b"[left] 40 frames" in errors
 
 
-def test_one_sensor_can_be_run_alone(folder: Path) -> None:
-    assert run("--sensor", "right", "--quiet", cwd=folder).returncode == 0
+def test_added_lines_go_to_a_file_for_each_sensor(whole: tuple[Path, bytes]) -> None:
+    assert sorted(file.name for file in whole[0].glob("o-*")) == ["o-left.jsonl", "o-right.jsonl"]
+    assert [len(rows(whole[0] / name)) for name in ("o-left.jsonl", "o-right.jsonl")] == [40, 30]
+
+
+def test_what_is_no_text_on_standard_error_is_passed_on_with_what_follows(whole: tuple[Path, bytes]) -> None:
+    assert b"[left] no text: \xff\n" in whole[1]
+    assert b"[left] and more\n" in whole[1]
+
+
+def test_a_file_in_the_current_folder_is_not_taken_for_a_module_of_python(whole: tuple[Path, bytes]) -> None:
+    assert not (whole[0] / "taken").exists()
+
+
+def test_one_sensor_can_be_run_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    assert main(["run", "--sensor", "right", "--quiet"]) == 0
     assert not (folder / "out-left.jsonl").exists()
     assert len(rows(folder / "out-right.jsonl")) == 30
 
@@ -94,7 +144,10 @@ def test_all_sensors_publish_at_one_address(folder: Path, monkeypatch: pytest.Mo
         process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "tactflow", "run", "--quiet"),
-                *("--set", f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}', wait_for_subscriber: 20}}"),
+                *(
+                    "--set",
+                    f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}', wait_for_subscriber: {PATIENCE}}}",
+                ),
                 *("--set", "sinks.zmq.backlog=100"),
             ],
             cwd=folder,
@@ -155,7 +208,8 @@ def test_a_sensor_that_hangs_is_killed_and_started_again(folder: Path) -> None:
     (folder / "pipeline.yaml").write_text(text)
     done = run("--quiet", "--hang-after", "15", cwd=folder)
     assert done.returncode == 0, done.stderr
-    assert "left has given no sign of life for 15 s; it is killed" in done.stderr
+    # It has longer until its first sign of life, before which a quick machine comes to that frame.
+    assert re.search(r"left has given no sign of life for (15|60) s; it is killed", done.stderr)
     assert "left failed (exit code -9); starting again in 1 s" in done.stderr
     assert [row["seq"] for row in rows(folder / "out-left.jsonl")][-40:] == list(range(40))
 
@@ -202,20 +256,14 @@ def test_a_file_that_may_not_be_touched_is_refused_for_good(folder: Path) -> Non
 
 
 def test_a_start_after_one_that_came_to_no_file_does_with_it_what_was_asked(late: Path) -> None:
-    (late / "out-left.jsonl").write_text("{}\n")
-    done = run("--quiet", "--set", "sinks.jsonl.overwrite=true", cwd=late)
+    for name in ("out-left.jsonl", "a-left.mcap", "a-right.mcap"):
+        (late / name).write_bytes(b"old")
+    options = ("--out", "a.mcap", "--overwrite", "--quiet", "--set", "sinks.jsonl.overwrite=true")
+    done = run(*options, cwd=late, command="record")
     assert done.returncode == 0, done.stderr
     assert "left failed (exit code 4); starting again in 1 s" in done.stderr
-    assert [row["seq"] for row in rows(late / "out-left.jsonl")] == list(range(40))
-
-
-def test_a_start_after_one_that_came_to_no_recording_replaces_it_as_asked(late: Path) -> None:
-    (late / "a-left.mcap").write_bytes(b"old")
-    (late / "a-right.mcap").write_bytes(b"old")
-    arguments = ("--out", "a.mcap", "--overwrite", "--quiet", "--max-frames", "3")
-    done = run(*arguments, cwd=late, command="record")
-    assert done.returncode == 0, done.stderr
     assert (late / "attempts").read_text() == "xx"
+    assert [row["seq"] for row in rows(late / "out-left.jsonl")] == list(range(40))
     assert sorted(path.name for path in late.glob("*.mcap")) == ["a-left.mcap", "a-right.mcap"]
     assert (late / "a-left.mcap").read_bytes() != b"old"
 
@@ -345,12 +393,14 @@ def test_a_full_disk_behind_standard_output_ends_the_run_with_an_error(folder: P
     assert "".join(complaints) == "tactflow: standard output: No space left on device; the run ends\n"
 
 
-def test_a_device_in_the_file_may_be_written_by_all_sensors(folder: Path) -> None:
+def test_a_device_in_the_file_may_be_written_by_all_sensors(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = (folder / "pipeline.yaml").read_text().replace("out-{sensor}.jsonl", "/dev/null")
     assert "/dev/null" in text
     (folder / "pipeline.yaml").write_text(text)
-    done = run(cwd=folder, command="check")
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(folder)
+    assert main(["check"]) == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
@@ -486,60 +536,3 @@ def test_check_tells_a_mistake_of_all_sensors_once(
     assert both.startswith("tactflow: 2 mistakes\n")
     assert both.count("mistakes") == 1
     assert alone.removeprefix("tactflow: ") in both
-
-
-@pytest.mark.parametrize(
-    ("path", "names"),
-    [("o-{sensor}.jsonl", ["o-left.jsonl", "o-right.jsonl"]), ("o.jsonl", ["o-left.jsonl", "o-right.jsonl"])],
-)
-def test_added_lines_go_to_a_file_for_each_sensor(path: str, names: list[str], folder: Path) -> None:
-    done = run("--quiet", "--max-frames", "2", "--jsonl", path, "--stats", os.devnull, cwd=folder)
-    assert done.returncode == 0, done.stderr
-    assert sorted(file.name for file in folder.glob("o-*")) == names
-    assert [len(rows(folder / name)) for name in names] == [2, 2]
-
-
-NOISY = """
-import sys
-
-from tactflow.stages.capture import Capture
-
-
-class Noisy(Capture):
-    def open(self) -> None:
-        sys.stderr.buffer.write(b"no text: \\xff\\n")
-        print("and more", file=sys.stderr, flush=True)
-        super().open()
-"""
-
-
-def test_what_is_no_text_on_standard_error_is_passed_on_with_what_follows(folder: Path) -> None:
-    (folder / "noisy.py").write_text(NOISY)
-    text = GRAPH.replace(
-        'capture: {source: "sim:press', "capture: {use: './noisy.py:Noisy', source: \"sim:press"
-    )
-    (folder / "pipeline.yaml").write_text(text)
-    done = subprocess.run(
-        [sys.executable, "-m", "tactflow", "run", "--quiet"],
-        cwd=folder,
-        capture_output=True,
-        timeout=100,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert b"[left] no text: \xff\n" in done.stderr
-    assert b"[left] and more\n" in done.stderr
-
-
-def test_a_file_in_the_current_folder_is_not_taken_for_a_module_of_python(folder: Path) -> None:
-    (folder / "select.py").write_text("open('taken', 'w').close()\n")
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "tactflow", "run", "--quiet"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert not (folder / "taken").exists()

@@ -1,8 +1,10 @@
 """Load until it is too much: results, drops, their age and memory against sensors, subscribers and pages.
 
-    python -m tests.load.knee
+    python -m tests.load.knee                              writes the section "load" of docs/reliability.md
+    python -m tests.load.knee --sensors 1 --rate 60        prints one load: the latency of one sensor at 60 Hz
+    python -m tests.load.knee --sensors 4                  the same of four at 30 Hz
 
-writes the section "load" of docs/reliability.md. The subscribers and pages run on the same machine.
+The subscribers and pages run on the same machine, in a process of their own.
 """
 
 from __future__ import annotations
@@ -57,10 +59,11 @@ class Seen:
     results : that arrived at the first subscriber, 0..1; the others are missing from `seq`. shown : pictures
     a second that each page got. p50, p99 : age of a result at the subscribers, ms. oldest : of the last
     second, ms. memory, growth : of all processes, MB, and by how much it grew while it was measured. busy :
-    what the machine's processors did, 0..1.
+    what the machine's processors did, 0..1. rate : of each sensor, frames per second.
     """
 
     load: Load
+    rate: float
     results: float
     shown: float
     p50: float
@@ -78,12 +81,12 @@ def loads() -> Iterator[Load]:
     yield from (Load(pages=count) for count in PAGES)
 
 
-def measure(load: Load, port: int, folder: Path) -> Seen:
+def measure(load: Load, port: int, folder: Path, rate: float = RATE) -> Seen:
     """Run one load and look at it."""
     names = [f"s{number}" for number in range(load.sensors)]
     sinks = {"zmq": {"endpoint": f"tcp://127.0.0.1:{port}"}, "view": {"port": port + 1}}
     sensors = {"sensors": {name: {} for name in names}} if load.sensors > 1 else {"sensor": "s0"}
-    write_pipeline(folder, SIZE, {"rate": RATE}, {"sinks": sinks, **sensors})
+    write_pipeline(folder, SIZE, {"rate": rate}, {"sinks": sinks, **sensors})
     subscribers = Subscribers(f"tcp://127.0.0.1:{port}", load.subscribers, keep=True)
     with ExitStack() as stack:
         process = stack.enter_context(running(folder))
@@ -106,10 +109,11 @@ def measure(load: Load, port: int, folder: Path) -> Seen:
         busy = 1 - (_idle() - idle) / (seconds * (os.cpu_count() or 1))
         after = _memory(process.pid)
         shown = sum(pictures) - shown
-    last = ages[-max(1, round(RATE * load.sensors * load.subscribers)) :]
+    last = ages[-max(1, round(rate * load.sensors * load.subscribers)) :]
     p50, p99 = (float(np.percentile(ages, part)) for part in (50, 99))
     per_page = shown / seconds / max(1, load.pages)
-    return Seen(load, float(np.mean(got)), per_page, p50, p99, float(last.max()), after, after - before, busy)
+    oldest = float(last.max())
+    return Seen(load, rate, float(np.mean(got)), per_page, p50, p99, oldest, after, after - before, busy)
 
 
 def _memory(pid: int) -> float:
@@ -156,11 +160,29 @@ def report(found: list[Seen], others: float) -> str:
     )
 
 
+def told(seen: Seen) -> str:
+    """One load in words."""
+    sensors = "1 sensor" if seen.load.sensors == 1 else f"{seen.load.sensors} sensors"
+    return (
+        f"{sensors} of {SIZE[0]} x {SIZE[1]} px at {seen.rate:g} frames a second for {MEASURED:g} s: "
+        f"{100 * seen.results:.1f} % of the results, age at the subscriber p50 {seen.p50:.2f} ms, "
+        f"p99 {seen.p99:.2f} ms; processors {100 * seen.busy:.0f} % busy"
+    )
+
+
 def main() -> None:
     """Measure all loads and write what was seen."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--port", type=int, default=5750)
+    parser.add_argument("--sensors", type=int, help="only this many, printed")
+    parser.add_argument("--rate", type=float, default=RATE, help="of each of them, frames per second (30)")
     args = parser.parse_args()
+    if args.sensors is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            print(told(measure(Load(sensors=args.sensors), args.port, Path(folder), args.rate)))
+        return
     found = []
     others = os.getloadavg()[0]
     for load in loads():

@@ -78,16 +78,19 @@ def plain_scaled_change(
 def plain_change_strength(
     blurred: Float,
     inside: NDArray[np.uint8],
+    gain: np.float32,
+    strongest: Float,
     strength: Float,
     common: Float,
 ) -> None:
-    """Smoothed along y, length and mean over the channels, 0 outside."""
+    """Smoothed along y, weighed length and mean over the channels, 0 outside."""
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
     planes = [
         cv2.sepFilter2D(plane, cv2.CV_32F, np.ones(1), weights).reshape(plane.shape) for plane in blurred
     ]
     change = np.stack(planes) * (inside != 0).repeat(2, axis=0).repeat(2, axis=1)
-    strength[:] = np.sqrt((change**2).sum(axis=0))
+    square = gain * (change**2).sum(axis=0) - np.tensordot(strongest, change, 1) ** 2
+    strength[:] = np.sqrt(np.maximum(square, 0))
     common[:] = change.mean(axis=0)
 
 

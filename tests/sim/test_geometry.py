@@ -29,7 +29,7 @@ HOMOGRAPHIES: dict[str, Any] = {
 }  # fmt: skip
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=len(RADIUS) * 3)
 def one_dot(seed: int, downsample: int) -> tuple[Scene, NDArray[np.uint8], NDArray[np.uint8]]:
     # A single marker, thrown by up to 0.45 x 400 px off the centre: another sub-pixel place for each seed.
     scene = open_scene(
@@ -59,7 +59,8 @@ def expected(mapping: Any, center: NDArray[np.float64], radius: float, blur: flo
     integral of f(p) a(p) |df/dp| dp over integral of a(p) |df/dp| dp, a being the dot's coverage: it lies off
     f(c) by second-order terms (up to 0.2 px here). Without a homography f is affine and both are the same.
     """
-    line = np.arange(-radius - 4 * blur, radius + 4 * blur + 0.25, 0.5)
+    # As many samples for a large dot as for a small one.
+    line = np.linspace(-radius - 4 * blur, radius + 4 * blur, 89)
     offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     sharp = coverage(*offsets.T.astype(np.float32), radius, "round").reshape(len(line), -1)
     weight = cv2.GaussianBlur(sharp, (0, 0), blur / (line[1] - line[0])).ravel().astype(np.float64)

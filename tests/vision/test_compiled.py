@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -94,17 +95,19 @@ def _moved(value: float) -> float:
 FACTOR = 3.0
 
 
-@pytest.fixture
-def program(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
-    """Starts PROGRAM in a fresh folder; kernels are kept in `kept` unless said otherwise."""
-    (tmp_path / "loops.py").write_text(MODULE)
-    (tmp_path / "program.py").write_text(PROGRAM)
+Program = Callable[..., subprocess.Popen[str]]
+
+
+def program_in(folder: Path) -> Program:
+    """Starts PROGRAM in a folder; kernels are kept in `kept` unless said otherwise."""
+    (folder / "loops.py").write_text(MODULE)
+    (folder / "program.py").write_text(PROGRAM)
 
     def start(**variables: str) -> subprocess.Popen[str]:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept"), **variables}
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kept"), **variables}
         return subprocess.Popen(
             [sys.executable, "program.py"],
-            cwd=tmp_path,
+            cwd=folder,
             env={name: value for name, value in environment.items() if value},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -112,6 +115,28 @@ def program(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
         )
 
     return start
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Program:
+    """PROGRAM in a fresh folder."""
+    return program_in(tmp_path)
+
+
+class Warm(NamedTuple):
+    """A folder whose kernels are on disk: what starts PROGRAM there, its first output and what it said."""
+
+    folder: Path
+    program: Program
+    first: tuple[str, str]
+
+
+@pytest.fixture(scope="module")
+def warm(tmp_path_factory: pytest.TempPathFactory) -> Warm:
+    """Compiled once for many tests, which leave whole kernels behind."""
+    folder = tmp_path_factory.mktemp("warm")
+    program = program_in(folder)
+    return Warm(folder, program, program().communicate())
 
 
 @contextmanager
@@ -169,17 +194,14 @@ def test_a_kernel_calls_helpers_of_its_file_which_call_others() -> None:
     assert _moved.plain(2.0) == 7.0
 
 
-def test_compiling_is_announced_once_and_not_again_when_it_is_on_disk(
-    program: Callable[..., subprocess.Popen[str]],
-) -> None:
-    first, second = (program().communicate() for _ in range(2))
-    assert first[0].split()[1:] == second[0].split()[1:] == RESULTS
-    assert first[1].count("compiling") == 1
-    assert second == (" ".join(["0", *RESULTS]) + "\n", "")
+def test_compiling_is_announced_once_and_not_again_when_it_is_on_disk(warm: Warm) -> None:
+    assert warm.first[0].split()[1:] == RESULTS
+    assert warm.first[1].count("compiling") == 1
+    assert warm.program().communicate() == (" ".join(["0", *RESULTS]) + "\n", "")
 
 
 def test_two_processes_that_start_together_compute_the_same(
-    program: Callable[..., subprocess.Popen[str]],
+    program: Program,
 ) -> None:
     both = [program(), program()]
     ends = [process.communicate() for process in both]
@@ -210,8 +232,8 @@ def test_a_kernel_works_where_its_result_cannot_be_kept() -> None:
     assert done.stdout.strip() == "42.0"
 
 
-def test_where_numba_may_write_nowhere_kernels_are_kept_among_the_temporary_files(
-    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
+def test_where_numba_may_write_nowhere_kernels_are_kept_in_a_temporary_folder_that_nobody_else_writes_to(
+    program: Program, tmp_path: Path
 ) -> None:
     # A file where a folder would have to be: not even root can write into it.
     (tmp_path / "__pycache__").write_text("")
@@ -225,47 +247,30 @@ def test_where_numba_may_write_nowhere_kernels_are_kept_among_the_temporary_file
     assert second == (" ".join(["0", *RESULTS]) + "\n", "")
     (folder,) = temporary.iterdir()
     assert folder.stat().st_mode & 0o777 == 0o700
-
-
-def test_a_folder_that_others_can_write_to_is_not_trusted(
-    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
-    (tmp_path / "__pycache__").write_text("")
-    (tmp_path / "home").write_text("")
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    place = {"NUMBA_CACHE_DIR": "", "HOME": str(tmp_path / "home"), "TMPDIR": str(temporary)}
-    place["XDG_CACHE_HOME"] = str(tmp_path / "home" / "cache")
-    program(**place).communicate()
-    (folder,) = temporary.iterdir()
     folder.chmod(0o777)
     out, said = program(**place).communicate()
     assert out.split()[1:] == RESULTS
     assert "belongs to somebody else" in said
 
 
-def test_a_damaged_cache_is_said_and_compiled_around(
-    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
-    program().communicate()
-    (index,) = (tmp_path / "kept").rglob("loops.twice*.nbi")
+def test_a_damaged_cache_is_said_and_compiled_around(warm: Warm) -> None:
+    (index,) = (warm.folder / "kept").rglob("loops.twice*.nbi")
+    whole = index.read_bytes()
     index.write_bytes(b"")
-    out, said = program().communicate()
+    out, said = warm.program().communicate()
+    index.write_bytes(whole)
     assert out.split()[1:] == RESULTS, said
     assert "cannot be kept or read" in said
 
 
-def test_a_damaged_file_of_the_cache_is_replaced(
-    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
-    program().communicate()
+def test_a_damaged_file_of_the_cache_is_replaced(warm: Warm) -> None:
     for damaged in ("loops.twice*.nbi", "loops.thrice*.nbc"):
-        (file,) = (tmp_path / "kept").rglob(damaged)
+        (file,) = (warm.folder / "kept").rglob(damaged)
         file.write_bytes(bytes(300))
-    out, said = program().communicate()
+    out, said = warm.program().communicate()
     assert out.split() == ["2", *RESULTS], said
     assert "compiled again" in said
-    assert program().communicate() == (" ".join(["0", *RESULTS]) + "\n", "")
+    assert warm.program().communicate() == (" ".join(["0", *RESULTS]) + "\n", "")
 
 
 def test_processes_that_compile_run_no_code_of_the_current_folder(tmp_path: Path) -> None:
@@ -296,13 +301,10 @@ print(len(worker.stdout.read().splitlines()))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no claims on Windows")
-def test_a_process_that_waits_for_another_says_so(
-    program: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
-    program().communicate()
-    (index,) = (tmp_path / "kept").rglob("loops.twice*.nbi")
+def test_a_process_that_waits_for_another_says_so(warm: Warm) -> None:
+    (index,) = (warm.folder / "kept").rglob("loops.twice*.nbi")
     with hold(index.parent, "loops.twice") as holder:
-        waiting = program()
+        waiting = warm.program()
         assert waiting.stderr is not None
         assert "waiting for another process" in waiting.stderr.readline()
         holder.kill()
@@ -326,7 +328,7 @@ def test_nobody_waits_for_ever_for_a_process_that_is_stopped(
 
 
 def test_without_the_compiler_kernels_run_as_plain_python_and_say_so(
-    program: Callable[..., subprocess.Popen[str]],
+    program: Program,
 ) -> None:
     out, said = program(NUMBA_DISABLE_JIT="1").communicate()
     assert out.split() == ["0", *RESULTS], said

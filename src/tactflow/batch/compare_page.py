@@ -44,7 +44,7 @@ def write_comparison(
         "numbers": "\n".join(_number(spread) for spread in comparison.spreads.values()),
         "worst": worst or "<p>there is none: no frame has a contact</p>",
     }
-    return replaced(folder.path / "compare.html", [filled_in("compare.html", values)])
+    return replaced(folder.path / "compare.html", [filled_in("compare.html", values, scripts=False)])
 
 
 def described(comparison: Comparison, names: tuple[str, str]) -> list[str]:

@@ -60,15 +60,18 @@ def write_page(folder: Folder, rows: Sequence[Row], title: str, facts: Iterable[
         "facts": "\n".join(f"<p>{escape(line)}</p>" for line in lines),
         "columns": heads,
     }
-    head, foot = filled_in("index.html", values).split("<!-- rows -->\n")
+    head, foot = filled_in("index.html", values, scripts=True).split("<!-- rows -->\n")
     return replaced(folder.path / "index.html", chain([head], (_row(folder, row) for row in shown), [foot]))
 
 
-def filled_in(name: str, values: Mapping[str, str]) -> str:
-    """A page of this package with values, in HTML, in it."""
+def filled_in(name: str, values: Mapping[str, str], *, scripts: bool) -> str:
+    """A page of this package with values, in HTML, in it. scripts : whether it has one."""
     room = files("tactflow.batch")
-    style = room.joinpath("page.css").read_text(encoding="utf-8")
-    return Template(room.joinpath(name).read_text(encoding="utf-8")).substitute(values, style=style)
+    style, head, rest = (
+        room.joinpath(n).read_text(encoding="utf-8") for n in ("page.css", "head.html", name)
+    )
+    allowed = "'unsafe-inline'" if scripts else "'none'"
+    return Template(head + rest).substitute(values, style=style, script=allowed)
 
 
 def replaced(path: Path, parts: Iterable[str]) -> Path:

@@ -223,3 +223,13 @@ def test_a_faint_band_of_light_through_a_contact_does_not_move_its_outline() -> 
     band = np.zeros_like(ball)
     band[:, 56:72] = 0.2 * np.linalg.norm(ball, axis=2).max() / 3**0.5
     assert overlap(found(ball + band), found(ball)) > 0.95
+
+
+def test_a_wrinkle_beside_a_dented_contact_is_not_joined_to_it() -> None:
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    dent = (np.abs(columns - 49.5) < 5) & (rows > 62)
+    ball = tilted(disc(22), ring=12.0)
+    dented = ball * np.where(dent, np.float32(0.1), np.float32(1))[..., None]
+    wrinkled = dented.copy()
+    wrinkled[80:82, 38:62] += np.float32(0.25) * ball.max()
+    assert overlap(found(wrinkled), found(dented)) > 0.98

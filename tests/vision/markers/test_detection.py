@@ -94,6 +94,29 @@ def test_a_few_lamps_are_not_preferred_to_many_faint_dots() -> None:
     assert detection.doubt is None
 
 
+def with_lamps(gain: float) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Bright dots; and beside them lamps that saturate the camera, where a row might go on."""
+    dots = grid(8, 9, 24, corner=(25, 32))
+    image = render((240, 230), dots, 4, bright=True, noise=1)
+    image = np.asarray(cv2.convertScaleAbs(image, alpha=gain), np.uint8)
+    for x in range(37, 200, 48):
+        cv2.circle(image, (x, 8), 5, (255, 255, 255), cv2.FILLED, cv2.LINE_AA)
+    return dots, image
+
+
+def test_lamps_beside_bright_marks_are_no_marks() -> None:
+    dots, image = with_lamps(gain=1.0)
+    which, away = match(detect_markers(image).centers, dots)
+    assert sorted(which) == list(range(len(dots)))
+    assert away.max() < 0.5
+
+
+def test_marks_as_bright_as_lamps_are_still_marks() -> None:
+    dots, image = with_lamps(gain=1.5)
+    _, away = match(dots, detect_markers(image).centers)
+    assert away.max() < 0.5
+
+
 @pytest.mark.parametrize("kind", ["speckle", "waves", "scattered"])
 def test_a_random_texture_is_refused_in_words(kind: str) -> None:
     rng = np.random.default_rng(4)

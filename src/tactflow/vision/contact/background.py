@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tactflow.vision.contact.background_kernels import change_strength, scaled_change, weigh_change
 from tactflow.vision.contact.contact_outline import WindowChange
 from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
+from tactflow.vision.contact.response import light_response
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 
@@ -180,6 +181,7 @@ class BackgroundModel:
     ) -> WindowChange:
         """How strongly a window has changed, in standard deviations, at half resolution.
 
+        Slopes of all directions count alike, as far as `light_response` can tell how they show.
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
         count.
         """
@@ -197,7 +199,9 @@ class BackgroundModel:
             known.half_scale,
             blurred,
         )
-        change_strength(blurred, np.ascontiguousarray(inside).view(np.uint8), strength, brightness)
+        response = light_response(blurred, inside)
+        belongs = np.ascontiguousarray(inside).view(np.uint8)
+        change_strength(blurred, belongs, *response, strength, brightness)
         return WindowChange(strength, brightness)
 
     def _derived(self) -> _Derived:

@@ -135,15 +135,22 @@ def scaled_change(
             row[last] = (before + before) * BESIDE + line[last] * MIDDLE
 
 
-@kernel("void(float32[:, :, ::1], uint8[:, ::1], float32[:, ::1], float32[:, ::1])", reorder=True)
-def change_strength(blurred: Float, inside: Byte, strength: Float, common: Float) -> None:
+@kernel(
+    "void(float32[:, :, ::1], uint8[:, ::1], float32, float32[::1], float32[:, ::1], float32[:, ::1])",
+    reorder=True,
+)
+def change_strength(
+    blurred: Float, inside: Byte, gain: np.float32, strongest: Float, strength: Float, common: Float
+) -> None:
     """Smooth a change along y, and reduce its channels to one.
 
-    blurred : (3, h, w), from `scaled_change`. inside : (h / 2, w / 2), cells that count. strength : (h, w),
-    filled with the length of the change over the channels. common : (h, w), filled with their mean.
+    blurred : (3, h, w), from `scaled_change`. inside : (h / 2, w / 2), cells that count. gain, strongest : a
+    `Response`. strength : (h, w), filled with the length of the change over the channels, so weighed.
+    common : (h, w), filled with their mean.
     """
     high, wide = strength.shape
     counts, third = np.empty(wide, np.float32), np.float32(1 / 3)
+    along = np.empty(wide, np.float32)
     for y in range(high):
         above = min(1, high - 1) if y == 0 else y - 1
         below = max(high - 2, 0) if y == high - 1 else y + 1
@@ -155,7 +162,9 @@ def change_strength(blurred: Float, inside: Byte, strength: Float, common: Float
             for x in range(wide):
                 value = ((upper[x] + lower[x]) * BESIDE + here[x] * MIDDLE) * counts[x]
                 length[x] = value * value + (length[x] if c else np.float32(0))
+                along[x] = value * strongest[c] + (along[x] if c else np.float32(0))
                 tone[x] = value + (tone[x] if c else np.float32(0))
         for x in range(wide):
-            length[x] = np.sqrt(length[x])
+            square = gain * length[x] - along[x] * along[x]
+            length[x] = np.sqrt(square if square > 0 else np.float32(0))
             tone[x] *= third

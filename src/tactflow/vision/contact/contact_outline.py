@@ -154,8 +154,8 @@ def _level(change: WindowChange, bridge: float, hidden: Mask | None) -> tuple[Fl
     cap = GLOSS * _typical(
         change.strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
     )
-    # Half the time of `np.minimum`, and of `np.maximum` below.
-    strength = np.asarray(cv2.min(change.strength, cap), np.float32)
+    # Half the time of `np.minimum`.
+    strength = np.clip(change.strength, np.float32(0), np.float32(cap))
     tone = np.float32(cap / 3**0.5)
     brightness = np.clip(change.brightness, -tone, tone)
     if EVEN * cv2.norm(brightness, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
@@ -187,12 +187,12 @@ def _largest_nearby(values: Float) -> Float:
     largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
     largest = largest[reach:, reach:][: coarse[1], : coarse[0]]
     largest = cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(cv2.max(largest, FAINT * peak), np.float32)
+    return np.clip(largest, np.float32(FAINT * peak), np.float32(np.inf))
 
 
 def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
     """Level set of a contact that has brightened or darkened as a whole, whichever is stronger."""
-    brighter = np.maximum(brightness, np.float32(0))
+    brighter = np.clip(brightness, np.float32(0), np.float32(np.inf))
     darker = brighter - brightness
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         brightness, darker = -brightness, brighter
@@ -215,14 +215,23 @@ def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float,
     changed = (local > OUTER).view(np.uint8)
     filled = fill_pockets(outlined(changed, hidden))
     solid = is_solid(filled)
+    specks = None
     if not solid:
-        ring = changed if hidden is None else np.asarray(cv2.bitwise_and(changed | hidden, filled), np.uint8)
+        # A wrinkle or what is left of a marker is no far side of the contact, to which a gap is closed.
+        kept = _without_specks(filled.astype(np.float32), strength)
+        specks, filled = kept < 0, (kept > 0).view(np.uint8)
+        ring = changed if hidden is None else changed | hidden
+        ring = np.asarray(cv2.bitwise_and(ring, filled), np.uint8)
         reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
         filled = fill(close_gaps(ring, reach) | filled)
     if cv2.countNonZero(filled) == filled.size:
         return np.ones_like(strength), None
     depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
-    parts = depth if solid else _without_specks(depth, strength)
+    parts = depth
+    if specks is not None:
+        parts = _without_specks(depth, strength)
+        if specks.any():
+            parts = np.where(specks & (parts <= 0), np.float32(-1), parts)
     level = np.asarray(parts - np.float32(_border_depth(parts, local, hidden)), np.float32)
     if parts is depth:
         return level if solid else _without_specks(level, strength), None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
@@ -47,6 +48,14 @@ CROWDED: Final = 0.37
 on sts_torque160."""
 LEAST_RADIUS: Final = 0.5
 """Of a mark, px: none is smaller than a pixel, not even of two that are found at one place."""
+
+SATURATED: Final = 250.0
+"""Grey level of a lamp, or its mirror image, in the picture, at least. Chosen by hand."""
+NEARLY_WHITE: Final = 230.0
+MOST_MARKS: Final = 90.0
+"""Grey level that so many of 100 bright marks keep below, where one that saturates the camera is a lamp:
+marks throw back a part of a lamp's light. On sts_640, beside whose marks lamps are, 90 of 100 are below 210;
+on tactip_video, 62 of 100 pins are saturated."""
 
 LONE_PITCH: Final = 8.0
 """Pitch of a single mark, in radii. Chosen by hand."""
@@ -245,8 +254,25 @@ def _found_in(
     best = found[0]
     if dot_radius is None:
         _require_lattice(found)
-        return _detection(gray, best, family.united(best, scales[best.polarity]), found[1:])
+        best, by_scale = _without_lamps(gray, best, scales[best.polarity])
+        return _detection(gray, best, family.united(best, by_scale), found[1:])
     return _detection(gray, best, best.spots, found[1:])
+
+
+def _without_lamps(
+    gray: NDArray[np.float32], best: Family, by_scale: Mapping[float, Spots]
+) -> tuple[Family, Mapping[float, Spots]]:
+    """The family, and the spots of its polarity, without those that saturate the camera if marks do not."""
+    if best.polarity == "dark" or np.percentile(_levels(gray, best.spots), MOST_MARKS) > NEARLY_WHITE:
+        return best, by_scale
+    kept = {s: spots.at(_levels(gray, spots) < SATURATED) for s, spots in by_scale.items()}
+    return best._replace(spots=best.spots.at(_levels(gray, best.spots) < SATURATED)), kept
+
+
+def _levels(gray: NDArray[np.float32], spots: Spots) -> NDArray[np.float32]:
+    """(N,) grey level in the middle of each spot."""
+    column, row = np.clip(np.rint(spots.points).astype(np.int64), 0, np.array(gray.shape[::-1]) - 1).T
+    return np.asarray(gray[row, column], np.float32)
 
 
 def _require_lattice(found: list[Family]) -> None:
