@@ -36,6 +36,8 @@ KEPT: Final = (1.0, 0.4, 0.4)
 """Share of the candidates of a round that goes on to the next but one. The front goes on in any case."""
 FINALISTS: Final = 6
 """Candidates of the last round, at most. Chosen by hand."""
+REFINED: Final = (Case("press", 140),)
+"""Simulated recording of the refinements. Untouched for 14 frames: a reference of 8 needs that."""
 FEWEST: Final = 3
 """Candidates with which a round is begun, at least. Chosen by hand."""
 ALLOWED: Final = 1.5
@@ -307,13 +309,13 @@ class Search:
         """One change at a time on the chosen one: kept where it is cheaper and no worse, or more exact."""
         tried = refinements(base, chosen)
         shown = sum(len(order) for order in checks.orders(recording.frames).values())
-        if self._room(sum(case.frames for case in ROUNDS[1]) + shown, 1.0) <= len(tried):
+        if self._room(sum(case.frames for case in REFINED) + shown, 1.0) <= len(tried):
             self._words.append("no time was left to try the probe's settings and more reference frames")
             return chosen, found
         for candidate in (chosen, *tried):
             self._known[candidate.name] = candidate
         self._say(f"refinements: {', '.join(c.name.removeprefix(chosen.name + ', ') for c in tried)}")
-        again = self._judged([chosen, *tried], ROUNDS[1], look, folder, self._seed + 500)
+        again = self._judged([chosen, *tried], REFINED, look, folder, self._seed + 500)
         mark_unsound(again)
         again = self._on_recording(again, recording, folder)
         if self._late():
