@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tactflow.vision.contact.background_kernels import change_strength, scaled_change, weigh_change
 from tactflow.vision.contact.contact_outline import WindowChange
 from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
-from tactflow.vision.contact.response import light_response
+from tactflow.vision.contact.response import EVEN, light_response
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 
@@ -38,6 +38,9 @@ NOISE_CORRELATION: Final = 2.0
 leave little noise between neighbours, and more over distances. Chosen by hand."""
 CELL_VALID: Final = 128
 """Mean of a valid area, 0 to 255, over a cell that counts, at least: half of it."""
+CUT: Final = 0.5
+"""Change at the picture's border, over the largest one of a contact, from which on the border cuts it. Chosen
+by hand, near the part at which `contact_outline` takes a change for the contact's."""
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
@@ -181,7 +184,8 @@ class BackgroundModel:
     ) -> WindowChange:
         """How strongly a window has changed, in standard deviations, at half resolution.
 
-        Slopes of all directions count alike, as far as `light_response` can tell how they show.
+        Slopes of all directions count alike, as far as `light_response` can tell how they show: not where the
+        picture ends before the contact does.
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
         count.
         """
@@ -199,7 +203,8 @@ class BackgroundModel:
             known.half_scale,
             blurred,
         )
-        response = light_response(blurred, inside)
+        whole = not _cut_by_border(blurred, rows, columns, known.colour_factor.shape)
+        response = light_response(blurred, inside) if whole else EVEN
         belongs = np.ascontiguousarray(inside).view(np.uint8)
         change_strength(blurred, belongs, *response, strength, brightness)
         return WindowChange(strength, brightness)
@@ -243,6 +248,26 @@ class BackgroundModel:
         edges = self._shift / 2 * _steepness(self._half)
         variance = noise.mean(axis=(1, 2), keepdims=True) + light**2 + edges**2
         return np.asarray(1 / np.sqrt(variance), np.float32)
+
+
+def _cut_by_border(change: Float, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
+    """Whether a contact, not only what is left of its change further out, reaches the picture's border.
+
+    change : (3, 2h, 2w), of a window. rows, columns : the window, cells. shape : of the picture, cells.
+    """
+    sides = [
+        line
+        for line, at_border in (
+            (change[:, 0], rows.start == 0),
+            (change[:, -1], rows.stop == shape[0]),
+            (change[:, :, 0], columns.start == 0),
+            (change[:, :, -1], columns.stop == shape[1]),
+        )
+        if at_border
+    ]
+    if not sides:
+        return False
+    return max(float(np.abs(line).max()) for line in sides) > CUT * float(np.abs(change).max())
 
 
 def _planes(picture: NDArray[np.uint8]) -> Float:
