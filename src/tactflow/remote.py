@@ -21,6 +21,8 @@ DEFAULT_ENDPOINT = "tcp://127.0.0.1:5557"
 """Where `tactflow control` looks for a run that takes commands."""
 LONGEST_ANSWER = 1 << 20
 """Bytes of an answer at most; statistics have some ten thousand. Chosen by hand."""
+MOST_BROKEN_OFF = 5
+"""Handshakes that the other side breaks off before it counts as one that refuses us. Chosen by hand."""
 
 Answer = dict[str, Any]
 
@@ -69,7 +71,7 @@ class RemoteControl(Connection):
             zmq.REQ_CORRELATE: 1,
             zmq.MAXMSGSIZE: LONGEST_ANSWER,
         }
-        super().__init__(zmq.REQ, endpoint, options, keys, DEFAULT_ENDPOINT)
+        super().__init__(zmq.REQ, endpoint, options, keys, DEFAULT_ENDPOINT, MOST_BROKEN_OFF)
 
     def ping(self) -> Answer:
         """Whether the run is there."""
@@ -101,7 +103,9 @@ class RemoteControl(Connection):
 
     def ask(self, command: str) -> Answer:
         """Send a command by its name, and wait for the answer."""
-        self._socket.send(orjson.dumps({"do": command}), zmq.NOBLOCK)
+        # Where we have been refused already, there is nobody to send it to.
+        with suppress(zmq.Again):
+            self._socket.send(orjson.dumps({"do": command}), zmq.NOBLOCK)
         end = time.monotonic() + self.timeout
         while self._wait(end - time.monotonic()):
             # A late answer to an earlier command wakes us, and is dropped by the socket.

@@ -12,6 +12,7 @@ from tactflow.batch.engine import Engine, Headway
 from tactflow.batch.folder import Folder, Ledger
 from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.run import Plan, Result, Stopping, make_plan, resolved, run_batch
+from tactflow.batch.split import Splitting
 from tactflow.batch.task import Format, Outcome, PipelineRequest, Task
 from tactflow.batch.work import work
 from tests.clock import PATIENCE
@@ -99,10 +100,15 @@ class Batch:
         self.engine: InTurn
 
     def __call__(
-        self, *overrides: str, verify: bool = False, fail_fast: bool = False, stop_after: int | None = None
+        self,
+        *overrides: str,
+        verify: bool = False,
+        fail_fast: bool = False,
+        stop_after: int | None = None,
+        split: float = 0.0,
     ) -> Result:
         """One call; after `stop_after` outcomes a signal comes."""
-        request = resolved(self.file, overrides, None, self.format)
+        request = resolved(self.file, overrides, None, self.format, split)
         self.engine = InTurn()
         stopping = Stopping()
         seen: list[Outcome] = []
@@ -117,7 +123,7 @@ class Batch:
             return run_batch(
                 self.plan,
                 lambda one: Task(one, request, self.format, str(self.folder.path), str(scratch), verify),
-                self.engine,
+                Splitting(self.engine) if split else self.engine,
                 ledger,
                 stopping=stopping,
                 fail_fast=fail_fast,

@@ -61,15 +61,15 @@ def test_a_cluster_of_other_versions_is_refused_before_anything_is_begun(
         def __init__(self, *_: object, **__: object) -> None:
             self.closed = False
 
-        def get_versions(self, check: bool) -> None:
-            assert check
-            raise ValueError("Mismatched versions found: msgpack")
+        def get_versions(self) -> dict[str, Any]:
+            here, old = ({"packages": {"distributed": version}} for version in ("2026.8.0", "2024.1.0"))
+            return {"client": here, "scheduler": here, "workers": {"tcp://a:1": here, "tcp://b:1": old}}
 
         def close(self) -> None:
             self.closed = True
 
     monkeypatch.setattr(cluster, "_distributed", lambda: SimpleNamespace(Client=Client))
-    with pytest.raises(ConfigError, match="other versions than here: Mismatched versions found: msgpack"):
+    with pytest.raises(ConfigError, match=r"has distributed 2024\.1\.0, here is 2026\.8\.0"):
         DaskCluster("tcp://127.0.0.1:8786")
 
 

@@ -516,7 +516,7 @@ def test_all_mistakes_come_at_once_in_the_order_of_the_file(
     err = capsys.readouterr().err
     places = re.findall(r"^bad\.yaml:(\d+):\d+  ", err, re.MULTILINE)
     assert places == ["1", "5", "5", "5", "6"]
-    assert err.startswith("tactflow: 5 mistakes in the pipeline\n")
+    assert err.startswith("tactflow: 5 mistakes\n")
 
 
 def test_the_caret_stands_under_the_mistake(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

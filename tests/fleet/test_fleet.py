@@ -517,7 +517,7 @@ def test_check_tells_what_run_would_refuse_and_all_other_mistakes(
     assert main(["check"]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err.startswith("tactflow: 2 mistakes in the pipeline\npipeline.yaml:9:28  ")
+    assert captured.err.startswith("tactflow: 2 mistakes\npipeline.yaml:9:28  ")
     assert "left and middle would both write out.jsonl" in captured.err
 
 
@@ -533,6 +533,6 @@ def test_check_tells_a_mistake_of_all_sensors_once(
     (folder / "pipeline.yaml").write_text(text.replace("rotate: 0", "rotate: 7"))
     assert main(["check"]) == 2
     both = capsys.readouterr().err
-    assert both.startswith("tactflow: 2 mistakes in the pipeline\n")
+    assert both.startswith("tactflow: 2 mistakes\n")
     assert both.count("mistakes") == 1
     assert alone.removeprefix("tactflow: ") in both

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import queue
 import time
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -137,15 +138,27 @@ def _local_cluster(workers: int) -> Any:
 def _connect(address: str) -> Any:
     """A client of the scheduler that is sure to understand it."""
     try:
-        client = _distributed().Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        with warnings.catch_warnings():
+            # What differs is looked at below.
+            warnings.filterwarnings("ignore", "Mismatched versions")
+            client = _distributed().Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, ImportError, TypeError) as error:
         raise ConfigError(
             f"--scheduler {address}: nobody answers who understands ({error}); is it the address that "
             "`dask scheduler` shows, tcp://HOST:8786, of the same version of Dask?"
         ) from None
-    try:
-        client.get_versions(check=True)
-    except ValueError as error:
+    known = client.get_versions()
+    here = _dask_version(known["client"])
+    there = {_dask_version(one) for one in (known["scheduler"], *known["workers"].values())} - {here}
+    if there:
         client.close()
-        raise ConfigError(f"--scheduler {address}: other versions than here: {error}") from None
+        raise ConfigError(
+            f"--scheduler {address}: has distributed {', '.join(sorted(there))}, here is {here}; install the "
+            "same version on all machines"
+        )
     return client
+
+
+def _dask_version(known: Mapping[str, Any]) -> str:
+    """Version of the package that talks to others; what computes, each worker checks for itself."""
+    return str(known["packages"]["distributed"])

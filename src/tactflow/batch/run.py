@@ -46,14 +46,18 @@ class Plan:
         return ", ".join(parts)
 
 
-def resolved(file: Path, overrides: Sequence[str], sensor: str | None, format_: Format) -> PipelineRequest:
+def resolved(
+    file: Path, overrides: Sequence[str], sensor: str | None, format_: Format, split: float = 0.0
+) -> PipelineRequest:
     """A pipeline as workers are asked for it, checked.
+
+    split : length of the parts that recordings are cut into, s; 0 for none.
 
     Raises
     ------
     ConfigError : the file is wrong.
     """
-    request = PipelineRequest(os.path.abspath(file), tuple(overrides), sensor)
+    request = PipelineRequest(os.path.abspath(file), tuple(overrides), sensor, split)
     _, digest = pipeline_for(request, format_)
     return replace(request, digest=digest, versions=tuple(versions().items()))
 

@@ -106,8 +106,9 @@ class Summary:
 
     def __init__(self) -> None:
         self.curve = Curve()
-        self.contacts = self.touching = 0
+        self.frames = self.contacts = self.touching = 0
         self.largest = self.duration = 0.0
+        self._first: bool | None = None
         self._pictures: list[Thumbnail] = []
         self._best: tuple[Tick, Results] | None = None
 
@@ -119,6 +120,8 @@ class Summary:
         angle = None if contact is None else contact.angle
         self.curve.add(Point(tick.frame.t, area, mean, angle))
         self.duration = tick.frame.t
+        self.frames += 1
+        self._first = contact is not None if self._first is None else self._first
         if contact is None:
             self._end_contact()
             return
@@ -127,6 +130,11 @@ class Summary:
         self.largest = max(self.largest, area)
         if self._best is None or self._best[1].contact is None or area > self._best[1].contact.area:
             self._best = tick, results
+
+    @property
+    def ends(self) -> tuple[bool, bool]:
+        """Whether there is a contact in the first frame, and in the last one so far."""
+        return bool(self._first), self._best is not None
 
     def _end_contact(self) -> None:
         """Keep a picture of the contact that is over, if it is one of the largest."""

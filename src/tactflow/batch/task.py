@@ -22,15 +22,35 @@ Report = Callable[[int, int | None], None]
 class PipelineRequest:
     """Which pipeline, so that any process can load it.
 
-    file : absolute. overrides : as for `--set`. sensor : of several; None is the only one. digest : what it
-    must come to. versions : with which it does.
+    file : absolute. overrides : as for `--set`. sensor : of several; None is the only one. split : length of
+    the parts that recordings are cut into, s, 0 for none. digest : what it must come to. versions : with
+    which it does.
     """
 
     file: str
     overrides: tuple[str, ...]
     sensor: str | None
+    split: float = 0.0
     digest: str = ""
     versions: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Consecutive frames of a recording, by their `seq`.
+
+    number : of the part, from 0. begin : the first frame that stages see. first, end : those that sinks see,
+    from `first` to before `end`; of the last part, `end` is None.
+    """
+
+    number: int
+    begin: int
+    first: int
+    end: int | None
+
+    def holds(self, seq: int) -> bool:
+        """Whether a frame is told of in this part."""
+        return self.first <= seq and (self.end is None or seq < self.end)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +58,7 @@ class Task:
     """One recording to work on.
 
     folder : `--out`, absolute. scratch : the folder in it for what is not finished. verify : read results
-    that are there instead of trusting their size and time.
+    that are there instead of trusting their size and time. part : of the recording; None is all of it.
     """
 
     recording: Recording
@@ -47,6 +67,7 @@ class Task:
     folder: str
     scratch: str
     verify: bool = False
+    part: Part | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,11 @@ import math
 import os
 import socket
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import orjson
 
@@ -27,6 +28,7 @@ from tactflow.batch.keys import (
     result_key,
     versions,
 )
+from tactflow.batch.parts import OVERLAP, of_part
 from tactflow.batch.recordings import Recording
 from tactflow.batch.summary import Summary, with_looker
 from tactflow.batch.task import Format, Outcome, PipelineRequest, Report, Task, result_name
@@ -68,19 +70,22 @@ def work(task: Task, report: Report = lambda _done, _total: None) -> Outcome:
             else:
                 outcome = _result(task, blank, report)
     except TactflowError as error:
-        outcome = replace(blank, error=str(error), disk_full=_is_disk_full(error))
+        outcome = replace(blank, error=str(error), disk_full=is_disk_full(error))
+    except OSError as error:
+        where = "" if error.filename is None else f"{error.filename}: "
+        what = f"{where}{error.strerror or error}"
+        outcome = replace(blank, error=what, disk_full=is_disk_full(error))
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         what = f"{type(error).__name__}: {error} ({place.filename}:{place.lineno})"
-        outcome = replace(blank, error=what, disk_full=_is_disk_full(error))
+        outcome = replace(blank, error=what, disk_full=is_disk_full(error))
     return replace(outcome, seconds=0.0 if outcome.reused else SYSTEM.now() - began)
 
 
 @contextmanager
 def attempt(task: Task) -> Iterator[int]:
     """Count that a worker begins a recording; the count is forgotten when the worker is through with it."""
-    name = hashlib.sha256(task.recording.source.encode()).hexdigest()[:16]
-    marks = Path(task.scratch, f"{name}.attempts")
+    marks = Path(task.scratch, f"{scratch_name(task)}.attempts")
     with marks.open("ab") as file:
         file.write(b"x")
     attempts = marks.stat().st_size
@@ -91,59 +96,79 @@ def attempt(task: Task) -> Iterator[int]:
             marks.unlink()
 
 
+def scratch_name(task: Task) -> str:
+    """What files of a task are called while it is not finished: no two of a call have the same."""
+    name = hashlib.sha256(task.recording.source.encode()).hexdigest()[:16]
+    return name if task.part is None else f"{name}-{task.part.number}"
+
+
 def _result(task: Task, blank: Outcome, report: Report) -> Outcome:
     """The outcome of a recording: that of an earlier call if its result is there, else of a run."""
     path = task.recording.path
     try:
         before = None if path is None else fingerprint(path)
-        read = input_digest(task.recording)
+        # The parts of a recording have one digest: the first one works it out.
+        read = "" if task.part is not None and task.part.number else input_digest(task.recording)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if task.part is not None:
+        return _part(task, replace(blank, input=before, input_digest=read), report)
     key = result_key(read, task.pipeline.digest)
     folder = Folder(Path(task.folder))
     there = folder.outcome_of(key, verify=task.verify)
     if there is not None:
         return replace(there.of(task.recording), input=before, reused=True, started=blank.started)
     found = replace(blank, key=key, input=before, input_digest=read)
-    found, summary = _run(task, found, report)
-    if path is not None and fingerprint(path) != before:
-        raise SourceError(f"{path}: was changed while it was read; call again")
-    _commit(task, folder, found, summary)
+    unfinished = Path(task.scratch, f"{os.getpid()}-{scratch_name(task)}")
+    try:
+        found, summary = _run(task, found, unfinished, report)
+        found = moved_to_place(task, found, unfinished)
+    finally:
+        with suppress(OSError):
+            remove(unfinished)
+    _refuse_changed(task, found)
+    commit(task, found, summary.finished())
     return found
 
 
-def _run(task: Task, blank: Outcome, report: Report) -> tuple[Outcome, Summary]:
-    """Run the pipeline into a file of the scratch folder, and move that into its place."""
-    name = result_name(task.recording, blank.key, task.format)
-    unfinished = Path(task.scratch, f"{os.getpid()}-{name}")
+def _refuse_changed(task: Task, outcome: Outcome) -> None:
+    path = task.recording.path
+    if path is not None and fingerprint(path) != outcome.input:
+        raise SourceError(f"{path}: was changed while it was read; call again")
+
+
+def _part(task: Task, blank: Outcome, report: Report) -> Outcome:
+    """Run the pipeline over a part of a recording, and leave result and summary in the scratch folder."""
+    unfinished = Path(task.scratch, scratch_name(task))
+    if unfinished.exists():
+        # Of a worker that has died.
+        remove(unfinished)
+    found, summary = _run(task, blank, unfinished, report)
+    _refuse_changed(task, found)
+    told = {"outcome": asdict(found), "ends": summary.ends, **summary.finished()}
+    unfinished.with_suffix(".json").write_bytes(orjson.dumps(told))
+    return found
+
+
+def _run(task: Task, blank: Outcome, unfinished: Path, report: Report) -> tuple[Outcome, Summary]:
+    """Run the pipeline into a file of the scratch folder."""
     summary = Summary()
-    pipeline = _for_recording(task, unfinished)
-    runner = make_runner(with_looker(pipeline, summary))
+    pipeline = with_looker(_for_recording(task, unfinished), summary)
+    if task.part is not None:
+        pipeline = of_part(pipeline, task.part)
+    runner = make_runner(pipeline)
 
     def progress(now: Progress) -> None:
         report(now.frames, None if runner.source is None else runner.source.total)
 
-    try:
-        with _notes() as notes:
-            result = runner.run(progress, interval_s=0.25)
-        if result.failure is not None:
-            raise result.failure
-        written, digest = fingerprint(unfinished), digest_of(unfinished)
-        place = Path(task.folder, "results", name)
-        if place.is_dir():
-            # Of a call that ended before it could say that this is complete; no folder replaces another.
-            remove(place)
-        unfinished.replace(place)
-    finally:
-        with suppress(OSError):
-            remove(unfinished)
+    with _notes() as notes:
+        result = runner.run(progress, interval_s=0.25)
+    if result.failure is not None:
+        raise result.failure
     outcome = replace(
         blank,
         status="done",
-        result=name,
-        result_file=written,
-        result_digest=digest,
-        frames=result.stats["frames"],
+        frames=result.stats["frames"] if task.part is None else summary.frames,
         dropped=result.stats["dropped"],
         duration=summary.duration,
         contacts=summary.contacts,
@@ -154,13 +179,24 @@ def _run(task: Task, blank: Outcome, report: Report) -> tuple[Outcome, Summary]:
     return outcome, summary
 
 
-def _commit(task: Task, folder: Folder, outcome: Outcome, summary: Summary) -> None:
+def moved_to_place(task: Task, outcome: Outcome, unfinished: Path) -> Outcome:
+    """Move a result that is whole from the scratch folder to where results are; the outcome names it."""
+    written, digest = fingerprint(unfinished), digest_of(unfinished)
+    name = result_name(task.recording, outcome.key, task.format)
+    place = Path(task.folder, "results", name)
+    if place.is_dir():
+        # Of a call that ended before it could say that this is complete; no folder replaces another.
+        remove(place)
+    unfinished.replace(place)
+    return replace(outcome, result=name, result_file=written, result_digest=digest)
+
+
+def commit(task: Task, outcome: Outcome, told: Mapping[str, Any]) -> None:
     """Store what is told of a result: only what has this is complete."""
-    record = {"outcome": asdict(outcome), **summary.finished()}
     unfinished = Path(task.scratch, f"{os.getpid()}-{outcome.key}.json")
     try:
-        unfinished.write_bytes(orjson.dumps(record))
-        unfinished.replace(folder.records / f"{outcome.key}.json")
+        unfinished.write_bytes(orjson.dumps({"outcome": asdict(outcome), **told}))
+        unfinished.replace(Folder(Path(task.folder)).records / f"{outcome.key}.json")
     finally:
         with suppress(OSError):
             unfinished.unlink()
@@ -184,7 +220,10 @@ def pipeline_for(request: PipelineRequest, format_: Format) -> tuple[Pipeline, s
     pipeline = replace(loaded, nodes=kept, opencv_threads=1)
     if "source" not in pipeline.source.component.params.model_fields:
         raise ConfigError(f"{pipeline.source.mark}: a batch needs a source with the parameter source")
-    return pipeline, pipeline_digest(pipeline)
+    digest = pipeline_digest(pipeline)
+    if request.split:
+        digest = hashlib.sha256(f"{digest}\n{request.split!r} s, {OVERLAP} frames".encode()).hexdigest()
+    return pipeline, digest
 
 
 kept_pipeline_for = functools.lru_cache(maxsize=4)(pipeline_for)
@@ -231,7 +270,7 @@ def reading(pipeline: Pipeline, recording: Recording) -> Pipeline:
     return replace(pipeline, nodes=nodes, settings=settings)
 
 
-def _is_disk_full(error: BaseException | None) -> bool:
+def is_disk_full(error: BaseException | None) -> bool:
     """Whether that is why, however deep it lies."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):

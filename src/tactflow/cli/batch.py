@@ -21,10 +21,11 @@ from tactflow.batch.page import write_page
 from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.run import Result, Stopping, make_plan, resolved, run_batch
 from tactflow.batch.runs import Row, require_pyarrow, write_runs
+from tactflow.batch.split import Splitting
 from tactflow.batch.task import Format, PipelineRequest, Task
 from tactflow.batch.work import kept_pipeline_for, reading
 from tactflow.cli.batch_progress import batch_display, in_short
-from tactflow.cli.options import positive
+from tactflow.cli.options import positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
@@ -63,6 +64,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="override one value of the pipeline file; repeatable",
     )
     parser.add_argument("--sensor", metavar="NAME", help="which one of a pipeline with several sensors")
+    _add_division(parser)
+    parser.add_argument(
+        "--verify",
+        action="store_true",
+        help="read all recordings and results instead of trusting that what has the same size and time of "
+        "change is the same",
+    )
+    parser.add_argument(
+        "--compare",
+        metavar="OTHER",
+        help="run this pipeline over the same recordings too, and tell how the numbers differ and in which "
+        "frames most; --set changes the first pipeline alone",
+    )
+    parser.add_argument("--fail-fast", action="store_true", help="begin nothing more once a recording fails")
+    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
+
+
+def _add_division(parser: argparse.ArgumentParser) -> None:
+    """Declare on what the work is done, and in which parts."""
     parser.add_argument(
         "--workers", type=positive, metavar="N", help="processes on this machine (default: one a processor)"
     )
@@ -83,19 +103,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "gathers the table and the page",
     )
     parser.add_argument(
-        "--verify",
-        action="store_true",
-        help="read all recordings and results instead of trusting that what has the same size and time of "
-        "change is the same",
+        "--split",
+        type=seconds,
+        default=0.0,
+        metavar="TIME",
+        help="cut recordings into parts of 60s, 5min, ... that are worked on side by side; their numbers "
+        "differ a little, and --compare tells by how much: with it, only the first pipeline is cut",
     )
-    parser.add_argument(
-        "--compare",
-        metavar="OTHER",
-        help="run this pipeline over the same recordings too, and tell how the numbers differ and in which "
-        "frames most; --set changes the first pipeline alone",
-    )
-    parser.add_argument("--fail-fast", action="store_true", help="begin nothing more once a recording fails")
-    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -109,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "parquet":
         require_pyarrow()
     file, words = _pipeline_and_sources(args.words)
-    requests = [resolved(file, _overrides(args, file), args.sensor, args.format)]
+    requests = [resolved(file, _overrides(args, file), args.sensor, args.format, args.split)]
     if args.compare is not None:
         requests.append(resolved(find_pipeline(args.compare), [], args.sensor, args.format))
         _refuse_the_same(requests)
@@ -170,6 +184,8 @@ class _Call:
             return Task(recording, request, args.format, out, scratch, args.verify)
 
         engine = _engine(args)
+        if request.split:
+            engine = Splitting(engine)
         with batch_display(self._console, plan, engine, shown=not args.quiet) as display:
             return run_batch(
                 *(plan, make_task, engine, self._ledger),
@@ -211,7 +227,8 @@ def _two_names(requests: Sequence[PipelineRequest]) -> tuple[str, str]:
     """What two pipelines are called side by side."""
     first, second = (Path(request.file).stem for request in requests)
     if first == second:
-        first = f"{first} {' '.join(requests[0].overrides)}".strip()
+        cut = ["in parts"] if requests[0].split else []
+        first = " ".join([first, *requests[0].overrides, *cut])
     return (first, second) if first != second else (requests[0].file, requests[1].file)
 
 
@@ -219,7 +236,7 @@ def _refuse_the_same(requests: Sequence[PipelineRequest]) -> None:
     if requests[0].digest == requests[1].digest:
         raise ConfigError(
             f"--compare {requests[1].file}: computes just what {requests[0].file} does; name another one, or "
-            "change the first with --set"
+            "change the first with --set or --split"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,9 @@ from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan, make_plan
+
+UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
+"""Unit -> seconds."""
 
 
 def add_pipeline(parser: argparse.ArgumentParser) -> None:
@@ -68,3 +72,20 @@ def positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"required a whole number from 1, got {text!r}")
     return value
+
+
+def seconds(text: str) -> float:
+    """A type of argparse: a length of time above 0, s.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        If the text is none.
+
+    >>> seconds("90s"), seconds("1.5min")
+    (90.0, 90.0)
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-z]*)", text.strip())
+    if match is None or match[2] not in UNITS or float(match[1]) <= 0:
+        raise argparse.ArgumentTypeError(f"required a time such as 90s, 2min or 1h, got {text!r}")
+    return float(match[1]) * UNITS[match[2]]

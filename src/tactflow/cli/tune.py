@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
 import tempfile
 import time
 from pathlib import Path
@@ -12,12 +11,10 @@ from pathlib import Path
 import orjson
 
 from tactflow.cli.notes import say, without_notes
+from tactflow.cli.options import seconds
 from tactflow.cli.printable import printable
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
-
-UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
-"""Unit of `--budget` -> seconds."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="which error counts: contact's centre, displacement of dots, mean flow; default: the largest",
     )
     parser.add_argument(
-        "--budget", type=_seconds, default=120.0, metavar="TIME", help="as 90s, 2min (default)"
+        "--budget", type=seconds, default=120.0, metavar="TIME", help="as 90s, 2min (default)"
     )
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="the same errors again; not the times"
@@ -131,10 +128,3 @@ def _positive(text: str) -> float:
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"required a number above 0, got {text!r}")
     return value
-
-
-def _seconds(text: str) -> float:
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-z]*)", text.strip())
-    if match is None or match[2] not in UNITS or float(match[1]) <= 0:
-        raise argparse.ArgumentTypeError(f"required a time such as 90s, 2min or 1h, got {text!r}")
-    return float(match[1]) * UNITS[match[2]]

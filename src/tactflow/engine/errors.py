@@ -31,7 +31,7 @@ class ConfigError(TactflowError):
     exit_code = 2
 
     def __init__(self, *mistakes: str) -> None:
-        title = [f"{len(mistakes)} mistakes in the pipeline"] if len(mistakes) > 1 else []
+        title = [f"{len(mistakes)} mistakes"] if len(mistakes) > 1 else []
         super().__init__("\n".join([*title, *mistakes]))
         self.mistakes = mistakes
 
