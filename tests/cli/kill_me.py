@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from tactflow.message import Results
 from tactflow.sinks.record import Record
 
 
+@lru_cache(maxsize=10_000)
 def image(seq: int) -> np.ndarray:
     return np.random.default_rng(seq).integers(0, 256, (24, 32, 3), np.uint8)
 

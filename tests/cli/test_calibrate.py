@@ -28,13 +28,13 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     pitch = f"{open_scene('ball').layout.pitch * RAW_MM:.5f}"
-    words = ["--from", "sim:ball?frames=240", "--pitch", pitch, "--ball-radius", "2.375"]
+    words = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--ball-radius", "2.375"]
     assert calibrate(*words) == 0
     told = capsys.readouterr().err
     assert "press 8 of 30: good, radius" in told
     assert "calibration/main.yaml is written" in told
     said = yaml.safe_load(Path("calibration/main.yaml").read_text())
-    assert said["made_from"] == "sim:ball?frames=240"
+    assert said["made_from"] == "sim:ball?frames=200"
     assert said["photometric"]["presses"] >= 8
 
     settings = {"calibration": "calibration/main.yaml"}
@@ -47,13 +47,13 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     sunk = float(open_scene("press?seed=11&frames=80").truth(deepest.seq).sunk.max()) * RAW_MM
     assert abs(deepest.depth.greatest - sunk) < max(3 * deepest.depth.greatest_stderr, 0.03 * sunk)
 
-    gauge = ["sim", "ball?frames=140&shear=0.6", "--truth", "gauge.csv", "--quiet"]
+    gauge = ["sim", "ball?frames=100&shear=0.6", "--truth", "gauge.csv", "--quiet"]
     assert main(gauge) == 0
     force = [
         "force",
         "calibration/main.yaml",
         "--from",
-        "sim:ball?frames=140&shear=0.6",
+        "sim:ball?frames=100&shear=0.6",
         "--csv",
         "gauge.csv",
     ]
@@ -86,7 +86,7 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
 
     assert calibrate(*words) == 2
     assert "give --overwrite" in capsys.readouterr().err
-    assert calibrate("check", "calibration/main.yaml", "--source", "sim:ball?frames=80&seed=2") == 0
+    assert calibrate("check", "calibration/main.yaml", "--source", "sim:ball?frames=60&seed=2") == 0
     assert "it still fits" in capsys.readouterr().out
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:round_gel?frames=3") == 3
     assert "calibrate anew" in capsys.readouterr().out

@@ -15,6 +15,8 @@ import zmq
 
 from tactflow.cli.main import main
 from tactflow.fleet import supervisor
+from tactflow.sources import open_source
+from tactflow.sources.mcap import Recording
 from tests.clock import PATIENCE, until
 
 GRAPH = """
@@ -46,6 +48,15 @@ def run(*arguments: str, cwd: Path, command: str = "run") -> subprocess.Complete
 
 def rows(path: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def numbers(path: Path) -> list[int]:
+    """Of the frames in a recording."""
+    source = open_source(str(path))
+    assert isinstance(source, Recording)
+    found = [stamp.seq for _, _, stamp in iter(source.read_stamped, None)]
+    source.close()
+    return found
 
 
 @pytest.fixture
@@ -187,7 +198,10 @@ def test_a_sensor_that_fails_is_started_again_and_the_others_are_not_disturbed(f
         'capture: {source: "sim:press', "capture: {use: './flaky.py:Flaky', source: \"sim:press"
     )
     (folder / "pipeline.yaml").write_text(text)
-    done = run("--quiet", "--jsonl", "more.jsonl", cwd=folder)
+    for name in ("a-left.mcap", "a-right.mcap"):
+        (folder / name).write_bytes(b"old")
+    options = ("--out", "a.mcap", "--overwrite", "--jsonl", "more.jsonl", "--quiet")
+    done = run(*options, cwd=folder, command="record")
     assert done.returncode == 0, done.stderr
     assert "left failed (exit code 4); starting again in 1 s" in done.stderr
     assert "the cable is loose" in done.stderr
@@ -196,6 +210,12 @@ def test_a_sensor_that_fails_is_started_again_and_the_others_are_not_disturbed(f
         assert [row["seq"] for row in rows(folder / file)] == [*range(10), *range(40)], "nothing is lost"
     assert len(rows(folder / "out-right.jsonl")) == 30
     assert done.stderr.count("right failed") == 0
+    recorded = {path.name: numbers(path) for path in folder.glob("*.mcap")}
+    assert recorded == {
+        "a-left.mcap": list(range(10)),
+        "a-left-001.mcap": list(range(40)),
+        "a-right.mcap": list(range(30)),
+    }
 
 
 @pytest.mark.slow

@@ -295,7 +295,12 @@ def test_the_same_touch_for_ever_gives_the_same_mask_for_ever(method: str) -> No
 
 # -- large ------------------------------------------------------------------------------------------------
 
-LARGE = [name for name in PICTURE_METHODS if name not in ("inpaint-telea", "inpaint-ns")]
+LARGE = [
+    # It takes four seconds.
+    pytest.param(name, marks=pytest.mark.slow) if name == "marker_mask-dog" else name
+    for name in PICTURE_METHODS
+    if name not in ("inpaint-telea", "inpaint-ns")
+]
 
 
 @pytest.fixture(scope="module")

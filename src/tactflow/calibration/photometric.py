@@ -26,7 +26,14 @@ from tactflow.calibration.file import PhotometricEntry
 from tactflow.calibration.presses import Press, Session
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel, colour_terms, place_terms
-from tactflow.vision.depth.surface import FADE, Rest, Surface, Window, colour_change, contact_window
+from tactflow.vision.depth.surface import (
+    FADE,
+    Rest,
+    Surface,
+    Window,
+    colour_change,
+    surroundings,
+)
 from tactflow.vision.types import Scale
 
 Double = NDArray[np.float64]
@@ -158,17 +165,17 @@ def check_presses(session: Session, scale: Scale, ball_radius: float) -> None:
 
 
 def _prepare(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> _Sample:
-    window = contact_window(press.mask, rest.window)
+    window = surroundings(press.mask, rest.window, 0).window
     change = colour_change(press.image, rest, window)
     place = place_terms((rest.window.right, rest.window.bottom))[(slice(None), *window.part)]
-    colours = colour_terms(change).reshape(COLOUR_TERMS, -1)
+    colours = colour_terms(change)
     terms = (place.reshape(PLACE_TERMS, 1, -1) * colours).reshape(PLACE_TERMS * COLOUR_TERMS, -1)
     rows, columns = np.mgrid[window.part]
     # The centre of a pixel at half resolution lies between two of the processed frame.
     x = (2.0 * columns + 0.5 - scale.origin[0]) * scale.x
     y = (2.0 * rows + 0.5 - scale.origin[1]) * scale.y
     hidden = _halved(press.hidden, window)
-    inner = np.zeros(change.shape[:2], np.bool_)
+    inner = np.zeros(change.shape[1:], np.bool_)
     inner[FADE:-FADE, FADE:-FADE] = True
     reach = min(INNER * press.radius * (scale.x * scale.y) ** 0.5, INNER * ball_radius)
     start = np.array(scale.point(press.center))
@@ -293,10 +300,8 @@ def _held_out(
         weights, _ = _fit(samples, learned, ball_radius)
         surface = Surface(SlopeModel(_shaped(weights)), scale)
         for i in others:
-            image = session.presses[i].image
-            tried.append(
-                _errors(samples[i], weights, surface.heights(image, rest, samples[i].window), ball_radius)
-            )
+            heights = _heights(surface, session.presses[i], rest, samples[i].window)
+            tried.append(_errors(samples[i], weights, heights, ball_radius))
     return _summary(np.array(tried))
 
 
@@ -311,9 +316,17 @@ def try_photometry(session: Session, model: SlopeModel, scale: Scale, ball_radiu
     tried = []
     for press in session.presses:
         sample = _prepare(press, rest, scale, ball_radius)
-        heights = surface.heights(press.image, rest, sample.window)
+        heights = _heights(surface, press, rest, sample.window)
         tried.append(_errors(sample, weights, heights, ball_radius))
     return _summary(np.array(tried))
+
+
+def _heights(surface: Surface, press: Press, rest: Rest, window: Window) -> NDArray[np.float32]:
+    """(h, w): heights in a window, as a run finds them in its own, larger one."""
+    around = surroundings(press.mask, rest.window)
+    top, left = window.top - around.window.top, window.left - around.window.left
+    rows, columns = window.bottom - window.top, window.right - window.left
+    return surface.heights(press.image, rest, around)[top : top + rows, left : left + columns]
 
 
 def _errors(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from tactflow.vision.change import ChangeProbe
 Image = NDArray[np.uint8]
 
 
+@lru_cache(maxsize=1)
 def gel(height: int = 240, width: int = 320, shift: float = 0.0) -> NDArray[np.float32]:
     """A gel with soft dark dots of radius 4 px on a grid of pitch 24 px, moved to the right by `shift` px."""
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
@@ -23,8 +26,8 @@ def gel(height: int = 240, width: int = 320, shift: float = 0.0) -> NDArray[np.f
 
 def noisy(image: NDArray[np.float32], seed: int, sigma: float = 2.0) -> Image:
     """The image as a camera with Gaussian noise sees it."""
-    noise = np.random.default_rng(seed).normal(0, sigma, image.shape)
-    return np.clip(np.round(image + noise), 0, 255).astype(np.uint8)
+    noise = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
+    return np.clip(np.rint(image + np.float32(sigma) * noise), 0, 255).astype(np.uint8)
 
 
 def warmed_up(image: NDArray[np.float32], frames: int = 20, sigma: float = 2.0) -> ChangeProbe:

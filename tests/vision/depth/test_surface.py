@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from tactflow.vision.depth.poisson import integrate
 from tactflow.vision.depth.slopes import STEEPEST, SlopeModel, place_terms
-from tactflow.vision.depth.surface import Rest, Surface, contact_window
+from tactflow.vision.depth.surface import LEAST_MARGIN, Rest, Surface, surroundings
 from tactflow.vision.types import Scale
 
 GEL = np.full((80, 120, 3), (90, 120, 100), np.uint8)
@@ -26,12 +27,40 @@ def test_heights_are_those_of_the_surface_that_has_the_slopes() -> None:
 def test_the_window_is_even_and_inside_the_picture_wherever_the_contact_is(corner: tuple[int, int]) -> None:
     mask = np.zeros(GEL.shape[:2], np.uint8)
     mask[corner[0] : corner[0] + 9, corner[1] : corner[1] + 15] = 255
-    window = contact_window(mask, Rest(GEL).window)
+    window, bands = surroundings(mask, Rest(GEL).window)
     assert (window.bottom - window.top) % 2 == (window.right - window.left) % 2 == 0
     assert 0 <= window.top <= corner[0] // 2
     assert window.bottom <= 40
     assert 0 <= window.left <= corner[1] // 2
     assert window.right <= 60
+    # All of the contact is in the bands, and they are in the window.
+    near = np.zeros(mask.shape, np.bool_)
+    for band in bands:
+        assert window.top <= band.top < band.bottom <= window.bottom
+        assert window.left <= band.left < band.right <= window.right
+        near[band.whole] = True
+    assert near[:80, :120][mask > 0].all()
+
+
+def test_of_a_slanting_contact_only_the_gel_beside_it_is_looked_at() -> None:
+    mask = np.zeros((400, 400), np.uint8)
+    cv2.line(mask, (20, 20), (380, 380), 255, 12)
+    window, bands = surroundings(mask, Rest(np.zeros((400, 400, 3), np.uint8)).window)
+    pixels = sum((band.bottom - band.top) * (band.right - band.left) for band in bands)
+    assert pixels < 0.45 * (window.bottom - window.top) * (window.right - window.left)
+    for band in bands[2:-2]:
+        middle = (band.top + band.bottom) / 2
+        assert abs(middle - (band.left + band.right) / 2) < 5
+        assert band.right - band.left >= 2 * LEAST_MARGIN
+
+
+def test_a_contact_in_the_last_line_that_no_half_resolution_has_is_no_depth() -> None:
+    mask = np.zeros((83, 121), np.uint8)
+    mask[82, 120] = 255
+    gel = np.zeros((83, 121, 3), np.uint8)
+    depth = Surface(SlopeModel(ANY), Scale(0.1, 0.1, (0, 0), (0, 0))).depth(gel, Rest(gel), mask)
+    assert depth.heights.shape == mask.shape
+    assert depth.greatest == 0
 
 
 def test_no_change_of_colour_is_no_depth_and_neither_is_a_change_of_all_the_light() -> None:
@@ -46,10 +75,10 @@ def test_no_change_of_colour_is_no_depth_and_neither_is_a_change_of_all_the_ligh
 
 
 def test_normals_are_the_polynomial_of_colour_and_place_and_never_too_steep() -> None:
-    change = np.random.default_rng(2).normal(0, 0.4, (50, 60, 3)).astype(np.float32)
+    change = np.random.default_rng(2).normal(0, 0.4, (3, 50, 60)).astype(np.float32)
     place = place_terms((60, 50))
     found = SlopeModel(ANY).normals(change, place)
-    b, g, r = change[31, 44].astype(float)
+    b, g, r = change[:, 31, 44].astype(float)
     colours = [b, g, r, b * b, b * g, b * r, g * g, g * r, r * r, b * b * b, b * b * g, b * b * r]
     colours += [b * g * g, b * g * r, b * r * r, g * g * g, g * g * r, g * r * r, r * r * r]
     expected = np.einsum("p,c,pcd->d", place[:, 31, 44], colours, ANY)

@@ -1,0 +1,195 @@
+"""The tables of calibration.md: errors of height maps, of simulated contacts and of a real ball.
+
+python docs/depth_table.py            simulated contacts under three lights; a minute
+python docs/depth_table.py FOLDER     wedge_ball, in the folder that has its pictures and labels.csv
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+import tempfile
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.bench.depth import (
+    LIGHTS,
+    RAW_MM,
+    WEDGE_BALL,
+    WEDGE_SCALE,
+    deepest,
+    learn,
+    noisy,
+    scale,
+)
+from tactflow.bench.pipelines import on_recording
+from tactflow.bench.recordings import stack
+from tactflow.calibration.photometric import fit_photometry, fit_sphere
+from tactflow.calibration.presses import find_presses
+from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline
+from tactflow.sim import open_scene
+from tactflow.vision.depth.slopes import SlopeModel, place_terms
+from tactflow.vision.depth.surface import Rest, Surface, colour_change, surroundings
+from tactflow.vision.geometry import Preprocessor
+
+Values = NDArray[np.float64]
+
+SCENES = ("press", "finger", "cable", "bent_cable", "long_edge", "box", "coin", "two", "screw")
+SHARP = {"long_edge", "box", "coin"}
+"""What has edges."""
+SEEDS = (12, 13)
+"""Nothing was chosen on these."""
+CONTACTS = 3
+"""Of each recording, the first ones at their deepest."""
+INNER, OUTER = 0.85, 0.8
+"""Part of a contact's radius in which normals are judged, and of the ball's in which heights are."""
+
+
+@dataclass
+class Tally:
+    """Errors of one scene under one light. rms : % of the greatest depth. depth, volume : in stated ones."""
+
+    rms: list[float] = field(default_factory=list)
+    depth: list[float] = field(default_factory=list)
+    volume: list[float] = field(default_factory=list)
+
+    def add(
+        self, found: Surface, rest: Rest, image: NDArray[np.uint8], mask: NDArray[np.uint8], true: Values
+    ) -> None:
+        """One contact. true : (H, W), mm."""
+        seen = found.depth(image, rest, mask)
+        around = true > 0.02 * true.max()
+        self.rms.append(100 * float(np.sqrt(np.mean((seen.heights - true)[around] ** 2)) / true.max()))
+        volume = float(true.sum()) * scale().area(1.0)
+        assert seen.greatest_stderr is not None
+        assert seen.volume_stderr is not None
+        self.depth.append(abs(seen.greatest - float(true.max())) / seen.greatest_stderr)
+        self.volume.append(abs(seen.volume - volume) / seen.volume_stderr)
+
+
+def simulated() -> None:
+    """Print the table of the simulated contacts, and how many errors are within the stated ones."""
+    tallies: dict[tuple[str, str], Tally] = {}
+    for light in LIGHTS:
+        known = learn(f"ball?frames=600&light={light}")
+        surface = Surface(known.model, scale(), known.found.errors())
+        for name in SCENES:
+            tallies[light, name] = tried(surface, name, light)
+        row = " | ".join(f"{np.mean(tallies[light, name].rms):.1f}" for name in SCENES)
+        print(f"| `{light}` | {row} |", flush=True)
+    for what, names in (("all", set(SCENES)), ("round", set(SCENES) - SHARP), ("sharp", SHARP)):
+        chosen = [tally for (_, name), tally in tallies.items() if name in names]
+        shares = [
+            100 * np.mean(np.concatenate([getattr(tally, part) for tally in chosen]) < bound)
+            for part in ("depth", "volume")
+            for bound in (1, 2)
+        ]
+        count = sum(len(tally.depth) for tally in chosen)
+        print(f"| {what} | {count} | " + " | ".join(f"{share:.0f}" for share in shares) + " |")
+
+
+def tried(surface: Surface, name: str, light: str) -> Tally:
+    """The errors on one scene under one light."""
+    preprocess = Preprocessor((800, 600), rotate=90, downsample=2)
+    tally = Tally()
+    for seed in SEEDS:
+        scene = open_scene(f"{name}?seed={seed}&light={light}")
+        rest = Rest(scene.truth(0, preprocess).unmarked)
+        for index in deepest(scene)[:CONTACTS]:
+            truth = scene.truth(index, preprocess)
+            mask: NDArray[np.uint8] = np.uint8(255) * truth.contact_mask
+            tally.add(
+                surface, rest, noisy(truth.unmarked, index), mask, truth.sunk.astype(np.float64) * RAW_MM
+            )
+    return tally
+
+
+class Ball:
+    """Presses of wedge_ball, each judged by what was learned from the other half.
+
+    folder : of the pictures. labels : (N, 3), x, y and radius, px.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        with (folder / "labels.csv").open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        self.labels = np.array([[float(row[key]) for key in ("x", "y", "radius")] for row in rows])
+        with tempfile.TemporaryDirectory() as scratch:
+            files = [folder / "reference.jpg", *(folder / row["file"] for row in rows)]
+            pipeline = load_pipeline(find_pipeline("wedge"))
+            self.session = find_presses(on_recording(pipeline, stack(files, Path(scratch))))
+        self.rest = Rest(self.session.untouched)
+        self.all = fit_photometry(self.session, WEDGE_SCALE, WEDGE_BALL)
+        presses = self.session.presses
+        labelled = self.labels[[press.seq - 1 for press in presses]]
+        self.offset = np.median((self.all.centers - labelled[:, :2])[self.all.kept], axis=0)
+
+    def print(self) -> None:
+        """Print the rows of the table."""
+        good = np.flatnonzero(self.all.kept)
+        tried = []
+        for learned, others in ((good[::2], good[1::2]), (good[1::2], good[::2])):
+            half = replace(self.session, presses=[self.session.presses[i] for i in learned])
+            model = fit_photometry(half, WEDGE_SCALE, WEDGE_BALL).model
+            tried += [self.errors(model, int(i)) for i in others]
+        inner, disc, labelled, radius, rms = np.array(tried).T
+        print(f"presses: {len(self.session.presses)} found, {len(good)} kept")
+        print(f"normals: {inner.mean():.1f} degrees; over the whole disc {disc.mean():.1f}")
+        print(f"normals from the labels: {labelled.mean():.1f} degrees")
+        low, middle, high = 100 * np.percentile(radius, (10, 50, 90))
+        print(f"radius of the sphere: median {middle:+.1f} %, 10 to 90 % from {low:+.1f} to {high:+.1f} %")
+        print(f"heights from the sphere, RMS: {rms.mean():.3f} mm")
+
+    def errors(self, model: SlopeModel, index: int) -> list[float]:
+        """Angles of the normals inside, over the disc, from the label; radius and RMS of the sphere."""
+        press, middle = self.session.presses[index], self.all.centers[index]
+        label = self.labels[press.seq - 1]
+        around = surroundings(press.mask, self.rest.window)
+        place = place_terms((self.rest.window.right, self.rest.window.bottom))[
+            (slice(None), *around.window.part)
+        ]
+        normal = model.normals(colour_change(press.image, self.rest, around.window), place)
+        heights = Surface(model, WEDGE_SCALE).heights(press.image, self.rest, around)
+        rows, columns = np.mgrid[around.window.part]
+        points = np.stack([2 * columns + 0.5, 2 * rows + 0.5], axis=-1)
+        hidden = press.hidden[around.window.whole][::2, ::2]
+        ball = WEDGE_BALL / WEDGE_SCALE.x
+        angles = []
+        for center, reach in (
+            (middle, INNER * min(press.radius, ball)),
+            (middle, label[2]),
+            (label[:2] + self.offset, label[2]),
+        ):
+            away = points - center
+            distance = np.hypot(away[..., 0], away[..., 1])
+            inside = ~hidden & (distance < min(reach, ball))
+            angles.append(angle(normal, away, ball, inside))
+        away = points - middle
+        cap = np.hypot(away[..., 0], away[..., 1]) <= OUTER * ball
+        surface = np.column_stack([away[cap] * WEDGE_SCALE.x, heights[cap].astype(np.float64)])
+        radius, rms = fit_sphere(surface)
+        return [*angles, radius / WEDGE_BALL - 1, rms]
+
+
+def angle(normal: NDArray[np.float32], away: Values, ball: float, where: NDArray[np.bool_]) -> float:
+    """Mean angle between normals (2, h, w) and those of a ball, degrees. away : (h, w, 2), px."""
+    vectors = [upright(normal.transpose(1, 2, 0)[where].astype(np.float64)), upright(away[where] / ball)]
+    return float(np.degrees(np.arccos(np.clip((vectors[0] * vectors[1]).sum(axis=1), -1, 1))).mean())
+
+
+def upright(flat: Values) -> Values:
+    """(n, 3) unit normals from their horizontal parts (n, 2)."""
+    return np.column_stack([flat, np.sqrt(np.maximum(1 - (flat**2).sum(axis=1), 0))])
+
+
+if __name__ == "__main__":
+    cv2.setNumThreads(1)
+    if len(sys.argv) > 1:
+        Ball(Path(sys.argv[1])).print()
+    else:
+        simulated()
