@@ -27,7 +27,7 @@ SMALL = Look((320, 240), "markers=10x8", 2.0, 0.0, 0, (1.0, 1.0, 1.0), 1.0)
 
 def found(name: str, ms: float, error: float, **more: object) -> Found:
     interval = Interval(error, 0.9 * error, 1.1 * error)
-    one = Found(name, {"center": interval, ANY: interval}, ms=Interval(ms, ms, ms), mean_ms=ms)
+    one = Found(name, {"center": interval, ANY: interval}, ms=Interval(ms, ms, ms))
     for key, value in more.items():
         setattr(one, key, value)
     return one

@@ -60,7 +60,7 @@ class Found:
     """What is known of a candidate.
 
     error : of each of `ERRORS` that it has, px of the camera's picture. quantities : what the bench's scores
-    say, processed pixels. ms : CPU time of a frame with contact, median. mean_ms : of all frames, mean.
+    say, processed pixels. ms : CPU time of a frame with contact, median.
     frames : simulated ones that it was judged on. failure : why it has none. unsound : what it gets wrong.
     checks : what the recording itself says, see `tactflow.tune.checks`.
     """
@@ -69,7 +69,6 @@ class Found:
     error: dict[str, Interval] = field(default_factory=dict[str, Interval])
     quantities: dict[str, float] = field(default_factory=dict[str, float])
     ms: Interval = field(default_factory=Interval)
-    mean_ms: float = math.nan
     frames: int = 0
     failure: str | None = None
     unsound: str = ""
@@ -176,7 +175,7 @@ def _found(name: str, kept: _Kept, failure: str | None, seed: int) -> Found:
 
 
 def set_time(found: Found, times: Mapping[str, Samples], seed: int) -> None:
-    """Time of a frame with contact, or of any where none has one, and the mean of all but references."""
+    """Time of a frame with contact, or of any but references where none has one."""
     counted = {kind: np.array(samples.cpu) * 1e3 for kind, samples in times.items() if kind != "reference"}
     if not counted:
         return
@@ -185,7 +184,6 @@ def set_time(found: Found, times: Mapping[str, Samples], seed: int) -> None:
     draws = np.median(rng.choice(busy, (DRAWS, len(busy))), axis=1)
     low, high = np.percentile(draws, INTERVAL)
     found.ms = Interval(float(np.median(busy)), float(low), float(high))
-    found.mean_ms = float(np.mean(np.concatenate(list(counted.values()))))
 
 
 def _interval(values: NDArray[np.float64], seed: int, power: float) -> Interval:

@@ -94,7 +94,6 @@ def as_json(tuned: Tuned) -> dict[str, Any]:
             {
                 "name": one.name,
                 "ms": vars(one.ms),
-                "mean_ms": one.mean_ms,
                 "errors": {kind: vars(value) for kind, value in one.error.items()},
                 "checks": one.checks,
                 "failure": one.failure,

@@ -23,7 +23,7 @@ from tactflow.tune import checks
 from tactflow.tune.measure import ANY, ERRORS, Found, Interval, judge, mark_unsound, on_sensor, set_time
 from tactflow.tune.recording import Recording
 from tactflow.tune.sensor import Fitted, Look, fit
-from tactflow.tune.space import Candidate, candidates, refinements
+from tactflow.tune.space import Candidate, candidates, with_more_references
 
 ROUNDS: Final = (
     (Case("press", 24),),
@@ -36,6 +36,8 @@ KEPT: Final = (1.0, 0.4, 0.4)
 """Share of the candidates of a round that goes on to the next but one. The front goes on in any case."""
 FINALISTS: Final = 6
 """Candidates of the last round, at most. Chosen by hand."""
+REFINED: Final = (Case("press", 140),)
+"""Simulated recording for more references: untouched for 14 frames."""
 FEWEST: Final = 3
 """Candidates with which a round is begun, at least. Chosen by hand."""
 ALLOWED: Final = 1.5
@@ -116,7 +118,7 @@ class Search:
     original script's pipeline, for comparison. goal : what is asked for.
     seconds : the budget. Finished in any case are the first round, a simulated recording that is under way,
     and a turn of all candidates on the recording. seed : of the simulated recordings and the intervals.
-    refine : whether the chosen one is tried with changes. say : told what happens.
+    refine : whether more references are tried. say : told what happens.
     """
 
     def __init__(
@@ -304,31 +306,24 @@ class Search:
         look: Look,
         folder: Path,
     ) -> tuple[Candidate, list[Found]]:
-        """One change at a time on the chosen one: kept where it is cheaper and no worse, or more exact."""
-        tried = refinements(base, chosen)
-        shown = sum(len(order) for order in checks.orders(recording.frames).values())
-        if self._room(sum(case.frames for case in ROUNDS[1]) + shown, 1.0) <= len(tried):
-            self._words.append("no time was left to try the probe's settings and more reference frames")
+        """The chosen one with more frames of the reference, where these make it more exact."""
+        more = with_more_references(base, chosen)
+        if more is None:
             return chosen, found
-        for candidate in (chosen, *tried):
-            self._known[candidate.name] = candidate
-        self._say(f"refinements: {', '.join(c.name.removeprefix(chosen.name + ', ') for c in tried)}")
-        again = self._judged([chosen, *tried], ROUNDS[1], look, folder, self._seed + 500)
+        shown = sum(len(order) for order in checks.orders(recording.frames).values())
+        if self._room(sum(case.frames for case in REFINED) + shown, 1.0) < 2:
+            self._words.append("no time was left to try more frames of the reference")
+            return chosen, found
+        self._known[more.name] = more
+        self._say(more.name.removeprefix(f"{chosen.name}, "))
+        again = self._judged([chosen, more], REFINED, look, folder, self._seed + 500)
         mark_unsound(again)
         again = self._on_recording(again, recording, folder)
-        if self._late():
+        before, one = (next(f for f in again if f.name == name) for name in (chosen.name, more.name))
+        if self._late() or not one.usable or not _better(one, before, self._goal):
             return chosen, found
-        by_name = {one.name: one for one in again}
-        before = by_name[chosen.name]
-        best = chosen
-        for candidate in tried:
-            one = by_name[candidate.name]
-            if one.usable and _better(one, before, self._goal):
-                best, before = candidate, one
-        if best is chosen:
-            return chosen, found
-        self._words.append(f"refined: {best.name.removeprefix(chosen.name + ', ')}")
-        return best, [*found, by_name[best.name]]
+        self._words.append(f"refined: {more.name.removeprefix(f'{chosen.name}, ')}")
+        return more, [*found, one]
 
 
 def _likely(error: Interval) -> float:
@@ -337,11 +332,8 @@ def _likely(error: Interval) -> float:
 
 
 def _better(one: Found, before: Found, goal: Goal) -> bool:
-    """Whether a refinement is worth it: a tenth less time on the whole recording at no more error, or a tenth
-    less error at no more time."""
-    error, was = one.of(goal.kind), before.of(goal.kind)
-    cheaper = one.mean_ms < 0.9 * before.mean_ms and error <= 1.02 * was
-    return cheaper or (error < 0.9 * was and one.mean_ms <= 1.02 * before.mean_ms)
+    """Whether a refinement is worth it: a tenth less error at no more time."""
+    return one.of(goal.kind) < 0.9 * before.of(goal.kind) and one.ms.value <= before.ms.high
 
 
 def front(found: Sequence[Found], kind: str) -> list[str]:
