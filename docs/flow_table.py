@@ -21,6 +21,7 @@ from tactflow.bench.motion import seen_markers
 from tactflow.bench.pipelines import on_recording
 from tactflow.bench.scenes import FULL, NOMINAL, Rendered, render_all
 from tactflow.bench.score import FlowScore
+from tactflow.bench.timing import BLOCK, CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.sim import Truth, open_scene
 from tactflow.vision.flow import FieldModel, SlipTest, flow_in_mask, flow_of_field
@@ -42,12 +43,14 @@ class Row:
 
     limit : with the true outline and the true positions of the markers. found : of the default pipeline.
     plain : mean over the markers inside the outline found. stated : px, standard errors of `found`.
+    cost : of the stages field and flow_in_mask, medians of their calls, copies of a raw frame.
     """
 
     limit: FlowScore = field(default_factory=FlowScore)
     found: FlowScore = field(default_factory=FlowScore)
     plain: FlowScore = field(default_factory=FlowScore)
     stated: list[float] = field(default_factory=list)
+    cost: float | None = None
 
     def add(self, outcome: Outcome, truth: Truth) -> None:
         """One frame."""
@@ -67,6 +70,7 @@ class Row:
             _number(metrics.percentile(self.stated, 50)),
             *(_number(found.get(key), 0) for key in ("flow_within_one", "flow_within_two")),
             _number(plain.get("flow_rms")),
+            _number(self.cost, 1),
         ]
         return f"| {name} | " + " | ".join(cells) + " |"
 
@@ -80,13 +84,17 @@ def from_truth(truth: Truth) -> Flow | None:
     return None if found is None else flow_of_field(found, markers, mask)
 
 
-def measure(rendered: Rendered) -> Row:
-    """Run the default pipeline on one scene."""
+def measure(rendered: Rendered, unit: CopyUnit) -> Row:
+    """Run the default pipeline on one scene. unit : measured along the way."""
     pipeline = LockstepPipeline(on_recording(load_pipeline(PIPELINE), rendered.path), None)
     row = Row()
-    for outcome in iter(pipeline.step, None):
-        if outcome.mapping is not None:
-            row.add(outcome, rendered.truths(outcome.mapping)[outcome.frame.seq])
+    while outcomes := pipeline.block(BLOCK):
+        unit.take(BLOCK)
+        for outcome in outcomes:
+            if outcome.mapping is not None:
+                row.add(outcome, rendered.truths(outcome.mapping)[outcome.frame.seq])
+    times = pipeline.stages_ms()
+    row.cost = (times["field"] + times["flow_in_mask"]) / unit.copy_ms
     return row
 
 
@@ -132,6 +140,7 @@ if __name__ == "__main__":
     if sys.argv[1:] == ["stick"]:
         print_stick_ratios()
         sys.exit()
+    copies = CopyUnit()
     with tempfile.TemporaryDirectory() as folder:
         for recording in render_all(tuple(case for case in FULL if case.label in NOMINAL), Path(folder)):
-            print(measure(recording).text(recording.case.label), flush=True)
+            print(measure(recording, copies).text(recording.case.label), flush=True)

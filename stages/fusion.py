@@ -67,6 +67,7 @@ class Fusion(Stage):
         """Forget the reference; a new one follows."""
         self._motion: MotionTest | None = None
         self._changed = 0
+        self._lit = False
 
     def process(
         self, contact_mask: ContactMask, touching: Touching, markers: Markers | None = None
@@ -82,7 +83,8 @@ class Fusion(Stage):
                 steadiness=params.steadiness,
                 relaxation=params.relaxation,
             )
-        fused = fuse_contact(contact_mask, markers, self._motion)
+        fused = fuse_contact(contact_mask, markers, self._motion, lit=self._lit)
+        self._lit = fused.lit
         self._changed = self._changed + 1 if fused.light_changed else 0
         if self._changed == self.params.patience > 0:
             self.wants_reference = "light_changed"

@@ -118,6 +118,22 @@ def test_a_promise_is_judged_by_the_worst_scene() -> None:
     assert target.met is True
 
 
+def test_the_time_of_a_contact_is_judged_by_the_median_scene_and_by_the_dearest() -> None:
+    made = Result(quick=True, copy_ms=0.1)
+    for scene, copies in (("press", 5.0), ("cable", 11.5), ("two", 6.0)):
+        made.measurements.append(Measurement("pipeline", "default", scene, copies={"contact": copies}))
+        script = Measurement("pipeline", "original script", scene, copies={"contact": 900.0})
+        made.measurements.append(script)
+    (target,) = (
+        t
+        for t in judge(made, "default", None, wedge="wedge", markerless="markerless")
+        if t.quantity == "frame with contact"
+    )
+    assert target.met is False
+    assert "6.0 copies, 11.5 at most; 150 times" in target.result
+    assert "cable" in target.on
+
+
 def test_an_unknown_scene_is_refused_before_anything_is_measured() -> None:
     with pytest.raises(ConfigError, match="nowhere"):
         run_bench(Plan(FILES, scenes=frozenset({"nowhere"})))

@@ -185,15 +185,17 @@ def test_a_full_disk_behind_standard_output_is_an_error_and_no_traceback(words: 
     assert "Traceback" not in done.stderr
 
 
-def test_names_in_brackets_are_shown_as_they_are(tmp_path: Path) -> None:
+def test_names_in_brackets_are_shown_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     name = "[bold][/y]"
     words = ["run", "--source", "sim:idle?frames=3", "--set", "sinks.zmq=null", "--set", "sinks.view=null"]
-    done = program(*words, "--jsonl", f"{name}.jsonl", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert f"jsonl_2: {name}.jsonl" in done.stderr.replace("jsonl: [", "jsonl_2: [")
-    missing = program(*words[:1], "--source", f"{name}.png", *words[3:], cwd=tmp_path)
-    assert missing.returncode == 4
-    *_, error, ending = missing.stderr.splitlines()
+    assert main([*words, "--jsonl", f"{name}.jsonl"]) == 0
+    said = capsys.readouterr().err
+    assert f"jsonl_2: {name}.jsonl" in said.replace("jsonl: [", "jsonl_2: [")
+    assert main([*words[:1], "--source", f"{name}.png", *words[3:]]) == 4
+    *_, error, ending = capsys.readouterr().err.splitlines()
     assert f"capture (--source {name}.png): " in error
     assert ending.endswith("0 dropped (error)")
 

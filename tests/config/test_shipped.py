@@ -23,7 +23,7 @@ def test_a_shipped_pipeline_has_no_mistakes_and_says_what_it_is_for(name: str) -
 def test_a_shipped_pipeline_sees_a_simulated_press(name: str) -> None:
     scene = "unmarked" if name in PLAIN else "bright_dots" if name == "tactip" else "press"
     settings = {"stages.preprocess.downsample": 2, "stages.preprocess.rotate": 90}
-    found = list(tactflow.stream(name, source=f"sim:{scene}?frames=60", settings=settings))
+    found = list(tactflow.stream(name, source=f"sim:{scene}?frames=44", settings=settings))
     assert found[0].contact is None
     assert any(result.contact is not None for result in found)
     assert (found[-1].markers is None) == (name in PLAIN)

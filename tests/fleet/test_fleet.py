@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import zmq
@@ -79,9 +80,17 @@ class Noisy(Capture):
 """
 
 
+class Whole(NamedTuple):
+    """What a run of both sensors has left behind and said."""
+
+    folder: Path
+    out: bytes
+    errors: bytes
+
+
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
-    """A run of both sensors from its start to its end, for many tests: its folder, and its standard error."""
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """A run of both sensors from its start to its end, for many tests."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "noisy.py").write_text(NOISY)
     (folder / "select.py").write_text("open('taken', 'w').close()\n")
@@ -89,41 +98,39 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
         'capture: {source: "sim:press', "capture: {use: './noisy.py:Noisy', source: \"sim:press"
     )
     (folder / "pipeline.yaml").write_text(text)
-    options = ("--stats", "stats.json", "--jsonl", "o-{sensor}.jsonl")
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "tactflow", "run", *options],
+        [sys.executable, "-P", "-m", "tactflow", "run", "--stats", "stats.json", "--jsonl", "-"],
         cwd=folder,
         capture_output=True,
         timeout=100,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return folder, done.stderr
+    return Whole(folder, done.stdout, done.stderr)
 
 
-def test_each_sensor_runs_the_graph_with_its_own_changes(whole: tuple[Path, bytes]) -> None:
-    folder, errors = whole
-    left, right = rows(folder / "out-left.jsonl"), rows(folder / "out-right.jsonl")
+def test_each_sensor_runs_the_graph_with_its_own_changes(whole: Whole) -> None:
+    left, right = rows(whole.folder / "out-left.jsonl"), rows(whole.folder / "out-right.jsonl")
     assert [len(left), len(right)] == [40, 30]
     assert {row["sensor"] for row in left} == {"left"}
     assert left[0]["size"] == [600, 800]
     assert right[0]["size"] == [800, 600]
-    assert json.loads((folder / "stats-left.json").read_text())["frames"] == 40
-    assert b"[left] 40 frames" in errors
+    assert json.loads((whole.folder / "stats-left.json").read_text())["frames"] == 40
+    assert b"[left] 40 frames" in whole.errors
 
 
-def test_added_lines_go_to_a_file_for_each_sensor(whole: tuple[Path, bytes]) -> None:
-    assert sorted(file.name for file in whole[0].glob("o-*")) == ["o-left.jsonl", "o-right.jsonl"]
-    assert [len(rows(whole[0] / name)) for name in ("o-left.jsonl", "o-right.jsonl")] == [40, 30]
+def test_lines_on_standard_output_do_not_mix(whole: Whole) -> None:
+    counts = Counter(json.loads(line)["sensor"] for line in whole.out.splitlines())
+    assert counts == {"left": 40, "right": 30}
 
 
-def test_what_is_no_text_on_standard_error_is_passed_on_with_what_follows(whole: tuple[Path, bytes]) -> None:
-    assert b"[left] no text: \xff\n" in whole[1]
-    assert b"[left] and more\n" in whole[1]
+def test_what_is_no_text_on_standard_error_is_passed_on_with_what_follows(whole: Whole) -> None:
+    assert b"[left] no text: \xff\n" in whole.errors
+    assert b"[left] and more\n" in whole.errors
 
 
-def test_a_file_in_the_current_folder_is_not_taken_for_a_module_of_python(whole: tuple[Path, bytes]) -> None:
-    assert not (whole[0] / "taken").exists()
+def test_a_file_in_the_current_folder_is_not_taken_for_a_module_of_python(whole: Whole) -> None:
+    assert not (whole.folder / "taken").exists()
 
 
 def test_one_sensor_can_be_run_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,13 +138,6 @@ def test_one_sensor_can_be_run_alone(folder: Path, monkeypatch: pytest.MonkeyPat
     assert main(["run", "--sensor", "right", "--quiet"]) == 0
     assert not (folder / "out-left.jsonl").exists()
     assert len(rows(folder / "out-right.jsonl")) == 30
-
-
-def test_lines_on_standard_output_do_not_mix(folder: Path) -> None:
-    done = run("--set", "sinks.jsonl=null", "--jsonl", "-", "--quiet", cwd=folder)
-    assert done.returncode == 0, done.stderr
-    counts = Counter(json.loads(line)["sensor"] for line in done.stdout.splitlines())
-    assert counts == {"left": 40, "right": 30}
 
 
 def test_all_sensors_publish_at_one_address(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,7 +208,8 @@ def test_a_sensor_that_fails_is_started_again_and_the_others_are_not_disturbed(f
     assert (folder / "attempts").read_text() == "xx"
     for file in ("out-left.jsonl", "more-left.jsonl"):
         assert [row["seq"] for row in rows(folder / file)] == [*range(10), *range(40)], "nothing is lost"
-    assert len(rows(folder / "out-right.jsonl")) == 30
+    for file in ("out-right.jsonl", "more-right.jsonl"):
+        assert len(rows(folder / file)) == 30
     assert done.stderr.count("right failed") == 0
     recorded = {path.name: numbers(path) for path in folder.glob("*.mcap")}
     assert recorded == {
@@ -279,13 +280,14 @@ def test_a_start_after_one_that_came_to_no_file_does_with_it_what_was_asked(late
     for name in ("out-left.jsonl", "a-left.mcap", "a-right.mcap"):
         (late / name).write_bytes(b"old")
     options = ("--out", "a.mcap", "--overwrite", "--quiet", "--set", "sinks.jsonl.overwrite=true")
-    done = run(*options, cwd=late, command="record")
+    done = run(*options, "--jsonl", "o-{sensor}.jsonl", cwd=late, command="record")
     assert done.returncode == 0, done.stderr
     assert "left failed (exit code 4); starting again in 1 s" in done.stderr
     assert (late / "attempts").read_text() == "xx"
     assert [row["seq"] for row in rows(late / "out-left.jsonl")] == list(range(40))
     assert sorted(path.name for path in late.glob("*.mcap")) == ["a-left.mcap", "a-right.mcap"]
     assert (late / "a-left.mcap").read_bytes() != b"old"
+    assert [len(rows(late / name)) for name in ("o-left.jsonl", "o-right.jsonl")] == [40, 30]
 
 
 # A module that a sensor's process imports long before it can end well. What it does there comes last.

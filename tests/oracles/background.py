@@ -61,15 +61,17 @@ def plain_scaled_change(
     down: Float,
     mean: Float,
     scale: Float,
+    pattern: Float,
     blurred: Float,
 ) -> None:
-    """The change less that of the illumination, in standard deviations, smoothed along x."""
+    """The change less that of light and pattern, in standard deviations, smoothed along x."""
     high, wide = blurred.shape[1:]
     rows, columns = slice(top, top + high), slice(left, left + wide)
     planes = half.reshape(len(half), -1, 3)[rows, columns].transpose(2, 0, 1)
     window = slice(None), rows, columns
     change = _change(planes, mean[window], coefficients, across[columns], down[rows])
     change *= scale[window]
+    change -= pattern[window] * (pattern[window] * change).sum(axis=0)
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
     for plane, smooth in zip(change, blurred, strict=True):
         smooth[:] = cv2.sepFilter2D(plane, cv2.CV_32F, weights, np.ones(1)).reshape(smooth.shape)

@@ -23,7 +23,7 @@ ALWAYS = frozenset({"idle", "drift", "flicker", "noisy"})
 _COUNTED = {f"{RECORDING}{name}" for name in ("sts_640", "sts_torque160", "handmade_dots", "wrs_cam1")}
 """Recordings with dots that are hard to find."""
 
-MOST_GROWTH = 4.4
+MOST_GROWTH = 4.0
 """Promise: times as long as before that a frame of 4 times the pixels and markers takes at most."""
 
 
@@ -53,8 +53,8 @@ def _times(result: Result, nominal: Collection[Measurement]) -> list[Target]:
     script = {m.scene: m for m in result.of("pipeline", ORIGINAL)}
     copies = f"copies of a raw frame ({result.copy_ms:.3f} ms here)"
     return [
-        _time("frame with contact", nominal, script, "contact", 13, 60, copies),
-        _time("frame without contact", nominal, script, "idle", 5, 150, copies),
+        _time("frame with contact", nominal, script, "contact", 8, 100, copies, worst=11),
+        _time("frame without contact", nominal, script, "idle", 1.5, 150, copies),
     ]
 
 
@@ -158,21 +158,25 @@ def _time(
     most: float,
     faster: float,
     unit: str,
+    *,
+    worst: float | None = None,
 ) -> Target:
+    """Judged by the median of the scenes, and by the dearest one if `worst` is given."""
     known = [m for m in measurements if kind in m.copies]
     ratios = [
         script[m.scene].copies[kind] / m.copies[kind]
         for m in known
         if m.scene in script and kind in script[m.scene].copies
     ]
-    target = f"<= {most:g} {unit}; >= {faster:g} times as fast as the original script"
+    at_most = f", <= {worst:g} in each" if worst is not None else ""
+    target = f"<= {most:g} {unit}{at_most}; >= {faster:g} times as fast as the original script"
     if not known or not ratios:
         return Target(name, target, "-", None)
-    cost = median(m.copies[kind] for m in known)
-    result = f"{cost:.1f} copies; {median(ratios):.0f} times"
-    return Target(
-        name, target, result, cost <= most and median(ratios) >= faster, f"median of {len(known)} scenes"
-    )
+    cost, dearest = median(m.copies[kind] for m in known), max(known, key=lambda m: m.copies[kind])
+    highest = dearest.copies[kind]
+    met = cost <= most and (worst is None or highest <= worst) and median(ratios) >= faster
+    result = f"{cost:.1f} copies, {highest:.1f} at most; {median(ratios):.0f} times"
+    return Target(name, target, result, met, f"median of {len(known)} scenes; most: {dearest.scene}")
 
 
 def _worst(

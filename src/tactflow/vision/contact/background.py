@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tactflow.vision.contact.background_kernels import change_strength, scaled_change, weigh_change
 from tactflow.vision.contact.contact_outline import WindowChange
 from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
-from tactflow.vision.contact.response import light_response
+from tactflow.vision.contact.response import EVEN, light_response
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 
@@ -38,6 +38,9 @@ NOISE_CORRELATION: Final = 2.0
 leave little noise between neighbours, and more over distances. Chosen by hand."""
 CELL_VALID: Final = 128
 """Mean of a valid area, 0 to 255, over a cell that counts, at least: half of it."""
+CUT: Final = 0.5
+"""Change at the picture's border, over the largest one of a contact, from which on the border cuts it. Chosen
+by hand, near the part at which `contact_outline` takes a change for the contact's."""
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
@@ -71,7 +74,8 @@ class _Derived:
 
     weight : one over the standard deviation. brightness : weight of a change along the background's own
     colour. colour_factor : (h, w), how much more a change of colour counts than one of brightness.
-    half_scale : turns grey levels into standard deviations.
+    half_scale : turns grey levels into standard deviations. pattern : part of such a change that is left out,
+    as `scaled_change` takes it.
     """
 
     illumination: IlluminationModel
@@ -81,6 +85,7 @@ class _Derived:
     colour_factor: Float
     half_mean: Float
     half_scale: Float
+    pattern: Float
 
 
 class BackgroundModel:
@@ -181,7 +186,8 @@ class BackgroundModel:
     ) -> WindowChange:
         """How strongly a window has changed, in standard deviations, at half resolution.
 
-        Slopes of all directions count alike, as far as `light_response` can tell how they show.
+        Slopes of all directions count alike, as far as `light_response` can tell how they show: not where the
+        picture ends before the contact does.
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
         count.
         """
@@ -197,9 +203,11 @@ class BackgroundModel:
             positions(len(change.half)),
             known.half_mean,
             known.half_scale,
+            known.pattern,
             blurred,
         )
-        response = light_response(blurred, inside)
+        whole = not _cut_by_border(blurred, rows, columns, known.colour_factor.shape)
+        response = light_response(blurred, inside) if whole else EVEN
         belongs = np.ascontiguousarray(inside).view(np.uint8)
         change_strength(blurred, belongs, *response, strength, brightness)
         return WindowChange(strength, brightness)
@@ -217,7 +225,7 @@ class BackgroundModel:
         factor = (variance / (steady + (self._tint * mean) ** 2)).min(axis=0)
         direction = mean * weight
         direction /= np.linalg.norm(direction, axis=0) + np.float32(1e-6)
-        half_scale = self._half_scale(np.asarray(noise, np.float32))
+        half_scale, pattern = self._half_scale(np.asarray(noise, np.float32))
         if self._counts is not None:
             weight = weight * self._counts
             half_scale = half_scale * self._counts.repeat(2, axis=0).repeat(2, axis=1)
@@ -229,20 +237,47 @@ class BackgroundModel:
             colour_factor=np.asarray(factor, np.float32),
             half_mean=half,
             half_scale=np.asarray(half_scale, np.float32),
+            pattern=pattern,
         )
         return self._known
 
-    def _half_scale(self, noise: Float) -> Float:
-        """One over the standard deviation at half resolution, (3, 2h, 2w). noise : variance of cells.
+    def _half_scale(self, noise: Float) -> tuple[Float, Float]:
+        """What turns grey levels into deviations at half resolution, and the pattern in them.
 
+        Both (3, 2h, 2w). noise : variance of cells.
         Half a cell, smoothed, is about as noisy as a smoothed cell. How far the light varies is taken from
         the brightness of the whole picture: relative to itself, a dark channel that a tilt lights up would
-        outshine the others.
+        outshine the others. Where a pattern on the gel has moved, all channels change in proportion: in that
+        direction e, standard deviations, the variance is 1 + e^2, in others still 1.
         """
         light = self._repeatability * self._half.mean()
-        edges = self._shift / 2 * _steepness(self._half)
-        variance = noise.mean(axis=(1, 2), keepdims=True) + light**2 + edges**2
-        return np.asarray(1 / np.sqrt(variance), np.float32)
+        together, apart = _steepness_of_pattern(self._half)
+        variance = noise.mean(axis=(1, 2), keepdims=True) + light**2 + (self._shift / 2 * apart) ** 2
+        scale = np.asarray(1 / np.sqrt(variance), np.float32)
+        pattern = (self._shift / 2) * together * scale
+        square = (pattern * pattern).sum(axis=0)
+        left_out = (1 - 1 / np.sqrt(1 + square)) / np.maximum(square, np.float32(1e-6))
+        return scale, np.asarray(pattern * np.sqrt(left_out), np.float32)
+
+
+def _cut_by_border(change: Float, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
+    """Whether a contact, not only what is left of its change further out, reaches the picture's border.
+
+    change : (3, 2h, 2w), of a window. rows, columns : the window, cells. shape : of the picture, cells.
+    """
+    sides = [
+        line
+        for line, at_border in (
+            (change[:, 0], rows.start == 0),
+            (change[:, -1], rows.stop == shape[0]),
+            (change[:, :, 0], columns.start == 0),
+            (change[:, :, -1], columns.stop == shape[1]),
+        )
+        if at_border
+    ]
+    if not sides:
+        return False
+    return max(float(np.abs(line).max()) for line in sides) > CUT * float(np.abs(change).max())
 
 
 def _planes(picture: NDArray[np.uint8]) -> Float:
@@ -280,12 +315,33 @@ def _counting(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArr
 
 def _steepness(planes: Float) -> Float:
     """Grey levels per cell by which the brightness changes, here or in the cells around; (3, h, w)."""
-    return np.stack([_plane_steepness(plane) for plane in planes])
+    return np.stack([_length_around(*_gradient(plane)) for plane in planes])
 
 
-def _plane_steepness(plane: Float) -> Float:
+def _steepness_of_pattern(planes: Float) -> tuple[Float, Float]:
+    """Grey levels per cell by which all channels change in proportion, and those by which each does beside.
+
+    As `_steepness`.
+    """
+    gradients = [_gradient(plane) for plane in planes]
+    total = np.maximum(planes.sum(axis=0), np.float32(1))
+    across, down = (np.asarray(sum(parts) / total, np.float32) for parts in zip(*gradients, strict=True))
+    apart = [
+        _length_around(x - plane * across, y - plane * down)
+        for plane, (x, y) in zip(planes, gradients, strict=True)
+    ]
+    return planes * _length_around(across, down), np.stack(apart)
+
+
+def _gradient(plane: Float) -> tuple[Float, Float]:
+    """Changes per cell along x and y, (h, w) each."""
     across = cv2.Scharr(plane, cv2.CV_32F, 1, 0, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
     down = cv2.Scharr(plane, cv2.CV_32F, 0, 1, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(across, np.float32), np.asarray(down, np.float32)
+
+
+def _length_around(across: Float, down: Float) -> Float:
+    """(h, w): the largest length of a gradient, here or in the cells around."""
     return np.asarray(cv2.dilate(cv2.magnitude(across, down), np.ones((3, 3), np.uint8)), np.float32)
 
 

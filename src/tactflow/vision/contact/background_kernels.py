@@ -94,7 +94,7 @@ def weigh_change(
 
 @kernel(
     "void(uint8[:, ::1], int64, int64, float32[:, ::1], float32[::1], float32[::1], float32[:, :, ::1],"
-    " float32[:, :, ::1], float32[:, :, ::1])",
+    " float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1])",
     reorder=True,
 )
 def scaled_change(
@@ -106,28 +106,38 @@ def scaled_change(
     down: Float,
     mean: Float,
     scale: Float,
+    pattern: Float,
     blurred: Float,
 ) -> None:
     """How a window has changed at half resolution, in standard deviations, smoothed along x.
 
     half : (H, 3 W), the frame. top, left : of the window. coefficients, across, down : as for
-    `weigh_change`, at this resolution. mean, scale : (3, H, W). blurred : (3, h, w), filled.
+    `weigh_change`, at this resolution. mean, scale : (3, H, W). pattern : (3, H, W), direction p in which the
+    channels change where the gel's pattern moves: of a change v, (p . v) p is left out.
+    blurred : (3, h, w), filled.
     """
     high, wide = blurred.shape[1:]
-    line, place = np.empty(wide, np.float32), across[left:]
+    lines, place = np.empty((3, wide), np.float32), across[left:]
+    along = np.empty(wide, np.float32)
     second, last = min(1, wide - 1), wide - 1
     for y in range(high):
         picture = half[top + y, 3 * left :]
         for c in range(3):
             gain = coefficients[c, 0] + coefficients[c, 2] * down[top + y]
             slope, offset = coefficients[c, 1], coefficients[c, 3]
-            usual, unit, row = mean[c, top + y, left:], scale[c, top + y, left:], blurred[c, y]
+            usual, unit = mean[c, top + y, left:], scale[c, top + y, left:]
+            line, toward = lines[c], pattern[c, top + y, left:]
             for x in range(wide):
                 light = usual[x] * (gain + slope * place[x]) + offset
                 value = np.float32(picture[3 * x + c])
                 change, least = value - usual[x] - light, value - WHITE
                 change = change if change > least else least
                 line[x] = change * unit[x]
+                along[x] = line[x] * toward[x] + (along[x] if c else np.float32(0))
+        for c in range(3):
+            line, row, toward = lines[c], blurred[c, y], pattern[c, top + y, left:]
+            for x in range(wide):
+                line[x] -= along[x] * toward[x]
             for x in range(1, wide - 1):
                 row[x] = (line[x - 1] + line[x + 1]) * BESIDE + line[x] * MIDDLE
             row[0] = (line[second] + line[second]) * BESIDE + line[0] * MIDDLE
