@@ -22,7 +22,7 @@ from tactflow.bench.timing import CopyUnit
 from tactflow.config.shipped import find_pipeline
 from tactflow.tune.measure import Found, judge, mark_unsound, on_sensor
 from tactflow.tune.recording import take
-from tactflow.tune.search import DEFAULT, Goal, Search, Tuned
+from tactflow.tune.search import DEFAULT, ROUNDS, Goal, Search, Tuned
 from tactflow.tune.sensor import Fitted, Look
 from tactflow.tune.space import Candidate, candidates
 
@@ -36,7 +36,7 @@ SENSORS = {
     "bright dots": ("default", Look((800, 600), "markers=10x8&polarity=bright", 2.0, 0.0, 0, WHITE, 1.0)),
 }
 """Name -> the pipeline that tune starts from, and the sensor."""
-JUDGED = (Case("press", 56), Case("slide", 32))
+JUDGED = ROUNDS[-1]
 """Recordings on which everything is judged with its truth: the contacts that tune judges by, made anew."""
 ALLOWED = 1.5
 """The budget, in least true errors."""

@@ -86,15 +86,20 @@ def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     assert report.html(tuned).count("<circle") == sum(not one.failure for one in tuned.found)
 
 
-def test_a_budget_that_is_over_ends_the_search_after_the_first_round(
+def test_a_budget_that_is_over_ends_the_search_after_a_group_of_candidates(
     recorded: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tactflow.tune.space.AXES", (Axis("fusion", {"fusion": {}}),))
+    several = Axis("fusion", {"fusion": {}, "no fusion": {"stages.fusion": None}, "without": {}})
+    monkeypatch.setattr("tactflow.tune.space.AXES", (several,))
+    monkeypatch.setattr(search, "GROUP", 2)
     monkeypatch.setattr(search, "ROUNDS", ((Case("press", 16),), (Case("press", 20),)))
     tuned = Search(find_pipeline("default"), Goal(), seconds=1e-6).run(recorded, tmp_path)
     assert tuned.rounds == [(2, 16)]
     assert tuned.chosen is not None
-    assert "the budget was over after round 1 of 2" in tuned.words
+    assert tuned.words[:2] == [
+        "the budget was over after 2 of 4 candidates",
+        "the budget was over after round 1 of 2",
+    ]
     # The recording was not shown any more: the times are of the simulated one.
     assert not any(one.checks for one in tuned.found)
     assert all(one.ms.value > 0 for one in tuned.found)

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from tactflow.bench.scenes import Case
 from tactflow.bench.timing import CopyUnit
 from tactflow.engine.errors import ConfigError, SourceError
@@ -38,6 +40,8 @@ FINALISTS: Final = 6
 """Candidates of the last round, at most. Chosen by hand."""
 REFINED: Final = (Case("press", 140),)
 """Simulated recording for more references: untouched for 14 frames."""
+GROUP: Final = 6
+"""Candidates of the first round that take turns; between groups the budget may end it. Chosen by hand."""
 FEWEST: Final = 3
 """Candidates with which a round is begun, at least. Chosen by hand."""
 ALLOWED: Final = 1.5
@@ -116,9 +120,9 @@ class Search:
     ----------
     file : the user's pipeline. sensor : which of several, or None. original : the
     original script's pipeline, for comparison. goal : what is asked for.
-    seconds : the budget. Finished in any case are the first round, a simulated recording that is under way,
-    and a turn of all candidates on the recording. seed : of the simulated recordings and the intervals.
-    refine : whether more references are tried. say : told what happens.
+    seconds : the budget. Finished in any case are a group of the first round, a simulated recording that is
+    under way, and a turn of all candidates on the recording. seed : of the simulated recordings and the
+    intervals. refine : whether more references are tried. say : told what happens.
     """
 
     def __init__(
@@ -193,11 +197,14 @@ class Search:
             started = time.monotonic()
             frames = sum(case.frames for case in cases)
             self._say(f"round {number + 1}: {len(running)} candidates, {frames} frames")
-            found = self._judged(running, cases, look, folder, self._seed + 100 * number)
+            if number:
+                found = self._judged(running, cases, look, folder, self._seed + 100 * number)
+            else:
+                found = self._first_round(running, look, folder)
             mark_unsound(found)
             seen = max((one.frames for one in found), default=0)
-            self._rounds.append((len(running), seen))
-            self._pace = (time.monotonic() - started) / max(1, len(running) * seen)
+            self._rounds.append((len(found), seen))
+            self._pace = (time.monotonic() - started) / max(1, len(found) * seen)
             if number + 1 == len(ROUNDS):
                 break
             # Half of the time is for what comes after the next round.
@@ -207,6 +214,19 @@ class Search:
                 names = {candidate.name for candidate in self._kept(found, number, FINALISTS)}
                 return [one for one in found if one.name in names]
             running = self._kept(found, number, room)
+        return found
+
+    def _first_round(self, running: Sequence[Candidate], look: Look, folder: Path) -> list[Found]:
+        """All of them, a group at a time and the groups from all over the list, until the budget is over."""
+        order = [0, *(1 + np.random.default_rng(self._seed).permutation(len(running) - 1))]
+        groups = max(1, round(len(running) / GROUP))
+        found: list[Found] = []
+        for start in range(groups):
+            if found and self._late():
+                self._words.append(f"the budget was over after {len(found)} of {len(running)} candidates")
+                break
+            group = [running[index] for index in order[start::groups]]
+            found += self._judged(group, ROUNDS[0], look, folder, self._seed)
         return found
 
     def _judged(

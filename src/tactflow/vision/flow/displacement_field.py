@@ -223,7 +223,9 @@ class _Update:
     def __init__(self, inverse: FloatArray, chosen: IntArray, certainty: FloatArray) -> None:
         self._chosen = chosen
         self._columns = inverse[:, chosen]
-        self._middle = np.linalg.inv(np.diag(certainty) + self._columns[chosen])
+        # Of few markers; a third of the time of NumPy's, nothing of which is in the caches.
+        _, middle = cv2.invert(np.diag(certainty) + self._columns[chosen])
+        self._middle = np.asarray(middle, np.float64)
 
     def apply(self, product: FloatArray) -> FloatArray:
         """The new inverse times something, from the old inverse times the same, (N, m)."""
