@@ -6,12 +6,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from tactflow.cli.main import main
+from tests.clock import PATIENCE
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
@@ -25,10 +25,9 @@ def test_one_ctrl_c_ends_compiling_and_the_processes_that_help(tmp_path: Path) -
         while line and "compiling" not in line:
             line = run.stderr.readline()
         run.send_signal(signal.SIGINT)
-        begin = time.monotonic()
-        assert run.wait(timeout=30) == 0
-        # As long as it takes to compile the longest loop on a machine with other work.
-        assert time.monotonic() - begin < 10
+        assert run.wait(PATIENCE) == 0
+    # Each process may finish the loop at which it is; the default pipeline has some twenty.
+    assert len(list((tmp_path / "kept").rglob("*.nbi"))) < 10
     assert not [path for path in Path("/proc").glob("[0-9]*") if mentions(path, tmp_path)]
 
 

@@ -22,9 +22,12 @@ def picture(seq: int) -> np.ndarray:
 
 def run(folder: Path, seqs: list[int], **params: Any) -> Images:
     sink = Images(Images.Params(folder=str(folder), **params))
-    sink.open()
-    for seq in seqs:
-        sink.write(Tick(Frame("main", seq, 0.0, picture(seq))), picture(seq))
+    try:
+        sink.open()
+        for seq in seqs:
+            sink.write(Tick(Frame("main", seq, 0.0, picture(seq))), picture(seq))
+    finally:
+        sink.close()
     return sink
 
 
