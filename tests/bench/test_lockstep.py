@@ -157,30 +157,6 @@ class Sleeps(Stage):
     assert all(outcome.cpu < outcome.wall for outcome in outcomes[1::2])
 
 
-def test_what_is_kept_of_a_frame_is_not_the_memory_that_the_pipeline_works_in(tmp_path: Path) -> None:
-    source = """
-from tactflow.engine.contract import Stage
-from tactflow.engine.frame import Frame
-from tactflow.ports import Image
-import numpy as np
-
-class Again(Stage):
-    memory = "pure"
-    def __init__(self, params):
-        self.picture = np.zeros((6, 8, 3), np.uint8)
-    def process(self, frame: Frame) -> Image:
-        self.picture[:] = frame.image
-        return self.picture
-"""
-    (tmp_path / "stages.py").write_text(source)
-    (tmp_path / "pipeline.yaml").write_text(PIPELINE.replace("stages.py:Mean", "stages.py:Again"))
-    again = load_pipeline(tmp_path / "pipeline.yaml")
-    lockstep = LockstepPipeline(on_recording(again, recording(tmp_path, 1, 2, 3)), None)
-    kept = [outcome.image for outcome in lockstep.block(3)]
-    lockstep.close()
-    assert [int(image[0, 0, 0]) for image in kept if image is not None] == [1, 2, 3]
-
-
 def test_what_it_takes_to_read_a_recording_is_no_part_of_a_frames_time(
     pipeline: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,6 @@ memory as a camera's do, and not in the cache.
 
 from __future__ import annotations
 
-import mmap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -166,16 +165,16 @@ class LockstepPipeline:
     def _keep(self, cpu: float, wall: float) -> None:
         collect: Any = self._runner.nodes[_COLLECT].instance
         source: Any = self._runner.source
-        last, collect.last = collect.last, {}
+        last = collect.last
         self._outcomes.append(
             Outcome(
                 frame=source.last_frame,
                 contact=last.get("contact"),
                 flow=last.get("flow"),
                 markers=last.get("markers"),
-                contact_mask=_aside(last.get("contact_mask")),
+                contact_mask=last.get("contact_mask"),
                 mapping=last.get("mapping"),
-                image=_aside(last.get("image")),
+                image=last.get("image"),
                 cpu=cpu,
                 wall=wall,
             )
@@ -235,18 +234,6 @@ class LockstepPipeline:
 
 _COLLECT = "bench"
 """Id of the sink that takes each frame's results."""
-
-
-def _aside(array: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
-    """A copy in memory of its own: kept themselves, results would have the next frame use fresh memory.
-
-    In contacts of `cable`, that was 100 pages a frame, which cost 1.5 copies of the raw frame.
-    """
-    if array is None:
-        return None
-    copy = np.frombuffer(mmap.mmap(-1, array.nbytes), array.dtype).reshape(array.shape)
-    copy[...] = array
-    return copy
 
 
 class _InMemory:

@@ -120,7 +120,7 @@ def colour_change(image: Bytes, rest: Rest, window: Window) -> Float:
 
 
 def surroundings(mask: Bytes, whole: Window, relative: float = MARGIN) -> Surroundings:
-    """Around the contact of a mask (H, W) uint8, not 0 in contact; not all 0.
+    """Around the contact of a mask (H, W) uint8, 255 in contact; not all 0.
 
     relative : how far, in halves of the contact's shorter axis; `LEAST_MARGIN` at least.
     """
@@ -191,7 +191,7 @@ class Surface:
     def depth(self, image: Bytes, rest: Rest, mask: Bytes) -> Depth:
         """The height map of a frame.
 
-        image : (H, W, 3) uint8, BGR, without markers. mask : (H, W) uint8, not 0 in contact; not all 0.
+        image : (H, W, 3) uint8, BGR, without markers. mask : (H, W) uint8, 255 in contact; not all 0.
         """
         around = surroundings(mask, rest.window)
         window = around.window
