@@ -201,7 +201,7 @@ class Fitted(Rendered):
         self.frames = np.lib.format.open_memmap(self.path, mode="w+", dtype=np.uint8, shape=shape)
         rng = np.random.default_rng([seed, 0x7475])
         for index in range(case.frames):
-            self.frames[index] = self._spoilt(look, self.draw(look, self.scene, index), rng)
+            self.frames[index] = self._spoilt(look, self._light(look, self.scene, index), rng)
         self.frames.flush()
         self._truths: dict[Any, list[Truth]] = {}
         self._scale = width / SIZE[0], height / SIZE[1]
@@ -209,18 +209,25 @@ class Fitted(Rendered):
     @staticmethod
     def draw(look: Look, scene: Any, index: int) -> Image:
         """A frame without noise, of the sensor's size, light and contrast of dots."""
-        image = scene.frame(index)
+        return compressed(Fitted._light(look, scene, index), 0)
+
+    @staticmethod
+    def _light(look: Look, scene: Any, index: int) -> NDArray[np.float32]:
+        """The same in grey levels that are not rounded: rounded before the noise is added, they have steps in
+        which nothing changes, and the contact's centre is off by half as much again.
+        """
+        image = scene.frame(index).astype(np.float32)
         if look.contrast != 1.0:
-            image = cv2.addWeighted(image, look.contrast, scene.clean(index), 1.0 - look.contrast, 0.0)
+            clean = scene.clean(index).astype(np.float32)
+            image = cv2.addWeighted(image, look.contrast, clean, 1.0 - look.contrast, 0.0)
         if look.size != SIZE:
             shrinks = look.size[0] < SIZE[0]
             image = cv2.resize(image, look.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-        return np.asarray(np.clip(image * np.array(look.levels), 0, 255), np.uint8)
+        return np.asarray(image * np.array(look.levels, np.float32), np.float32)
 
     @staticmethod
-    def _spoilt(look: Look, image: Image, rng: np.random.Generator) -> Image:
+    def _spoilt(look: Look, light: NDArray[np.float32], rng: np.random.Generator) -> Image:
         """The same as the camera gives it."""
-        light = image.astype(np.float32)
         if look.blur:
             light = np.asarray(cv2.GaussianBlur(light, (0, 0), look.blur), np.float32)
         light += np.float32(look.noise) * rng.standard_normal(light.shape, dtype=np.float32)
