@@ -67,7 +67,6 @@ class Fusion(Stage):
         """Forget the reference; a new one follows."""
         self._motion: MotionTest | None = None
         self._changed = 0
-        self._lit = False
 
     def process(
         self, contact_mask: ContactMask, touching: Touching, markers: Markers | None = None
@@ -83,8 +82,7 @@ class Fusion(Stage):
                 steadiness=params.steadiness,
                 relaxation=params.relaxation,
             )
-        fused = fuse_contact(contact_mask, markers, self._motion, lit=self._lit)
-        self._lit = fused.lit
+        fused = fuse_contact(contact_mask, markers, self._motion)
         self._changed = self._changed + 1 if fused.light_changed else 0
         if self._changed == self.params.patience > 0:
             self.wants_reference = "light_changed"

@@ -54,6 +54,7 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first, the others in the order in which they were found."""
     places = {REPOSITORY / "tests" / name: place for place, name in enumerate(LONG_FILES)}
+    assert all(path.is_file() for path in places), "a file of LONG_FILES is not there any more"
     items.sort(key=lambda item: places.get(item.path, len(places)))
 
 

@@ -41,28 +41,6 @@ def test_what_both_see_has_the_outline_of_the_light() -> None:
     assert fused.mask is seen
 
 
-def test_markers_on_their_way_back_from_a_contact_that_the_light_showed_are_none() -> None:
-    test, lit = MotionTest(ORIGIN), False
-    seen = light(120, 100, 170, 150)
-    told = []
-    for shown, displacement in (
-        (seen, 30.0),
-        (DARK, 28.0),  # the light fails for a frame
-        (DARK, 5.0),
-        (DARK, 4.0),
-        (seen, 30.0),
-        (DARK, 0.0),
-        (DARK, 20.0),  # another contact, in the dark
-    ):
-        fused = fuse_contact(shown, markers(displacement), test, lit=lit)
-        lit = fused.lit
-        told.append(fused.evidence)
-    assert told == ["both", "dots", None, None, "both", None, "dots"]
-    # Where the light never showed it, the same motion is contact.
-    alone = MotionTest(ORIGIN)
-    assert [fuse_contact(DARK, markers(d), alone).evidence for d in (30.0, 5.0)] == ["dots", "dots"]
-
-
 def test_a_second_region_is_contact_only_if_markers_around_it_move_as_well() -> None:
     pressed, beside, far = light(120, 100, 170, 150), light(60, 60, 90, 90), light(275, 15, 310, 60)
     for seen, kept in ((pressed | far, pressed), (pressed | beside, pressed | beside), (far, far)):

@@ -38,9 +38,6 @@ more for smoothing. Chosen by hand."""
 RIM: Final = 2.0
 """Distance of a region from the centre of a marker, radii, up to which it may be what is left of it. Chosen
 by hand: on sts_640 and tactip_video such remains are 0 to 1.9 away."""
-LET_GO: Final = 0.25
-"""Part of the strongest recent motion up to which markers are on their way back, once the light no longer
-shows the contact that it showed. Where the simulated ball of `slide` leaves the gel it is 0.10 to 0.18."""
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 
 
@@ -49,14 +46,12 @@ class FusedContact:
     """Where a frame shows contact.
 
     mask : (H, W) uint8, 255 in contact. evidence : what showed it; None where nothing touches.
-    light_changed : whether there is a change of the light that is no contact. lit : whether the light has
-    shown this contact, now or before, or that one from which the markers are on their way back.
+    light_changed : whether there is a change of the light that is no contact.
     """
 
     mask: Mask
     evidence: Evidence | None
     light_changed: bool = False
-    lit: bool = False
 
     @property
     def touching(self) -> bool:
@@ -64,14 +59,13 @@ class FusedContact:
         return self.evidence is not None
 
 
-def fuse_contact(light: Mask, markers: Markers, test: MotionTest, *, lit: bool = False) -> FusedContact:
+def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContact:
     """Join the contact that the light shows and the one that the markers show.
 
     Parameters
     ----------
     light : (H, W) uint8, 255 where the light shows contact; returned as it is where it shows the contact.
     markers : of the same frame. test : of the motion of these markers, given every frame in order.
-    lit : what the frame before gave; then markers alone show a contact only while they do not go back.
 
     Returns
     -------
@@ -92,16 +86,13 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest, *, lit: bool =
     if not cv2.countNonZero(light):
         if not motion.clearly:
             return FusedContact(light, None)
-        if lit and motion.largest < LET_GO * test.strongest:
-            return FusedContact(light, None, lit=True)
-        return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots", lit=lit)
+        return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        return FusedContact(_without_reflections(light, markers, motion, test.pitch), "both", lit=True)
+        return FusedContact(_without_reflections(light, markers, motion, test.pitch), "both")
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
     light = _without_rims(light, markers)
-    shown = cv2.countNonZero(light) > 0
-    return FusedContact(light, "light" if shown else None, lit=shown)
+    return FusedContact(light, "light" if cv2.countNonZero(light) else None)
 
 
 def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:

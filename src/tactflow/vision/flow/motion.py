@@ -128,8 +128,7 @@ class MotionTest:
         # A motion in a plane exceeds k standard deviations with exp(-k^2 / 2); three must at once.
         alone = (false_alarms / (TRIPLES * max(1, len(origin)))) ** (1 / TOGETHER)
         self._limit = math.sqrt(-2 * math.log(alone))
-        self.strongest = 0.0
-        """The third largest of the motions, px, in the frame in which it was most; fades by `FORGET`."""
+        self._strongest = 0.0
         self._moving = self._clearly = False
 
     def __call__(self, markers: Markers) -> Motion:
@@ -148,7 +147,7 @@ class MotionTest:
             if number >= TOGETHER:
                 moved = markers.position[tracked].T - self._origin[:, tracked]
                 left[tracked] = _unexplained(moved, self._arms[:, tracked])
-        remembered = self._relaxation * self.strongest
+        remembered = self._relaxation * self._strongest
         bound = self._limit * np.sqrt(markers.stderr * markers.stderr + self._variance)
         far = np.maximum(ALONE * (STAY if self._clearly else 1.0) * bound, remembered)
         # Comparing with an unknown standard error, which is NaN, gives False. What is beyond the far bound is
@@ -157,7 +156,7 @@ class MotionTest:
         near = np.maximum(STAY * bound if self._moving else bound, remembered)
         self._moving = self._clearly or self._together(left > near)
         largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
-        self.strongest = max(self.strongest * FORGET, largest if self._moving else 0.0)
+        self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
         return Motion(self._moving, self._clearly, largest, left, bound)
 
     def stretched(self, markers: Markers) -> FloatArray:
