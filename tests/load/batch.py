@@ -6,8 +6,8 @@
     python -m tests.load.batch growth
     python -m tests.load.batch resume
 
-Each takes two to four minutes on two quiet cores, tells what it has done on stderr, and prints the table that
-stands in docs/batch.md. Everything is written below a temporary folder. `--recordings` makes it shorter.
+Each tells what it has done on stderr, and prints the table that stands in docs/batch.md. Everything is written
+below a temporary folder. `--recordings` makes it shorter.
 """
 
 from __future__ import annotations
