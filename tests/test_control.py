@@ -6,7 +6,6 @@ import json
 import socket as system_socket
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -206,25 +205,6 @@ def test_only_who_has_a_key_is_obeyed(tmp_path: Path) -> None:
             assert run.ping()["ok"]
     finally:
         sink.close()
-
-
-def test_who_hangs_up_again_and_again_is_no_tactflow() -> None:
-    with system_socket.create_server(("127.0.0.1", 0)) as listener:
-
-        def hang_up() -> None:
-            with suppress(OSError):
-                while True:
-                    listener.accept()[0].close()
-
-        thread = threading.Thread(target=hang_up)
-        thread.start()
-        with (
-            remote(f"tcp://127.0.0.1:{listener.getsockname()[1]}") as run,
-            pytest.raises(PermissionError, match="is no tactflow"),
-        ):
-            run.ping()
-        listener.shutdown(system_socket.SHUT_RDWR)
-        thread.join()
 
 
 def test_an_address_that_others_reach_takes_keys_also_where_everybody_may_read() -> None:

@@ -15,6 +15,7 @@ from tactflow import publisher as publisher_module
 from tactflow.cli.main import main
 from tactflow.client import Subscriber
 from tactflow.config.load import load_pipeline
+from tactflow.connection import asked_for
 from tactflow.engine.errors import StageError
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import clash_problems
@@ -117,6 +118,19 @@ def test_the_relay_of_several_sensors_asks_for_keys_and_their_own_processes_need
                 stranger.receive()
     finally:
         sensor.close(0)
+
+
+def test_what_a_publisher_asks_for_is_known_before_it_hangs_up(
+    folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    for endpoint in ("tcp://127.0.0.1:*", f"ipc://{tmp_path}/results"):
+        for keys, mechanism in ((None, "NULL"), (str(folders[0]), "CURVE")):
+            opened = Publisher(endpoint, 1, 32768, keys)
+            try:
+                assert asked_for(opened.endpoint) == mechanism
+            finally:
+                opened.close(0)
+        assert asked_for(opened.endpoint) is None
 
 
 def test_several_sensors_with_different_keys_at_one_address_are_refused(tmp_path: Path) -> None:

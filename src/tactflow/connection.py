@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import math
+import socket as system_socket
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +24,45 @@ BROKEN_OFF = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 """The other side has hung up before it said which keys it asks for, or was ended; ZeroMQ tries again."""
 
 
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03"
+"""How a greeting of ZMTP 3 begins: signature and version (rfc.zeromq.org/spec/37)."""
+MECHANISM = slice(12, 32)
+"""Where the other side's greeting names what it asks for: NULL, or CURVE for keys."""
+PATIENCE = 1.0
+"""Time to connect and to be greeted at most, s. Chosen by hand."""
+
+
+def asked_for(endpoint: str) -> str | None:
+    """What the side at an address asks for, NULL or CURVE; None if it does not greet as ZeroMQ does.
+
+    ZeroMQ hangs up on who does not name the same, often before its own greeting is out, and then the socket
+    cannot tell why. Who names nothing is greeted.
+    """
+    scheme, _, place = endpoint.partition("://")
+    try:
+        if scheme == "ipc" and sys.platform != "win32":
+            with system_socket.socket(system_socket.AF_UNIX) as stream:
+                stream.settimeout(PATIENCE)
+                stream.connect(place)
+                return _mechanism(stream)
+        host, _, port = place.rpartition(":")
+        with system_socket.create_connection((host.strip("[]"), int(port)), PATIENCE) as stream:
+            return _mechanism(stream)
+    except (OSError, ValueError):
+        return None
+
+
+def _mechanism(stream: system_socket.socket) -> str | None:
+    stream.sendall(GREETING)
+    greeting = b""
+    while len(greeting) < MECHANISM.stop:
+        received = stream.recv(MECHANISM.stop - len(greeting))
+        if not received:
+            return None
+        greeting += received
+    return greeting[MECHANISM].rstrip(b"\0").decode("ascii", "replace")
+
+
 class Connection:
     """A socket with a context of its own that notices when it is not admitted; a context manager.
 
@@ -31,8 +72,6 @@ class Connection:
     options : ZeroMQ's number of an option -> its value.
     keys : the subscriber's folder that `tactflow keys new` makes; None where there are none.
     example : an endpoint, for the error about one that is no address.
-    tries : handshakes that may be broken off before this counts as a refusal. A side that asks for keys may
-        break off before it has said so, every time; so may what stands for a run that is not there yet.
 
     Raises
     ------
@@ -47,10 +86,9 @@ class Connection:
         options: Mapping[int, int | bytes],
         keys: str | Path | None,
         example: str,
-        tries: float = math.inf,
     ) -> None:
         self.endpoint = endpoint
-        self._tries = tries
+        self._is_refused = False
         self._has_keys = keys is not None
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(kind)
@@ -83,13 +121,14 @@ class Connection:
             If the other side does not admit us.
         """
         end = time.monotonic() + seconds
-        while self._tries > 0:
+        while not self._is_refused:
             left = max(end - time.monotonic(), 0.0)
             ready = dict(self._poller.poll(math.ceil(left * 1000)))
             if self._refused not in ready:
                 return bool(ready)
             broken_off = recv_monitor_message(self._refused)["event"] == BROKEN_OFF
-            self._tries = self._tries - 1 if broken_off else 0
+            ours = "CURVE" if self._has_keys else "NULL"
+            self._is_refused = not broken_off or asked_for(self.endpoint) not in (ours, None)
         why = (
             "does not admit these keys"
             if self._has_keys

@@ -21,9 +21,6 @@ DEFAULT_ENDPOINT = "tcp://127.0.0.1:5557"
 """Where `tactflow control` looks for a run that takes commands."""
 LONGEST_ANSWER = 1 << 20
 """Bytes of an answer at most; statistics have some ten thousand. Chosen by hand."""
-MOST_BROKEN_OFF = 5
-"""Handshakes that the other side breaks off before it counts as one that refuses us. Chosen by hand."""
-
 Answer = dict[str, Any]
 
 
@@ -71,7 +68,7 @@ class RemoteControl(Connection):
             zmq.REQ_CORRELATE: 1,
             zmq.MAXMSGSIZE: LONGEST_ANSWER,
         }
-        super().__init__(zmq.REQ, endpoint, options, keys, DEFAULT_ENDPOINT, MOST_BROKEN_OFF)
+        super().__init__(zmq.REQ, endpoint, options, keys, DEFAULT_ENDPOINT)
 
     def ping(self) -> Answer:
         """Whether the run is there."""
