@@ -147,8 +147,8 @@ def report() -> str:
     return "\n".join(
         [
             f"One sensor of {SIZE[0]} x {SIZE[1]} px at {RATE:g} frames a second, `press`, the default "
-            f"pipeline, from the moment a frame was due to its result at a subscriber in another process; medians of "
-            f"{len(touched)} frames with contact and {len(idle)} without one, ms:",
+            f"pipeline, from the moment a frame was due to its result at a subscriber in another process; "
+            f"medians of {len(touched)} frames with contact and {len(idle)} without one, ms:",
             "",
             "| part | contact | none |",
             "| --- | --- | --- |",
