@@ -8,7 +8,7 @@ import json
 from tactflow.cli.listen import seconds
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError, SourceError, StageError
-from tactflow.remote import DEFAULT_ENDPOINT, RemoteControl
+from tactflow.network.remote_control import DEFAULT_ENDPOINT, RemoteControl
 
 COMMANDS = {
     "take-reference": "take the next frame as the reference",

@@ -10,8 +10,8 @@ from collections import deque
 from typing import Any
 
 from tactflow.cli.printable import printable
-from tactflow.client import DEFAULT_ENDPOINT, Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.network.subscriber import DEFAULT_ENDPOINT, Subscriber
 
 Message = dict[str, Any]
 
