@@ -27,6 +27,11 @@ def add_pipeline(parser: argparse.ArgumentParser) -> None:
         metavar="PIPELINE",
         help="default: ./pipeline.yaml, else the packaged one; Python code that it names is run",
     )
+    add_overrides(parser)
+
+
+def add_overrides(parser: argparse.ArgumentParser) -> None:
+    """Declare `--set`."""
     parser.add_argument(
         "--set",
         dest="overrides",

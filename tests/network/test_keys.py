@@ -15,18 +15,17 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from tactflow import connection
-from tactflow import publisher as publisher_module
 from tactflow.cli.main import main
-from tactflow.client import Subscriber
 from tactflow.config.load import load_pipeline
-from tactflow.connection import GREETING, asked_for
 from tactflow.engine.errors import StageError
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import clash_problems
-from tactflow.keys import WrongKeysError, make_keys
-from tactflow.publisher import Publisher
-from tactflow.remote import RemoteControl
+from tactflow.network import bound_socket, connection
+from tactflow.network.connection import GREETING, asked_for
+from tactflow.network.keys import WrongKeysError, make_keys
+from tactflow.network.publisher import Publisher
+from tactflow.network.remote_control import RemoteControl
+from tactflow.network.subscriber import Subscriber
 from tactflow.sinks.zmq import Zmq
 from tests.clock import PATIENCE, until
 from tests.conftest import REPOSITORY
@@ -37,8 +36,7 @@ MESSAGE = (
 )
 PUBLISH = f"""
 import sys, time
-from tactflow.publisher import Publisher
-from tactflow.remote import RemoteControl
+from tactflow.network.publisher import Publisher
 publisher = Publisher("tcp://127.0.0.1:*", 10, 32768, sys.argv[1])
 print(publisher.endpoint, flush=True)
 while True:
@@ -241,7 +239,7 @@ def test_the_relay_ends_a_flood_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> 
         ):
             assert sensor.socket.recv() == b"\x01tactflow."
             left = [0]
-            monkeypatch.setattr(publisher_module, "files_left", lambda: left.pop() if left else 1000)
+            monkeypatch.setattr(bound_socket, "files_left", lambda: left.pop() if left else 1000)
             # It lets go of the sensors as well, and comes again with those who come again.
             assert sensor.socket.recv() == b"\x00tactflow."
             until(lambda: messages._socket.poll(1) or sensor.socket.poll(1))

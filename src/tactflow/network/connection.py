@@ -1,5 +1,5 @@
 """The socket of whoever connects to a running tactflow: `Subscriber` and `RemoteControl`. Its counterpart is
-`publisher.BoundSocket`."""
+`bound_socket.BoundSocket`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from tactflow.files import expanded
-from tactflow.keys import WrongKeysError, secure_subscriber
+from tactflow.network.keys import WrongKeysError, secure_subscriber
 
 REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
 """After these, ZeroMQ does not try again."""
