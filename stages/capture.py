@@ -1,4 +1,4 @@
-"""Capture: frames from a simulated sensor, a recording, a camera or a stream."""
+"""Stage `capture`: frames from a simulated sensor, a recording, a camera or a stream."""
 
 from __future__ import annotations
 

@@ -191,12 +191,12 @@ def pages(ports: Sequence[int], count: int) -> Iterator[list[int]]:
             thread.join(5)
 
 
-def write_section(name: str, text: str) -> None:
-    """Replace one section of docs/reliability.md, between its two markers."""
+def write_section(name: str, text: str, path: Path = PAGE) -> None:
+    """Replace one section of a page, of docs/reliability.md by default, between its two markers."""
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    page = PAGE.read_text(encoding="utf-8")
+    page = path.read_text(encoding="utf-8")
     before, _, rest = page.partition(begin)
     _, found, after = rest.partition(end)
     if not found:
-        raise SystemExit(f"{PAGE}: required the lines {begin} and {end}")
-    PAGE.write_text(f"{before}{begin}\n\n{text.strip()}\n\n{end}{after}", encoding="utf-8")
+        raise SystemExit(f"{path}: required the lines {begin} and {end}")
+    path.write_text(f"{before}{begin}\n\n{text.strip()}\n\n{end}{after}", encoding="utf-8")

@@ -25,7 +25,7 @@ from tactflow.batch.split import Splitting
 from tactflow.batch.task import Format, PipelineRequest, Task
 from tactflow.batch.work import kept_pipeline_for, reading
 from tactflow.cli.batch_progress import batch_display, in_short
-from tactflow.cli.options import positive, seconds
+from tactflow.cli.options import add_overrides, positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
@@ -55,14 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="parquet",
         help="of the results and of the table of runs (default: %(default)s)",
     )
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="a.b.c=VALUE",
-        help="override one value of the pipeline file; repeatable",
-    )
+    add_overrides(parser)
     parser.add_argument("--sensor", metavar="NAME", help="which one of a pipeline with several sensors")
     _add_division(parser)
     parser.add_argument(
