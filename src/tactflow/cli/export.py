@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 from pathlib import Path
 
+from tactflow.cli.notes import say
 from tactflow.engine.errors import ConfigError, StageError
 
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         for recording in args.recordings:
             frames = writer.add(stream(args.pipeline, source=recording, settings=settings, images=True))
-            print(f"{recording}: {frames} frames", file=sys.stderr)
+            say(f"{recording}: {frames} frames")
         writer.finish()
         unfinished.replace(args.out)
     except StageError as error:
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         raise StageError(f"{args.out}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-    print(f"{args.out}: {len(args.recordings)} episodes at {fps} fps", file=sys.stderr)
+    say(f"{args.out}: {len(args.recordings)} episodes at {fps} fps")
     return 0
 
 
