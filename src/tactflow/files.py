@@ -60,13 +60,15 @@ def next_name(path: Path) -> Path:
 def completed(path: Path) -> Iterator[Path]:
     """A place to write a file or a folder to, moved to `path` if all went well and removed if not.
 
+    It replaces what is there; but no file replaces a folder.
+
     Its name begins with a dot and ends as that of `path` does. Folders above are made. Raises OSError.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield partial
-        if path.is_dir():
+        if path.is_dir() and partial.is_dir():
             shutil.rmtree(path)
         os.replace(partial, path)
     finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 from pathlib import Path
 
 import orjson
@@ -103,6 +104,20 @@ def test_one_that_fails_stops_no_other_and_is_tried_again(batch: Batch) -> None:
     assert (failed.name, failed.status) == ("1.npy", "failed")
     assert "not a .npy file" in str(failed.error)
     assert statuses(batch) == ["0.npy done before", "1.npy failed", "2.npy done before"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
+def test_a_pipe_or_a_device_fails_and_nobody_waits_for_its_end(batch: Batch) -> None:
+    os.mkfifo(batch.recordings / "pipe.npy")
+    (batch.recordings / "endless.npy").symlink_to("/dev/zero")
+    (batch.recordings / "pictures").mkdir()
+    (batch.recordings / "pictures" / "1.png").symlink_to("/dev/zero")
+    result = batch()
+    assert len(result.outcomes) == 3 + len(result.failed)
+    assert [outcome.error for outcome in result.failed] == [
+        f"{batch.recordings / name}: cannot be read: it is a pipe or a device, not a file"
+        for name in ("endless.npy", "pipe.npy", "pictures/1.png")
+    ]
 
 
 def test_fail_fast_begins_nothing_more(batch: Batch) -> None:

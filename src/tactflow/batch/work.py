@@ -110,7 +110,7 @@ def _result(task: Task, blank: Outcome, report: Report) -> Outcome:
         # The parts of a recording have one digest: the first one works it out.
         read = "" if task.part is not None and task.part.number else input_digest(task.recording)
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise SourceError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     if task.part is not None:
         return _part(task, replace(blank, input=before, input_digest=read), report)
     key = result_key(read, task.pipeline.digest)

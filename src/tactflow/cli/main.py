@@ -84,7 +84,10 @@ def main(argv: Sequence[str]) -> int:
         _collect_garbage()
         return int(args.run(args))
     except TactflowError as error:
-        print(printable(f"tactflow: {error}"), file=sys.stderr)
+        # Imported here: it reads YAML, which not every command does.
+        from tactflow.redaction import public_address
+
+        print(printable(public_address(f"tactflow: {error}")), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         return 130

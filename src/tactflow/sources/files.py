@@ -204,24 +204,26 @@ def open_glob(pattern: str, directory: Path | None = None, fps: float | None = N
     """
     wanted = expanded(pattern)
     for base in (Path(), directory):
-        files = (
-            [] if base is None else sorted(_matching(base / wanted), key=lambda path: natural_key(str(path)))
-        )
+        files = [] if base is None else [path for path in matching(base / wanted) if path.is_file()]
         if files:
             return ImageFiles(files, pattern, fps)
     raise SourceError(f"{pattern}: no file matches this pattern; on a command line, quote it")
 
 
-def _matching(pattern: Path) -> list[Path]:
-    """Files that match, but hidden ones. `**` follows no links: they may lead in circles."""
+def matching(pattern: Path) -> list[Path]:
+    """What matches a pattern, in natural order, but what is hidden.
+
+    `**` follows no links: they may lead in circles.
+    """
     parts = pattern.parts
     fixed = next((index for index, part in enumerate(parts) if glob.has_magic(part)), len(parts))
     folder = Path(*parts[:fixed])
-    return [
+    found = [
         path
         for path in folder.glob(str(Path(*parts[fixed:])))
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if not any(part.startswith(".") for part in path.relative_to(folder).parts)
     ]
+    return sorted(found, key=lambda path: natural_key(str(path)))
 
 
 class ArrayFile:
