@@ -35,7 +35,7 @@ def test_every_recording_has_a_result_of_every_frame_and_a_second_call_does_noth
     messages = [orjson.loads(line) for line in path.read_bytes().splitlines()]
     assert [bool(message["contact"]) for message in messages] == [False] * 2 + [True] * 4
     assert statuses(batch) == ["0.npy done before", "1.npy done before", "2.npy done before"]
-    assert batch.engine.submitted == []
+    assert batch.executor.submitted == []
     assert batch.plan.words == "3 recordings, 3 done before, 0 new or failed before"
     assert not list(batch.folder.unfinished.iterdir())
 
@@ -46,7 +46,7 @@ def test_only_what_has_changed_is_done_again(batch: Batch) -> None:
     assert statuses(batch) == ["0.npy done before", "1.npy done", "2.npy done before"]
     assert batch.plan.changed == 1
     batch("stages.hull.min_area=7")
-    assert len(batch.engine.submitted) == 3
+    assert len(batch.executor.submitted) == 3
 
 
 @pytest.mark.parametrize("damage", ["cut off", "gone", "other bytes", "no record"])
@@ -131,7 +131,7 @@ def test_fail_fast_begins_nothing_more(batch: Batch) -> None:
 def test_one_signal_finishes_what_runs_and_leaves_the_rest_for_the_next_call(batch: Batch) -> None:
     result = batch(stop_after=1)
     assert (len(result.outcomes), len(result.undone), result.ended) == (2, 1, "interrupted")
-    assert not batch.engine.killed
+    assert not batch.executor.killed
     assert statuses(batch) == ["0.npy done before", "1.npy done before", "2.npy done"]
 
 
