@@ -167,21 +167,21 @@ def _compare_blocks(
     limit: Float,
 ) -> None:
     """Fill `excess` (n,) with means over blocks less `reference`, and `limit`, 0 where they are saturated."""
-    line, at = np.empty(plane.shape[1], np.float32), 0
-    for block in range(len(row_weights)):
+    high, wide = plane.shape
+    down, across = len(row_weights), len(column_weights)
+    line = np.empty(wide, np.float32)
+    for row in range(down):
         line[:] = 0
-        for y in range(len(plane)):
-            weight, row = row_weights[block, y], plane[y]
-            if weight > 0:
-                for x in range(line.size):
-                    line[x] += weight * row[x]
-        for weights in column_weights:
-            mean = np.float32(0)
-            for x in range(line.size):
-                mean += line[x] * weights[x]
+        # A block takes no other lines and columns than those from its first to its last one.
+        for y in range(row * high // down, -(-(row + 1) * high // down)):
+            for x in range(wide):
+                line[x] += row_weights[row, y] * plane[y, x]
+        for column in range(across):
+            mean, at = np.float32(0), row * across + column
+            for x in range(column * wide // across, -(-(column + 1) * wide // across)):
+                mean += line[x] * column_weights[column, x]
             excess[at] = mean - reference[at]
             limit[at] = usual_limit[at] if mean < SATURATED else np.float32(0)
-            at += 1
 
 
 @helper
