@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from tactflow.engine.errors import SourceError
-from tactflow.files import expanded
+from tactflow.files import expanded, is_utf8
 from tactflow.redaction import public_address
 from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream
@@ -83,6 +83,8 @@ def open_source(
     tactflow.engine.errors.SourceError: ftp://camera: unknown kind of source ftp://; required one of: ...
     """
     spec = spec.strip()
+    if not is_utf8(spec):
+        raise SourceError(f"{spec}: is not UTF-8; rename the file")
     if not spec:
         raise SourceError(f"the source is empty; required one of: {KINDS}")
     if spec.startswith("sim:"):
