@@ -6,6 +6,7 @@ import argparse
 import difflib
 import gc
 import importlib
+import io
 import os
 import re
 import signal
@@ -59,6 +60,9 @@ def entry() -> None:
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
     sys.stderr = Unheard(sys.stderr)
+    # Names of files may have letters that the terminal, or UTF-8, has not.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = main(sys.argv[1:])
         sys.stdout.flush()
@@ -67,9 +71,9 @@ def entry() -> None:
         lead_nowhere(sys.stdout)
         code = 0
         if not isinstance(error, BrokenPipeError):
-            print(
-                f"tactflow: {error.filename or 'standard output'}: {error.strerror or error}", file=sys.stderr
-            )
+            # Only the question where we are fails so, without a name.
+            unnamed = "the current folder" if isinstance(error, FileNotFoundError) else "standard output"
+            print(f"tactflow: {error.filename or unnamed}: {error.strerror or error}", file=sys.stderr)
             code = StageError.exit_code
     # The code is known; what comes now shall not change it.
     for number in ENDING:
