@@ -173,7 +173,7 @@ def compare_blocks(
     limit: Float,
     coefficients: Float,
 ) -> None:
-    """What the fit starts from: `excess` and `limit`, (3, n), and gains in `coefficients`, (3, 4), are filled.
+    """What a fit starts from: `excess` and `limit`, (3, n), and gains in `coefficients`, (3, 4), are filled.
 
     cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. reference :
     (3, n), their means, which excess is beyond. usual_limit : (3, n); limit is 0 where a block is saturated.
