@@ -40,6 +40,7 @@ from tactflow.vision.contact import (
     continuation,
     illumination,
     resolution,
+    response,
 )
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.components import Component, contact_components, union, wide_change
@@ -191,6 +192,7 @@ class ContactDetector:
                 downsample,
                 illumination,
                 resolution,
+                response,
             )
         self.reset()
 
