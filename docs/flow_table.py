@@ -40,20 +40,7 @@ SEEDS = (11, 12)
 DRAGGED = ("slide", "stick_slip")
 """Scenes in which contacts slip altogether, twice in each recording."""
 ONSET_SEEDS = (7, 11, 12, 13)
-STILL = (
-    "press",
-    "box",
-    "cable",
-    "bright",
-    "mixed",
-    "two",
-    "twist",
-    "dense",
-    "edge",
-    "sparse",
-    "border",
-    "roll",
-)
+STILL = (*STICKING, "mixed", "dense", "edge", "sparse", "border")
 """Scenes for slip that is not there."""
 STILL_FRAMES = 1650
 LEAST = 0.1
