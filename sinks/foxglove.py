@@ -13,7 +13,7 @@ from tactflow.engine.frame import Tick
 from tactflow.extras import missing
 from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
-from tactflow.view.address import is_loopback
+from tactflow.network.address import is_loopback
 
 if TYPE_CHECKING:
     from foxglove import Channel, Context

@@ -13,8 +13,10 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.frame import Tick
 from tactflow.jpeg import encode_jpeg
+from tactflow.network.address import is_reachable, picks_a_port
+from tactflow.network.bound_socket import FloodError
+from tactflow.network.publisher import Publisher
 from tactflow.ports import Image
-from tactflow.publisher import FloodError, Publisher, is_reachable, picks_a_port
 
 log = logging.getLogger("tactflow")
 

@@ -22,8 +22,9 @@ from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
 from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
+from tactflow.network.address import is_loopback
 from tactflow.ports import Image, Valid
-from tactflow.view.address import Neighbours, address, bind, is_loopback
+from tactflow.view.address import Neighbours, address, bind
 from tactflow.view.compact import compact_markers, compact_surface
 from tactflow.view.guided import Guiding
 from tactflow.vision.draw import dimmed, field_arrows

@@ -12,8 +12,6 @@ import orjson
 import zmq
 from pydantic import Field, field_validator, model_validator
 
-from tactflow.commands import Commands
-from tactflow.control_socket import ControlSocket
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
@@ -21,7 +19,11 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.rate import RateLimit
 from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
-from tactflow.publisher import FloodError, Publisher, is_reachable, picks_a_port
+from tactflow.network.address import is_reachable, picks_a_port
+from tactflow.network.bound_socket import FloodError
+from tactflow.network.commands import Commands
+from tactflow.network.control_socket import ControlSocket
+from tactflow.network.publisher import Publisher
 
 log = logging.getLogger("tactflow")
 

@@ -1,4 +1,4 @@
-"""Hold: another signal, kept true for longer."""
+"""Stage `hold`: another signal, kept true for longer."""
 
 from __future__ import annotations
 

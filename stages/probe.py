@@ -1,4 +1,4 @@
-"""Probe: has anything changed since the last frame that was worked on?"""
+"""Stage `probe`: has anything changed since the last frame that was worked on?"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ import yaml
 import zmq
 
 from tactflow.cli.main import main
-from tactflow.message import message_schema
+from tactflow.message_schema import message_schema
 from tests.clock import PATIENCE, until
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -291,7 +291,7 @@ def test_realtime_plays_a_recording_at_its_own_pace(tmp_path: Path, monkeypatch:
 
 
 def test_importing_tactflow_does_not_import_opencv() -> None:
-    code = "import sys, tactflow, tactflow.client; print('cv2' in sys.modules)"
+    code = "import sys, tactflow, tactflow.network.subscriber; print('cv2' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
     )

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from tactflow.api import load as load
     from tactflow.api import run as run
     from tactflow.api import stage as stage
-    from tactflow.client import Subscriber as Subscriber
     from tactflow.engine.contract import Sink as Sink
     from tactflow.engine.contract import Source as Source
     from tactflow.engine.contract import Stage as Stage
@@ -37,7 +36,8 @@ if TYPE_CHECKING:
     from tactflow.engine.frame import Frame as Frame
     from tactflow.engine.frame import Tick as Tick
     from tactflow.message import Results as Results
-    from tactflow.remote import RemoteControl as RemoteControl
+    from tactflow.network.remote_control import RemoteControl as RemoteControl
+    from tactflow.network.subscriber import Subscriber as Subscriber
     from tactflow.sim.scenes import open_scene as open_scene
     from tactflow.streaming import Result as Result
     from tactflow.streaming import stream as stream
@@ -51,8 +51,8 @@ __version__ = "0.1.0"
 _HOMES = {
     "tactflow.api": ("load", "check", "run", "stage"),
     "tactflow.streaming": ("stream", "Result"),
-    "tactflow.client": ("Subscriber",),
-    "tactflow.remote": ("RemoteControl",),
+    "tactflow.network.subscriber": ("Subscriber",),
+    "tactflow.network.remote_control": ("RemoteControl",),
     "tactflow.sim.scenes": ("open_scene",),
     "tactflow.vision.types": ("Contact", "Flow", "Markers", "MarkerStatus"),
     "tactflow.engine.contract": ("Stage", "Sink", "Source", "StageParams"),

@@ -4,8 +4,20 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tactflow.bench import limit
+
+_erf = np.frompyfunc(math.erf, 1, 1)
+
+
+def soft_disc(
+    shape: tuple[int, int], center: tuple[float, float], radius: float, edge: float
+) -> NDArray[np.float64]:
+    """The disc that the limit is about. shape : (height, width), px. center : (x, y), px."""
+    y, x = np.indices(shape, dtype=np.float64)
+    r = np.hypot(x - center[0], y - center[1])
+    return np.asarray(0.5 * (1 + _erf((radius - r) / (edge * math.sqrt(2)))), dtype=np.float64)
 
 
 def test_the_information_of_a_large_disc_is_that_of_the_closed_form() -> None:
@@ -13,11 +25,6 @@ def test_the_information_of_a_large_disc_is_that_of_the_closed_form() -> None:
     assert limit.disc_information(10, 0.5) == pytest.approx(
         math.pi * 10 / (2 * math.sqrt(math.pi) * 0.5), rel=5e-3
     )
-
-
-def test_the_disc_is_as_large_as_it_says() -> None:
-    # The integral of Phi((R - r) / b) over the plane is pi (R^2 + b^2); sampled finely enough at b = 1.
-    assert limit.soft_disc((40, 40), (19.3, 20.1), 5, 1).sum() == pytest.approx(math.pi * 26, rel=1e-3)
 
 
 def test_the_bound_falls_with_contrast_and_channels() -> None:
@@ -41,13 +48,13 @@ def test_maximum_likelihood_reaches_the_bound_and_does_not_beat_it() -> None:
     radius, edge, contrast, noise = 3.5, 0.8, 60.0, 3.0
     shape, center = (21, 21), (10.2, 9.7)
     random = np.random.default_rng(5)
-    clean = limit.soft_disc(shape, center, radius, edge)
+    clean = soft_disc(shape, center, radius, edge)
     step = 1e-3
     gradient = np.stack(
         [
             (
-                limit.soft_disc(shape, (center[0] + step * i, center[1] + step * j), radius, edge)
-                - limit.soft_disc(shape, (center[0] - step * i, center[1] - step * j), radius, edge)
+                soft_disc(shape, (center[0] + step * i, center[1] + step * j), radius, edge)
+                - soft_disc(shape, (center[0] - step * i, center[1] - step * j), radius, edge)
             )
             / (2 * step)
             for i, j in ((1, 0), (0, 1))

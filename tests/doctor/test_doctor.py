@@ -147,7 +147,7 @@ def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        (["--source", "sim:idle", "--seconds", "0"], 2, "required a number above 0"),
+        (["--source", "sim:idle", "--seconds", "0"], 2, "required a time such as 90s"),
         (["--source", "nowhere.avi"], 4, "no such file"),
     ],
 )

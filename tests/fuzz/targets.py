@@ -20,14 +20,14 @@ from mcap.writer import CompressionType, Writer
 from tactflow.calibration.file import Calibration
 from tactflow.cli import explain, listen
 from tactflow.cli.statistics import read_statistics
-from tactflow.client import _parsed
-from tactflow.commands import Commands
 from tactflow.config.load import load_pipeline
-from tactflow.control_socket import ControlSocket
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.plan import make_plan
 from tactflow.message import Results, encode_message
+from tactflow.network.commands import Commands
+from tactflow.network.control_socket import ControlSocket
+from tactflow.network.subscriber import _parsed
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME, FrameCoder
 from tactflow.recording.records import NotARecordingError
 from tactflow.recording.repair import repair

@@ -16,9 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tactflow.cli import listen
-from tactflow.client import _parsed
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.network.subscriber import _parsed
 from tactflow.sources import open_source
 from tactflow.view.hub import Hub, Wire
 from tests.conftest import REPOSITORY

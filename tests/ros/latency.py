@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tactflow.client import Subscriber
+from tactflow.network.subscriber import Subscriber
 from tests.clock import until
 from tests.ros.programs import LISTENER, Program
 

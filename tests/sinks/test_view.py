@@ -31,9 +31,10 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
 from tactflow.message import Results
+from tactflow.network.address import is_loopback
 from tactflow.sinks.view import View
 from tactflow.view import server
-from tactflow.view.address import address, bind, is_loopback
+from tactflow.view.address import address, bind
 from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Contact, Depth, Markers, Scale
 from tests.clock import PATIENCE, until

@@ -16,10 +16,10 @@ import pytest
 import zmq
 from pydantic import ValidationError
 
-from tactflow import publisher
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
+from tactflow.network import bound_socket
 from tactflow.sinks.zmq import MOST_OTHERS, Zmq
 from tactflow.vision.types import Depth, Markers
 from tests.clock import PATIENCE, until
@@ -436,7 +436,7 @@ def test_connections_that_leave_no_files_are_ended(
     listener = subscribe(sink.endpoint)
     wait_until_wanted(sink)
     left = [0]
-    monkeypatch.setattr(publisher, "files_left", lambda: left.pop() if left else 1000)
+    monkeypatch.setattr(bound_socket, "files_left", lambda: left.pop() if left else 1000)
     until(lambda: sink.wants() is None or "too many connections" in caplog.text)
     until(lambda: listener.poll(1) or (sink.wants() and write(sink, range(1))))
     sink.close()

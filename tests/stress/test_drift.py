@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from tactflow.bench.stress import LARGEST_GROWTH, Block, Drift, measure_drift, memory_mb, memory_of
-from tactflow.cli.bench import frame_count
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError
 from tests.stress.builders import DIFFERENCES, TRACKERS, Image, gel
@@ -110,13 +109,3 @@ def test_memory_is_that_of_this_process() -> None:
 def test_memory_is_what_is_resident_not_what_is_reserved() -> None:
     page = mmap.PAGESIZE
     assert memory_of(f"{400 * 2**20 // page} {100 * 2**20 // page} 55 1 0 77 0") == 100
-
-
-@pytest.mark.parametrize("word", ["0", "-5", "1e5", "many", ""])
-def test_a_number_of_frames_that_is_none_is_refused(word: str) -> None:
-    with pytest.raises(Exception, match="required a whole number of frames >= 1"):
-        frame_count(word)
-
-
-def test_a_number_of_frames_is_read() -> None:
-    assert frame_count("100000") == 100_000

@@ -21,6 +21,7 @@ from tactflow.vision.contact import (
     contact_outline,
     illumination,
     resolution,
+    response,
 )
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.draw import Annotator
@@ -135,7 +136,7 @@ def both(compute: Callable[[], Any], *modules: Any) -> tuple[Any, Any]:
 def test_single_precision_costs_the_contact_nothing(method: str) -> None:
     pictures = gel(dots=False)
 
-    rooms = border, components, contact_outline, illumination, resolution
+    rooms = border, components, contact_outline, illumination, resolution, response
 
     def compute() -> contact.ContactResult:
         detector = DIFFERENCES[method]()

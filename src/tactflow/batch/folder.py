@@ -21,7 +21,7 @@ from typing import Any
 
 import orjson
 
-from tactflow.batch.keys import digest_of, fingerprint
+from tactflow.batch.digests import digest_of, fingerprint
 from tactflow.batch.task import Outcome, decoded
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.files import claim_path, make_folder

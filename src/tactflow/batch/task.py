@@ -1,4 +1,4 @@
-"""What an engine is given to do, and what it gives back."""
+"""What an executor is given to do, and what it gives back."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import orjson
 
-from tactflow.batch.keys import Fingerprint
+from tactflow.batch.digests import Fingerprint
 from tactflow.batch.recordings import Recording
 
 Format = Literal["parquet", "jsonl"]

@@ -35,31 +35,18 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
-
-_erf = np.frompyfunc(math.erf, 1, 1)
-
-
-def soft_disc(
-    shape: tuple[int, int], center: tuple[float, float], radius: float, edge: float
-) -> NDArray[np.float64]:
-    """A disc with a soft edge: 1 inside, 0 outside, Phi((radius - r) / edge) between.
-
-    Parameters
-    ----------
-    shape : (height, width), px. center : (x, y), px.
-    radius : of the half-way contour, px, > 0.
-    edge : standard deviation of the edge's blur, px, > 0. An area-averaged sharp edge has about 0.3.
-    """
-    y, x = np.indices(shape, dtype=np.float64)
-    r = np.hypot(x - center[0], y - center[1])
-    return np.asarray(0.5 * (1 + _erf((radius - r) / (edge * math.sqrt(2)))), dtype=np.float64)
 
 
 def disc_information(radius: float, edge: float) -> float:
-    """Sum of (d soft_disc / dx)^2 over the pixels of one channel, averaged over sub-pixel phases, 1 / px^2.
+    """Sum of (d disc / dx)^2 over the pixels of one channel, averaged over sub-pixel phases, 1 / px^2.
 
-    Multiply by (contrast / noise)^2 and sum over channels for the Fisher information of one coordinate.
+    The disc is 1 inside, 0 outside, and Phi((radius - r) / edge) between. Multiply by (contrast / noise)^2
+    and sum over channels for the Fisher information of one coordinate.
+
+    Parameters
+    ----------
+    radius : of the half-way contour, px, > 0.
+    edge : standard deviation of the edge's blur, px, > 0. An area-averaged sharp edge has about 0.3.
 
     Raises
     ------
@@ -84,7 +71,7 @@ def position_bound(radius: float, edge: float, contrast: float | Sequence[float]
 
     Parameters
     ----------
-    radius, edge : of the dot, px; see `soft_disc`.
+    radius, edge : of the dot, px; see `disc_information`.
     contrast : grey levels between dot and gel; one number, or one per channel.
     noise : standard deviation of one pixel of one channel, grey levels, > 0. Rounding to whole grey levels
         adds a variance of 1/12; see `rounded`.

@@ -25,26 +25,10 @@ class IdentityErrors:
     wrong : (N,) bool, claimed to be known, but nearer to another marker's true position than to its own, or
         more than half a pitch away from its own.
     lost : (N,) bool, visible, but declared lost by the method.
-    visible : (N,) bool, the markers that were judged.
     """
 
     wrong: BoolArray
     lost: BoolArray
-    visible: BoolArray
-
-    @property
-    def wrong_percent(self) -> float:
-        """Wrong markers among the visible ones, %."""
-        return _percent(int(np.count_nonzero(self.wrong)), int(np.count_nonzero(self.visible)))
-
-    @property
-    def lost_percent(self) -> float:
-        """Lost markers among the visible ones, %."""
-        return _percent(int(np.count_nonzero(self.lost)), int(np.count_nonzero(self.visible)))
-
-
-def _percent(part: int, whole: int) -> float:
-    return 100.0 * part / whole if whole else 0.0
 
 
 def _distances(a: FloatArray, b: FloatArray) -> NDArray[np.float64]:
@@ -120,14 +104,14 @@ def identity_errors(
     lost = np.asarray(lost, dtype=np.bool_)
     if count == 0:
         empty = np.zeros(0, dtype=np.bool_)
-        return IdentityErrors(empty, empty, empty)
+        return IdentityErrors(empty, empty)
     distance = _distances(position, truth)
     own = np.diagonal(distance).copy()
     nearest = np.argmin(distance, axis=1)
     # Ties go to the marker itself: two dots that truly coincide cannot be told apart by anybody.
     stolen = (nearest != np.arange(count)) & (distance[np.arange(count), nearest] < own)
     wrong = visible & ~lost & (stolen | (own > pitch / 2))
-    return IdentityErrors(wrong=wrong, lost=visible & lost, visible=visible)
+    return IdentityErrors(wrong=wrong, lost=visible & lost)
 
 
 def displacement_errors(displacement: FloatArray, truth: FloatArray) -> NDArray[np.float64]:

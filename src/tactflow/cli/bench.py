@@ -19,11 +19,13 @@ from tactflow.bench.methods import CLASSIC
 from tactflow.bench.report import html
 from tactflow.bench.results import Result
 from tactflow.bench.run import DEFAULT, MARKERLESS, WEDGE, Plan, run_bench
-from tactflow.bench.skipping import Pipelines, compare_all, print_comparisons
+from tactflow.bench.skipping import Pipelines, compare_all
+from tactflow.bench.skipping_table import print_comparisons
 from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
 from tactflow.bench.timing import CopyUnit
 from tactflow.cli.notes import without_notes
+from tactflow.cli.options import positive
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -96,7 +98,7 @@ def _add_other_measurements(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stress",
         nargs="?",
-        type=frame_count,
+        type=positive,
         const=100_000,
         metavar="FRAMES",
         help="instead: press and release, 100000 frames unless told otherwise, through the first PIPELINE; "
@@ -105,20 +107,13 @@ def _add_other_measurements(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--skipping",
         nargs="?",
-        type=frame_count,
+        type=positive,
         const=200,
         metavar="FRAMES",
         help="instead: compare the first PIPELINE with and without skipping, on 200 frames of each scene "
         "unless told otherwise, and on the recordings of --data; exit code 3 if a number changes beyond its "
         "noise",
     )
-
-
-def frame_count(word: str) -> int:
-    """A number of frames, >= 1, from the command line."""
-    if not word.isdecimal() or int(word) < 1:
-        raise argparse.ArgumentTypeError(f"required a whole number of frames >= 1, got {word}")
-    return int(word)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 
-from tactflow.cli.listen import seconds
+from tactflow.cli.options import seconds
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError, SourceError, StageError
-from tactflow.remote import DEFAULT_ENDPOINT, RemoteControl
+from tactflow.network.remote_control import DEFAULT_ENDPOINT, RemoteControl
 
 COMMANDS = {
     "take-reference": "take the next frame as the reference",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -12,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import orjson
 
+from tactflow.cli.options import seconds
 from tactflow.cli.printable import printable
-from tactflow.engine.errors import ConfigError, StageError
+from tactflow.engine.errors import StageError
 from tactflow.sources import KINDS
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--source", required=True, metavar="SRC", help=f"of the sensor: {KINDS}")
     parser.add_argument(
         "--seconds",
-        type=float,
+        type=seconds,
         default=LIVE_SECONDS,
         metavar="S",
         help=f"how much of it to look at; default {LIVE_SECONDS:g}. Leave the gel untouched at first and at "
@@ -48,14 +48,12 @@ def run(args: argparse.Namespace) -> int:
 
     Raises
     ------
-    ConfigError, SourceError
-        If the options are wrong, or the source delivers nothing.
+    SourceError
+        If the source delivers nothing.
     """
     from tactflow.doctor import examine, observe
     from tactflow.doctor.checks import worst
 
-    if not (math.isfinite(args.seconds) and args.seconds > 0):
-        raise ConfigError(f"--seconds: required a number above 0, got {args.seconds:g}")
     seen = observe(args.source, args.seconds, _progress)
     _progress(0)
     findings = examine(seen)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.keys import WrongKeysError, make_keys
+from tactflow.network.keys import WrongKeysError, make_keys
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,9 +9,10 @@ import time
 from collections import deque
 from typing import Any
 
+from tactflow.cli.options import positive, seconds
 from tactflow.cli.printable import printable
-from tactflow.client import DEFAULT_ENDPOINT, Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.network.subscriber import DEFAULT_ENDPOINT, Subscriber
 
 Message = dict[str, Any]
 
@@ -35,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     form.add_argument("--json", action="store_true", help="the messages as they are, one JSON object a line")
     form.add_argument("--table", action="store_true", help="a live table of the latest values, on a terminal")
     parser.add_argument("--latest", action="store_true", help="skip what is out of date; keep up at any rate")
-    parser.add_argument("--count", type=_count, metavar="N", help="end after N messages")
+    parser.add_argument("--count", type=positive, metavar="N", help="end after N messages")
     parser.add_argument(
         "--timeout",
         type=seconds,
@@ -156,20 +157,3 @@ def _cells(message: Message) -> list[str]:
 def _rate(arrivals: deque[float]) -> str:
     span = arrivals[-1] - arrivals[0]
     return f"{(len(arrivals) - 1) / span:.0f}" if span > 0 else ""
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"required a whole number from 1, got {text!r}")
-    return int(text)
-
-
-def seconds(text: str) -> float:
-    """A time from the command line, s."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (0 < value < math.inf):
-        raise argparse.ArgumentTypeError(f"required a number of seconds above 0, got {text!r}")
-    return value

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tactflow.cli.notes import say
 from tactflow.cli.statistics import read_statistics
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
@@ -27,6 +27,11 @@ def add_pipeline(parser: argparse.ArgumentParser) -> None:
         metavar="PIPELINE",
         help="default: ./pipeline.yaml, else the packaged one; Python code that it names is run",
     )
+    add_overrides(parser)
+
+
+def add_overrides(parser: argparse.ArgumentParser) -> None:
+    """Declare `--set`."""
     parser.add_argument(
         "--set",
         dest="overrides",
@@ -46,7 +51,7 @@ def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipe
     live = bool(getattr(pipeline.source.params, "realtime", False))
     plan = make_plan(pipeline, live=live)
     for warning in (*pipeline.warnings, *plan.warnings):
-        print(f"tactflow: warning: {warning}", file=sys.stderr)
+        say(f"tactflow: warning: {warning}")
     return pipeline, plan
 
 

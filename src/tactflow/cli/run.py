@@ -20,7 +20,7 @@ from rich.console import Console
 from tactflow.api import make_runner
 from tactflow.cli.notes import notes_on
 from tactflow.cli.opencv import warn_of_conflict
-from tactflow.cli.options import add_pipeline, positive
+from tactflow.cli.options import add_pipeline, positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.cli.progress import progress_display, summary, with_statistics
 from tactflow.config.load import load_pipeline, sensor_names
@@ -240,10 +240,7 @@ def _stop_at_end_of_input(runner: Runner) -> None:
 
 
 def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
+    value = seconds(text)
     if not 0.1 <= value <= 86400:
         raise argparse.ArgumentTypeError(f"required seconds from 0.1 to 86400, got {text!r}")
     return value

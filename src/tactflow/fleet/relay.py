@@ -10,7 +10,8 @@ from contextlib import contextmanager
 import zmq
 
 from tactflow.engine.errors import StageError
-from tactflow.publisher import FloodError, Publisher
+from tactflow.network.bound_socket import FloodError
+from tactflow.network.publisher import Publisher
 
 SEND_BUFFER = 32_768
 """Kernel send buffer per subscriber, bytes, the ZeroMQ sink's default. Large ones hold seconds of messages.

@@ -128,7 +128,8 @@ def pipeline_text(tuned: Tuned, file: Path, out: Path) -> str:
     for key, value in tuned.chosen.settings:
         _set(document, key.split("."), value)
     body = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None)
-    comments = "\n".join(f"# {line}".rstrip() for line in header)
+    # A recording may have a name of several lines; none of them may become YAML.
+    comments = "\n".join(f"# {line}".rstrip() for part in header for line in part.splitlines() or [""])
     return f"{comments}\n\n{body}"
 
 

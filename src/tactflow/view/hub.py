@@ -18,9 +18,9 @@ from typing import Any, NamedTuple, Protocol
 
 import orjson
 
-from tactflow.commands import Commands, RefusedError
 from tactflow.engine.control import Control
 from tactflow.engine.stats import Durations
+from tactflow.network.commands import Commands, RefusedError
 from tactflow.view.guided import Session
 
 log = logging.getLogger("tactflow")

@@ -19,18 +19,21 @@ from tactflow.vision.contact import (
     components,
     illumination,
     resolution,
+    response,
 )
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tests.oracles.background import (
     plain_change_strength,
     plain_scaled_change,
+    plain_smooth_cells,
     plain_weigh_change,
 )
 from tests.oracles.border import plain_border_level
 from tests.oracles.components import plain_close_changes
-from tests.oracles.illumination import plain_fit_robustly
+from tests.oracles.illumination import plain_fit_light
 from tests.oracles.resolution import plain_halve_window, plain_raise_mask
+from tests.oracles.response import plain_sum_change
 
 Image = NDArray[np.uint8]
 
@@ -41,7 +44,9 @@ ORACLES = (
     (background, "weigh_change", plain_weigh_change),
     (background, "scaled_change", plain_scaled_change),
     (background, "change_strength", plain_change_strength),
-    (illumination, "fit_robustly", plain_fit_robustly),
+    (background, "smooth_cells", plain_smooth_cells),
+    (response, "sum_change", plain_sum_change),
+    (illumination, "fit_light", plain_fit_light),
     (components, "close_changes", plain_close_changes),
     (border, "border_level", plain_border_level),
     (resolution, "raise_mask", plain_raise_mask),

@@ -120,12 +120,14 @@ def _level(change: WindowChange, bridge: float, hidden: Mask | None) -> tuple[Fl
     cap = GLOSS * _typical(
         change.strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
     )
-    # Half the time of `np.minimum`.
-    strength = np.clip(change.strength, np.float32(0), np.float32(cap))
-    tone = np.float32(cap / 3**0.5)
-    brightness = np.clip(change.brightness, -tone, tone)
-    if EVEN * cv2.norm(brightness, cv2.NORM_L2SQR) > cv2.norm(strength, cv2.NORM_L2SQR):
-        return _without_specks(_changed_as_a_whole(brightness, hidden), strength), None
+    strength = np.asarray(cv2.threshold(change.strength, cap, 0.0, cv2.THRESH_TRUNC)[1], np.float32)
+    even = cv2.norm(strength, cv2.NORM_L2SQR) / EVEN
+    # What is cut is no larger than before: where it is too little then, there is no need to cut it.
+    if cv2.norm(change.brightness, cv2.NORM_L2SQR) > even:
+        tone = np.float32(cap / 3**0.5)
+        brightness = np.clip(change.brightness, -tone, tone)
+        if cv2.norm(brightness, cv2.NORM_L2SQR) > even:
+            return _without_specks(_changed_as_a_whole(brightness, hidden), strength), None
     return _tilted(strength, bridge, hidden)
 
 
@@ -153,7 +155,7 @@ def _largest_nearby(values: Float) -> Float:
     largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
     largest = largest[reach:, reach:][: coarse[1], : coarse[0]]
     largest = cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR)
-    return np.clip(largest, np.float32(FAINT * peak), np.float32(np.inf))
+    return largest.clip(np.float32(FAINT * peak), np.float32(np.inf))
 
 
 def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:

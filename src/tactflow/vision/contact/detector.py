@@ -39,6 +39,7 @@ from tactflow.vision.contact import (
     components,
     illumination,
     resolution,
+    response,
 )
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.components import Component, contact_components, union, wide_change
@@ -189,6 +190,7 @@ class ContactDetector:
                 downsample,
                 illumination,
                 resolution,
+                response,
             )
         self.reset()
 

@@ -162,10 +162,11 @@ def fill_pockets(filled: Mask) -> Mask:
         if filled[seed[1], seed[0]] or not hull[seed[1], seed[0]]:
             continue
         other = filled.copy()
-        area, *_ = cv2.floodFill(other, None, seed, (2.0,))
-        pocket = (other == 2).view(np.uint8)
-        if cv2.countNonZero(cv2.bitwise_and(pocket, hull)) > POCKET * area:
-            filled |= pocket
+        area, _, _, (left, top, wide, high) = cv2.floodFill(other, None, seed, (2.0,))
+        box = slice(top, top + high), slice(left, left + wide)
+        pocket = (other[box] == 2).view(np.uint8)
+        if cv2.countNonZero(cv2.bitwise_and(pocket, hull[box])) > POCKET * area:
+            filled[box] |= pocket
             closed = True
     # What was open to both sides of a pocket is now a hole.
     return _without_holes(filled) if closed else filled

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel
 
 Float = NDArray[np.float32]
 
@@ -36,10 +36,6 @@ WHITE: Final = np.float32(255)
 DARK: Final = 0.25
 """Brightness of a block, relative to the mean of its channel, below which its ratio of change is too noisy to
 begin with. Chosen by hand."""
-
-
-_CHANNELS: Final = np.arange(3)
-"""Blue, green, red."""
 
 
 class IlluminationModel:
@@ -77,9 +73,9 @@ class IlluminationModel:
     def __init__(self, reference: Float, variance: Float, counts: NDArray[np.bool_] | None = None) -> None:
         height, width = reference.shape[1:]
         self._row_weights = _block_weights(max(1, height // BLOCK), height)
-        self._column_weights = np.ascontiguousarray(_block_weights(max(1, width // BLOCK), width).T)
-        self._center: Float = np.maximum(reference.mean(axis=(1, 2), keepdims=True), np.float32(1))
-        relative = reference / self._center
+        self._column_weights = _block_weights(max(1, width // BLOCK), width)
+        self._center: Float = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))[:, None]
+        relative = reference / self._center[:, None]
         slopes = np.stack([relative * positions(width), relative * positions(height)[:, None]], axis=1)
         terms = np.concatenate([relative[:, None], slopes, np.ones_like(relative)[:, None]], axis=1)
         basis = np.stack([self._block_means(channel) for channel in terms])
@@ -93,11 +89,7 @@ class IlluminationModel:
         self._basis: Float = np.ascontiguousarray(basis, np.float32)
         brightness = self._basis[:, 0]
         lit = brightness > DARK if self._fitted is None else (brightness > DARK) & self._fitted
-        self._lit: NDArray[np.bool_] = lit
-        # Blocks that tell nothing are sorted behind all others; a channel without light never changes.
-        nothing = np.where(lit.any(axis=1, keepdims=True), np.float32(np.nan), np.float32(0))
-        self._per_brightness: Float = np.where(lit, 1 / np.maximum(brightness, DARK), nothing)
-        self._middle = np.count_nonzero(lit, axis=1) // 2
+        self._per_brightness: Float = np.where(lit, 1 / np.maximum(brightness, DARK), np.float32(0))
         self._step: Float = np.ascontiguousarray(inverse @ fitted, np.float32)
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
@@ -110,31 +102,21 @@ class IlluminationModel:
         Returns (3, 4) float32: how much the gain exceeds 1, its slope along x and along y (over the whole
         frame), and the offset, grey levels.
         """
-        blocks = self._block_means(cells)
-        excess = blocks - self._reference
         coefficients = np.zeros((3, 4), np.float32)
-        limit = self._limit
-        if blocks.max() < SATURATED:
-            ratios = excess * self._per_brightness
-            ratios.sort(axis=1)
-            coefficients[:, 0] = ratios[_CHANNELS, self._middle]
-        else:
-            below = blocks < SATURATED
-            limit = limit * below
-            coefficients[:, 0] = self._ratio_below(excess, below)
-        fit_robustly(excess, self._basis, self._step, self._shrink, limit, coefficients)
-        coefficients[:, :3] /= self._center[:, :, 0]
+        fit_light(
+            cells,
+            self._row_weights,
+            self._column_weights,
+            self._reference,
+            self._per_brightness,
+            self._limit,
+            self._basis,
+            self._step,
+            self._shrink,
+            coefficients,
+        )
+        coefficients[:, :3] /= self._center
         return coefficients
-
-    def _ratio_below(self, excess: Float, below: NDArray[np.bool_]) -> Float:
-        """(3,) float32: median of the relative change of the blocks, (3, n), that are not saturated."""
-        ratios = excess * self._per_brightness
-        most: Float = np.fmax.reduce(ratios, axis=1, initial=0)
-        ratios[~below] = np.nan
-        ratios.sort(axis=1)
-        typical: Float = ratios[_CHANNELS, np.count_nonzero(self._lit & below, axis=1) // 2]
-        # Where all of a channel is saturated there is no median.
-        return np.where(np.isnan(typical), most, typical)
 
     def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         """Blocks (n,) of which at least half counts; None for all, also where there is none of them."""
@@ -145,7 +127,7 @@ class IlluminationModel:
 
     def _block_means(self, planes: Float) -> Float:
         """(n, blocks) float32: means over blocks of (n, h, w) planes; a cell may belong to two in parts."""
-        means = self._row_weights @ planes @ self._column_weights
+        means = self._row_weights @ planes @ self._column_weights.T
         return np.asarray(means.reshape(len(planes), -1), np.float32)
 
 
@@ -174,12 +156,93 @@ def _block_weights(blocks: int, count: int) -> Float:
     return np.asarray(np.maximum(covered, 0) * (blocks / count), np.float32)
 
 
+@helper
+def _compare_blocks(
+    plane: Float,
+    row_weights: Float,
+    column_weights: Float,
+    reference: Float,
+    usual_limit: Float,
+    excess: Float,
+    limit: Float,
+) -> None:
+    """Fill `excess` (n,) with means over blocks less `reference`, and `limit`, 0 where they are saturated."""
+    high, wide = plane.shape
+    down, across = len(row_weights), len(column_weights)
+    line = np.empty(wide, np.float32)
+    for row in range(down):
+        line[:] = 0
+        # A block takes no other lines and columns than those from its first to its last one.
+        for y in range(row * high // down, -(-(row + 1) * high // down)):
+            for x in range(wide):
+                line[x] += row_weights[row, y] * plane[y, x]
+        for column in range(across):
+            mean, at = np.float32(0), row * across + column
+            for x in range(column * wide // across, -(-(column + 1) * wide // across)):
+                mean += line[x] * column_weights[column, x]
+            excess[at] = mean - reference[at]
+            limit[at] = usual_limit[at] if mean < SATURATED else np.float32(0)
+
+
+@helper
+def _typical_ratio(excess: Float, per_brightness: Float, limit: Float) -> np.float32:
+    """Median of the relative change of the blocks (n,) that are lit and not saturated.
+
+    Where all are saturated, the largest relative change; 0 in a channel without light.
+    """
+    ratios, count, most = np.empty(excess.size, np.float32), 0, np.float32(0)
+    for i in range(excess.size):
+        if per_brightness[i] > 0:
+            ratio = excess[i] * per_brightness[i]
+            most = max(most, ratio)
+            if limit[i] > 0:
+                ratios[count] = ratio
+                count += 1
+    for i in range(count):
+        below = up_to = 0
+        for j in range(count):
+            below += ratios[j] < ratios[i]
+            up_to += ratios[j] <= ratios[i]
+        if below <= count // 2 < up_to:
+            return np.float32(ratios[i])
+    return most
+
+
 @kernel(
-    "void(float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1],"
-    " float32[:, ::1])",
+    "void(float32[:, :, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1],"
+    " float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1])",
     reorder=True,
 )
-def fit_robustly(
+def fit_light(
+    cells: Float,
+    row_weights: Float,
+    column_weights: Float,
+    reference: Float,
+    per_brightness: Float,
+    usual_limit: Float,
+    basis: Float,
+    step: Float,
+    shrink: Float,
+    coefficients: Float,
+) -> None:
+    """What `IlluminationModel.fit` does; `coefficients`, (3, 4), 0 at first, is filled.
+
+    cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. reference,
+    per_brightness, usual_limit : (3, n), of the blocks: what they are usually, one over their brightness
+    (0 where not lit), and where residuals are clipped. basis, step : (3, 4, n), the model and its
+    pseudo-inverse. shrink : (3, 4, 4), what the ridge takes from the coefficients in a step.
+    """
+    excess, limit = np.empty_like(reference), np.empty_like(reference)
+    for c in range(3):
+        _compare_blocks(
+            cells[c], row_weights, column_weights, reference[c], usual_limit[c], excess[c], limit[c]
+        )
+        coefficients[c, 0] = _typical_ratio(excess[c], per_brightness[c], limit[c])
+    _fit_robustly(excess, basis, step, shrink, limit, coefficients)
+
+
+@helper
+def _fit_robustly(
     excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
 ) -> None:
     """Least-squares steps with clipped residuals; `coefficients`, (3, 4), start and result.

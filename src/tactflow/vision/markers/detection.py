@@ -255,7 +255,7 @@ def _found_in(
     if dot_radius is None:
         _require_lattice(found)
         best, by_scale = _without_lamps(gray, best, scales[best.polarity])
-        return _detection(gray, best, family.united(best, by_scale), found[1:])
+        return _detection(gray, best, family.united(gray, best, by_scale), found[1:])
     return _detection(gray, best, best.spots, found[1:])
 
 

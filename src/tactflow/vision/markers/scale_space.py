@@ -47,10 +47,6 @@ RING_POINTS: Final = 16
 RING_MISSES: Final = 2
 """Points of the ring that need not differ from the spot: what touches it there. Chosen by hand."""
 
-RING_CONTRAST: Final = 0.3
-"""Contrast of a spot with all other points of the ring, at least, over the median contrast. Chosen by
-hand."""
-
 OVERLAP: Final = 1.3
 """Distance of neighbouring marks at least, in radii: spots closer than that are ridges of a pattern."""
 
@@ -98,8 +94,8 @@ def find_spots(
 ) -> Spots:
     """Spots of one scale and polarity, strongest first, without those that the border cuts.
 
-    Edges and lines also answer to a difference of Gaussians, but are as dark along themselves: a spot has to
-    differ from (almost) the whole ring around it.
+    Edges and lines also answer to a difference of Gaussians, but are as dark along themselves: `clear` tells
+    whether a spot differs from (almost) the whole ring around it.
 
     gray : (H, W) float32, grey levels. sigma : px. valid : (H, W) uint8, not 0 where there is gel.
 
@@ -120,7 +116,7 @@ def find_spots(
     spots = Spots(points, np.full(len(points), radius), strength, clear)
     margin, (height, width) = BORDER_MARGIN * radius, gray.shape
     inside = ((points >= margin) & (points <= np.array([width, height]) - 1 - margin)).all(axis=1)
-    spots = spots.at(inside & (clear > RING_CONTRAST))
+    spots = spots.at(np.flatnonzero(inside))
     return spots if valid is None else spots.at(_on_gel(valid, spots.points, radius))
 
 

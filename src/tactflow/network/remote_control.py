@@ -15,7 +15,7 @@ from typing import Any
 import orjson
 import zmq
 
-from tactflow.connection import Connection
+from tactflow.network.connection import Connection
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5557"
 """Where `tactflow control` looks for a run that takes commands."""

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import zmq
 
-from tactflow import client
 from tactflow.cli import listen
-from tactflow.client import LONGEST_MESSAGE, Subscriber
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results, encode_message
+from tactflow.network import subscriber
+from tactflow.network.subscriber import LONGEST_MESSAGE, Subscriber
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
 from tests.clock import PATIENCE, ManualClock, until
@@ -168,7 +168,7 @@ class Ticking(ManualClock):
 
 
 def test_a_long_wait_is_made_of_short_ones(publisher: Publisher, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client, "LONGEST_WAIT", 0.001)
+    monkeypatch.setattr(subscriber, "LONGEST_WAIT", 0.001)
     clock = Ticking()
     with Subscriber(publisher.endpoint, timeout=0.5, clock=clock) as messages:
         began = clock.now()
@@ -206,7 +206,9 @@ def test_an_address_that_makes_no_sense_is_refused(endpoint: str) -> None:
 
 
 def test_a_subscriber_needs_no_opencv() -> None:
-    program = "import sys, tactflow.client; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"
+    program = (
+        "import sys, tactflow.network.subscriber; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", program], check=False, timeout=60).returncode == 0
 
 
@@ -366,8 +368,8 @@ def test_what_a_publisher_sends_commands_no_terminal() -> None:
 
 def test_invented_sensors_take_no_memory() -> None:
     with Subscriber() as results:
-        for number in range(2 * client.MOST_SENSORS):
+        for number in range(2 * subscriber.MOST_SENSORS):
             results._count(f"sensor{number}", 0)
         results._count("sensor0", 3)
-        assert len(results._last_seq) == client.MOST_SENSORS
+        assert len(results._last_seq) == subscriber.MOST_SENSORS
         assert results.lost == 2

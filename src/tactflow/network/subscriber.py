@@ -1,6 +1,6 @@
 """A subscriber for programs that use what a running tactflow publishes.
 
->>> from tactflow.client import Subscriber
+>>> from tactflow.network.subscriber import Subscriber
 >>> with Subscriber(latest=True, timeout=5) as messages:      # doctest: +SKIP
 ...     for message in messages:
 ...         print(message["seq"], message["contact"])
@@ -19,7 +19,7 @@ import orjson
 import zmq
 
 from tactflow.clock import SYSTEM, Clock
-from tactflow.connection import Connection
+from tactflow.network.connection import Connection
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Where tactflow publishes unless its pipeline says otherwise."""

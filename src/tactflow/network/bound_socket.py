@@ -1,5 +1,5 @@
-"""Sockets that others connect to over ZeroMQ: of whoever publishes (the sink `zmq`, the relay of several
-sensors), and of whoever takes commands."""
+"""A socket that others connect to over ZeroMQ: to read results (`publisher.py`), to send commands
+(`control_socket.py`). Its counterpart is `connection.py`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ import zmq
 
 from tactflow.engine.errors import StageError
 from tactflow.files import expanded, files_left
-from tactflow.keys import DOMAIN, WrongKeysError, secure_publisher, subscribers_folder
-from tactflow.view.address import is_loopback
+from tactflow.network.keys import DOMAIN, WrongKeysError, secure_publisher, subscribers_folder
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
@@ -24,9 +23,6 @@ if TYPE_CHECKING:
 LONGEST_REQUEST = 4096
 """Bytes of a subscription or a command, which have some twenty. ZeroMQ keeps subscriptions in a tree and
 takes a step on the stack for each of their bytes: one of a megabyte ends the process."""
-MOST_SUBSCRIBED = 1 << 18
-"""Bytes that all different subscriptions may have together, thousands of topics. ZeroMQ takes some 50 times
-as much memory for them (600 MB for 12 MB, measured)."""
 HANDSHAKE_MS = 5000
 """A connection that has not said by then that it is a subscriber ends, ms. Chosen by hand."""
 KEEPALIVE_S = 10
@@ -35,8 +31,6 @@ FEWEST_FILES = 64
 """Files that a run must still be able to open; each connection takes one. Chosen by hand."""
 FILES_EVERY = 0.2
 """Time between two looks at how many there are, s. Chosen by hand."""
-LOOPBACK_INTERFACES = frozenset({"lo", "lo0"})
-"""What Linux and macOS call the network that ends in this machine; an address may name it."""
 
 
 class FloodError(Exception):
@@ -139,69 +133,6 @@ class BoundSocket:
             self._authenticator = None
         self.socket.close(linger=int(linger * 1000))
         self._context.term()
-
-
-class Publisher(BoundSocket):
-    """An XPUB socket that is bound.
-
-    endpoint, keys : as of `BoundSocket`. backlog : messages that may wait for each subscriber.
-    send_buffer : of the kernel for each, bytes.
-    """
-
-    hint = (
-        "another tactflow run, or another program, publishes there. End it, choose another address "
-        "(--set sinks.zmq.endpoint=tcp://127.0.0.1:5557) or publish nothing (--set sinks.zmq=null)"
-    )
-
-    def __init__(self, endpoint: str, backlog: int, send_buffer: int, keys: str | None = None) -> None:
-        self._subscribed = 0
-        super().__init__(zmq.XPUB, endpoint, {zmq.SNDHWM: backlog, zmq.SNDBUF: send_buffer}, keys)
-
-    def next_event(self) -> bytes | None:
-        """The next subscription, 1 and the beginning of what is wanted, or its end, 0 and the same; or None.
-
-        Never waits.
-
-        Raises
-        ------
-        FloodError
-            If all subscriptions together are too long, or connections take too many files: `renew` ends it.
-        """
-        self.refuse_crowd()
-        if not int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            return None
-        event = self.socket.recv(zmq.NOBLOCK)
-        self._subscribed += (len(event) - 1) * (1 if event[:1] == b"\x01" else -1)
-        if self._subscribed > MOST_SUBSCRIBED:
-            raise FloodError("too many subscriptions")
-        return event
-
-    def renew(self) -> None:
-        """As of `BoundSocket`; nobody has subscribed then."""
-        self._subscribed = 0
-        super().renew()
-
-
-def is_reachable(endpoint: str) -> bool:
-    """Whether other machines can reach an address.
-
-    >>> is_reachable("tcp://*:5556"), is_reachable("tcp://127.0.0.1:5556"), is_reachable("ipc:///tmp/tactflow")
-    (True, False, False)
-    """
-    scheme, _, place = endpoint.partition("://")
-    if scheme in ("ipc", "inproc"):
-        return False
-    host = place.rpartition(":")[0].strip("[]")
-    return not (scheme == "tcp" and (is_loopback(host) or host in LOOPBACK_INTERFACES))
-
-
-def picks_a_port(endpoint: str) -> bool:
-    """Whether an address leaves its port to the system.
-
-    >>> picks_a_port("tcp://127.0.0.1:*"), picks_a_port("tcp://127.0.0.1:5556"), picks_a_port("ipc:///tmp/a")
-    (True, False, False)
-    """
-    return endpoint.startswith("tcp://") and endpoint.endswith((":*", ":0"))
 
 
 def _refuse_taken_path(endpoint: str, hint: str) -> None:

@@ -13,16 +13,16 @@ import pytest
 import zmq
 from pydantic import ValidationError
 
-from tactflow import control_socket, publisher
 from tactflow.cli.main import main
-from tactflow.commands import Commands
 from tactflow.config.load import load_pipeline
-from tactflow.control_socket import ControlSocket
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.run import Runner
-from tactflow.keys import make_keys
-from tactflow.remote import RemoteControl
+from tactflow.network import bound_socket, control_socket
+from tactflow.network.commands import Commands
+from tactflow.network.control_socket import ControlSocket
+from tactflow.network.keys import make_keys
+from tactflow.network.remote_control import RemoteControl
 from tactflow.sinks.record import Record
 from tactflow.sinks.zmq import Zmq
 from tactflow.sources import open_source
@@ -181,9 +181,8 @@ def test_too_many_connections_are_ended_and_commands_are_taken_again(
     looks = iter([0])
     with remote(bare.endpoint) as run:
         assert run.ping()["ok"]
-        monkeypatch.setattr(publisher, "files_left", lambda: next(looks, 10_000))
+        monkeypatch.setattr(bound_socket, "files_left", lambda: next(looks, 10_000))
         until(lambda: "too many connections" in caplog.text)
-        until(lambda: bare._thread.is_alive())
     with remote(bare.endpoint) as run:
         assert run.ping()["ok"]
 

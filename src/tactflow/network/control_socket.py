@@ -15,9 +15,9 @@ from typing import Any
 import orjson
 import zmq
 
-from tactflow.commands import Commands, RefusedError
 from tactflow.engine.errors import StageError
-from tactflow.publisher import BoundSocket, FloodError
+from tactflow.network.bound_socket import BoundSocket, FloodError
+from tactflow.network.commands import Commands, RefusedError
 
 log = logging.getLogger("tactflow")
 

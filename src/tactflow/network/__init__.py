@@ -1,0 +1,1 @@
+"""What other programs connect to, and with what: results, commands, keys."""
