@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import sys
 from pathlib import Path
@@ -65,6 +66,30 @@ def test_a_result_that_is_not_as_it_was_written_is_no_result(batch: Batch, damag
             record.unlink()
     assert statuses(batch)[2] == "2.npy done"
     assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    "change", [{"frames": "many"}, {"notes": 5}, {"started": None}, {"more": 1}, {"result": "../records"}]
+)
+def test_a_line_of_the_ledger_that_is_not_ours_counts_for_nothing(
+    batch: Batch, change: dict[str, object]
+) -> None:
+    batch()
+    ledger = batch.folder.ledgers / "1-of-1.jsonl"
+    lines = [json.loads(line) | change for line in ledger.read_text().split("\n") if line]
+    ledger.write_text("\n".join(map(json.dumps, lines)))
+    assert statuses(batch) == ["0.npy done before", "1.npy done before", "2.npy done before"]
+
+
+@pytest.mark.parametrize(
+    "record", [b"[]", b"{}", b'{"outcome": null}', b'{"curve": [[1]], "pictures": [{"jpeg": "<script>"}]}']
+)
+def test_a_record_that_is_not_ours_is_none(batch: Batch, record: bytes) -> None:
+    batch()
+    (first, *_) = batch.folder.records.iterdir()
+    assert batch.folder.record(first.stem) is not None
+    first.write_bytes(record)
+    assert batch.folder.record(first.stem) is None
 
 
 def test_tables_are_whole_only_with_all_their_parts(batch: Batch) -> None:

@@ -31,7 +31,7 @@ from tests.oracles.background import (
 )
 from tests.oracles.border import plain_border_level
 from tests.oracles.components import plain_close_changes
-from tests.oracles.illumination import plain_fit_light
+from tests.oracles.illumination import plain_compare_blocks, plain_fit_robustly
 from tests.oracles.resolution import plain_halve_window, plain_raise_mask
 from tests.oracles.response import plain_sum_change
 
@@ -46,7 +46,8 @@ ORACLES = (
     (background, "change_strength", plain_change_strength),
     (background, "smooth_cells", plain_smooth_cells),
     (response, "sum_change", plain_sum_change),
-    (illumination, "fit_light", plain_fit_light),
+    (illumination, "compare_blocks", plain_compare_blocks),
+    (illumination, "fit_robustly", plain_fit_robustly),
     (components, "close_changes", plain_close_changes),
     (border, "border_level", plain_border_level),
     (resolution, "raise_mask", plain_raise_mask),
