@@ -1,4 +1,4 @@
-"""The result message `tactflow.frame/1`: what sinks publish about one frame, and its JSON Schema.
+"""The result message `tactflow.frame/1`, which sinks publish; described by `message_schema.py`.
 
 Numbers are written with full precision (the shortest decimal that reads back as the same double); nothing
 is rounded.
@@ -6,16 +6,13 @@ is rounded.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
-from pydantic.json_schema import GenerateJsonSchema
 
 from tactflow.engine.frame import Tick
 from tactflow.ports import Image
@@ -23,7 +20,6 @@ from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.types import (
     Contact,
     Depth,
-    Evidence,
     Flow,
     Force,
     Markers,
@@ -265,197 +261,3 @@ def _points(points: NDArray[Any], name: str) -> NDArray[np.float64]:
 _origin = _Kept(lambda points: _points(points, "markers.origin"))
 _position = _Kept(lambda points: _points(points, "markers.position"))
 _status = _Kept(lambda status: [STATUS_NAMES[value] for value in status.tolist()])
-
-
-# -- the schema ----------------------------------------------------------------------------------------------
-
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
-_Point = tuple[_Finite, _Finite]
-_Angle = Annotated[float, Field(gt=-90, le=90, allow_inf_nan=False)]
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-
-class _EllipseModel(_Strict):
-    """Ellipse fitted to the contact."""
-
-    center: _Point = Field(description="(x, y), px")
-    axes: tuple[_Positive, _Positive] = Field(description="full lengths (major, minor), px")
-    angle: _Angle | None = Field(description="of the major axis, degrees; null for a circle")
-
-
-class _ContactModel(_Strict):
-    """Geometry of the contact region."""
-
-    area: float = Field(ge=0, description="of the convex hull, px^2")
-    center: _Point = Field(description="centroid of the contact region, px")
-    angle: _Angle | None = Field(
-        description="principal axis, degrees, counter-clockwise as seen; null where there is no direction"
-    )
-    slope: _Finite | None = Field(
-        description="dy/dx of that axis, y down; null where it is vertical or there is no direction"
-    )
-    hull: list[_Point] = Field(description="vertices of the convex hull in order, px")
-    ellipse: _EllipseModel | None = Field(description="null where none can be fitted")
-    evidence: Evidence = Field(
-        description="what shows it: a change of the light, motion of the markers (dots), or both"
-    )
-    confidence: float = Field(
-        0.0, ge=0, le=1, description="of the direction: 0 a disc, towards 1 a line (detail)"
-    )
-    center_mm: _Point | None = Field(None, description="center from the scale's origin, mm (calibrated)")
-    center_mm_stderr: _Point | None = Field(
-        None, description="what the scale's error does to center_mm, mm (calibrated, detail)"
-    )
-    area_mm2: Annotated[float, Field(ge=0)] | None = Field(None, description="area, mm^2 (calibrated)")
-    area_mm2_stderr: Annotated[float, Field(ge=0)] | None = Field(
-        None, description="what the scale's error does to area_mm2, mm^2 (calibrated, detail)"
-    )
-    depth_mm: Annotated[float, Field(ge=0)] | None = Field(
-        None, description="how far the surface has been pushed in where it is deepest, mm (calibrated)"
-    )
-    depth_mm_stderr: Annotated[float, Field(ge=0)] | None = Field(
-        None, description="standard error of depth_mm, mm; null when unknown (calibrated, detail)"
-    )
-    volume_mm3: Annotated[float, Field(ge=0)] | None = Field(
-        None, description="between the untouched surface and the pressed one, mm^3 (calibrated)"
-    )
-    volume_mm3_stderr: Annotated[float, Field(ge=0)] | None = Field(
-        None, description="standard error of volume_mm3, mm^3; null when unknown (calibrated, detail)"
-    )
-
-
-class _FlowModel(_Strict):
-    """How the gel inside the contact has moved."""
-
-    mean: _Point | None = Field(description="mean displacement (dx, dy), px; null when not known")
-    count: int = Field(ge=0, description="number of markers inside the contact")
-    mean_mm: _Point | None = Field(None, description="mean, mm; null when not known (calibrated)")
-    mean_mm_stderr: _Point | None = Field(
-        None, description="standard error of mean_mm, mm (calibrated, detail)"
-    )
-    stderr: _Point | None = Field(None, description="standard error of mean, px; null when unknown (detail)")
-    rotation: _Finite | None = Field(
-        None, description="twist, degrees, counter-clockwise as seen; null when unknown (detail)"
-    )
-    divergence: _Finite | None = Field(
-        None, description="relative growth in area of the gel; null when unknown (detail)"
-    )
-    residual: _Finite | None = Field(
-        None,
-        description="RMS of what mean, rotation, divergence leave, px; null when unknown (detail)",
-    )
-    shear: _Point | None = Field(
-        None,
-        description="(du/dx - dv/dy, du/dy + dv/dx) of the displacement (u, v); null when unknown (detail)",
-    )
-    rotation_stderr: _Positive | None = Field(None, description="degrees; null when unknown (detail)")
-    divergence_stderr: _Positive | None = Field(None, description="null when unknown (detail)")
-    shear_stderr: _Positive | None = Field(None, description="of each part; null when unknown (detail)")
-
-
-class _MarkersModel(_Strict):
-    """The markers; index i is the same physical marker for the whole run."""
-
-    origin: list[_Point] = Field(description="positions in the reference frame, px")
-    position: list[_Point] = Field(description="positions now, px")
-    status: list[Literal["tracked", "inferred", "lost"]] = Field(description="how each position is known")
-    stderr: list[Annotated[float, Field(ge=0)] | None] = Field(
-        default_factory=list, description="standard error of each position, px; null when unknown (detail)"
-    )
-
-
-class _SlipModel(_Strict):
-    """Whether what touches the gel slips."""
-
-    slipping: bool = Field(description="whether it slides over the gel")
-    stick_ratio: float = Field(
-        ge=0, le=1, description="share of the contact on which the gel moves with it; 0 while it slides"
-    )
-
-
-class _ScaleModel(_Strict):
-    """Millimetres of pixels: mm = mm_per_px * (px - origin) along each axis."""
-
-    mm_per_px: tuple[_Positive, _Positive] = Field(description="along (x, y), mm per px")
-    origin: _Point = Field(description="(x, y) where the mm coordinates are 0, px")
-
-
-class _ForceModel(_Strict):
-    """The force on the gel."""
-
-    value: tuple[_Finite | None, _Finite | None, _NotNegative] = Field(
-        description="(x, y, z), N: z presses on the gel, x and y drag it along the axes of the picture; null "
-        "when not known"
-    )
-    stderr: tuple[_NotNegative | None, _NotNegative | None, _NotNegative] = Field(
-        description="standard errors, N; null where value is"
-    )
-    in_range: bool = Field(
-        description="whether the calibration was fitted to such contacts; stderr only holds there"
-    )
-
-
-class _FieldModel(_Strict):
-    """Displacement of the gel on a regular grid."""
-
-    first: _Point = Field(description="(x, y) of row 0, column 0, in the reference frame, px")
-    spacing: _Positive = Field(description="from one point to the next along both axes, px")
-    displacement: list[list[_Point]] = Field(description="rows of (dx, dy), px")
-    stderr: list[list[Annotated[float, Field(ge=0)]]] = Field(
-        description="standard error of each component, rows, px"
-    )
-
-
-class _Message(_Strict):
-    """What tactflow says about one processed frame."""
-
-    model_config = ConfigDict(title=SCHEMA)
-
-    schema_: Literal["tactflow.frame/1"] = Field(alias="schema")
-    sensor: str = Field(description="name of the sensor")
-    seq: int = Field(ge=0, description="index of the frame at the source; a dropped frame leaves a gap")
-    t: _Finite = Field(description="capture time, s: from the start of a recording, or Unix time if live")
-    size: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] = Field(
-        description="(width, height) of the processed frame, px"
-    )
-    contact: _ContactModel | None = Field(description="null when nothing touches the gel")
-    contacts: list[_ContactModel] = Field(
-        description="every separate contact, that with the most pixels first; empty when nothing touches"
-    )
-    flow: _FlowModel | None = Field(description="null when there is no contact")
-    markers: _MarkersModel | None = Field(description="null when markers were not computed")
-    field: _FieldModel | None = Field(
-        None, description="displacement field; null without contact (only where the sink's field is true)"
-    )
-    slip: _SlipModel | None = Field(
-        None, description="of the contact (only where the pipeline has the stage slip)"
-    )
-    scale: _ScaleModel | None = Field(None, description="makes mm of px (calibrated)")
-    force: _ForceModel | None = Field(
-        None, description="on the gel; only where something touches (calibrated)"
-    )
-    skipped: dict[str, str] = Field(
-        description="port -> why this frame did not need it; reference -> why this frame became a new one"
-    )
-
-
-class _NoDefaults(GenerateJsonSchema):
-    """Leaves defaults out: a field that a message lacks was not asked for; it has no value."""
-
-    def default_schema(self, schema: Any) -> dict[str, Any]:
-        return self.generate_inner(schema["schema"])
-
-
-@functools.cache
-def message_schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of the result message; made once, not to be changed.
-
-    `field`, and what is marked (detail) or (calibrated), is optional.
-    """
-    schema = _Message.model_json_schema(by_alias=True, schema_generator=_NoDefaults)
-    return {"$schema": GenerateJsonSchema.schema_dialect, **schema}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -76,3 +78,32 @@ def test_all_mistakes_are_told_at_once(data: Path) -> None:
     with pytest.raises(ConfigError) as raised:
         find_recordings(["no.npy", "none.npy", "empty"])
     assert len(raised.value.mistakes) == 3
+
+
+def test_lists_may_name_themselves_and_each_other(data: Path) -> None:
+    (data / "b" / "list.txt").write_text("list.txt\npress-2.npy\nother.txt\n")
+    (data / "b" / "other.txt").write_text("list.txt\npress-10.npy\n")
+    assert names("b/list.txt", "b/other.txt") == ["press-2.npy", "press-10.npy"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows asks for a privilege")
+def test_a_pattern_follows_no_links_in_circles(data: Path) -> None:
+    for link in "xyz":
+        (data / "b" / link).symlink_to(data / "b")
+    assert names("b/**/*.npy") == ["press-2.npy", "press-10.npy"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
+def test_a_file_may_be_named_like_a_pattern_or_as_if_options_followed(data: Path) -> None:
+    for name in ("c[1].npy", "c*.npy", "c?fps=3.npy"):
+        (data / "c" / name).parent.mkdir(exist_ok=True)
+        (data / "c" / name).touch()
+        assert find_recordings([f"c/{name}"])[0].path == data / "c" / name
+    assert {one.path for one in find_recordings(["c"])} == set((data / "c").iterdir())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux alone")
+def test_a_name_that_no_table_can_hold_is_refused(data: Path) -> None:
+    Path(os.fsdecode(bytes(data / "a") + b"/\xff.npy")).touch()
+    with pytest.raises(ConfigError, match="not UTF-8; rename it"):
+        find_recordings(["a"])

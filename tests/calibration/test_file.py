@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -118,6 +121,8 @@ def test_a_gel_that_looks_unlike_is_warned_of_with_the_numbers(
         ({"format": "other/1"}, "format"),
         ({"scale": {"mm_per_pixel": [0.1]}}, "scale"),
         ({"colour": 1}, "colour"),
+        ({"corners": [[0.0, 0.0], [1.0], [0.0, 1.0], [1.0, 1.0]]}, "corners.1"),
+        ({"made": "x" * (1 << 18)}, "larger than 128 KiB"),
     ],
 )
 def test_a_file_that_is_no_calibration_is_refused(
@@ -128,6 +133,35 @@ def test_a_file_that_is_no_calibration_is_refused(
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
     with pytest.raises(ConfigError, match=words):
         Calibration.load(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
+def test_nobody_waits_at_a_pipe_for_a_calibration(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "left.yaml")
+    with pytest.raises(ConfigError, match="is a pipe or a device"):
+        Calibration.load(tmp_path / "left.yaml")
+
+
+def test_a_calibration_that_cannot_be_written_leaves_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "left.yaml"
+    CALIBRATION.save(path)
+
+    def full(file: Path, **_: object) -> None:
+        file.write_bytes(b"PK")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(ConfigError, match="No space left"):
+        replace(CALIBRATION, sensor="right").save(path)
+    assert Calibration.load(path).sensor == "left"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_the_password_of_a_camera_is_not_kept(tmp_path: Path) -> None:
+    replace(CALIBRATION, made_from="rtsp://me:secret@camera/1?pwd=secret").save(tmp_path / "left.yaml")
+    assert "secret" not in (tmp_path / "left.yaml").read_text()
 
 
 def test_a_recording_keeps_the_calibration_and_playing_it_finds_it(pipeline: Path, tmp_path: Path) -> None:

@@ -402,8 +402,9 @@ def test_an_option_adds_no_second_sink_for_a_file_that_is_written_already(load: 
 
 
 @pytest.mark.parametrize("link", ["", "symbolic", "hard"])
-def test_a_sink_never_writes_over_what_a_stage_reads(tmp_path: Path, link: str) -> None:
-    source = tmp_path / "press.npy"
+@pytest.mark.parametrize("name", ["press.npy", "press[1].npy"])
+def test_a_sink_never_writes_over_what_a_stage_reads(tmp_path: Path, link: str, name: str) -> None:
+    source = tmp_path / name
     np.save(source, np.zeros((2, 60, 80, 3), np.uint8))
     target = source
     if link:
@@ -411,9 +412,9 @@ def test_a_sink_never_writes_over_what_a_stage_reads(tmp_path: Path, link: str) 
         (os.symlink if link == "symbolic" else os.link)(source, target)
     text = f"""
 stages:
-  capture: {{source: "press.npy?loop=2"}}
+  capture: {{source: "{name}?loop=2"}}
 sinks:
-  jsonl: {{path: {target}, overwrite: true}}
+  jsonl: {{path: "{target}", overwrite: true}}
 """
     (tmp_path / "pipeline.yaml").write_text(text)
     with pytest.raises(

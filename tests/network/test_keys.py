@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,10 +20,11 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import StageError
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import clash_problems
-from tactflow.network import bound_socket
-from tactflow.network.connection import asked_for
+from tactflow.network import bound_socket, connection
+from tactflow.network.connection import GREETING, asked_for
 from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.network.publisher import Publisher
+from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import Subscriber
 from tactflow.sinks.zmq import Zmq
 from tests.clock import PATIENCE, until
@@ -133,6 +138,41 @@ def test_what_a_publisher_asks_for_is_known_before_it_hangs_up(
         assert asked_for(opened.endpoint) is None
 
 
+def test_who_greets_a_byte_at_a_time_is_not_waited_for_beyond_the_time_that_is_left() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def greet_slowly() -> None:
+            stream = listener.accept()[0]
+            with stream, suppress(OSError):
+                for byte in GREETING + b"\0NULL".ljust(30, b"\0"):
+                    time.sleep(0.05)
+                    stream.send(bytes([byte]))
+
+        slow = threading.Thread(target=greet_slowly)
+        slow.start()
+        assert asked_for(f"tcp://127.0.0.1:{listener.getsockname()[1]}", 0.2) is None
+        slow.join()
+
+
+def test_who_hangs_up_is_asked_why_within_the_time_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[float] = []
+    monkeypatch.setattr(connection, "asked_for", lambda _endpoint, seconds: given.append(seconds))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def hang_up() -> None:
+            with suppress(OSError):
+                while True:
+                    listener.accept()[0].close()
+
+        threading.Thread(target=hang_up, daemon=True).start()
+        endpoint = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+        with RemoteControl(endpoint, 0.5) as run, pytest.raises(TimeoutError):
+            run.ping()
+        listener.shutdown(socket.SHUT_RDWR)
+    assert given
+    assert max(given) <= 0.5
+
+
 def test_several_sensors_with_different_keys_at_one_address_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "two.yaml"
     text = (REPOSITORY / "pipeline.yaml").read_text(encoding="utf-8").replace("sensor: main", "")
@@ -162,6 +202,14 @@ def test_only_their_owner_can_read_keys_and_others_are_refused(folders: tuple[Pa
         Publisher("tcp://127.0.0.1:*", 1, 32768, str(publisher))
     with pytest.raises(WrongKeysError, match=r"others may read it; chmod 600"):
         Subscriber(keys=subscriber)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="permissions are another matter there")
+@pytest.mark.parametrize("place", ["", "subscribers", "subscribers/laptop.key"])
+def test_who_may_read_is_not_for_others_to_say(folders: tuple[Path, Path], place: str) -> None:
+    os.chmod(folders[0] / place, 0o770)
+    with pytest.raises(StageError, match=r"others may write to it; chmod go-w"):
+        Publisher("tcp://127.0.0.1:*", 1, 32768, str(folders[0]))
 
 
 def test_keys_that_are_missing_or_damaged_are_refused_with_a_hint(folders: tuple[Path, Path]) -> None:

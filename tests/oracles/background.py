@@ -13,6 +13,7 @@ from tactflow.vision.contact.background_kernels import (
     MIDDLE,
     change_strength,
     scaled_change,
+    smooth_cells,
     weigh_change,
 )
 from tests.oracles.gains import Gain
@@ -24,6 +25,12 @@ def _change(planes: Float, mean: Float, coefficients: Float, across: Float, down
     gain, slope_x, slope_y, offset = coefficients.T[:, :, None, None]
     light = mean * (gain + slope_y * down[:, None] + slope_x * across) + offset
     return np.asarray(np.maximum(planes - mean - light, planes - np.float32(255)), np.float32)
+
+
+def plain_smooth_cells(cells: NDArray[np.uint8], smooth: Float) -> None:
+    """A box filter."""
+    means = cv2.boxFilter(cells.reshape(len(cells), -1, 3), cv2.CV_32F, (3, 3))
+    smooth[:] = means.reshape(*smooth.shape[1:], 3).transpose(2, 0, 1)
 
 
 def plain_weigh_change(
@@ -97,6 +104,8 @@ def plain_change_strength(
 
 
 GAINS = [
+    # Grey levels; OpenCV multiplies the last ones of a line in float64.
+    Gain(smooth_cells, plain_smooth_cells, tolerance=2e-5),
     # Squared deviations up to some thousands, to the rounding of float32; sums of thousands of them.
     Gain(weigh_change, plain_weigh_change, tolerance=2.0),
     Gain(scaled_change, plain_scaled_change, tolerance=1e-5),

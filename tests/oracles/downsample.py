@@ -22,11 +22,14 @@ def plain_halve_block(
     height: int,
     width: int,
     far: bool,  # noqa: ARG001
+    upside_down: bool,
 ) -> None:
     """Block averages by OpenCV; rows hold three channels a pixel."""
     pixels, halves = picture.reshape(len(picture), -1, 3), half.reshape(len(half), -1, 3)
     block = pixels[top : top + 2 * height, left : left + 2 * width]
-    halves[half_top : half_top + height, half_left : half_left + width] = plain_halved(block)
+    halves[half_top : half_top + height, half_left : half_left + width] = plain_halved(block)[
+        :: -1 if upside_down else 1
+    ]
 
 
 def plain_halved(picture: Bytes) -> Bytes:

@@ -1,14 +1,44 @@
-"""Plain version of the kernel of the illumination."""
+"""Plain versions of the kernels of the illumination."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.illumination import CONVERGED, MAX_STEPS, NEVER, REJECT, fit_robustly
+from tactflow.vision.contact.illumination import (
+    CONVERGED,
+    MAX_STEPS,
+    NEVER,
+    REJECT,
+    SATURATED,
+    compare_blocks,
+    fit_robustly,
+)
 from tests.oracles.gains import Gain
 
 Float = NDArray[np.float32]
+
+
+def plain_compare_blocks(
+    cells: Float,
+    row_weights: Float,
+    column_weights: Float,
+    reference: Float,
+    per_brightness: Float,
+    usual_limit: Float,
+    excess: Float,
+    limit: Float,
+    coefficients: Float,
+) -> None:
+    """Means over blocks, and the median of their relative changes."""
+    blocks = (row_weights @ cells @ column_weights.T).reshape(reference.shape)
+    below = blocks < SATURATED
+    excess[:] = blocks - reference
+    limit[:] = usual_limit * below
+    for c in range(3):
+        ratios = excess[c] * per_brightness[c]
+        used = np.sort(ratios[(per_brightness[c] > 0) & below[c]])
+        coefficients[c, 0] = used[len(used) // 2] if len(used) else ratios.max(initial=0)
 
 
 def plain_fit_robustly(
@@ -26,4 +56,7 @@ def plain_fit_robustly(
                 break
 
 
-GAINS = [Gain(fit_robustly, plain_fit_robustly, tolerance=1e-3)]
+GAINS = [
+    Gain(compare_blocks, plain_compare_blocks, tolerance=1e-3),
+    Gain(fit_robustly, plain_fit_robustly, tolerance=1e-3),
+]

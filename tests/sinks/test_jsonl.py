@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +19,7 @@ from tactflow.message import Results
 from tactflow.sinks import jsonl as jsonl_module
 from tactflow.sinks.jsonl import Jsonl
 from tests.clock import PATIENCE
+from tests.sinks.full_disk import disk_full_after
 
 IMAGE = np.zeros((3, 4, 3), np.uint8)
 
@@ -52,17 +50,6 @@ def seqs_in(path: Path) -> list[int]:
     text = path.read_text()
     assert text == "" or text.endswith("\n")
     return [json.loads(line)["seq"] for line in text.splitlines()]
-
-
-@contextmanager
-def disk_full_after(size: int) -> Iterator[None]:
-    """Files cannot grow beyond `size` bytes: the kernel then refuses writes as it does on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_every_frame_is_one_line_and_folders_are_created(tmp_path: Path) -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +23,7 @@ from tactflow.sinks.record import Record
 from tactflow.sources import open_source
 from tactflow.sources.mcap import Recording
 from tactflow.vision.types import Contact
+from tests.sinks.full_disk import disk_full_after
 
 FPS = 10.0
 TOUCH = Contact(
@@ -71,17 +69,6 @@ def seqs_in(path: Path) -> list[int]:
         seqs.append(stamp.seq)
     source.close()
     return seqs
-
-
-@contextmanager
-def disk_full_after(size: int) -> Iterator[None]:
-    """Files cannot grow beyond `size` bytes: the kernel then refuses writes as it does on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_every_frame_comes_back_bit_for_bit_with_its_seq_time_and_flag(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError, SourceError
-from tactflow.files import expanded
+from tactflow.files import expanded, is_utf8
 from tactflow.sources.base import find_path
-from tactflow.sources.files import IMAGE_SUFFIXES, natural_key
+from tactflow.sources.files import IMAGE_SUFFIXES, matching, natural_key
 from tactflow.sources.lerobot import SCHEME
 
 FILE_SUFFIXES = frozenset(
@@ -59,8 +59,10 @@ class Recording:
         """The file, or the folder, also of a pattern; None for the simulated sensor."""
         if self.source.startswith("sim:"):
             return None
-        path = Path(self.source.removeprefix(SCHEME).partition("?")[0])
-        while "*" in path.name or "[" in path.name:
+        whole = self.source.removeprefix(SCHEME)
+        # A file may be named like a pattern, or as if options followed.
+        path = Path(whole) if os.path.exists(whole) else Path(whole.partition("?")[0])
+        while ("*" in path.name or "[" in path.name) and not path.exists():
             path = path.parent
         return path
 
@@ -80,7 +82,9 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
     ['sim:press?seed=1', 'sim:press?seed=2']
     """
     mistakes: list[str] = []
-    sources = list(dict.fromkeys(_sources(words, None, mistakes)))
+    sources = list(dict.fromkeys(_sources(words, None, mistakes, set())))
+    # Messages and tables are UTF-8.
+    mistakes += [f"{source}: its name is not UTF-8; rename it" for source in sources if not is_utf8(source)]
     if len(mistakes) > _SHOWN:
         mistakes[_SHOWN:] = [f"and {len(mistakes) - _SHOWN} more"]
     if mistakes:
@@ -91,16 +95,21 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
     return [Recording(source, name) for source, name in zip(sources, _short_names(sources), strict=True)]
 
 
-def _sources(words: Iterable[str], directory: Path | None, mistakes: list[str]) -> Iterator[str]:
-    """Sources that words name; what names none is added to the mistakes."""
+def _sources(
+    words: Iterable[str], directory: Path | None, mistakes: list[str], lists: set[Path]
+) -> Iterator[str]:
+    """Sources that words name; what names none is added to the mistakes.
+
+    lists : those that were read, each once: they may name each other.
+    """
     for word in words:
         try:
-            yield from _named(word.strip(), directory, mistakes)
+            yield from _named(word.strip(), directory, mistakes, lists)
         except SourceError as error:
             mistakes.append(str(error))
 
 
-def _named(word: str, directory: Path | None, mistakes: list[str]) -> Iterator[str]:
+def _named(word: str, directory: Path | None, mistakes: list[str], lists: set[Path]) -> Iterator[str]:
     if word.startswith("sim:"):
         yield word
         return
@@ -108,15 +117,19 @@ def _named(word: str, directory: Path | None, mistakes: list[str]) -> Iterator[s
         mistakes.append(f"{word}: is live; a batch takes recordings. `tactflow record` makes one")
         return
     kind, word = (SCHEME, word.removeprefix(SCHEME)) if word.startswith(SCHEME) else ("", word)
-    plain, mark, options = word.partition("?")
+    there = any((base / expanded(word)).exists() for base in (Path(), directory or Path()))
+    # A file may be named like a pattern, or as if options followed.
+    plain, mark, options = (word, "", "") if there else word.partition("?")
     # In a pattern `?` stands for any character, unless options follow it.
-    if glob.has_magic(plain):
+    if glob.has_magic(plain) and not there:
         pattern, tail = (plain, mark + options) if "=" in options else (word, "")
         yield from (kind + found + tail for found in _matching(pattern, directory))
         return
     path = find_path(plain, directory)
     if path.suffix.lower() in LISTS and path.is_file():
-        yield from _sources(_lines(path), path.parent, mistakes)
+        if path.resolve() not in lists:
+            lists.add(path.resolve())
+            yield from _sources(_lines(path), path.parent, mistakes, lists)
     elif path.is_dir() and not mark and path.suffix.lower() not in FOLDERS:
         found = list(_inside(path))
         if not found:
@@ -133,16 +146,16 @@ def _matching(pattern: str, directory: Path | None) -> Iterator[str]:
     for base in (Path(), directory):
         if base is None:
             continue
-        whole = str(base / expanded(pattern))
-        paths = sorted(glob.glob(whole, recursive=True), key=natural_key)
-        if paths and all(Path(path).suffix.lower() in IMAGE_SUFFIXES for path in paths):
-            yield _absolute(Path(whole))
+        whole = base / expanded(pattern)
+        paths = matching(whole)
+        if paths and all(path.suffix.lower() in IMAGE_SUFFIXES for path in paths):
+            yield _absolute(whole)
             return
         if paths:
-            for path in map(Path, paths):
-                if path.is_dir():
+            for path in paths:
+                if path.is_dir() and path.suffix.lower() not in FOLDERS:
                     yield from _inside(path)
-                elif path.suffix.lower() in FILE_SUFFIXES:
+                elif path.suffix.lower() in FILE_SUFFIXES | FOLDERS:
                     yield _absolute(path)
             return
     raise SourceError(f"{pattern}: no file matches this pattern")

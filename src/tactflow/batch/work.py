@@ -1,4 +1,4 @@
-"""Works on one recording, in whatever process an engine has chosen for it."""
+"""Works on one recording, in whatever process an executor has chosen for it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from typing import Any
 import orjson
 
 from tactflow.api import make_runner
-from tactflow.batch.folder import Folder, remove
-from tactflow.batch.keys import (
+from tactflow.batch.digests import (
     digest_of,
     fingerprint,
     input_digest,
@@ -28,6 +27,7 @@ from tactflow.batch.keys import (
     result_key,
     versions,
 )
+from tactflow.batch.folder import Folder, remove
 from tactflow.batch.parts import OVERLAP, of_part
 from tactflow.batch.recordings import Recording
 from tactflow.batch.summary import Summary, with_looker
@@ -110,7 +110,7 @@ def _result(task: Task, blank: Outcome, report: Report) -> Outcome:
         # The parts of a recording have one digest: the first one works it out.
         read = "" if task.part is not None and task.part.number else input_digest(task.recording)
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise SourceError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     if task.part is not None:
         return _part(task, replace(blank, input=before, input_digest=read), report)
     key = result_key(read, task.pipeline.digest)

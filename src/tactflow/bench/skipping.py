@@ -18,8 +18,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from tactflow.bench.lockstep import LockstepPipeline, Outcome
 from tactflow.bench.pipelines import on_recording
@@ -71,7 +69,7 @@ _MEDIAN_DEVIATION = 0.6745
 """Median of the absolute value of a standard normal deviate."""
 _OUTLIER = 5.0
 """Second differences above so many deviations are motion, not noise; chosen by hand."""
-_ENOUGH = 20
+ENOUGH = 20
 """Differences from which a noise or an RMS is told: it is then known to about a fifth."""
 
 
@@ -117,7 +115,7 @@ class Comparison:
         """What skipping changed beyond noise; empty if nothing."""
         found = [f"{self.decisions} contact decisions differ"] if self.decisions else []
         for name, rms in self.rms.items():
-            enough = self.values[name] >= _ENOUGH
+            enough = self.values[name] >= ENOUGH
             if enough and name in self.noise and rms > ALLOWED * self.noise[name].rms:
                 found.append(f"{name}: RMS difference {rms:.3g} with a noise of {self.noise[name].rms:.3g}")
         if self.stale > STALE:
@@ -241,9 +239,9 @@ def _noise_of(name: str, rows: Sequence[_Row]) -> Noise | None:
             always.append(bend)
             if before.repeated and now.repeated and after.repeated:
                 resting.append(bend)
-    bends = resting if sum(bend.size for bend in resting) >= _ENOUGH else always
+    bends = resting if sum(bend.size for bend in resting) >= ENOUGH else always
     joined = np.concatenate([np.empty(0), *bends])
-    if joined.size < _ENOUGH:
+    if joined.size < ENOUGH:
         return None
     rms = float(np.sqrt(np.square(joined).mean()))
     peaks = np.sort([np.abs(bend).max() for bend in bends])
@@ -311,62 +309,3 @@ def _recordings(pipelines: Pipelines, data: Path) -> list[tuple[str, Pipeline, P
     found = [(name, pipelines.wedge, data / name) for name in ("wedge_roll", "wedge_ball")]
     found += [(f.stem, pipelines.markerless, f) for f in sorted((data / "wedge_grasp").glob("*.avi"))]
     return [item for item in found if item[2].exists()]
-
-
-def print_comparisons(comparisons: Sequence[Comparison], copies: CopyUnit, console: Console) -> None:
-    """Three tables: what skipping changed, how long in the scenes made to catch it out, and what it saved."""
-    changed = Table(
-        title="skipping on against off, what was repeated: RMS / largest difference (noise of one result / "
-        "largest difference of two)",
-        title_justify="left",
-        title_style="bold",
-    )
-    changed.add_column("scene")
-    for heading in ("frames", "repeated", "decisions differ"):
-        changed.add_column(heading, justify="right")
-    for name, unit in NUMBERS.items():
-        changed.add_column(f"{name}, {unit}", justify="right")
-    changed.add_column("beyond noise")
-    for one in comparisons:
-        cells = [one.scene, str(one.frames), f"{100 * one.repeated / max(one.frames, 1):.0f} %"]
-        cells.append(str(one.decisions))
-        for name in NUMBERS:
-            if name not in one.rms:
-                cells.append("-")
-                continue
-            noise = one.noise.get(name)
-            own = f"{noise.rms:.2g} / {noise.largest:.2g}" if noise else "-"
-            cells.append(f"{one.rms[name]:.2g} / {one.worst[name]:.2g} ({own})")
-        changed.add_row(*cells, "; ".join(one.faults) or "nothing")
-    changed.caption = (
-        f"beyond noise: RMS of at least {_ENOUGH} values above {ALLOWED:g} x noise, a contact decision that "
-        f"differs, or a number stale for more than {STALE} frame"
-    )
-    changed.caption_justify = "left"
-    console.print(changed)
-
-    hard = Table(
-        title=f"scenes made to catch skipping out, frames (promised: missed 0, stale {STALE})",
-        title_justify="left",
-    )
-    for heading in ("scene", "what it does", "contact missed", "number stale", "in all", "longest rest"):
-        hard.add_column(heading, justify="left" if heading in ("scene", "what it does") else "right")
-    for one in comparisons:
-        if one.scene in ADVERSARIES:
-            counts = (one.missed, one.stale, one.late, one.rest)
-            hard.add_row(one.scene, ADVERSARIES[one.scene], *map(str, counts))
-    hard.caption = (
-        f"stale: further from a fresh number than {LARGEST:g} x what two fresh ones differ by at most"
-    )
-    hard.caption_justify = "left"
-    console.print(hard)
-
-    saved = Table(title="median CPU time of a frame, copies of the raw frame", title_justify="left")
-    for heading in ("scene", "on", "off", "on / off"):
-        saved.add_column(heading, justify="left" if heading == "scene" else "right")
-    for one in comparisons:
-        on, off = (one.times[name].summary()["cpu_ms_p50"] for name in ("on", "off"))
-        saved.add_row(
-            one.scene, f"{on / copies.copy_ms:.1f}", f"{off / copies.copy_ms:.1f}", f"{on / off:.2f}"
-        )
-    console.print(saved)

@@ -12,7 +12,7 @@ from collections.abc import Container
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -22,6 +22,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from tactflow import __version__
 from tactflow.engine.errors import ConfigError
+from tactflow.files import completed, is_device
+from tactflow.redaction import public_address
 from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import SurfaceErrors
 from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, ForceModel, LinearForce
@@ -40,7 +42,9 @@ channel, from which on it is said to look unlike. Chosen by hand: presses of one
 
 
 LARGEST: Final = 1 << 20
-"""Bytes of either file at most, and of the arrays when they are unpacked; ours have some thousands."""
+"""Bytes of the arrays at most, packed and unpacked; ours have some thousands."""
+LONGEST: Final = 1 << 17
+"""Bytes of the YAML file at most; ours have some thousands. PyYAML takes 4 s for so many."""
 
 
 class _Strict(BaseModel):
@@ -140,7 +144,9 @@ class _File(_Strict):
     tactflow: str
     raw_size: list[int] = Field(min_length=2, max_length=2)
     size: list[int] = Field(min_length=2, max_length=2)
-    corners: list[list[float]] = Field(min_length=4, max_length=4)
+    corners: list[Annotated[list[float], Field(min_length=2, max_length=2)]] = Field(
+        min_length=4, max_length=4
+    )
     scale: ScaleEntry
     photometric: PhotometricEntry | None = None
     force: ForceEntry | None = None
@@ -184,7 +190,7 @@ class Calibration:
             format=FORMAT,
             sensor=self.sensor,
             made=self.made or datetime.now(UTC).isoformat(timespec="seconds"),
-            made_from=self.made_from,
+            made_from=public_address(self.made_from),
             tactflow=self.version,
             raw_size=list(self.raw_size),
             size=list(self.size),
@@ -202,9 +208,10 @@ class Calibration:
         if self.slopes is not None:
             arrays["slopes"] = self.slopes.coefficients
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(path.with_suffix(".npz"), **arrays)
-            path.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
+            # Both are whole before one takes the place of an earlier calibration.
+            with completed(path) as unfinished, completed(path.with_suffix(".npz")) as unfinished_arrays:
+                np.savez(unfinished_arrays, **arrays)
+                unfinished.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
         except OSError as error:
             raise ConfigError(f"calibration: cannot write {path}: {error.strerror or error}") from None
 
@@ -298,12 +305,14 @@ def raw_corners(mapping: PixelMapping) -> NDArray[np.float64]:
     return np.asarray(mapping.to_raw([[0, 0], [right, 0], [0, low], [right, low]]), np.float64)
 
 
-def _bounded(path: Path) -> bytes:
+def _bounded(path: Path, most: int) -> bytes:
     """The bytes of a file, unless they are more than any calibration has: a device has no end."""
+    if is_device(str(path)):
+        raise ValueError(f"{path} is a pipe or a device, not a file")
     with path.open("rb") as file:
-        data = file.read(LARGEST + 1)
-    if len(data) > LARGEST:
-        raise ValueError(f"{path} is larger than {LARGEST >> 20} MiB")
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise ValueError(f"{path} is larger than {most >> 10} KiB")
     return data
 
 
@@ -312,14 +321,19 @@ def stored_text(path: Path) -> bytes:
 
     Raises OSError or ValueError if it is not there, or larger than any calibration.
     """
-    return _recorded(path, "calibration.yaml") if path.suffix == ".mcap" else _bounded(path)
+    if path.suffix != ".mcap":
+        return _bounded(path, LONGEST)
+    text = _recorded(path, "calibration.yaml")
+    if len(text) > LONGEST:
+        raise ValueError(f"its calibration is larger than {LONGEST >> 10} KiB")
+    return text
 
 
 def stored_arrays(path: Path) -> bytes:
     """The `.npz` file of a calibration; as `stored_text`."""
     if path.suffix == ".mcap":
         return _recorded(path, "calibration.npz")
-    return _bounded(path.with_suffix(".npz"))
+    return _bounded(path.with_suffix(".npz"), LARGEST)
 
 
 def _recorded(path: Path, name: str) -> bytes:

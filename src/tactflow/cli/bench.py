@@ -19,7 +19,8 @@ from tactflow.bench.methods import CLASSIC
 from tactflow.bench.report import html
 from tactflow.bench.results import Result
 from tactflow.bench.run import DEFAULT, MARKERLESS, WEDGE, Plan, run_bench
-from tactflow.bench.skipping import Pipelines, compare_all, print_comparisons
+from tactflow.bench.skipping import Pipelines, compare_all
+from tactflow.bench.skipping_table import print_comparisons
 from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result
 from tactflow.bench.timing import CopyUnit

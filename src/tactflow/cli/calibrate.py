@@ -20,6 +20,7 @@ from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_f
 from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.cli.notes import notes_on, say
+from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.view.guided import Guiding
@@ -173,7 +174,7 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     session = find_presses(_load(args, pipeline), Guide(args.presses, say))
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
-        print(f"does not fit: {misfit}")
+        print(printable(f"does not fit: {misfit}"))
         return 3
     unlike = calibration.unlikeness(session.untouched)
     fits = unlike <= UNLIKE

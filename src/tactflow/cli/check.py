@@ -6,6 +6,7 @@ import argparse
 
 from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline, load_plan
+from tactflow.cli.printable import printable
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -35,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         # What several sensors have in common is said once.
         raise ConfigError(*dict.fromkeys(mistakes))
     for name, (pipeline, plan) in good.items():
-        print(_summary(pipeline, plan, name))
+        print(printable(_summary(pipeline, plan, name)))
     return 0
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
 from tactflow.vision.geometry import Preprocessor
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     if without > 0:
         lines.append(f"dim: {100 * without:.0f} % of the picture show no gel; --all looks there, too")
     text = "\n".join([title, *lines])
-    print(text)
+    print(printable(text))
     if args.picture is not None:
         _write(args.picture, draw_detection(image, marks, text, rival=rival, valid=valid))
     return 0

@@ -8,6 +8,7 @@ from typing import Any
 
 from tactflow.cli.node_summary import NodeSummary, milliseconds, saving
 from tactflow.cli.options import add_pipeline_and_stats, load_with_stats
+from tactflow.cli.printable import printable
 from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
@@ -20,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph for each stage and sink."""
-    print("\n".join(explanation(*load_with_stats(args))))
+    print(printable("\n".join(explanation(*load_with_stats(args)))))
     return 0
 
 

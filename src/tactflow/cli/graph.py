@@ -8,6 +8,7 @@ from typing import Any
 
 from tactflow.cli.node_summary import NodeSummary, milliseconds, share
 from tactflow.cli.options import add_pipeline_and_stats, load_with_stats
+from tactflow.cli.printable import printable
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.plan import Plan
 
@@ -22,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the flowchart."""
-    print("\n".join(mermaid(*load_with_stats(args))))
+    print(printable("\n".join(mermaid(*load_with_stats(args)))))
     return 0
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tactflow.cli.notes import say
 from tactflow.cli.statistics import read_statistics
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
@@ -51,7 +51,7 @@ def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipe
     live = bool(getattr(pipeline.source.params, "realtime", False))
     plan = make_plan(pipeline, live=live)
     for warning in (*pipeline.warnings, *plan.warnings):
-        print(f"tactflow: warning: {warning}", file=sys.stderr)
+        say(f"tactflow: warning: {warning}")
     return pipeline, plan
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import tempfile
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
+from tactflow.cli.notes import say
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.files import claim
 from tactflow.recording import missing_packages
@@ -107,4 +107,4 @@ def _repair(path: Path, copy: Path, out: Path, *, quiet: bool) -> int:
 
 def _say(text: str, *, quiet: bool) -> None:
     if not quiet:
-        print(text, file=sys.stderr)
+        say(text)

@@ -106,7 +106,8 @@ def _list() -> None:
         print(f"  {name:<{max(map(len, scenes))}}  {description}")
     print("settings, as in NAME?key=value&key=value:")
     for name, key in KEYS.items():
-        values = "|".join(key.choices) if key.choices else f"{key.low:g} to {key.high:g} {key.unit}".strip()
+        limits = f"{key.low:g} to {key.high:.10g} {key.unit}".strip()
+        values = "|".join(key.choices) or limits
         if name == "markers":
             values = "COLUMNSxROWS | none"
         print(f"  {name:<{max(map(len, KEYS))}}  {key.meaning} ({values})")

@@ -48,8 +48,10 @@ def files_read(params: BaseModel, directory: Path) -> set[FileId]:
 def files_named(params: BaseModel, directory: Path) -> Iterator[Path]:
     """Every path that parameters may mean: each text in them, as `files_read` takes it."""
     for text in _texts(params.model_dump()):
-        for name in {text, text.partition("?")[0]} - {""}:
-            path = expanded(_folder_of_pattern(name))
+        names = {text, text.partition("?")[0]}
+        # A file may be named like a pattern.
+        for name in (names | {_folder_of_pattern(name) for name in names}) - {""}:
+            path = expanded(name)
             yield from (path, directory / path)
 
 

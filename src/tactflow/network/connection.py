@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
@@ -32,31 +32,52 @@ PATIENCE = 1.0
 """Time to connect and to be greeted at most, s. Chosen by hand."""
 
 
-def asked_for(endpoint: str) -> str | None:
-    """What the side at an address asks for, NULL or CURVE; None if it does not greet as ZeroMQ does.
+def asked_for(endpoint: str, seconds: float = PATIENCE) -> str | None:
+    """What the side at an address asks for, NULL or CURVE; None if it does not greet as ZeroMQ does in time.
 
     ZeroMQ hangs up on who does not name the same, often before its own greeting is out, and then the socket
     cannot tell why. Who names nothing is greeted.
+
+    seconds : for all of it, however many addresses a name has and however slowly the other side speaks.
     """
+    end = time.monotonic() + seconds
+    for family, address in _places(endpoint):
+        with system_socket.socket(family) as stream:
+            try:
+                return _mechanism(stream, address, end)
+            except OSError:
+                continue
+    return None
+
+
+def _places(endpoint: str) -> list[tuple[int, Any]]:
+    """Families and addresses of the sockets that an endpoint stands for; none if it is no such address."""
     scheme, _, place = endpoint.partition("://")
+    if scheme == "ipc":
+        return [] if sys.platform == "win32" else [(system_socket.AF_UNIX, place)]
+    host, _, port = place.rpartition(":")
     try:
-        if scheme == "ipc" and sys.platform != "win32":
-            with system_socket.socket(system_socket.AF_UNIX) as stream:
-                stream.settimeout(PATIENCE)
-                stream.connect(place)
-                return _mechanism(stream)
-        host, _, port = place.rpartition(":")
-        with system_socket.create_connection((host.strip("[]"), int(port)), PATIENCE) as stream:
-            return _mechanism(stream)
+        found = system_socket.getaddrinfo(host.strip("[]"), int(port), type=system_socket.SOCK_STREAM)
     except (OSError, ValueError):
-        return None
+        return []
+    return [(family, address) for family, _, _, _, address in found]
 
 
-def _mechanism(stream: system_socket.socket) -> str | None:
-    stream.sendall(GREETING)
+def _mechanism(stream: system_socket.socket, address: Any, end: float) -> str | None:
+    """As `asked_for`, of one address, until `end` (monotonic time). Raises OSError if nobody is there."""
+
+    def in_time() -> system_socket.socket:
+        left = end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        stream.settimeout(left)
+        return stream
+
+    in_time().connect(address)
+    in_time().sendall(GREETING)
     greeting = b""
     while len(greeting) < MECHANISM.stop:
-        received = stream.recv(MECHANISM.stop - len(greeting))
+        received = in_time().recv(MECHANISM.stop - len(greeting))
         if not received:
             return None
         greeting += received
@@ -128,7 +149,8 @@ class Connection:
                 return bool(ready)
             broken_off = recv_monitor_message(self._refused)["event"] == BROKEN_OFF
             ours = "CURVE" if self._has_keys else "NULL"
-            self._is_refused = not broken_off or asked_for(self.endpoint) not in (ours, None)
+            left = min(end - time.monotonic(), PATIENCE)
+            self._is_refused = not broken_off or asked_for(self.endpoint, left) not in (ours, None)
         why = (
             "does not admit these keys"
             if self._has_keys

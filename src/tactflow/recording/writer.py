@@ -13,7 +13,7 @@ from typing import IO, cast
 from mcap.writer import CompressionType, Writer
 
 from tactflow.files import claim, make_folder, taken_away
-from tactflow.message import message_schema
+from tactflow.message_schema import message_schema
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
 from tactflow.recording.schemas import channel_types
 

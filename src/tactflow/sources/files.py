@@ -204,24 +204,26 @@ def open_glob(pattern: str, directory: Path | None = None, fps: float | None = N
     """
     wanted = expanded(pattern)
     for base in (Path(), directory):
-        files = (
-            [] if base is None else sorted(_matching(base / wanted), key=lambda path: natural_key(str(path)))
-        )
+        files = [] if base is None else [path for path in matching(base / wanted) if path.is_file()]
         if files:
             return ImageFiles(files, pattern, fps)
     raise SourceError(f"{pattern}: no file matches this pattern; on a command line, quote it")
 
 
-def _matching(pattern: Path) -> list[Path]:
-    """Files that match, but hidden ones. `**` follows no links: they may lead in circles."""
+def matching(pattern: Path) -> list[Path]:
+    """What matches a pattern, in natural order, but what is hidden.
+
+    `**` follows no links: they may lead in circles.
+    """
     parts = pattern.parts
     fixed = next((index for index, part in enumerate(parts) if glob.has_magic(part)), len(parts))
     folder = Path(*parts[:fixed])
-    return [
+    found = [
         path
         for path in folder.glob(str(Path(*parts[fixed:])))
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if not any(part.startswith(".") for part in path.relative_to(folder).parts)
     ]
+    return sorted(found, key=lambda path: natural_key(str(path)))
 
 
 class ArrayFile:
@@ -332,7 +334,7 @@ def _map_array(path: Path) -> np.memmap[Any, Any]:
     return array
 
 
-def _look_at_beginning(path: Path) -> None:
+def refuse_playlist(path: Path) -> None:
     """Refuse an empty file, and a list of other files: what is handed on as a video shall not open others."""
     try:
         with path.open("rb") as file:
@@ -360,7 +362,7 @@ class VideoFile:
     live = False
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        _look_at_beginning(path)
+        refuse_playlist(path)
         with quiet_opencv():
             self._capture: cv2.VideoCapture | None = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():

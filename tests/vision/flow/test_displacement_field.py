@@ -70,6 +70,19 @@ def test_a_marker_that_is_not_seen_is_as_if_it_had_never_been_there(unseen: Mark
     rest = np.delete(np.arange(len(GRID)), gone)
     expected = krige(GRID[rest], moved[rest], np.zeros(len(rest)), field.grid.points.reshape(-1, 2))
     np.testing.assert_allclose(field.displacement.reshape(-1, 2), expected, atol=1e-7)
+    fewer = markers(moved)
+    fewer = replace(fewer, origin=GRID[rest], position=fewer.position[rest], status=fewer.status[rest])
+    without = field_of(replace(fewer, stderr=fewer.stderr[rest]))
+    for mask in (disc((100, 100), 25), disc((150, 200), 120)):
+        one, other = field.motion(mask), without.motion(mask)
+        assert one is not None
+        assert other is not None
+        assert one.gradient is not None
+        assert other.gradient is not None
+        assert one.mean == pytest.approx(other.mean, abs=1e-7)
+        assert one.stderr == pytest.approx(other.stderr, rel=1e-6)
+        assert one.gradient.dx_stderr == pytest.approx(other.gradient.dx_stderr, rel=1e-6)
+        assert one.gradient.dy_stderr == pytest.approx(other.gradient.dy_stderr, rel=1e-6)
     # There is more to be wrong about where it was.
     everywhere = field_of(markers(np.where(status[:, None] == 0, moved, 0.0)))
     row, column = np.unravel_index(

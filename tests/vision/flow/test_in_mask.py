@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -205,6 +205,7 @@ def test_float32_markers_agree_with_float64() -> None:
     size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
     dilate=st.one_of(st.just(0.0), st.floats(0, 12)),
 )
+@example(seed=0, size=(25, 27), dilate=math.nextafter(2.0, 0.0))
 def test_inside_is_the_same_as_looking_up_the_distance(
     seed: int, size: tuple[int, int], dilate: float
 ) -> None:

@@ -27,6 +27,7 @@ def test_halves_are_those_of_opencv_to_the_bit(size: tuple[int, int], far: bool)
     # Sums of which every remainder occurs, also with the largest values.
     picture[:1, :, 0], picture[1:, :, 0] = 255, 254
     assert np.array_equal(halved(picture, far=far), plain_halved(picture))
+    assert np.array_equal(halved(picture, far=far, upside_down=True), plain_halved(picture)[::-1])
 
 
 def test_a_block_is_halved_as_if_it_were_cut_out_first() -> None:

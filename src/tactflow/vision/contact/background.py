@@ -14,7 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.background_kernels import change_strength, scaled_change, weigh_change
+from tactflow.vision.contact.background_kernels import (
+    change_strength,
+    scaled_change,
+    smooth_cells,
+    weigh_change,
+)
 from tactflow.vision.contact.contact_outline import WindowChange
 from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
 from tactflow.vision.contact.response import EVEN, light_response
@@ -265,19 +270,17 @@ def _cut_by_border(change: Float, rows: slice, columns: slice, shape: tuple[int,
 
     change : (3, 2h, 2w), of a window. rows, columns : the window, cells. shape : of the picture, cells.
     """
-    sides = [
-        line
-        for line, at_border in (
-            (change[:, 0], rows.start == 0),
-            (change[:, -1], rows.stop == shape[0]),
-            (change[:, :, 0], columns.start == 0),
-            (change[:, :, -1], columns.stop == shape[1]),
-        )
-        if at_border
-    ]
+    borders = (
+        (rows.start == 0, change[:, 0]),
+        (rows.stop == shape[0], change[:, -1]),
+        (columns.start == 0, change[:, :, 0]),
+        (columns.stop == shape[1], change[:, :, -1]),
+    )
+    sides = [side for reached, side in borders if reached]
     if not sides:
         return False
-    return max(float(np.abs(line).max()) for line in sides) > CUT * float(np.abs(change).max())
+    enough = CUT * cv2.norm(change.reshape(-1, change.shape[2]), cv2.NORM_INF)
+    return any(float(np.abs(side).max()) > enough for side in sides)
 
 
 def _planes(picture: NDArray[np.uint8]) -> Float:
@@ -287,9 +290,8 @@ def _planes(picture: NDArray[np.uint8]) -> Float:
 
 def _smoothed(cells: NDArray[np.uint8]) -> Float:
     """(3, h, w) float32: means over 3 x 3 cells of (h, w, 3)."""
-    smooth = cv2.boxFilter(cells, cv2.CV_32F, (3, 3)).reshape(cells.shape)
     planes = np.empty((3, *cells.shape[:2]), np.float32)
-    cv2.split(smooth, list(planes))
+    smooth_cells(cells.reshape(len(cells), -1), planes)
     return planes
 
 

@@ -35,11 +35,11 @@ from numpy.typing import NDArray
 from tactflow.vision import compiled
 from tactflow.vision.contact import (
     background_kernels,
+    border,
     components,
-    contact_outline,
-    continuation,
     illumination,
     resolution,
+    response,
 )
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.components import Component, contact_components, union, wide_change
@@ -185,12 +185,12 @@ class ContactDetector:
         if method == "noise":
             compiled.load(
                 background_kernels,
+                border,
                 components,
-                contact_outline,
-                continuation,
                 downsample,
                 illumination,
                 resolution,
+                response,
             )
         self.reset()
 

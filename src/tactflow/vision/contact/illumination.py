@@ -38,10 +38,6 @@ DARK: Final = 0.25
 begin with. Chosen by hand."""
 
 
-_CHANNELS: Final = np.arange(3)
-"""Blue, green, red."""
-
-
 class IlluminationModel:
     """Robust fit of gain, slopes of the gain and offset per channel between a frame and the untouched gel.
 
@@ -77,9 +73,9 @@ class IlluminationModel:
     def __init__(self, reference: Float, variance: Float, counts: NDArray[np.bool_] | None = None) -> None:
         height, width = reference.shape[1:]
         self._row_weights = _block_weights(max(1, height // BLOCK), height)
-        self._column_weights = np.ascontiguousarray(_block_weights(max(1, width // BLOCK), width).T)
-        self._center: Float = np.maximum(reference.mean(axis=(1, 2), keepdims=True), np.float32(1))
-        relative = reference / self._center
+        self._column_weights = _block_weights(max(1, width // BLOCK), width)
+        self._center: Float = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))[:, None]
+        relative = reference / self._center[:, None]
         slopes = np.stack([relative * positions(width), relative * positions(height)[:, None]], axis=1)
         terms = np.concatenate([relative[:, None], slopes, np.ones_like(relative)[:, None]], axis=1)
         basis = np.stack([self._block_means(channel) for channel in terms])
@@ -93,11 +89,7 @@ class IlluminationModel:
         self._basis: Float = np.ascontiguousarray(basis, np.float32)
         brightness = self._basis[:, 0]
         lit = brightness > DARK if self._fitted is None else (brightness > DARK) & self._fitted
-        self._lit: NDArray[np.bool_] = lit
-        # Blocks that tell nothing are sorted behind all others; a channel without light never changes.
-        nothing = np.where(lit.any(axis=1, keepdims=True), np.float32(np.nan), np.float32(0))
-        self._per_brightness: Float = np.where(lit, 1 / np.maximum(brightness, DARK), nothing)
-        self._middle = np.count_nonzero(lit, axis=1) // 2
+        self._per_brightness: Float = np.where(lit, 1 / np.maximum(brightness, DARK), np.float32(0))
         self._step: Float = np.ascontiguousarray(inverse @ fitted, np.float32)
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
@@ -110,31 +102,22 @@ class IlluminationModel:
         Returns (3, 4) float32: how much the gain exceeds 1, its slope along x and along y (over the whole
         frame), and the offset, grey levels.
         """
-        blocks = self._block_means(cells)
-        excess = blocks - self._reference
         coefficients = np.zeros((3, 4), np.float32)
-        limit = self._limit
-        if blocks.max() < SATURATED:
-            ratios = excess * self._per_brightness
-            ratios.sort(axis=1)
-            coefficients[:, 0] = ratios[_CHANNELS, self._middle]
-        else:
-            below = blocks < SATURATED
-            limit = limit * below
-            coefficients[:, 0] = self._ratio_below(excess, below)
+        excess, limit = np.empty((2, *self._reference.shape), np.float32)
+        compare_blocks(
+            cells,
+            self._row_weights,
+            self._column_weights,
+            self._reference,
+            self._per_brightness,
+            self._limit,
+            excess,
+            limit,
+            coefficients,
+        )
         fit_robustly(excess, self._basis, self._step, self._shrink, limit, coefficients)
-        coefficients[:, :3] /= self._center[:, :, 0]
+        coefficients[:, :3] /= self._center
         return coefficients
-
-    def _ratio_below(self, excess: Float, below: NDArray[np.bool_]) -> Float:
-        """(3,) float32: median of the relative change of the blocks, (3, n), that are not saturated."""
-        ratios = excess * self._per_brightness
-        most: Float = np.fmax.reduce(ratios, axis=1, initial=0)
-        ratios[~below] = np.nan
-        ratios.sort(axis=1)
-        typical: Float = ratios[_CHANNELS, np.count_nonzero(self._lit & below, axis=1) // 2]
-        # Where all of a channel is saturated there is no median.
-        return np.where(np.isnan(typical), most, typical)
 
     def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         """Blocks (n,) of which at least half counts; None for all, also where there is none of them."""
@@ -145,7 +128,7 @@ class IlluminationModel:
 
     def _block_means(self, planes: Float) -> Float:
         """(n, blocks) float32: means over blocks of (n, h, w) planes; a cell may belong to two in parts."""
-        means = self._row_weights @ planes @ self._column_weights
+        means = self._row_weights @ planes @ self._column_weights.T
         return np.asarray(means.reshape(len(planes), -1), np.float32)
 
 
@@ -172,6 +155,61 @@ def _block_weights(blocks: int, count: int) -> Float:
     pixels = np.arange(count)
     covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
     return np.asarray(np.maximum(covered, 0) * (blocks / count), np.float32)
+
+
+@kernel(
+    "void(float32[:, :, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1],"
+    " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
+    reorder=True,
+)
+def compare_blocks(
+    cells: Float,
+    row_weights: Float,
+    column_weights: Float,
+    reference: Float,
+    per_brightness: Float,
+    usual_limit: Float,
+    excess: Float,
+    limit: Float,
+    coefficients: Float,
+) -> None:
+    """What a fit starts from: `excess` and `limit`, (3, n), and gains in `coefficients`, (3, 4), are filled.
+
+    cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. reference :
+    (3, n), their means, which excess is beyond. usual_limit : (3, n); limit is 0 where a block is saturated.
+    per_brightness : (3, n), one over the brightness, 0 where it is not lit: a gain is the median of the
+    relative change of the blocks that are lit and not saturated, or the largest one where all are saturated.
+    """
+    high, wide = cells.shape[1:]
+    down, across = len(row_weights), len(column_weights)
+    line, ratios = np.empty(wide, np.float32), np.empty(down * across, np.float32)
+    for c in range(3):
+        count, most = 0, np.float32(0)
+        for row in range(down):
+            line[:] = 0
+            # A block takes no other lines and columns than those from its first to its last one.
+            for y in range(row * high // down, -(-(row + 1) * high // down)):
+                for x in range(wide):
+                    line[x] += row_weights[row, y] * cells[c, y, x]
+            for column in range(across):
+                mean, at = np.float32(0), row * across + column
+                for x in range(column * wide // across, -(-(column + 1) * wide // across)):
+                    mean += line[x] * column_weights[column, x]
+                excess[c, at] = mean - reference[c, at]
+                limit[c, at] = usual_limit[c, at] if mean < SATURATED else np.float32(0)
+                if per_brightness[c, at] > 0:
+                    ratios[count] = excess[c, at] * per_brightness[c, at]
+                    most = max(most, ratios[count])
+                    count += limit[c, at] > 0
+        for i in range(count):
+            below = up_to = 0
+            for j in range(count):
+                below += ratios[j] < ratios[i]
+                up_to += ratios[j] <= ratios[i]
+            if below <= count // 2 < up_to:
+                most = ratios[i]
+                break
+        coefficients[c, 0] = most
 
 
 @kernel(

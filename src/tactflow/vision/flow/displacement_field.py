@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.flow.inside import check_mask
-from tactflow.vision.flow.region import sample_region, sum_pairs, sum_region
+from tactflow.vision.flow.region import sample_region, sum_markers, sum_region
 from tactflow.vision.markers.family import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -114,6 +114,7 @@ class GelMotion:
     mean : (dx, dy), px: the integral of the displacement over the part, over its area at rest.
     stderr : of each component of the mean, px, for a region whose outline is exact.
     outline_stderr : what the outline of a contact adds to that, (dx, dy), px.
+    spread : RMS by which each component of the displacement differs from the mean within the part, px.
     gradient : of the affine motion that is nearest to the displacement; None for a part too small to tell.
     residual : RMS of what mean, turn and spread leave, px; None where gradient is None.
     unknown : share of what the mean could be that the markers leave open, 0 to 1: how far they are away.
@@ -122,6 +123,7 @@ class GelMotion:
     mean: tuple[float, float]
     stderr: float
     outline_stderr: tuple[float, float]
+    spread: float
     gradient: Gradient | None
     residual: float | None
     unknown: float
@@ -176,24 +178,23 @@ class FieldModel:
         self.inverse: FloatArray = np.asarray(
             np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64
         )
-        self.diagonal = np.diagonal(self.inverse).copy()
+        self.precision = 0.5 / np.diagonal(self.inverse)
+        """(N,): 1 over twice the variance of each marker given all others, relative to the field's."""
+        self.rest = np.ascontiguousarray(self.origin.T)
+        """(2, N), x and y of each marker in the reference, px."""
         rows, columns = self.grid.shape
         self.to_markers = self._kernel(self.grid.points.reshape(-1, 2)).reshape(rows, columns, -1)
         """(rows, columns, N), the kernel between cells and markers."""
         down, across = np.mgrid[:rows, 1 - columns : columns] * self.grid.spacing
-        self._between = matern(np.hypot(down, across) / self._length)
+        between = matern(np.hypot(down, across) / self._length)
+        self.between = {1: between, 2: np.ascontiguousarray(between[::2, (columns - 1) % 2 :: 2])}
+        """Kernel between two cells, by how many rows and columns they are apart, 0 columns in the middle: of
+        all cells, and of every other row and column."""
 
     def _kernel(self, points: FloatArray) -> FloatArray:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
         offset = points[:, None] - self.origin
         return matern(np.sqrt(np.einsum("mnk,mnk->mn", offset, offset)) / self._length)
-
-    def between(self, rows: int, columns: int, step: int) -> FloatArray:
-        """(rows, 2 columns - 1): kernel between cells so many rows and columns apart, the latter from
-        1 - columns on; rows and columns are those of every so many cells of the grid."""
-        middle, across = self.grid.shape[1] - 1, step * (columns - 1)
-        near = self._between[: step * (rows - 1) + 1 : step, middle - across : middle + across + 1 : step]
-        return np.ascontiguousarray(near)
 
     @cached_property
     def weights(self) -> FloatArray:
@@ -213,28 +214,27 @@ class FieldModel:
         return DisplacementField(self, markers, seen)
 
 
-class _Update:
-    """The inverse of a kernel matrix with more variance for some markers.
+class _Update(NamedTuple):
+    """What the inverse of a kernel matrix loses where less is known of S markers: rows.T @ lost, (S, N)."""
 
-    inverse : (N, N), of all markers. chosen : (S,), markers of which less is known. certainty : (S,), the
-    field's variance over the markers' own, 0 for those that are not seen at all.
-    """
+    rows: FloatArray
+    lost: FloatArray
 
-    def __init__(self, inverse: FloatArray, chosen: IntArray, certainty: FloatArray) -> None:
-        self._chosen = chosen
-        self._columns = inverse[:, chosen]
+    @classmethod
+    def of(cls, inverse: FloatArray, chosen: IntArray, certainty: FloatArray) -> _Update:
+        """With more variance for some markers.
+
+        inverse : (N, N), of all markers. chosen : (S,), markers of which less is known. certainty : (S,), the
+        field's variance over the markers' own, 0 for those that are not seen at all.
+        """
+        rows = inverse[chosen]
         # Of few markers; a third of the time of NumPy's, nothing of which is in the caches.
-        _, middle = cv2.invert(np.diag(certainty) + self._columns[chosen])
-        self._middle = np.asarray(middle, np.float64)
+        _, middle = cv2.invert(np.diag(certainty) + rows[:, chosen])
+        return cls(rows, np.asarray(middle, np.float64) @ rows)
 
-    def apply(self, product: FloatArray) -> FloatArray:
-        """The new inverse times something, from the old inverse times the same, (N, m)."""
-        return np.asarray(product - self._columns @ (self._middle @ product[self._chosen]))
-
-    @property
-    def taken(self) -> FloatArray:
-        """(N,): what the diagonal of the inverse loses."""
-        return np.asarray(((self._columns @ self._middle) * self._columns).sum(axis=1))
+    def taken(self, vectors: FloatArray) -> FloatArray:
+        """What vectors (m, N) lose in their products with the inverse, (m, N)."""
+        return np.asarray(vectors @ self.rows.T @ self.lost)
 
 
 class DisplacementField:
@@ -251,9 +251,10 @@ class DisplacementField:
     def __init__(self, model: FieldModel, markers: Markers, seen: NDArray[np.bool_]) -> None:
         self.grid = model.grid
         self._model, self._seen = model, seen
-        # What is not seen counts as unmoved until it is left out below.
-        moved = np.where(seen[:, None], markers.position - model.origin, 0.0)
-        self._farthest = moved.min(axis=0).tolist(), moved.max(axis=0).tolist()
+        # x and y apart: sums along contiguous rows. What is not seen counts as unmoved until it is left out.
+        moved = np.subtract(markers.position.T, model.rest, order="C")
+        moved *= seen
+        self._farthest = moved.min(axis=1).tolist(), moved.max(axis=1).tolist()
         known = seen & np.isfinite(markers.stderr)
         ordered = np.sort(markers.stderr[known])
         typical = ordered[len(ordered) // 2] if len(ordered) else 0.0
@@ -261,36 +262,39 @@ class DisplacementField:
         error = np.where(known, markers.stderr, typical)
         self._variance = error * error
         self._update: _Update | None = None
-        self._coefficients = model.inverse @ moved
+        self._coefficients = moved @ model.inverse
         poor = seen & (error > POOR * typical)
         left_out = np.flatnonzero(~seen | poor)
         if len(left_out):
             self._leave_out(left_out, poor[left_out], moved)
 
     def _leave_out(self, left_out: IntArray, poor: NDArray[np.bool_], moved: FloatArray) -> None:
-        """Take markers (S,) out of the field, those that are `poor` (S,) only as far as their errors ask."""
+        """Take markers (S,) out of the field, those that are `poor` (S,) only as far as their errors ask.
+
+        moved : (2, N), px.
+        """
         whole = self._coefficients
-        self._update = _Update(self._model.inverse, left_out, np.zeros(len(left_out)))
-        self._coefficients = self._update.apply(whole)
-        sure = len(moved) - len(left_out)
+        self._update = _Update.of(self._model.inverse, left_out, np.zeros(len(left_out)))
+        self._coefficients = whole - self._update.taken(moved)
+        sure = moved.shape[1] - len(left_out)
         if poor.any() and sure:
             scale = float((moved * self._coefficients).sum()) / (2 * sure)
             certainty = np.where(poor, scale / self._variance[left_out], 0.0)
-            self._update = _Update(self._model.inverse, left_out, certainty)
-            self._coefficients = self._update.apply(whole)
+            self._update = _Update.of(self._model.inverse, left_out, certainty)
+            self._coefficients = whole - self._update.taken(moved)
 
     @cached_property
     def displacement(self) -> FloatArray:
         """(rows, columns, 2) float64, px."""
-        return np.asarray(self._model.to_markers @ self._coefficients)
+        return np.asarray(self._model.to_markers @ self._coefficients.T)
 
     @cached_property
     def stderr(self) -> FloatArray:
         """(rows, columns) float64, standard error of each component of `displacement`, px."""
-        kernel = self._model.to_markers.reshape(-1, len(self._coefficients))
+        kernel = self._model.to_markers.reshape(-1, len(self._seen))
         weights = self._model.weights
         if self._update is not None:
-            weights = self._update.apply(weights.T).T
+            weights = weights - self._update.taken(kernel)
         unknown = np.maximum(1 - np.einsum("gn,gn->g", weights, kernel), 0)
         squares = self._scale(kernel) * unknown + (weights * weights) @ self._variance
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
@@ -305,47 +309,36 @@ class DisplacementField:
         box = cv2.boundingRect(mask)
         step = 1 if box[2] * box[3] < MANY * self.grid.spacing**2 else 2
         cells = self._cells(mask, box, step)
-        if cells is None or not cells.inside.any():
+        if cells is None:
             return None
         model, spacing = self._model, step * self.grid.spacing
-        sums, pairs = np.zeros(13), np.empty(4)
-        weights, kernel = np.empty((3, cells.inside.size)), np.zeros((3, len(model.origin)))
-        sum_region(cells.inside, cells.moved, model.to_markers, cells.window, spacing, sums, weights, kernel)
-        sum_pairs(weights, model.between(*cells.shape, step), pairs)
-        return self._motion(sums.tolist(), pairs.tolist(), kernel, spacing)
-
-    def _motion(self, sums: list[float], pairs: list[float], kernel: FloatArray, spacing: float) -> GelMotion:
-        """The motion of a region from sums over its cells, see `sum_region` and `sum_pairs`.
-
-        kernel : (3, N), changed. spacing : of the cells, px.
-        """
-        cells, u, v, xx, xy, yy, xu, xv, yu, yv, squares, at_x, at_y = sums
-        inverse = _inverse(xx, xy, yy, spacing)
-        priors = pairs[:1]
-        if inverse is None:
-            kernel = kernel[:1]
-        else:
-            kernel[1:] = np.array(inverse) @ kernel[1:]
-            priors += [p * p * pairs[1] + 2 * p * q * pairs[2] + q * q * pairs[3] for p, q in inverse]
-        weights = kernel @ self._model.inverse
-        if self._update is not None:
-            weights = self._update.apply(weights.T).T
-        left = np.maximum(priors - (kernel * weights).sum(axis=1), 0)
-        # The markers near the region tell how rough the field is there, for the slopes as for the mean.
-        scale = float(self._scale(kernel[:1])[0])
-        stderr = np.sqrt(scale * left + (weights * weights) @ self._variance).tolist()
-        # An outline that is d too far out at s adds (m(s) - mean) d ds / area. Across it, the share of a cell
-        # falls from 1 to 0 within its width: share (1 - share) is 1 / 6 for a whole side.
-        unit = OUTLINE * 6 * spacing / (cells * spacing * spacing) ** 2
-        outline = math.sqrt(unit * at_x), math.sqrt(unit * at_y)
-        gradient = residual = None
-        if inverse is not None:
-            dx, dy = ((p * xu + q * yu, p * xv + q * yv) for p, q in inverse)
-            gradient = Gradient(dx, dy, stderr[1], stderr[2])
-            spread, turn = gradient.growth
-            rest = squares - 2 * (spread * (xu + yv) + turn * (xv - yu)) + (spread**2 + turn**2) * (xx + yy)
-            residual = math.sqrt(max(rest, 0.0))
-        return GelMotion((u, v), stderr[0], outline, gradient, residual, float(left[0]) / priors[0])
+        over_cells, over_markers = np.zeros(17), np.zeros(9)
+        weights, (kernel, counts) = np.empty((3, cells.inside.size)), np.zeros((2, 3, len(model.origin)))
+        sum_region(
+            cells.inside,
+            cells.moved,
+            model.to_markers,
+            cells.window,
+            spacing,
+            model.between[step],
+            over_cells,
+            weights,
+            kernel,
+        )
+        if over_cells[0] == 0:
+            return None
+        update = self._update or _Update(model.inverse[:0], model.inverse[:0])
+        sum_markers(
+            kernel,
+            model.inverse,
+            *update,
+            self._coefficients,
+            self._precision,
+            self._variance,
+            counts,
+            over_markers,
+        )
+        return _motion(over_cells.tolist(), over_markers.tolist(), spacing)
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
         """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
@@ -373,28 +366,27 @@ class DisplacementField:
             return None
         spacing = step * grid.spacing
         side = 2 * round((spacing - 1) / 2) + 1
-        # Whatever is around the region counts as outside, also beyond the border of the frame.
-        picture = cv2.copyMakeBorder(
-            mask[top : top + height, left : left + width], side, side, side, side, cv2.BORDER_CONSTANT
-        )
-        x = grid.first[0] + grid.spacing * across.start - left + side
-        y = grid.first[1] + grid.spacing * down.start - top + side
-        window = np.array([down.start, across.start, step, shape[1], side])
+        x = grid.first[0] + grid.spacing * across.start - left
+        y = grid.first[1] + grid.spacing * down.start - top
+        place, window = np.array([x, y, spacing]), np.array([down.start, across.start, step, shape[1], side])
         inside, moved = np.empty(shape[0] * shape[1]), np.empty((shape[0] * shape[1], 2))
-        coefficients = np.ascontiguousarray(self._coefficients.T)
-        place = np.array([x, y, spacing])
-        sums = np.asarray(cv2.integral(picture), np.int32)
-        sample_region(model.to_markers, coefficients, sums, place, window, inside, moved)
+        covered = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
+        sample_region(covered, model.to_markers, self._coefficients, place, window, inside, moved)
         return _Cells(shape, window, inside, moved)
+
+    @cached_property
+    def _precision(self) -> FloatArray:
+        """(N,), see `sum_markers`."""
+        if self._update is None:
+            return self._model.precision
+        rows, lost = self._update
+        left = 0.5 / self._model.precision - (rows * lost).sum(axis=0)
+        return np.asarray(np.where(self._seen, 0.5 / np.maximum(left, NUGGET), 0.0))
 
     def _scale(self, kernel: FloatArray) -> FloatArray:
         """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""
-        diagonal = self._model.diagonal
-        if self._update is not None:
-            diagonal = np.where(self._seen, np.maximum(diagonal - self._update.taken, NUGGET), 1.0)
-        squares = (self._coefficients * self._coefficients).sum(axis=1) / (2 * diagonal)
-        near = np.abs(kernel) * self._seen
-        return np.asarray(near @ squares / np.maximum(near.sum(axis=1), 1e-12))
+        squares = (self._coefficients * self._coefficients).sum(axis=0) * self._precision
+        return np.asarray(kernel @ squares / np.maximum(kernel @ self._seen, 1e-12))
 
 
 class Part(NamedTuple):
@@ -451,3 +443,35 @@ def _inverse(
     if determinant <= (xx + yy) * spacing * spacing / 12:
         return None
     return (yy / determinant, -xy / determinant), (-xy / determinant, xx / determinant)
+
+
+def _motion(over_cells: list[float], over_markers: list[float], spacing: float) -> GelMotion:
+    """The motion of a region from sums over its cells, and over the markers, see `region`.
+
+    spacing : of the cells, px.
+    """
+    cells, u, v, xx, xy, yy, xu, xv, yu, yv, squares, at_x, at_y, *prior = over_cells
+    scale, told, noise = over_markers[0], over_markers[1:5], over_markers[5:]
+    left = max(prior[0] - told[0], 0.0)
+    # An outline that is d too far out at s adds (m(s) - mean) d ds / area. Across it, the share of a cell
+    # falls from 1 to 0 within its width: share (1 - share) is 1 / 6 for a whole side.
+    unit = OUTLINE * 6 * spacing / (cells * spacing * spacing) ** 2
+    outline = math.sqrt(unit * at_x), math.sqrt(unit * at_y)
+    gradient = residual = None
+    inverse = _inverse(xx, xy, yy, spacing)
+    if inverse is not None:
+        dx, dy = ((p * xu + q * yu, p * xv + q * yv) for p, q in inverse)
+        unknown = [scale * max(_square(prior, at) - _square(told, at), 0.0) for at in inverse]
+        errors = [math.sqrt(part + _square(noise, at)) for part, at in zip(unknown, inverse, strict=True)]
+        gradient = Gradient(dx, dy, *errors)
+        spread, turn = gradient.growth
+        rest = squares - 2 * (spread * (xu + yv) + turn * (xv - yu)) + (spread**2 + turn**2) * (xx + yy)
+        residual = math.sqrt(max(rest, 0.0))
+    stderr = math.sqrt(scale * left + noise[0])
+    return GelMotion((u, v), stderr, outline, math.sqrt(squares / 2), gradient, residual, left / prior[0])
+
+
+def _square(form: list[float], at: tuple[float, float]) -> float:
+    """The square of a vector by a form, of which the last three numbers are xx, xy and yy."""
+    x, y = at
+    return x * x * form[1] + 2 * x * y * form[2] + y * y * form[3]

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _ROUNDING: Final = 1e-9
-"""Added to half the width of a disc's row, px, before it is cut to whole pixels: a whole number keeps its
-value where the square root is rounded down. Chosen by hand."""
+"""Added to a disc's radius, and to half the width of its rows, px, before they are cut to whole pixels: a
+whole number keeps its value where it was rounded down. Chosen by hand."""
 
 
 def check_mask(mask: NDArray[np.uint8], dilate: float) -> None:
@@ -41,7 +41,7 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
     inside = np.zeros(len(points), np.bool_)
     if len(points) == 0 or mask.size == 0:
         return inside
-    reach = math.floor(dilate)
+    reach = math.floor(dilate + _ROUNDING)
     if reach == 0:
         x, y = np.rint(points).T
         height, width = mask.shape
@@ -71,13 +71,13 @@ def _near_mask(
 ) -> NDArray[np.bool_]:
     """Whether the pixels (n,), (n,) have a non-zero pixel of the mask within `dilate` px."""
     height, width = mask.shape
-    reach = math.floor(dilate)
+    reach = math.floor(dilate + _ROUNDING)
     # Row by row of the disc, how many mask pixels lie in it, from sums over rectangles.
     ones: NDArray[Any] = cv2.threshold(mask, 0, 1, cv2.THRESH_BINARY)[1]
     sums = np.asarray(cv2.integral(ones))
     # Only rows that the mask has, so that a huge reach costs no more than the mask's height.
     down = np.arange(max(-reach, -int(y.max())), min(reach, height - 1 - int(y.min())) + 1)
-    half = np.floor(np.sqrt(dilate**2 - down**2) + _ROUNDING).astype(np.intp)
+    half = np.floor(np.sqrt(np.maximum(dilate**2 - down**2, 0)) + _ROUNDING).astype(np.intp)
     upper = y[:, None] + down
     begin, end = _clip(upper, height), _clip(upper + 1, height)
     first, last = _clip(x[:, None] - half, width), _clip(x[:, None] + half + 1, width)

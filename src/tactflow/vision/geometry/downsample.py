@@ -16,7 +16,7 @@ _BAND = 4
 
 @kernel(
     "void(Array(uint8, 2, 'C', readonly=True), int64, int64, "
-    "uint8[:, ::1], int64, int64, int64, int64, boolean)"
+    "uint8[:, ::1], int64, int64, int64, int64, boolean, boolean)"
 )
 def halve_block(
     picture: Bytes,
@@ -28,12 +28,14 @@ def halve_block(
     height: int,
     width: int,
     far: bool,
+    upside_down: bool,
 ) -> None:
     """Means over 2 x 2 px of a block of a picture, into a block of another; rounded half up, as OpenCV does.
 
     picture : (H, 3 W) uint8. top, left : first row and column of the block, px.
     half : (h, 3 w) uint8; height x width px from half_top and half_left on are written.
     far : whether the picture is not in the caches, or its memory not even mapped, as in a recording.
+    upside_down : whether the block's first line becomes the last one.
     The caller sees to it that both blocks lie inside their pictures.
     """
     stride = picture.shape[1]
@@ -49,10 +51,10 @@ def halve_block(
             for x in range(read.size):
                 any_bits = np.uint8(any_bits | read[x])
             # The compiler drops a result that goes nowhere; this one is written over below.
-            half[half_top + band, 3 * half_left] = any_bits
+            half[half_top + (height - 1 - band if upside_down else band), 3 * half_left] = any_bits
         for y in range(band, end):
             upper, lower = picture[top + 2 * y, 3 * left :], picture[top + 2 * y + 1, 3 * left :]
-            line = half[half_top + y, 3 * half_left :]
+            line = half[half_top + (height - 1 - y if upside_down else y), 3 * half_left :]
             # The channels one by one: so the compiler turns the line into whole vectors.
             for x in range(width):
                 line[3 * x] = (upper[6 * x] + upper[6 * x + 3] + lower[6 * x] + lower[6 * x + 3] + 2) >> 2
@@ -65,7 +67,12 @@ def halve_block(
 
 
 def halved(
-    picture: Bytes, block: tuple[slice, slice] | None = None, *, into: Bytes | None = None, far: bool = False
+    picture: Bytes,
+    block: tuple[slice, slice] | None = None,
+    *,
+    into: Bytes | None = None,
+    far: bool = False,
+    upside_down: bool = False,
 ) -> Bytes:
     """Means over 2 x 2 px of a picture or of a block of it, rounded half up.
 
@@ -73,6 +80,7 @@ def halved(
     block : rows and columns, slices with start and stop inside the picture; None takes all of it.
     into : (h // 2, w // 2, 3) uint8, C-contiguous; is written and returned, if given.
     far : whether the picture has not been read before; a matter of speed.
+    upside_down : whether the block's first line becomes the last one.
     Returns (h // 2, w // 2, 3) uint8; an odd last row or column of the block is left out.
 
     >>> picture = np.zeros((2, 4, 3), np.uint8)
@@ -88,5 +96,5 @@ def halved(
     half = np.empty((height, width, 3), np.uint8) if into is None else into
     lines = half.reshape(height, 3 * width)
     flat = picture.reshape(len(picture), -1)
-    halve_block(flat, rows.start, columns.start, lines, 0, 0, height, width, far)
+    halve_block(flat, rows.start, columns.start, lines, 0, 0, height, width, far, upside_down)
     return half

@@ -121,6 +121,9 @@ class Preprocessor:
             return self._pyramid(block if self._rotate == 0 else cv2.rotate(block, _ROTATIONS[self._rotate]))
         if self._levels:
             block = self._shrink(image)
+            if self._rotate == 90:
+                # Shrunk upside down: to exchange rows and columns takes two thirds of the time of turning.
+                return cv2.transpose(block)  # type: ignore[return-value]
         if self._rotate:
             return cv2.rotate(block, _ROTATIONS[self._rotate])  # type: ignore[return-value]
         if self._levels:
@@ -140,7 +143,9 @@ class Preprocessor:
             # What is halved or rotated afterwards can live in a buffer of our own.
             if len(self._shrunk) <= level:
                 self._shrunk.append(halved(image, block))
-            image, block = halved(image, block, into=self._shrunk[level], far=level == 0), None
+            turned = self._rotate == 90 and level == 0
+            image = halved(image, block, into=self._shrunk[level], far=level == 0, upside_down=turned)
+            block = None
         return image
 
     def _pyramid(self, image: NDArray[Any]) -> NDArray[Any]:

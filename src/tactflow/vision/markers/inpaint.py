@@ -150,7 +150,7 @@ def _fill_cells(whole: Bytes, mask: Bytes, radius: float) -> Bytes:
     own: _Buffers = _kept.buffers
     section = width + 2 * reach
     picture = whole.reshape(len(whole), -1)
-    halve_block(picture, 0, 0, own.half, 0, 0, 2 * height, 2 * width, False)
+    halve_block(picture, 0, 0, own.half, 0, 0, 2 * height, 2 * width, False, False)
     sum_valid(mask, own.either, own.valid, own.half, own.cells, reach, own.masked)
     far = FAR_WEIGHT * 16 / (2 * reach + 1) ** 2
     least = 64 * LEAST_WEIGHT

@@ -201,7 +201,9 @@ def _contrast(whole: Bytes, radius: float, polarity: Polarity) -> _Buffers:
         buffers[kind] = _Buffers(*kind)
     own = buffers[kind]
     picture = own.half
-    halve_block(whole.reshape(len(whole), -1), 0, 0, picture, own.reach, own.reach, height, width, False)
+    halve_block(
+        whole.reshape(len(whole), -1), 0, 0, picture, own.reach, own.reach, height, width, False, False
+    )
     if polarity == "bright":
         # A bright dot is a dark one in the negative.
         picture = np.invert(own.half, out=own.inverted)

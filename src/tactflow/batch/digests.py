@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import hashlib
 import os
+import stat
 import sys
 from dataclasses import dataclass
 from importlib import metadata
@@ -24,7 +26,7 @@ LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba")
 """Packages whose version may change a number."""
 COMPUTING = (
     *("calibration", "classic", "engine", "recording", "sim", "sinks", "sources", "stages", "vision"),
-    *("message", "tables"),
+    *("message", "message_schema", "tables"),
 )
 """Rooms and modules whose code may change a number."""
 
@@ -41,12 +43,22 @@ class Fingerprint:
 
 
 def fingerprint(path: Path) -> Fingerprint:
-    """Of a file, or of all files in a folder. Raises OSError if it is not there."""
+    """Of a file, or of all files in a folder.
+
+    Raises OSError if it is not there, or if one is a pipe or a device: reading it would not end.
+    """
     if not path.is_dir():
-        found = path.stat()
+        found = _regular(path)
         return Fingerprint(found.st_size, found.st_mtime_ns)
-    files = [file.stat() for file in _files(path)]
+    files = [_regular(file) for file in _files(path)]
     return Fingerprint(sum(f.st_size for f in files), max((f.st_mtime_ns for f in files), default=0))
+
+
+def _regular(path: Path) -> os.stat_result:
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(path))
+    return found
 
 
 def _files(folder: Path) -> list[Path]:
@@ -85,7 +97,7 @@ def input_digest(recording: Recording) -> str:
     try:
         content = "" if path is None else _content(path, fingerprint(path))
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise SourceError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     if path is not None:
         # Where it lies does not matter.
         options = options.replace(str(path), "", 1)
