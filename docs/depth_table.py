@@ -1,6 +1,7 @@
 """The tables of calibration.md: errors of height maps, of simulated contacts and of a real ball.
 
 python docs/depth_table.py            simulated contacts under three lights; a minute
+python docs/depth_table.py bound      what is left where the slopes are true, as far as the ball showed them
 python docs/depth_table.py FOLDER     wedge_ball, in the folder that has its pictures and labels.csv
 """
 
@@ -33,8 +34,9 @@ from tactflow.calibration.presses import find_presses
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.sim import open_scene
+from tactflow.vision.depth.poisson import integrate
 from tactflow.vision.depth.slopes import SlopeModel, place_terms
-from tactflow.vision.depth.surface import Rest, Surface, colour_change, surroundings
+from tactflow.vision.depth.surface import Rest, Surface, Surroundings, colour_change, surroundings
 from tactflow.vision.geometry import Preprocessor
 
 Values = NDArray[np.float64]
@@ -107,6 +109,52 @@ def tried(surface: Surface, name: str, light: str) -> Tally:
                 surface, rest, noisy(truth.unmarked, index), mask, truth.sunk.astype(np.float64) * RAW_MM
             )
     return tally
+
+
+def bound() -> None:
+    """Print errors of heights that are integrals of the true slopes, in % of the greatest depth.
+
+    One row with all slopes, one with those cut that are steeper than the calibration's ball has shown.
+    """
+    preprocess = Preprocessor((800, 600), rotate=90, downsample=2)
+    steepest = learn("ball?frames=600").found.steepest
+    assert steepest is not None
+    for most in (1.0, steepest):
+        row = []
+        for name in SCENES:
+            errors = []
+            for seed in SEEDS:
+                scene = open_scene(f"{name}?seed={seed}")
+                rest = Rest(scene.truth(0, preprocess).unmarked)
+                for index in deepest(scene)[:CONTACTS]:
+                    truth = scene.truth(index, preprocess)
+                    around = surroundings(np.uint8(255) * truth.contact_mask, rest.window)
+                    errors.append(integrated(truth.sunk.astype(np.float64) * RAW_MM, around, most))
+            row.append(f"{np.mean(errors):.1f}")
+        print(f"| {most:.2f} | " + " | ".join(row) + " |", flush=True)
+
+
+def integrated(true: Values, around: Surroundings, most: float) -> float:
+    """RMS error of the heights from the true slopes of a surface (H, W), mm, in % of the greatest depth.
+
+    most : horizontal part of a unit normal from which on slopes are cut.
+    """
+    down, across = np.gradient(true, 2 * RAW_MM)
+    length = np.hypot(down, across)
+    cut = np.minimum(1, most / np.sqrt(np.maximum(1 - most**2, 1e-9)) / np.maximum(length, 1e-9))
+    slopes = [
+        cv2.resize((part * cut)[around.window.whole], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        for part in (across, down)
+    ]
+    low = integrate(*(np.asarray(slope * 4 * RAW_MM, np.float32) for slope in slopes))
+    low -= np.median(np.concatenate([low[0], low[-1], low[:, 0], low[:, -1]]))
+    found = np.zeros(true.shape)
+    rows, columns = around.window.whole
+    found[rows, columns] = cv2.resize(
+        np.maximum(low, 0), (columns.stop - columns.start, rows.stop - rows.start)
+    )
+    sunk = true > 0.02 * true.max()
+    return 100 * float(np.sqrt(np.mean((found - true)[sunk] ** 2)) / true.max())
 
 
 class Ball:
@@ -189,7 +237,9 @@ def upright(flat: Values) -> Values:
 
 if __name__ == "__main__":
     cv2.setNumThreads(1)
-    if len(sys.argv) > 1:
+    if sys.argv[1:] == ["bound"]:
+        bound()
+    elif len(sys.argv) > 1:
         Ball(Path(sys.argv[1])).print()
     else:
         simulated()

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
@@ -27,7 +23,8 @@ from tactflow.recording import missing_packages
 
 if TYPE_CHECKING:
     from tactflow.recording.frames import FrameCoder
-    from tactflow.recording.writer import About, Entry, RecordingWriter
+    from tactflow.recording.series import FileSeries
+    from tactflow.recording.writer import About, Entry
 
 log = logging.getLogger("tactflow")
 
@@ -108,18 +105,14 @@ class Record(Recorder):
         """
         super().__init__(params)
         self.description = params.path
-        self._path = expanded(params.path)
         self._trigger = params.trigger or ("start" if params.ring is None else "button")
         self._sensor = sensor
         self._control = control
         self._lock = threading.RLock()
         self._coder: FrameCoder | None = None
-        self._file: RecordingWriter | None = None
+        self._files: FileSeries | None = None
         self._ends = False
         self._backlog: deque[Entry] = deque()
-        self._late: list[Entry] = []
-        self._in_force: list[Entry] = []
-        self._file_begins = 0
         self._references: list[Entry] = []
         self._ring: deque[Entry] = deque()
         self._ring_bytes = 0
@@ -127,7 +120,6 @@ class Record(Recorder):
         self._touching = False
         self._touched = 0.0
         self._previews = RateLimit(params.preview) if params.preview else None
-        self._counts = {"frames": 0, "files": 0, "bytes": 0}
 
     @classmethod
     def outputs(cls, params: Record.Params) -> Sequence[Output]:
@@ -151,15 +143,20 @@ class Record(Recorder):
         if problem is not None:
             raise StageError(problem)
         from tactflow.recording.frames import FrameCoder
+        from tactflow.recording.series import FileSeries
 
+        p = self.params
         self._coder = FrameCoder()
+        self._files = FileSeries(
+            expanded(p.path), self._about, rotate_size=p.rotate_size, rotate_after=p.rotate_after
+        )
         if self._trigger == "start":
-            self._begin(self._path, overwrite=self.params.overwrite)
+            self._begin(numbered=False)
 
     @property
     def recording(self) -> bool:
         """Whether a file is being written. In ring mode it ends by itself."""
-        return self._file is not None
+        return self._files is not None and self._files.is_open
 
     def start_recording(self) -> None:
         """Begin a new file with a number of its own; with a ring, save what it holds. Nothing if recording.
@@ -170,8 +167,8 @@ class Record(Recorder):
             If it cannot be written.
         """
         with self._lock:
-            if self._file is None and self._coder is not None:
-                self._begin_next()
+            if not self.recording and self._coder is not None:
+                self._begin(numbered=True)
                 self._ends = self.params.ring is not None
                 # While the run is paused no frame comes along that would take the ring with it.
                 if self._ends and self._control is not None and self._control.paused:
@@ -186,17 +183,19 @@ class Record(Recorder):
             If it cannot be written.
         """
         with self._lock:
-            if self._file is not None:
+            if self.recording:
                 self._write_backlog(len(self._backlog))
                 self._finish()
 
     def wants(self) -> bool:
         """Whether frames are written or kept."""
-        return self._file is not None or self.params.ring is not None or self._trigger == "contact"
+        return self.recording or self.params.ring is not None or self._trigger == "contact"
 
     def counters(self) -> dict[str, int]:
         """frames, files : written so far. bytes : of the finished files. ring_frames, ring_bytes : kept."""
-        return self._counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
+        files = self._files
+        counts = {key: 0 if files is None else getattr(files, key) for key in ("frames", "files", "bytes")}
+        return counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
 
     def write(self, tick: Tick, results: Results) -> None:
         """Record one frame, or keep it for later.
@@ -212,7 +211,7 @@ class Record(Recorder):
             entry = self._entry(tick, results)
             if self._trigger == "contact":
                 self._follow(results.contact is not None, tick.frame.t)
-            if self._file is not None and not self._ends:
+            if self.recording and not self._ends:
                 self._backlog.append(entry)
             self._write_backlog(BACKLOG_SHARE)
             if self._ends and not self._backlog:
@@ -250,15 +249,15 @@ class Record(Recorder):
     def _follow(self, touching: bool, t: float) -> None:
         """Begin a file when a contact begins, and end it some time after the contact."""
         if touching:
-            if self._file is None and not self._touching:
-                self._begin_next()
+            if not self.recording and not self._touching:
+                self._begin(numbered=True)
             elif self._ends:
                 # Touched again while the rest is being written: go on with what came meanwhile.
                 self._ends = False
                 written = self._backlog[-1].time if self._backlog else 0
                 self._backlog.extend(entry for entry in self._ring if entry.time > written)
             self._touched = t
-        elif self._file is not None and t - self._touched > self.params.after + SLACK:
+        elif self.recording and t - self._touched > self.params.after + SLACK:
             self._ends = True
         self._touching = touching
 
@@ -288,119 +287,37 @@ class Record(Recorder):
                 self.params.memory,
             )
 
-    def _begin_next(self) -> None:
-        self._with_next_name(self._begin)
-
-    def _with_next_name(self, begin: Callable[..., None]) -> None:
-        while True:
-            # Between the two, another run may take the name.
-            with suppress(FileExistsError):
-                begin(next_name(self._path), overwrite=False)
-                return
-
-    def _begin(self, path: Path, *, overwrite: bool) -> None:
+    def _begin(self, *, numbered: bool) -> None:
         """Open a file; the references and what the ring holds are to be written first."""
-        self._open_file(path, overwrite=overwrite)
-        self._ends = False
-        self._backlog = deque(self._ring)
+        assert self._files is not None
         first = self._ring[0] if self._ring else None
-        self._late = [
+        references = [
             reference
             for reference in self._references
             if first is None or (reference.epoch == first.epoch and reference.seq < first.seq)
         ]
-
-    def _open_file(self, path: Path, *, overwrite: bool) -> None:
-        from tactflow.recording.writer import RecordingWriter
-
-        try:
-            self._file = RecordingWriter(path, self._about(), overwrite=overwrite)
-        except FileExistsError as error:
-            if path != self._path:
-                raise
-            raise StageError(
-                f"{path}: this file exists; set overwrite: true to replace it, or give another path"
-            ) from error
-        except OSError as error:
-            raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
-        self.description = str(path)
-        if path != self._path:
-            log.info("record: %s", path)
+        if numbered:
+            self._files.begin_next(references)
+        else:
+            self._files.begin(references, overwrite=self.params.overwrite)
+        self.description = str(self._files.path)
+        self._ends = False
+        self._backlog = deque(self._ring)
 
     def _write_backlog(self, most: int) -> None:
         for _ in range(min(most, len(self._backlog))):
-            if self._file is None:
-                return
-            entry = self._backlog.popleft()
-            if self._is_full(self._file, entry):
-                self._rotate(entry)
-            self._write_entry(self._file, entry)
-
-    def _write_entry(self, file: RecordingWriter, entry: Entry) -> None:
-        self._refuse_interference(file)
-        if file.frames == 0:
-            self._file_begins, self._in_force = entry.time, []
-        try:
-            # The references of before stand where the file's time line begins, without results of that time.
-            for reference in self._late:
-                file.write(replace(reference, message=None, picture=None, annotations=None), entry.time)
-            file.write(entry)
-        except OSError as error:
-            self._give_up(file, error)
-        new = [*self._late, *([entry] if entry.reference else [])]
-        if new:
-            self._in_force = [reference for reference in self._in_force if reference.epoch == new[-1].epoch]
-            self._in_force += new
-        self._late = []
-        self._counts["frames"] += 1
-
-    def _is_full(self, file: RecordingWriter, entry: Entry) -> bool:
-        """Whether an entry is to go into another file."""
-        size, after = self.params.rotate_size, self.params.rotate_after
-        return file.frames > 0 and (
-            (size is not None and file.bytes >= size * 1_000_000)
-            or (after is not None and entry.time - self._file_begins >= after * 1e9)
-        )
-
-    def _rotate(self, entry: Entry) -> None:
-        """Go on in another file, which has the references of its first entry in it."""
-        ends = self._ends
-        self._finish()
-        self._with_next_name(self._open_file)
-        self._ends = ends
-        self._late = [reference for reference in self._in_force if reference.epoch == entry.epoch]
+            assert self._files is not None
+            try:
+                self._files.write(self._backlog.popleft())
+            except StageError:
+                self._backlog.clear()
+                raise
+            self.description = str(self._files.path)
 
     def _finish(self) -> None:
-        file, self._file = self._file, None
+        assert self._files is not None
         self._ends = False
-        assert file is not None
-        self._refuse_interference(file)
-        try:
-            file.finish()
-        except OSError as error:
-            self._give_up(file, error)
-        self._counts["files"] += 1
-        self._counts["bytes"] += file.bytes
-
-    def _refuse_interference(self, file: RecordingWriter) -> None:
-        what = file.interference()
-        if what is None:
-            return
-        self._file = None
-        self._backlog.clear()
-        file.abandon()
-        lost = "what was cut off is lost" if what == "cut" else f"its {file.frames} frames are not in it"
-        raise StageError(f"{file.path}: was {what} by another program while the run recorded to it; {lost}")
-
-    def _give_up(self, file: RecordingWriter, error: OSError) -> None:
-        self._file = None
-        self._backlog.clear()
-        file.abandon()
-        hint = "free some space, then " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        raise StageError(
-            f"{file.path}: cannot be written: {error.strerror or error}; the {file.frames} frames written "
-            f"before are complete and can be played; {hint}tactflow repair {file.path} adds the index"
-        ) from error
+        self._files.finish()
 
     def _about(self) -> About:
         from tactflow.recording.writer import About

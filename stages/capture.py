@@ -16,6 +16,7 @@ from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.sources import (
+    KINDS,
     Arrival,
     CameraRequest,
     FrameReader,
@@ -39,12 +40,7 @@ class Capture(Source):
     class Params(StageParams):
         """What to capture, and which frames are the reference."""
 
-        source: str = Field(
-            "sim:press",
-            description="sim:NAME?query, camera index, /dev/videoN or /dev/v4l/by-id/NAME, video file, "
-            "folder or glob of images, .npy file, .mcap recording, ROS bag with ?topic=, .h5 or .zarr with "
-            "?dataset=, lerobot:PATH?camera=KEY&episode=N, http:// rtsp:// udp:// stream",
-        )
+        source: str = Field("sim:press", description=KINDS)
         realtime: bool = Field(
             False, description="play a recording at its own pace, with a live camera's drop policy"
         )

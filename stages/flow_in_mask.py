@@ -9,7 +9,7 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
 from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field
-from tactflow.vision.types import Flow, Markers
+from tactflow.vision.types import Evidence, Flow, Markers
 
 
 class FlowInMask(Stage):
@@ -38,10 +38,14 @@ class FlowInMask(Stage):
         self._params = params
 
     def process(
-        self, markers: Markers, contact_mask: ContactMask, field: DisplacementField | None = None
+        self,
+        markers: Markers,
+        contact_mask: ContactMask,
+        field: DisplacementField | None = None,
+        evidence: Evidence | None = None,
     ) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside, or none near."""
         dilate = self._params.dilate
         if field is None or self._params.method == "mean":
             return flow_in_mask(markers, contact_mask, dilate=dilate)
-        return flow_of_field(field, markers, contact_mask, dilate=dilate)
+        return flow_of_field(field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Slipping, Touching
 from tactflow.vision.flow import DisplacementField, SlipTest
-from tactflow.vision.types import Flow, Slip
+from tactflow.vision.types import Slip
 
 
 class SlipPorts(NamedTuple):
@@ -34,15 +34,11 @@ class SlipStage(Stage):
         self._test.reset()
 
     def process(
-        self,
-        touching: Touching,
-        contact_mask: ContactMask,
-        field: DisplacementField | None = None,
-        flow: Flow | None = None,
+        self, touching: Touching, contact_mask: ContactMask, field: DisplacementField | None = None
     ) -> SlipPorts:
         """Slip of this frame's contact; `slip` is absent without one, or where no marker is near."""
         if not touching or field is None:
             self._test.reset()
             return SlipPorts(False, None)
-        slip = self._test(field, contact_mask, flow)
+        slip = self._test(field, contact_mask)
         return SlipPorts(slip is not None and slip.slipping, slip)

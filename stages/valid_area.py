@@ -12,7 +12,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.ports import Image, Valid
 from tactflow.sources.files import load_image
-from tactflow.vision.geometry.valid_area import polygon_area, valid_area
+from tactflow.vision.geometry.valid_area import polygon_mask, valid_area
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 Polygon = Annotated[list[Point], Field(min_length=3)]
@@ -58,7 +58,7 @@ class ValidArea(Stage):
             return np.full((height, width), 255, np.uint8)
         if not isinstance(self._area, str):
             try:
-                return polygon_area(self._area, width, height)
+                return polygon_mask(self._area, width, height)
             except ValueError as problem:
                 raise StageError(f"area: {problem}") from None
         mask = np.where(load_image(self._area, self._directory).any(axis=2), 255, 0).astype(np.uint8)

@@ -18,6 +18,7 @@ class Visualize(Stage):
     """Draw contact, markers and flow."""
 
     memory = "pure"
+    on_demand = True
 
     class Params(StageParams):
         """What is drawn."""

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+import logging
 
+import pytest
+from rich.console import Console
+
+from tactflow.cli.main import main
+from tactflow.cli.notes import notes_on
 from tactflow.redaction import public_address, without_secrets
 
 SECRET = "a-secret-of-some-length"
@@ -20,12 +25,39 @@ SECRET = "a-secret-of-some-length"
         f"stages: {{capture: {{source: 'rtsp://me:{SECRET}@camera/1'}}}}",
         f"stages: {{capture: {{source: 'rtsp://me:p@{SECRET}@camera/1'}}}}",
         f"stages: {{capture: {{source: 'http://camera/video?channel=1&PWD={SECRET}'}}}}",
+        f"stages: {{capture: {{source: 'http://camera/video?access_token={SECRET}'}}}}",
+        f'stages: {{capture: {{source: "rtsp://me:it\'s{SECRET}@camera/1"}}}}',
     ],
 )
 def test_a_pipeline_is_handed_on_without_its_secrets(text: str) -> None:
     public = without_secrets(text)
     assert SECRET not in public
     assert public.partition(":")[0] == text.partition(":")[0]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "--source", f"ftp://me:{SECRET}@camera/1"],
+        ["run", "--set", f"stages.capture.source=ftp://me:{SECRET}@camera/1"],
+        ["run", "--set", f"sinks.jsonl={{token: {SECRET}}}"],
+        ["batch", f"rtsp://me:{SECRET}@camera/1", "--out", "unused"],
+    ],
+)
+def test_no_error_message_tells_a_secret_of_the_command_line(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) in (2, 4)
+    said = capsys.readouterr().err
+    assert SECRET not in said
+    assert said
+
+
+def test_a_note_tells_the_address_of_the_page_with_its_token(capsys: pytest.CaptureFixture[str]) -> None:
+    address = f"http://127.0.0.1:8765/?token={SECRET}"
+    with notes_on(Console(stderr=True)):
+        logging.getLogger("tactflow").info("view: %s", address)
+    assert address in capsys.readouterr().err
 
 
 def test_what_is_no_secret_stays() -> None:

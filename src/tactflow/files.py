@@ -24,6 +24,15 @@ def expanded(text: str) -> Path:
     return Path(os.path.expanduser(text))
 
 
+def is_utf8(text: str) -> bool:
+    """Whether a text, such as the name of a file, can stand in messages and tables.
+
+    >>> is_utf8("left-ü"), is_utf8("left-\\udcff")
+    (True, False)
+    """
+    return text.encode(errors="replace").decode() == text
+
+
 def status(text: str) -> os.stat_result | None:
     """What the system knows about a path; None if there is nothing."""
     try:
@@ -179,6 +188,8 @@ class Unheard(io.TextIOWrapper):
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(stream.buffer, stream.encoding, stream.errors, line_buffering=True)
+        # It closes what both write to when nobody holds it any more.
+        self._taken_from = stream
 
     def write(self, text: str) -> int:
         """Write, or lose it."""

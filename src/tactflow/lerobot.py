@@ -43,7 +43,7 @@ SAMPLED = 10
 class DatasetWriter:
     """Writes one dataset.
 
-    folder : must not be there. fps : of the dataset, frames per second. task : what is done, in words.
+    folder : empty, or not there. fps : of the dataset, frames per second. task : what is done, in words.
     film : whether pictures are kept as H.264 video, which loses a little; else as PNG, without loss.
 
     Raises

@@ -8,13 +8,14 @@ from typing import Any
 
 import yaml
 
-# Up to the last @, since a password may have one in it.
-_USER = re.compile(r"(?<=//)[^/\s'\"]*@")
+# Up to the last @, since a password may have one in it, and quotes too.
+_USER = re.compile(r"(?<=//)[^/\s]*@")
 _IN_QUERY = re.compile(
-    r"([?&](?:user|usr|login|pass|pwd|token|auth|key|secret)\w*=)[^&\s'\"]+", re.IGNORECASE
+    r"([?&][\w.-]*(?:user|usr|login|pass|pwd|token|auth|key|secret)[\w.-]*=)[^&\s'\"]+", re.IGNORECASE
 )
 _KEYS = ("token", "password")
 """Parameters of stages and sinks whose values are secret."""
+_SETTING = re.compile(rf"\b({'|'.join(_KEYS)})(\s*[=:]\s*)[^\s,}}]+")
 
 
 def public_address(text: str) -> str:
@@ -24,6 +25,15 @@ def public_address(text: str) -> str:
     'rtsp://camera/1?channel=2&pwd=removed'
     """
     return _IN_QUERY.sub(r"\1removed", _USER.sub("", text))
+
+
+def public_setting(text: str) -> str:
+    """What `--set` was given, without secrets.
+
+    >>> public_setting("sinks.view={token: abc, port: 80}"), public_setting("sinks.view.token=abc")
+    ('sinks.view={token: removed, port: 80}', 'sinks.view.token=removed')
+    """
+    return public_address(_SETTING.sub(r"\1\2removed", text))
 
 
 def without_secrets(text: str) -> str:

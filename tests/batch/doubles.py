@@ -1,4 +1,4 @@
-"""Recordings, pipelines and engines for tests of a batch."""
+"""Recordings, pipelines and executors for tests of a batch."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactflow.batch.engine import Engine, Headway
+from tactflow.batch.executor import Executor, Headway
 from tactflow.batch.folder import Folder, Ledger
 from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.run import Plan, Result, Stopping, make_plan, resolved, run_batch
@@ -29,7 +29,7 @@ sinks: {}
 
 
 class InTurn:
-    """An `Engine` in this process."""
+    """An `Executor` in this process."""
 
     description = "this process"
     window = 2
@@ -62,18 +62,18 @@ def tasks(folder: Path, *names: str) -> list[Task]:
     ]
 
 
-def outcomes_of(engine: Engine, tasks: Sequence[Task]) -> dict[str, Outcome]:
-    """What an engine makes of tasks, by their names; it is closed then."""
+def outcomes_of(executor: Executor, tasks: Sequence[Task]) -> dict[str, Outcome]:
+    """What an executor makes of tasks, by their names; it is closed then."""
     outcomes: dict[str, Outcome] = {}
     try:
         for task in tasks:
-            engine.submit(task)
+            executor.submit(task)
         deadline = time.monotonic() + PATIENCE
         while len(outcomes) < len(tasks):
             assert time.monotonic() < deadline
-            outcomes |= {outcome.name: outcome for outcome in engine.finished(1.0)}
+            outcomes |= {outcome.name: outcome for outcome in executor.finished(1.0)}
     finally:
-        engine.close(kill=True)
+        executor.close(kill=True)
     return outcomes
 
 
@@ -97,7 +97,7 @@ class Batch:
         self.folder = Folder(folder / "out")
         self.format: Format = "jsonl"
         self.plan: Plan
-        self.engine: InTurn
+        self.executor: InTurn
 
     def __call__(
         self,
@@ -109,7 +109,7 @@ class Batch:
     ) -> Result:
         """One call; after `stop_after` outcomes a signal comes."""
         request = resolved(self.file, overrides, None, self.format, split)
-        self.engine = InTurn()
+        self.executor = InTurn()
         stopping = Stopping()
         seen: list[Outcome] = []
 
@@ -123,7 +123,7 @@ class Batch:
             return run_batch(
                 self.plan,
                 lambda one: Task(one, request, self.format, str(self.folder.path), str(scratch), verify),
-                Splitting(self.engine) if split else self.engine,
+                Splitting(self.executor) if split else self.executor,
                 ledger,
                 stopping=stopping,
                 fail_fast=fail_fast,

@@ -1,4 +1,4 @@
-"""A Dask cluster as an engine; what happens to its processes, `python -m tests.load.batch cluster` shows."""
+"""A Dask cluster as an executor; `python -m tests.load.batch cluster` shows what happens to its processes."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def scheduler() -> Iterator[Any]:
 
 
 def test_every_task_comes_back_also_one_whose_work_raises(scheduler: Any, tmp_path: Path) -> None:
-    engine = DaskCluster(scheduler.scheduler_address, work=toy)
-    assert engine.window == 2
-    outcomes = outcomes_of(engine, tasks(tmp_path, "a", "broken", "b"))
+    executor = DaskCluster(scheduler.scheduler_address, work=toy)
+    assert executor.window == 2
+    outcomes = outcomes_of(executor, tasks(tmp_path, "a", "broken", "b"))
     assert {name: outcome.status for name, outcome in outcomes.items()} == {
         **{"a": "done", "b": "done", "broken": "failed"}
     }
@@ -77,18 +77,18 @@ def test_a_scheduler_that_goes_is_said(
     scheduler: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
-    engine = DaskCluster(scheduler.scheduler_address, work=toy)
+    executor = DaskCluster(scheduler.scheduler_address, work=toy)
 
     def until_it_is_noticed() -> None:
         for task in tasks(tmp_path, "a"):
-            engine.submit(task)
+            executor.submit(task)
         deadline = time.monotonic() + 100
         while time.monotonic() < deadline:
-            engine.finished(0.5)
+            executor.finished(0.5)
 
     try:
         scheduler.close()
         with pytest.raises(StageError, match="is gone, with 1 recordings under way"):
             until_it_is_noticed()
     finally:
-        engine.close(kill=True)
+        executor.close(kill=True)

@@ -30,8 +30,8 @@ def toy(task: Task, report: Report) -> Outcome:
 
 
 def test_a_killed_worker_is_replaced_and_what_kills_two_is_set_aside(tmp_path: Path) -> None:
-    engine = LocalProcesses(2, work=toy)
-    outcomes = outcomes_of(engine, tasks(tmp_path, "a", "deadly", "unlucky", "b"))
+    executor = LocalProcesses(2, work=toy)
+    outcomes = outcomes_of(executor, tasks(tmp_path, "a", "deadly", "unlucky", "b"))
     assert {name: outcome.status for name, outcome in outcomes.items()} == {
         **{"a": "done", "b": "done", "unlucky": "done", "deadly": "set aside"}
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import sys
 from pathlib import Path
@@ -35,7 +36,7 @@ def test_every_recording_has_a_result_of_every_frame_and_a_second_call_does_noth
     messages = [orjson.loads(line) for line in path.read_bytes().splitlines()]
     assert [bool(message["contact"]) for message in messages] == [False] * 2 + [True] * 4
     assert statuses(batch) == ["0.npy done before", "1.npy done before", "2.npy done before"]
-    assert batch.engine.submitted == []
+    assert batch.executor.submitted == []
     assert batch.plan.words == "3 recordings, 3 done before, 0 new or failed before"
     assert not list(batch.folder.unfinished.iterdir())
 
@@ -46,7 +47,7 @@ def test_only_what_has_changed_is_done_again(batch: Batch) -> None:
     assert statuses(batch) == ["0.npy done before", "1.npy done", "2.npy done before"]
     assert batch.plan.changed == 1
     batch("stages.hull.min_area=7")
-    assert len(batch.engine.submitted) == 3
+    assert len(batch.executor.submitted) == 3
 
 
 @pytest.mark.parametrize("damage", ["cut off", "gone", "other bytes", "no record"])
@@ -65,6 +66,30 @@ def test_a_result_that_is_not_as_it_was_written_is_no_result(batch: Batch, damag
             record.unlink()
     assert statuses(batch)[2] == "2.npy done"
     assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    "change", [{"frames": "many"}, {"notes": 5}, {"started": None}, {"more": 1}, {"result": "../records"}]
+)
+def test_a_line_of_the_ledger_that_is_not_ours_counts_for_nothing(
+    batch: Batch, change: dict[str, object]
+) -> None:
+    batch()
+    ledger = batch.folder.ledgers / "1-of-1.jsonl"
+    lines = [json.loads(line) | change for line in ledger.read_text().split("\n") if line]
+    ledger.write_text("\n".join(map(json.dumps, lines)))
+    assert statuses(batch) == ["0.npy done before", "1.npy done before", "2.npy done before"]
+
+
+@pytest.mark.parametrize(
+    "record", [b"[]", b"{}", b'{"outcome": null}', b'{"curve": [[1]], "pictures": [{"jpeg": "<script>"}]}']
+)
+def test_a_record_that_is_not_ours_is_none(batch: Batch, record: bytes) -> None:
+    batch()
+    (first, *_) = batch.folder.records.iterdir()
+    assert batch.folder.record(first.stem) is not None
+    first.write_bytes(record)
+    assert batch.folder.record(first.stem) is None
 
 
 def test_tables_are_whole_only_with_all_their_parts(batch: Batch) -> None:
@@ -131,7 +156,7 @@ def test_fail_fast_begins_nothing_more(batch: Batch) -> None:
 def test_one_signal_finishes_what_runs_and_leaves_the_rest_for_the_next_call(batch: Batch) -> None:
     result = batch(stop_after=1)
     assert (len(result.outcomes), len(result.undone), result.ended) == (2, 1, "interrupted")
-    assert not batch.engine.killed
+    assert not batch.executor.killed
     assert statuses(batch) == ["0.npy done before", "1.npy done before", "2.npy done"]
 
 

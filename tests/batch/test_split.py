@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tactflow.batch import split
-from tactflow.batch.engine import died
+from tactflow.batch.executor import died
 from tactflow.batch.task import Outcome
 from tests.batch.doubles import Batch, InTurn, recording
 
@@ -24,7 +24,7 @@ def batch(tmp_path: Path) -> Batch:
 def test_parts_of_a_pipeline_without_memory_are_together_what_the_whole_is(batch: Batch) -> None:
     (whole,) = batch().outcomes.values()
     (parts,) = batch(split=1.0).outcomes.values()
-    assert len(batch.engine.submitted) == 3
+    assert len(batch.executor.submitted) == 3
     assert (parts.frames, parts.touching, parts.contacts) == (80, 78, 1)
     assert (whole.frames, whole.touching, whole.contacts) == (80, 78, 1)
     assert parts.key != whole.key
@@ -48,10 +48,10 @@ def test_tables_have_the_parts_of_all_parts(batch: Batch) -> None:
 def test_a_recording_fails_with_any_of_its_parts(batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     finished = InTurn.finished
 
-    def second_dies(engine: InTurn, timeout: float) -> Sequence[Outcome]:
-        if engine._tasks and engine._tasks[0].part and engine._tasks[0].part.number == 1:
-            return [died(engine._tasks.pop(0), "set aside", "it killed its worker")]
-        return finished(engine, timeout)
+    def second_dies(executor: InTurn, timeout: float) -> Sequence[Outcome]:
+        if executor._tasks and executor._tasks[0].part and executor._tasks[0].part.number == 1:
+            return [died(executor._tasks.pop(0), "set aside", "it killed its worker")]
+        return finished(executor, timeout)
 
     with monkeypatch.context() as patched:
         patched.setattr(InTurn, "finished", second_dies)

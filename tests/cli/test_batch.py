@@ -1,4 +1,4 @@
-"""`tactflow batch`, with an engine in this process."""
+"""`tactflow batch`, with an executor in this process."""
 
 from __future__ import annotations
 
@@ -109,7 +109,9 @@ def test_a_wrong_command_line_starts_nothing(
 def test_parquet_without_pyarrow_says_what_to_install(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("tactflow.batch.runs.missing", lambda *_: "Parquet tables need pyarrow: pip install")
+    monkeypatch.setattr(
+        "tactflow.batch.runs_table.missing", lambda *_: "Parquet tables need pyarrow: pip install"
+    )
     assert main(["batch", "p.yaml", "rec", "--out", str(folder / "o")]) == 2
     assert "pip install; or give --format jsonl" in capsys.readouterr().err
 

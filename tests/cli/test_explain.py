@@ -181,6 +181,15 @@ def test_check_counts_and_warns_on_standard_error(capsys: pytest.CaptureFixture[
     )
 
 
+def test_of_a_stage_that_waits_for_a_sink_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "default"]) == 0
+    out, err = capsys.readouterr()
+    assert out.endswith("segments)\n")
+    assert err == ""
+    assert main(["explain", "default"]) == 0
+    assert "pruned because  no sink needs what it makes" in capsys.readouterr().out
+
+
 def test_statistics_stand_on_the_nodes_of_the_graph(
     pipeline: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 import tactflow
 from tactflow.cli.main import main
+from tactflow.files import claim_path
 from tactflow.sources import open_source
 
 pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
@@ -100,7 +102,8 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
             "small.npy: observation.images.main with pictures of 24 x 16 pixels; those before",
         ),
         ([odd], 3, "a video needs even numbers; give --pictures png"),
-        ([first, "--fps", "0"], 2, "--fps: required at least 1"),
+        ([first, "--fps", "0"], 2, "--fps: required 1 to 1000"),
+        ([first, "--fps", "9" * 20], 2, "--fps: required 1 to 1000"),
         ([str(tmp_path / "none.npy")], 4, "no such file"),
     ):
         assert main(["export", "lerobot", *arguments, "--out", str(out), "--pipeline", "markerless"]) == code
@@ -109,3 +112,21 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
     out.mkdir()
     assert main(["export", "lerobot", first, "--out", str(out)]) == 2
     assert "is already there" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows refuses by itself")
+def test_a_second_export_of_the_same_dataset_is_refused_and_takes_nothing_from_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = tmp_path / ".unfinished-press" / "data" / "file"
+    written.parent.mkdir(parents=True)
+    written.touch()
+    claim = claim_path(written.parent.parent)
+    command = ["export", "lerobot", "sim:press?frames=2", "--out", str(tmp_path / "press")]
+    assert main(command) == 2
+    assert "another tactflow export makes" in capsys.readouterr().err
+    assert written.exists()
+    assert claim is not None
+    os.close(claim)
+    assert main([*command, "--pipeline", "markerless"]) == 0
+    assert not list(tmp_path.glob("press/data/file"))

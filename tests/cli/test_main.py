@@ -167,6 +167,22 @@ def test_a_program_without_standard_output_does_its_work() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="sh closes it")
+def test_a_program_without_standard_error_says_what_letters_its_output_has(tmp_path: Path) -> None:
+    (tmp_path / "ü.yaml").write_text("stages: {capture: {source: sim:idle}}")
+    done = subprocess.run(
+        ["sh", "-c", f"'{sys.executable}' -m tactflow check ü.yaml 2>&-"],
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=60,
+        check=False,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+    )
+    assert done.returncode == 0
+    assert done.stdout.startswith("\\xfc.yaml: OK")
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full here")
 @pytest.mark.parametrize("words", [("stages",), ("schema", "message"), ("sim", "--list"), ("explain",)])
 def test_a_full_disk_behind_standard_output_is_an_error_and_no_traceback(words: tuple[str, ...]) -> None:

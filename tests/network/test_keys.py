@@ -204,6 +204,14 @@ def test_only_their_owner_can_read_keys_and_others_are_refused(folders: tuple[Pa
         Subscriber(keys=subscriber)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="permissions are another matter there")
+@pytest.mark.parametrize("place", ["", "subscribers", "subscribers/laptop.key"])
+def test_who_may_read_is_not_for_others_to_say(folders: tuple[Path, Path], place: str) -> None:
+    os.chmod(folders[0] / place, 0o770)
+    with pytest.raises(StageError, match=r"others may write to it; chmod go-w"):
+        Publisher("tcp://127.0.0.1:*", 1, 32768, str(folders[0]))
+
+
 def test_keys_that_are_missing_or_damaged_are_refused_with_a_hint(folders: tuple[Path, Path]) -> None:
     publisher, subscriber = folders
     with pytest.raises(StageError, match=r"publisher.key_secret: there is no such file; tactflow keys new"):

@@ -1,36 +1,50 @@
-"""Plain version of the kernel of the illumination."""
+"""Plain versions of the kernels of the illumination."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.illumination import CONVERGED, MAX_STEPS, NEVER, REJECT, SATURATED, fit_light
+from tactflow.vision.contact.illumination import (
+    CONVERGED,
+    MAX_STEPS,
+    NEVER,
+    REJECT,
+    SATURATED,
+    compare_blocks,
+    fit_robustly,
+)
 from tests.oracles.gains import Gain
 
 Float = NDArray[np.float32]
 
 
-def plain_fit_light(
+def plain_compare_blocks(
     cells: Float,
     row_weights: Float,
     column_weights: Float,
     reference: Float,
     per_brightness: Float,
     usual_limit: Float,
-    basis: Float,
-    step: Float,
-    shrink: Float,
+    excess: Float,
+    limit: Float,
     coefficients: Float,
 ) -> None:
-    """Means over blocks, the median of their ratios, least-squares steps with clipped residuals, twice."""
+    """Means over blocks, and the median of their relative changes."""
     blocks = (row_weights @ cells @ column_weights.T).reshape(reference.shape)
-    excess, below = blocks - reference, blocks < SATURATED
-    limit = usual_limit * below
+    below = blocks < SATURATED
+    excess[:] = blocks - reference
+    limit[:] = usual_limit * below
     for c in range(3):
         ratios = excess[c] * per_brightness[c]
         used = np.sort(ratios[(per_brightness[c] > 0) & below[c]])
         coefficients[c, 0] = used[len(used) // 2] if len(used) else ratios.max(initial=0)
+
+
+def plain_fit_robustly(
+    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
+) -> None:
+    """Least-squares steps with clipped residuals, twice."""
     for reject in (NEVER, REJECT):
         for _ in range(MAX_STEPS):
             model = np.einsum("ck,ckn->cn", coefficients, basis)
@@ -42,4 +56,7 @@ def plain_fit_light(
                 break
 
 
-GAINS = [Gain(fit_light, plain_fit_light, tolerance=1e-3)]
+GAINS = [
+    Gain(compare_blocks, plain_compare_blocks, tolerance=1e-3),
+    Gain(fit_robustly, plain_fit_robustly, tolerance=1e-3),
+]

@@ -98,6 +98,34 @@ def test_pixels_in_another_file_are_not_read(tmp_path: Path) -> None:
         open_source(f"{tmp_path / 'press.h5'}?dataset=/frames")
 
 
+def test_a_zarr_array_that_would_run_code_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("zarr", reason="the extra zarr is not installed")
+    # As older versions do without being told.
+    monkeypatch.setattr("numcodecs.pickles.ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
+    frames = tmp_path / "evil.zarr" / "frames"
+    frames.mkdir(parents=True)
+    (frames.parent / ".zgroup").write_text('{"zarr_format": 2}')
+    described = {"zarr_format": 2, "shape": [4], "chunks": [4], "dtype": "|O", "order": "C"}
+    codecs = {"filters": [{"id": "vlen-bytes"}], "compressor": {"id": "pickle"}, "fill_value": None}
+    (frames / ".zarray").write_text(json.dumps(described | codecs))
+    (frames / "0").write_bytes(b"cos\nmkdir\n(V" + str(tmp_path / "ran").encode() + b"\ntR.")
+    with pytest.raises(SourceError, match="there is no /frames; required one of: nothing"):
+        open_source(f"{frames.parent}?dataset=/frames")
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
+def test_nobody_reads_a_device_among_the_pieces_of_an_array(tmp_path: Path) -> None:
+    path = write_zarr(tmp_path / "press.zarr", frames=IMAGES)
+    piece = max(path.rglob("c/*/0/0/0"))
+    piece.unlink()
+    piece.symlink_to("/dev/zero")
+    with pytest.raises(SourceError, match="is a pipe or a device"):
+        open_source(f"{path}?dataset=/gel/frames")
+
+
 KEY = "observation.images.gel"
 
 
@@ -184,6 +212,11 @@ def test_an_episode_of_a_lerobot_dataset_is_played(version: str, dtype: str, tmp
         open_source(f"lerobot:{root}")
     with pytest.raises(SourceError, match="episodes: 0 to 1"):
         open_source(f"lerobot:{root}?camera={KEY}&episode=2")
+    for video in root.rglob("*.mp4"):
+        video.write_text("ffconcat version 1.0\nfile other.mp4\n")
+    if dtype == "video":
+        with pytest.raises(SourceError, match="a list of other files"):
+            open_source(f"lerobot:{root}?camera={KEY}&episode=0")
     (root / "meta" / "info.json").write_text("{}")
     with pytest.raises(SourceError, match="this LeRobot dataset: is damaged or cut off"):
         open_source(f"lerobot:{root}?camera={KEY}&episode=0")

@@ -25,7 +25,7 @@ def run(**params: Any) -> Flow:
 
 def test_it_takes_markers_and_a_contact_mask_and_gives_a_flow() -> None:
     ports = read_ports(FlowInMask, "process")
-    assert [port.name for port in ports.inputs] == ["markers", "contact_mask", "field"]
+    assert [port.name for port in ports.inputs] == ["markers", "contact_mask", "field", "evidence"]
     assert [(port.name, port.optional) for port in ports.outputs] == [("flow", False)]
 
 
@@ -51,6 +51,23 @@ def test_with_a_field_the_mean_is_an_integral_unless_that_over_markers_is_asked_
     assert integral.mean is not None
     assert 0.1 < integral.mean[0] < 1.0
     assert integral.count == plain.count == 2
+
+
+def test_where_only_dots_show_a_contact_its_mean_is_as_uncertain_as_the_gel_there_moves_differently() -> None:
+    x, y = np.meshgrid(np.arange(10.0, 300, 20), np.arange(10.0, 300, 20))
+    origin = np.column_stack([x.ravel(), y.ravel()])
+    moved = 0.02 * (origin - 150) @ [[0, 1], [-1, 0]]
+    markers = Markers(origin, origin + moved, np.zeros(len(origin), np.uint8), np.full(len(origin), 0.02))
+    field = FieldModel(origin, (300, 300))(markers)
+    mask = np.zeros((300, 300), np.uint8)
+    mask[50:250, 50:250] = 255
+    stage = FlowInMask(FlowInMask.Params())
+    light, dots = (stage.process(markers, mask, field, evidence) for evidence in ("both", "dots"))
+    assert dots.mean == light.mean
+    # Each component varies evenly from -2 to 2 px within the square.
+    assert dots.stderr == pytest.approx((2 / 3**0.5,) * 2, rel=0.03)
+    assert light.stderr is not None
+    assert max(light.stderr) < 0.1
 
 
 @pytest.mark.parametrize("params", [{"dilate": -1}, {"method": "median"}, {"dilation": 3}], ids=str)

@@ -7,7 +7,7 @@ import numpy as np
 from tactflow.engine.contract import StageParams
 from tactflow.engine.ports import read_ports
 from tactflow.stages.slip import SlipPorts, SlipStage
-from tactflow.vision.flow import FieldModel, flow_of_field
+from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Markers, Slip
 
 X, Y = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
@@ -21,7 +21,7 @@ def step(stage: SlipStage, left: int) -> SlipPorts:
     mask = NOTHING.copy()
     mask[70:130, left : left + 60] = 255
     assert FIELD is not None
-    return stage.process(True, mask, FIELD, flow_of_field(FIELD, MARKERS, mask))
+    return stage.process(True, mask, FIELD)
 
 
 def test_it_gives_a_signal_for_gates_and_how_much_sticks() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -157,6 +158,18 @@ def test_what_is_changed_stands_in_the_file_and_removed_stages_are_gone(
     assert document["stages"]["preprocess"]["downsample"] == 4
     assert "fusion" not in document["stages"]
     assert document["skipping"] is False
+
+
+def test_no_line_of_a_recordings_name_becomes_part_of_the_pipeline(
+    recorded: Recording, tmp_path: Path
+) -> None:
+    odd = replace(recorded, source="press\nsinks:\u2028evil: {}\n.npy")
+    chosen = Candidate("chosen", ())
+    tuned = Tuned(odd, SMALL, Goal(), [found("chosen", 1, 1)], ["chosen"], chosen, 1)
+    file = find_pipeline("default")
+    text = report.pipeline_text(tuned, file, tmp_path / "tuned.yaml")
+    assert yaml.safe_load(text) == yaml.safe_load(file.read_text())
+    assert "# sinks:" in text
 
 
 @pytest.mark.parametrize(

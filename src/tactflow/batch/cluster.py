@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
-from tactflow.batch.engine import Headway, died
+from tactflow.batch.executor import Headway, died
 from tactflow.batch.task import Outcome, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import ConfigError, StageError
@@ -26,7 +26,7 @@ after Ctrl-C, fewer would let it wait for the way to the scheduler and back."""
 
 
 class DaskCluster:
-    """An `Engine` of the workers of a Dask cluster.
+    """An `Executor` of the workers of a Dask cluster.
 
     All of them must see the recordings, the pipeline and `--out` under the same paths, and have the same
     tactflow. A worker that dies is the scheduler's business, which gives its tasks to others.
@@ -65,7 +65,7 @@ class DaskCluster:
         return max(1, AHEAD * self._threads)
 
     def submit(self, task: Task) -> None:
-        """See `Engine.submit`."""
+        """See `Executor.submit`."""
         if not self._is_there:
             raise self._gone()
         future = self._client.submit(self._work, task, pure=False)
@@ -73,7 +73,7 @@ class DaskCluster:
         future.add_done_callback(self._ended.put)
 
     def finished(self, timeout: float) -> Sequence[Outcome]:
-        """See `Engine.finished`."""
+        """See `Executor.finished`."""
         outcomes: list[Outcome] = []
         try:
             while True:

@@ -20,11 +20,25 @@ from pathlib import Path
 from typing import Any
 
 import orjson
+from pydantic import BaseModel, Field
 
-from tactflow.batch.keys import digest_of, fingerprint
+from tactflow.batch.digests import digest_of, fingerprint
 from tactflow.batch.task import Outcome, decoded
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.files import claim_path, make_folder
+
+
+class _Picture(BaseModel):
+    seq: int
+    t: float
+    area: float
+    jpeg: str = Field(pattern="^[A-Za-z0-9+/=]*$")
+
+
+class _Record(BaseModel):
+    outcome: Outcome
+    curve: list[tuple[float, float, float | None, float | None]]
+    pictures: list[_Picture]
 
 
 def remove(path: Path) -> None:
@@ -96,9 +110,13 @@ class Folder:
         return found
 
     def record(self, key: str) -> dict[str, Any] | None:
-        """What is stored of a finished recording: `outcome`, `curve`, `pictures`; None if it is not there."""
+        """What is stored of a finished recording: `outcome`, `curve`, `pictures`.
+
+        None if it is not there, or damaged.
+        """
         try:
             found: dict[str, Any] = orjson.loads((self.records / f"{key}.json").read_bytes())
+            _Record.model_validate(found)
         except (OSError, ValueError):
             return None
         return found
@@ -114,7 +132,7 @@ class Folder:
 
         verify : read it even if size and time are as they were.
         """
-        if outcome.status != "done" or outcome.result is None:
+        if outcome.status != "done" or outcome.result is None or Path(outcome.result).name != outcome.result:
             return False
         path = self.results / outcome.result
         try:

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from tactflow.batch.engine import Headway
+from tactflow.batch.executor import Headway
 from tactflow.batch.task import Outcome, Report, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import StageError
@@ -63,7 +63,7 @@ class _Worker:
 
 
 class LocalProcesses:
-    """An `Engine` of processes on this machine; one that dies is replaced, and its task given to the next.
+    """An `Executor` of processes on this machine; one that dies is replaced, and its task given to the next.
 
     workers : how many. work : what they do, a function of a module.
     """
@@ -102,7 +102,7 @@ class LocalProcesses:
                 continue
 
     def finished(self, timeout: float) -> Sequence[Outcome]:
-        """See `Engine.finished`."""
+        """See `Executor.finished`."""
         ready = wait([worker.connection for worker in self._workers], timeout)
         outcomes: list[Outcome] = []
         for worker in [worker for worker in self._workers if worker.connection in ready]:

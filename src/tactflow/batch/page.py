@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import quote
 
 from tactflow.batch.folder import Folder
-from tactflow.batch.runs import Row
+from tactflow.batch.runs_table import Row
 from tactflow.batch.task import Outcome
 from tactflow.engine.errors import StageError
 from tactflow.files import completed

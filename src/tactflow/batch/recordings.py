@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError, SourceError
-from tactflow.files import expanded
+from tactflow.files import expanded, is_utf8
 from tactflow.sources.base import find_path
 from tactflow.sources.files import IMAGE_SUFFIXES, matching, natural_key
 from tactflow.sources.lerobot import SCHEME
@@ -84,7 +84,7 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
     mistakes: list[str] = []
     sources = list(dict.fromkeys(_sources(words, None, mistakes, set())))
     # Messages and tables are UTF-8.
-    mistakes += [f"{source}: its name is not UTF-8; rename it" for source in sources if not _is_utf8(source)]
+    mistakes += [f"{source}: its name is not UTF-8; rename it" for source in sources if not is_utf8(source)]
     if len(mistakes) > _SHOWN:
         mistakes[_SHOWN:] = [f"and {len(mistakes) - _SHOWN} more"]
     if mistakes:
@@ -93,10 +93,6 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
         kinds = "video files, .npy, .mcap, folders of pictures"
         raise ConfigError(f"there are no recordings in {', '.join(words) or 'nothing'}; required {kinds}")
     return [Recording(source, name) for source, name in zip(sources, _short_names(sources), strict=True)]
-
-
-def _is_utf8(text: str) -> bool:
-    return text.encode(errors="replace").decode() == text
 
 
 def _sources(

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from tactflow.batch.engine import Engine
+from tactflow.batch.digests import fingerprint, result_key, versions
+from tactflow.batch.executor import Executor
 from tactflow.batch.folder import Folder, Ledger
-from tactflow.batch.keys import fingerprint, result_key, versions
 from tactflow.batch.recordings import Recording
 from tactflow.batch.task import Format, Outcome, PipelineRequest, Task
 from tactflow.batch.work import pipeline_for
@@ -126,18 +126,18 @@ class Result:
 def run_batch(
     plan: Plan,
     make_task: Callable[[Recording], Task],
-    engine: Engine,
+    executor: Executor,
     ledger: Ledger,
     *,
     stopping: Stopping,
     fail_fast: bool = False,
     told: Callable[[Outcome], None] = lambda _: None,
-    shown: Callable[[Engine, int], None] = lambda _engine, _left: None,
+    shown: Callable[[Executor, int], None] = lambda _executor, _left: None,
 ) -> Result:
     """Work on what a plan has left.
 
-    After one signal no more is begun, after a second what runs is given up. A full disk, or an engine that is
-    gone, ends it; what is done stays done.
+    After one signal no more is begun, after a second what runs is given up. A full disk, or an executor that
+    is gone, ends it; what is done stays done.
 
     told : about each outcome. shown : called several times a second with the number that is left.
     """
@@ -149,23 +149,23 @@ def run_batch(
             if stopping.signals > 1:
                 break
             goes_on = not stopping.signals and result.ended is None
-            while goes_on and waiting and len(under_way) < engine.window:
+            while goes_on and waiting and len(under_way) < executor.window:
                 recording = waiting.popleft()
                 under_way[recording.source] = recording
-                engine.submit(make_task(recording))
+                executor.submit(make_task(recording))
             if not under_way:
                 break
-            for outcome in engine.finished(LOOK_EVERY):
+            for outcome in executor.finished(LOOK_EVERY):
                 del under_way[outcome.recording]
                 result.outcomes[outcome.recording] = outcome
                 result.ended = result.ended or _reason_to_end(outcome, fail_fast)
                 ledger.add(outcome)
                 told(outcome)
-            shown(engine, len(waiting) + len(under_way))
+            shown(executor, len(waiting) + len(under_way))
     except StageError as error:
         result.ended = result.ended or str(error)
     finally:
-        engine.close(kill=bool(under_way))
+        executor.close(kill=bool(under_way))
     if stopping.signals and (waiting or under_way):
         result.ended = result.ended or "interrupted"
     result.undone = [*under_way.values(), *waiting]

@@ -1,4 +1,4 @@
-"""Cuts long recordings, lets an engine work on the parts side by side, and joins the results."""
+"""Cuts long recordings, lets an executor work on the parts side by side, and joins the results."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 
 import orjson
 
-from tactflow.batch.engine import Engine, Headway
+from tactflow.batch.digests import result_key
+from tactflow.batch.executor import Executor, Headway
 from tactflow.batch.folder import Folder, remove
-from tactflow.batch.keys import result_key
 from tactflow.batch.parts import OVERLAP, cut
 from tactflow.batch.summary import MOST_PICTURES, Curve, Point
 from tactflow.batch.task import Outcome, Task, decoded
@@ -32,34 +32,34 @@ class _Whole:
 
 
 class Splitting:
-    """An `Engine` that cuts recordings for another one, and gives back one outcome for each recording.
+    """An `Executor` that cuts recordings for another one, and gives back one outcome for each recording.
 
-    engine : works on the parts. Results of parts are in the scratch folder until all are there.
+    executor : works on the parts. Results of parts are in the scratch folder until all are there.
     """
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
         self._wholes: dict[str, _Whole] = {}
-        self.description = engine.description
+        self.description = executor.description
 
     @property
     def window(self) -> int:
         """As of the other one, in recordings."""
-        return self._engine.window
+        return self._executor.window
 
     def submit(self, task: Task) -> None:
-        """See `Engine.submit`."""
+        """See `Executor.submit`."""
         pipeline, _ = kept_pipeline_for(task.pipeline, task.format)
         parts = [replace(task, part=part) for part in cut(task.recording, pipeline, task.pipeline.split)]
         if parts:
             self._wholes[task.recording.source] = _Whole(task, parts)
         for one in parts or [task]:
-            self._engine.submit(one)
+            self._executor.submit(one)
 
     def finished(self, timeout: float) -> Sequence[Outcome]:
-        """See `Engine.finished`."""
+        """See `Executor.finished`."""
         outcomes: list[Outcome] = []
-        for outcome in self._engine.finished(timeout):
+        for outcome in self._executor.finished(timeout):
             whole = self._wholes.get(outcome.recording)
             if whole is None:
                 outcomes.append(outcome)
@@ -71,12 +71,12 @@ class Splitting:
         return outcomes
 
     def headway(self) -> Sequence[Headway]:
-        """See `Engine.headway`."""
-        return self._engine.headway()
+        """See `Executor.headway`."""
+        return self._executor.headway()
 
     def close(self, *, kill: bool) -> None:
-        """See `Engine.close`."""
-        self._engine.close(kill=kill)
+        """See `Executor.close`."""
+        self._executor.close(kill=kill)
 
 
 def _joined(whole: _Whole) -> Outcome:

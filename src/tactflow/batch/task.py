@@ -1,14 +1,15 @@
-"""What an engine is given to do, and what it gives back."""
+"""What an executor is given to do, and what it gives back."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Literal
 
 import orjson
+from pydantic import TypeAdapter
 
-from tactflow.batch.keys import Fingerprint
+from tactflow.batch.digests import Fingerprint
 from tactflow.batch.recordings import Recording
 
 Format = Literal["parquet", "jsonl"]
@@ -117,14 +118,17 @@ class Outcome:
         return orjson.dumps(asdict(self))
 
 
+_OUTCOME = TypeAdapter(Outcome)
+_FIELDS = frozenset(field.name for field in fields(Outcome))
+
+
 def decoded(text: bytes) -> Outcome | None:
     """The outcome that a line says, or None if it is damaged or of another version."""
     try:
-        values: dict[str, Any] = orjson.loads(text)
-        for name in ("input", "result_file"):
-            values[name] = None if values[name] is None else Fingerprint(**values[name])
-        return Outcome(**values)
-    except (ValueError, TypeError, KeyError):
+        values = orjson.loads(text)
+        # pydantic leaves out what it does not know; what another version knows more, counts for that one.
+        return _OUTCOME.validate_python(values) if values.keys() == _FIELDS else None
+    except (ValueError, AttributeError):
         return None
 
 

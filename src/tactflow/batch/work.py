@@ -1,4 +1,4 @@
-"""Works on one recording, in whatever process an engine has chosen for it."""
+"""Works on one recording, in whatever process an executor has chosen for it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from typing import Any
 import orjson
 
 from tactflow.api import make_runner
-from tactflow.batch.folder import Folder, remove
-from tactflow.batch.keys import (
+from tactflow.batch.digests import (
     digest_of,
     fingerprint,
     input_digest,
@@ -28,6 +27,7 @@ from tactflow.batch.keys import (
     result_key,
     versions,
 )
+from tactflow.batch.folder import Folder, remove
 from tactflow.batch.parts import OVERLAP, of_part
 from tactflow.batch.recordings import Recording
 from tactflow.batch.summary import Summary, with_looker

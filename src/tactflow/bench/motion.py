@@ -17,7 +17,7 @@ from tactflow.bench import metrics
 from tactflow.bench.results import Measurement
 from tactflow.bench.timing import CopyUnit, Samples, timed
 from tactflow.sim import Scene, Truth, open_scene
-from tactflow.vision.flow import DisplacementField, FieldModel, SlipTest, flow_of_field
+from tactflow.vision.flow import DisplacementField, FieldModel, SlipTest
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -116,7 +116,7 @@ def _measured(scene: Scene, measurement: Measurement, unit: CopyUnit) -> Measure
         if found is None:
             continue
         mask = np.uint8(255) * truth.contact_mask
-        slip = test(found, mask, flow_of_field(found, markers, mask))
+        slip = test(found, mask)
         true.append(truth.slipping)
         said.append(slip is not None and slip.slipping)
         if index % EVERY == 0:

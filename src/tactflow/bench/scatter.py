@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Final
 
+from tactflow.bench.log_axis import LogAxis
 from tactflow.bench.pareto import Point, pareto
 from tactflow.bench.quantities import Quantity, format_number
 
@@ -56,31 +56,6 @@ class _Box:
         return width * height if width > 0 and height > 0 else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Axis:
-    """A logarithmic axis from 10^low to 10^high between two pixel positions."""
-
-    low: float
-    high: float
-    start: float
-    end: float
-
-    def at(self, value: float) -> float:
-        return self.start + (math.log10(value) - self.low) / (self.high - self.low) * (self.end - self.start)
-
-    def ticks(self) -> list[float]:
-        steps = (1, 2, 5) if self.high - self.low < 2.2 else (1,)
-        decades = range(math.floor(self.low), math.ceil(self.high) + 1)
-        values = [step * 10.0**decade for decade in decades for step in steps]
-        return [v for v in values if self.low - 1e-9 <= math.log10(v) <= self.high + 1e-9]
-
-
-def _span(values: Sequence[float], least: float) -> tuple[float, float]:
-    low, high = math.log10(min(values)), math.log10(max(values))
-    middle, half = (low + high) / 2, max((high - low) / 2 * 1.12 + 0.06, least / 2)
-    return middle - half, middle + half
-
-
 class _Plot:
     """The plot while it is drawn, from back to front.
 
@@ -98,9 +73,10 @@ class _Plot:
             self.positive.append(limit)
         self.bottom = HEIGHT - _BOTTOM - (_ZERO_BAND if self.has_zero else 0)
         self.zero_y = HEIGHT - _BOTTOM - _ZERO_BAND / 2
-        low, high = _span([p.cost for p in candidates] + ([floor] if floor else []), _SHORTEST_AXIS)
-        self.x_axis = _Axis(low, high + _ROOM_FOR_NAME * (high - low), _LEFT, WIDTH - _RIGHT)
-        self.y_axis = _Axis(*_span(self.positive or [1.0], _SHORTEST_AXIS), self.bottom, _TOP)
+        costs = [p.cost for p in candidates] + ([floor] if floor else [])
+        across = LogAxis.around(costs, _LEFT, WIDTH - _RIGHT, _SHORTEST_AXIS)
+        self.x_axis = replace(across, high=across.high + _ROOM_FOR_NAME * (across.high - across.low))
+        self.y_axis = LogAxis.around(self.positive or [1.0], self.bottom, _TOP, _SHORTEST_AXIS)
         self.places = {p.method: (self.x_axis.at(p.cost), self.y_of(p.error)) for p in candidates}
         self.on_front = {p.method for p in self.front}
         self.svg: list[str] = []

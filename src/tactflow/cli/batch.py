@@ -14,13 +14,13 @@ from rich.console import Console
 from tactflow.batch.cluster import DaskCluster
 from tactflow.batch.compare import compare
 from tactflow.batch.compare_page import described, text_table, write_comparison
-from tactflow.batch.engine import Engine
+from tactflow.batch.executor import Executor
 from tactflow.batch.folder import Folder, Ledger
 from tactflow.batch.local import LocalProcesses
 from tactflow.batch.page import write_page
 from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.run import Result, Stopping, make_plan, resolved, run_batch
-from tactflow.batch.runs import Row, require_pyarrow, write_runs
+from tactflow.batch.runs_table import Row, require_pyarrow, write_runs
 from tactflow.batch.split import Splitting
 from tactflow.batch.task import Format, PipelineRequest, Task
 from tactflow.batch.work import kept_pipeline_for, reading
@@ -176,12 +176,12 @@ class _Call:
             out, scratch = str(self._folder.path), str(self._scratch)
             return Task(recording, request, args.format, out, scratch, args.verify)
 
-        engine = _engine(args)
+        executor = _executor(args)
         if request.split:
-            engine = Splitting(engine)
-        with batch_display(self._console, plan, engine, shown=not args.quiet) as display:
+            executor = Splitting(executor)
+        with batch_display(self._console, plan, executor, shown=not args.quiet) as display:
             return run_batch(
-                *(plan, make_task, engine, self._ledger),
+                *(plan, make_task, executor, self._ledger),
                 stopping=self.stopping,
                 fail_fast=args.fail_fast,
                 told=display.told,
@@ -255,7 +255,7 @@ def _overrides(args: argparse.Namespace, file: Path) -> list[str]:
     return list(args.overrides)
 
 
-def _engine(args: argparse.Namespace) -> Engine:
+def _executor(args: argparse.Namespace) -> Executor:
     workers = args.workers or processors()
     address = args.scheduler or args.dask
     return LocalProcesses(workers) if address is None else DaskCluster(address, workers)

@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from tactflow.batch.engine import Engine
+from tactflow.batch.executor import Executor
 from tactflow.batch.run import Plan
 from tactflow.batch.task import Outcome
 from tactflow.cli.printable import printable
@@ -51,15 +51,15 @@ class BatchDisplay:
                 text = f"{outcome.status}: {outcome.name}: {in_short(outcome)}"
                 self._console.print(printable(text), markup=False)
 
-    def shown(self, engine: Engine, left: int) -> None:
+    def shown(self, executor: Executor, left: int) -> None:
         """Draw, if it is time to."""
         now = time.monotonic()
         if self._live is None or now - self._drawn < DRAW_EVERY:
             return
         self._drawn = now
-        self._live.update(self.picture(engine, left, now - self._began))
+        self._live.update(self.picture(executor, left, now - self._began))
 
-    def picture(self, engine: Engine, left: int, elapsed: float) -> Table:
+    def picture(self, executor: Executor, left: int, elapsed: float) -> Table:
         """What is shown.
 
         left : recordings. elapsed : s.
@@ -71,7 +71,7 @@ class BatchDisplay:
             f"{rate:.0f} frames/s",
             f"{_time(elapsed)} so far, {_estimate(self._count, left, elapsed)}",
         )
-        at_work = engine.headway()
+        at_work = executor.headway()
         if not at_work:
             for name in sorted(self._rates)[:_MOST_WORKERS]:
                 table.add_row(f"  worker {name}", self._pace(name))
@@ -113,10 +113,10 @@ def _time(seconds: float) -> str:
 
 
 @contextmanager
-def batch_display(console: Console, plan: Plan, engine: Engine, *, shown: bool) -> Iterator[BatchDisplay]:
+def batch_display(console: Console, plan: Plan, executor: Executor, *, shown: bool) -> Iterator[BatchDisplay]:
     """A display that is drawn on a terminal only; elsewhere it says what failed."""
     if shown:
-        console.print(f"on {engine.description}", markup=False)
+        console.print(f"on {executor.description}", markup=False)
     if not shown or not console.is_terminal or not plan.left:
         yield BatchDisplay(console, plan, None, talks=shown)
         return

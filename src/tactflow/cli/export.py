@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from tactflow.cli.notes import say
 from tactflow.engine.errors import ConfigError, StageError
+from tactflow.files import claim_path, make_folder
+
+FASTEST = 1000
+"""Frames per second of a dataset at most; cameras of gels are slower. Chosen by hand."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,28 +57,52 @@ def run(args: argparse.Namespace) -> int:
 
     if args.out.exists():
         raise ConfigError(f"--out: {args.out} is already there; give another folder")
-    if args.fps is not None and args.fps < 1:
-        raise ConfigError(f"--fps: required at least 1, got {args.fps}")
-    fps = args.fps or _rate(args.recordings[0])
-    unfinished = args.out.with_name(f".unfinished-{args.out.name}")
-    writer = DatasetWriter(unfinished, fps, args.task, film=args.pictures == "video")
+    fps = _rate(args.recordings[0]) if args.fps is None else args.fps
+    if not 1 <= fps <= FASTEST:
+        raise ConfigError(f"--fps: required 1 to {FASTEST}, got {fps}")
     settings: dict[str, object] = {"sinks": {}}
-    shutil.rmtree(unfinished, ignore_errors=True)
     recording = ""
     try:
-        for recording in args.recordings:
-            frames = writer.add(stream(args.pipeline, source=recording, settings=settings, images=True))
-            say(f"{recording}: {frames} frames")
-        writer.finish()
-        unfinished.replace(args.out)
+        with _unfinished(args.out) as folder:
+            writer = DatasetWriter(folder, fps, args.task, film=args.pictures == "video")
+            for recording in args.recordings:
+                frames = writer.add(stream(args.pipeline, source=recording, settings=settings, images=True))
+                say(f"{recording}: {frames} frames")
+            writer.finish()
+            folder.replace(args.out)
     except StageError as error:
-        raise StageError(f"{recording}: {error}") from error
+        raise StageError(f"{recording}: {error}" if recording else str(error)) from error
     except OSError as error:
         raise StageError(f"{args.out}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
     say(f"{args.out}: {len(args.recordings)} episodes at {fps} fps")
     return 0
+
+
+@contextmanager
+def _unfinished(out: Path) -> Iterator[Path]:
+    """An empty folder to make a dataset in; removed at the end unless it was moved.
+
+    Raises
+    ------
+    ConfigError : another export makes the same dataset. OSError : it cannot be made.
+    """
+    folder = out.with_name(f".unfinished-{out.name}")
+    make_folder(folder)
+    try:
+        claim = claim_path(folder)
+    except BlockingIOError:
+        raise ConfigError(
+            f"--out: another tactflow export makes {out}; wait for it, or name another one"
+        ) from None
+    try:
+        # Of one that was killed.
+        for left in folder.iterdir():
+            shutil.rmtree(left)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if claim is not None:
+            os.close(claim)
 
 
 def _rate(recording: str) -> int:

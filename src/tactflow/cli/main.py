@@ -6,6 +6,7 @@ import argparse
 import difflib
 import gc
 import importlib
+import io
 import os
 import re
 import signal
@@ -59,6 +60,9 @@ def entry() -> None:
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
     sys.stderr = Unheard(sys.stderr)
+    # Names of files may have letters that the terminal, or UTF-8, has not.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = main(sys.argv[1:])
         sys.stdout.flush()
@@ -67,9 +71,9 @@ def entry() -> None:
         lead_nowhere(sys.stdout)
         code = 0
         if not isinstance(error, BrokenPipeError):
-            print(
-                f"tactflow: {error.filename or 'standard output'}: {error.strerror or error}", file=sys.stderr
-            )
+            # Only the question where we are fails so, without a name.
+            unnamed = "the current folder" if isinstance(error, FileNotFoundError) else "standard output"
+            print(f"tactflow: {error.filename or unnamed}: {error.strerror or error}", file=sys.stderr)
             code = StageError.exit_code
     # The code is known; what comes now shall not change it.
     for number in ENDING:
@@ -84,7 +88,10 @@ def main(argv: Sequence[str]) -> int:
         _collect_garbage()
         return int(args.run(args))
     except TactflowError as error:
-        print(printable(f"tactflow: {error}"), file=sys.stderr)
+        # Imported here: it reads YAML, which not every command does.
+        from tactflow.redaction import public_address
+
+        print(printable(public_address(f"tactflow: {error}")), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         return 130

@@ -195,8 +195,8 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
         logger = logging.getLogger("tactflow")
         for warning in runner.pipeline.warnings:
             logger.warning("%s", warning)
-        if runner.plan.pruned:
-            logger.info("not run, as no sink needs it: %s", ", ".join(n.id for n in runner.plan.pruned))
+        if runner.plan.idle:
+            logger.info("not run, as no sink needs it: %s", ", ".join(node.id for node in runner.plan.idle))
         with progress_display(console, runner, shown=not args.quiet) as on_progress:
             result = runner.run(with_statistics(on_progress, runner, args.stats_every, console))
         code = 0 if result.exit_code == INTERRUPTED and len(caught) == 1 else result.exit_code

@@ -15,6 +15,7 @@ from tactflow.cli.options import seconds
 from tactflow.cli.printable import printable
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
+from tactflow.files import completed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -96,7 +97,8 @@ def run(args: argparse.Namespace) -> int:
     if tuned.chosen is None:
         say(impossible(tuned))
         return StageError.exit_code
-    _write(args.out, report.pipeline_text(tuned, file, args.out))
+    # YAML takes no control characters, which a name in a comment may have.
+    _write(args.out, printable(report.pipeline_text(tuned, file, args.out)))
     say(f"{args.out} and {page} are written; try: tactflow run {args.out} --source {args.source}")
     return 0
 
@@ -115,7 +117,8 @@ def _check_files(out: Path, page: Path, overwrite: bool) -> None:
 
 def _write(path: Path, text: str) -> None:
     try:
-        path.write_text(text, encoding="utf-8")
+        with completed(path) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
     except OSError as error:
         raise StageError(f"{path}: {error.strerror or error}") from error
 

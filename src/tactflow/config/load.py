@@ -25,6 +25,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
 from tactflow.files import expanded, is_device
+from tactflow.redaction import public_address
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 
@@ -182,7 +183,7 @@ def _set_values(drafts: Sequence[Draft], values: Mapping[str, Mapping[str, Any]]
     by_id = {draft.id: draft for draft in drafts}
     for id_, given in values.items():
         for name, value in given.items():
-            shown = f" {value}" if isinstance(value, str) and value.isprintable() else ""
+            shown = f" {public_address(value)}" if isinstance(value, str) and value.isprintable() else ""
             mark = Mark(f"--{name.replace('_', '-')}{shown}", 0, 0)
             if id_ not in by_id:
                 problems.add(mark, f"there is no stage {id_!r}{did_you_mean(id_, by_id)}")

@@ -10,6 +10,7 @@ from tactflow.config.registry import did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems, read_value, wrap
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Mark
+from tactflow.redaction import public_setting
 
 
 def as_yaml(value: Any) -> str:
@@ -27,7 +28,7 @@ def apply(root: Item, text: str, problems: Problems) -> Item:
 
     text : `a.b.c=VALUE`, with VALUE in YAML; null for a whole stage or sink removes it.
     """
-    mark = Mark(f"--set {text}", 0, 0)
+    mark = Mark(f"--set {public_setting(text)}", 0, 0)
     path, equals, value_text = text.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not equals or not all(keys):

@@ -30,6 +30,7 @@ _VALUES: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "threaded": _FLAG,
     "observer": _FLAG,
     "takes_references": _FLAG,
+    "on_demand": _FLAG,
     "live": _FLAG,
     "description": _TEXT,
     "wants_reference": _TEXT,

@@ -130,6 +130,10 @@ class Stage(Part):
     """Required. "pure": the outputs depend on the inputs alone, so the stage may be left out of a frame that
     nobody asks for, and results may be reused. "stateful": it sees every accepted frame, in order."""
 
+    on_demand: ClassVar[bool] = False
+    """Whether it waits in pipelines for a sink that may be added: that nothing needs it is then no mistake,
+    and nothing is said of it."""
+
     wants_reference: str | None = None
     """Why the gel must be looked at anew, a short snake_case word; None: it need not. `process` sets it on
     `self`; the engine takes it back and makes the next frame a reference, in a new epoch, as

@@ -61,11 +61,14 @@ class Plan:
         return next(name for name, nodes in self.segments.items() if node_id in nodes)
 
     @property
+    def idle(self) -> list[Node]:
+        """Stages that no sink needs, without those that wait for a sink: perhaps a mistake."""
+        return [node for node in self.pruned if not getattr(node.component.cls, "on_demand", False)]
+
+    @property
     def warnings(self) -> list[str]:
         """What the user should know before the run."""
-        return [
-            f"{node.mark}  {node.id}: not run, because no sink needs what it makes" for node in self.pruned
-        ]
+        return [f"{node.mark}  {node.id}: not run, because no sink needs what it makes" for node in self.idle]
 
 
 def dependencies(node: Node) -> set[str]:

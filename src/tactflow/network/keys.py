@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import stat
 import sys
 from pathlib import Path
@@ -76,7 +77,7 @@ def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
         _certificate(publisher, PUBLISHER)
     _certificate(subscriber, SUBSCRIBER)
     (subscriber / f"{SUBSCRIBER}.key").replace(allowed / f"{name}.key")
-    (subscriber / f"{PUBLISHER}.key").write_bytes((publisher / f"{PUBLISHER}.key").read_bytes())
+    shutil.copy(publisher / f"{PUBLISHER}.key", subscriber)
     return publisher, subscriber
 
 
@@ -85,7 +86,8 @@ def _certificate(folder: Path, name: str) -> None:
     secret = folder / f"{name}.key_secret"
     # pyzmq would make it readable for others.
     os.close(os.open(secret, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
-    zmq.auth.create_certificates(folder, name)
+    public, _ = zmq.auth.create_certificates(folder, name)
+    os.chmod(public, 0o600)
 
 
 def secure_publisher(socket: zmq.Socket[bytes], folder: Path) -> None:
@@ -133,12 +135,22 @@ def secure_subscriber(socket: zmq.Socket[bytes], folder: Path) -> None:
     socket.curve_serverkey = _read(folder / f"{PUBLISHER}.key")[0]
 
 
+def _refuse_open_to_others(file: Path, *, is_secret: bool) -> None:
+    """Whoever may write into the folder, or to a key in it, lets in whom he wants."""
+    if sys.platform == "win32":
+        return
+    if is_secret and stat.S_IMODE(file.stat().st_mode) & 0o077:
+        raise WrongKeysError(f"{file}: others may read it; chmod 600 {file}")
+    for place in (file.parent, file):
+        if stat.S_IMODE(place.stat().st_mode) & 0o022:
+            raise WrongKeysError(f"{place}: others may write to it; chmod go-w {place}")
+
+
 def _read(file: Path) -> tuple[bytes, bytes]:
     """The public and the secret key in a file; the latter is empty in one of a public key."""
     is_secret = file.suffix == ".key_secret"
     try:
-        if is_secret and sys.platform != "win32" and stat.S_IMODE(file.stat().st_mode) & 0o077:
-            raise WrongKeysError(f"{file}: others may read it; chmod 600 {file}")
+        _refuse_open_to_others(file, is_secret=is_secret)
         public, secret = zmq.auth.load_certificate(file)
     except WrongKeysError:
         raise

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from tactflow.engine.errors import SourceError
-from tactflow.files import expanded
+from tactflow.files import expanded, is_utf8
 from tactflow.redaction import public_address
 from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream
@@ -33,13 +33,12 @@ __all__ = [
 ]
 
 KINDS = (
-    "sim:NAME (simulated sensor), a camera index, /dev/videoN or /dev/v4l/by-id/NAME, a video file, "
+    "sim:NAME?query (simulated sensor), a camera index, /dev/videoN or /dev/v4l/by-id/NAME, a video file, "
     "a folder or glob of images, a .npy file, an .mcap recording of tactflow, "
     "a ROS or Foxglove recording (.mcap, .bag or folder, with ?topic=), .h5 or .zarr with ?dataset=, "
-    "lerobot:PATH?camera=...&episode=..., "
-    "an http://, rtsp:// or udp:// stream"
+    "lerobot:PATH?camera=KEY&episode=N, or an http://, rtsp:// or udp:// stream"
 )
-"""What a source can be, for messages."""
+"""What a source can be, for people: in messages, in `--help`, and for the parameter `source` of `capture`."""
 
 _STREAMS = frozenset(["http", "https", "rtsp", "udp"])
 
@@ -56,10 +55,7 @@ def open_source(
 
     Parameters
     ----------
-    spec : `sim:NAME?frames=300&seed=7`, a camera index, `/dev/videoN` or `/dev/v4l/by-id/NAME`, a video
-        file, a folder or glob of images, a `.npy` file, an `.mcap` recording, `FILE?topic=/name` of a ROS or
-        Foxglove recording, `file.h5?dataset=/name`, `lerobot:PATH?camera=KEY&episode=N`, or an `http://`,
-        `rtsp://`, `udp://` stream.
+    spec : one of `KINDS`, such as `sim:press?frames=300&seed=7` or `recording.avi`.
     directory : where a relative path is looked for if it is not in the current directory.
     fps : rate of recordings that do not know their own (images, arrays), frames per second; 30 by default.
     camera : size, rate and format to ask a camera for.
@@ -87,6 +83,8 @@ def open_source(
     tactflow.engine.errors.SourceError: ftp://camera: unknown kind of source ftp://; required one of: ...
     """
     spec = spec.strip()
+    if not is_utf8(spec):
+        raise SourceError(f"{spec}: is not UTF-8; rename the file")
     if not spec:
         raise SourceError(f"the source is empty; required one of: {KINDS}")
     if spec.startswith("sim:"):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import BgrImage, Normaliser, find_path, log
+from tactflow.sources.base import BgrImage, Normaliser, find_path, log, refuse_devices
 from tactflow.sources.messages import VideoDecoder, compressed_picture, kind_of, raw_picture, stamp_of
 from tactflow.sources.query import split_query
 from tactflow.sources.stores import McapFile, RosBag, Store, Topic, damaged
@@ -93,6 +93,7 @@ class Bag:
 
 
 def _opened(path: Path) -> Store:
+    refuse_devices(path)
     if path.suffix.lower() == ".mcap":
         return McapFile(path)
     return RosBag(path)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
-from tactflow.files import expanded
+from tactflow.files import expanded, is_device
 
 log = logging.getLogger("tactflow")
 
@@ -105,6 +105,22 @@ def refuse_too_large(name: str, width: int, height: int) -> None:
             f"{name}: its pictures are {width} x {height}, more than {MOST_PIXELS} pixels; if that is right, "
             "set the environment variable OPENCV_IO_MAX_IMAGE_PIXELS"
         )
+
+
+def refuse_devices(path: Path) -> None:
+    """Refuse a pipe or a device, also through a link, and a folder in which one is: reading it may never end.
+
+    Raises
+    ------
+    SourceError
+        If there is one.
+    """
+    places = [path]
+    if path.is_dir():
+        places = [Path(place, name) for place, _, names in os.walk(path) for name in names]
+    for place in places:
+        if is_device(str(place)):
+            raise SourceError(f"{place}: is a pipe or a device, not a file")
 
 
 def frame_size(capture: cv2.VideoCapture, name: str) -> tuple[int, int]:

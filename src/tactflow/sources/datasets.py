@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.extras import missing
-from tactflow.sources.base import BgrImage, Normaliser, find_path, refuse_too_large
+from tactflow.sources.base import BgrImage, Normaliser, find_path, refuse_devices, refuse_too_large
 from tactflow.sources.files import DEFAULT_FPS, decode_image
 from tactflow.sources.query import split_query
 from tactflow.sources.stores import damaged
@@ -122,6 +122,7 @@ def _opened(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
     problem = missing("Zarr files" if kind == "zarr" else "HDF5 files", kind.replace("h5py", "hdf5"), [kind])
     if problem is not None:
         raise SourceError(f"{path}: {problem}")
+    refuse_devices(path)
     try:
         return _open_zarr(path) if kind == "zarr" else _open_hdf5(path)
     except Exception as error:
@@ -147,10 +148,15 @@ def _open_zarr(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
     import zarr
 
     root = zarr.open(str(path), mode="r")
-    if isinstance(root, zarr.Array):
-        return {"/": root}, lambda: None
-    members = root.members(max_depth=None)
-    return {f"/{name}": one for name, one in members if isinstance(one, zarr.Array)}, lambda: None
+    members = [("", root)] if isinstance(root, zarr.Array) else root.members(max_depth=None)
+    arrays = {f"/{name}": one for name, one in members if isinstance(one, zarr.Array)}
+    return {name: array for name, array in arrays.items() if not _is_pickled(array)}, lambda: None
+
+
+def _is_pickled(array: Any) -> bool:
+    """Whether reading a Zarr array may run what is in it: only new versions of numcodecs refuse to."""
+    codecs = (*(array.filters or ()), *(array.compressors or ()))
+    return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
 
 
 def _chosen(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:

@@ -334,7 +334,7 @@ def _map_array(path: Path) -> np.memmap[Any, Any]:
     return array
 
 
-def _look_at_beginning(path: Path) -> None:
+def refuse_playlist(path: Path) -> None:
     """Refuse an empty file, and a list of other files: what is handed on as a video shall not open others."""
     try:
         with path.open("rb") as file:
@@ -362,7 +362,7 @@ class VideoFile:
     live = False
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        _look_at_beginning(path)
+        refuse_playlist(path)
         with quiet_opencv():
             self._capture: cv2.VideoCapture | None = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.extras import missing
-from tactflow.sources.base import BgrImage, Normaliser, find_path, refuse_too_large
-from tactflow.sources.files import decode_image
+from tactflow.sources.base import BgrImage, Normaliser, find_path, refuse_devices, refuse_too_large
+from tactflow.sources.files import decode_image, refuse_playlist
 from tactflow.sources.query import split_query
 from tactflow.sources.stores import damaged
 
@@ -55,11 +55,15 @@ class LeRobotEpisode:
             raise SourceError(f"{spec}: {problem}")
         name, settings = split_query(spec.removeprefix(SCHEME), directory, SETTINGS)
         root = find_path(name, directory)
+        refuse_devices(root / "meta")
         try:
             info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
             camera, episode, self._stored = _chosen(spec, info, settings)
             self._name = f"{root}, {camera}, episode {episode}"
             self._place = _find(root, info, camera, episode)
+            refuse_devices(self._place.data)
+            if self._stored == "video":
+                refuse_playlist(self._place.video)
             self.fps: float | None = float(info["fps"])
         except SourceError:
             raise

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import yaml
 
+from tactflow.bench.log_axis import LogAxis
 from tactflow.bench.quantities import format_number
 from tactflow.engine.errors import ConfigError
 from tactflow.tune.checks import WORDS
@@ -21,10 +22,6 @@ HEIGHT: Final = 480
 """Size of the plot, px. This and the lengths below were chosen by hand."""
 MARGINS: Final = (70, 24, 20, 50)
 """Left, right, top and bottom margin, px."""
-ROOM: Final = 1.25
-"""Factor by which the logarithmic axes reach beyond the points."""
-TICKS: Final = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
-"""Values of a decade that the axes show."""
 
 
 def lines(tuned: Tuned) -> Iterator[str]:
@@ -128,7 +125,8 @@ def pipeline_text(tuned: Tuned, file: Path, out: Path) -> str:
     for key, value in tuned.chosen.settings:
         _set(document, key.split("."), value)
     body = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None)
-    comments = "\n".join(f"# {line}".rstrip() for line in header)
+    # A recording may have a name of several lines; none of them may become YAML.
+    comments = "\n".join(f"# {line}".rstrip() for part in header for line in part.splitlines() or [""])
     return f"{comments}\n\n{body}"
 
 
@@ -191,57 +189,36 @@ def plot(tuned: Tuned) -> str:
     shown = [
         one for one in tuned.found if not one.failure and 0 < one.of(kind) < math.inf and one.ms.value > 0
     ]
-    across = _axis([v for one in shown for v in (one.ms.low, one.ms.high)], MARGINS[0], WIDTH - MARGINS[1])
+    times = [v for one in shown for v in (one.ms.low, one.ms.high)]
+    across = LogAxis.around(times or [1.0, 10.0], MARGINS[0], WIDTH - MARGINS[1])
     errors = [v for one in shown for v in (one.error[kind].low, one.error[kind].high) if v > 0]
-    up = _axis(errors, HEIGHT - MARGINS[3], MARGINS[2])
+    up = LogAxis.around(errors or [1.0, 10.0], HEIGHT - MARGINS[3], MARGINS[2])
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" role="img">', *_grid(across, up)]
     bounds = ((tuned.goal.max_ms, True), (tuned.goal.max_error, False))
     for bound, vertical in bounds:
         if bound is not None:
-            ends = (across(bound), float(MARGINS[2]), across(bound), float(HEIGHT - MARGINS[3]))
+            ends = (across.at(bound), float(MARGINS[2]), across.at(bound), float(HEIGHT - MARGINS[3]))
             if not vertical:
-                ends = (float(MARGINS[0]), up(bound), float(WIDTH - MARGINS[1]), up(bound))
+                ends = (float(MARGINS[0]), up.at(bound), float(WIDTH - MARGINS[1]), up.at(bound))
             parts.append(_rule(*ends, "#c00", "5 4"))
     for one in sorted(shown, key=lambda one: _is_chosen(tuned, one)):
         parts += _dot(tuned, one, across, up)
     return "\n".join([*parts, "</svg>"])
 
 
-class _Axis:
-    """A logarithmic axis between two places."""
-
-    def __init__(self, low: float, high: float, start: float, end: float) -> None:
-        self.low, self.high = math.log10(low / ROOM), math.log10(high * ROOM)
-        self.start, self.end = start, end
-
-    def __call__(self, value: float) -> float:
-        share = (math.log10(max(value, 1e-9)) - self.low) / (self.high - self.low)
-        return self.start + min(max(share, 0.0), 1.0) * (self.end - self.start)
-
-    def ticks(self) -> list[float]:
-        """Values to write."""
-        decades = range(math.floor(self.low), math.ceil(self.high) + 1)
-        values = [step * 10.0**decade for decade in decades for step in TICKS]
-        return [value for value in values if self.low <= math.log10(value) <= self.high]
-
-
-def _axis(values: Sequence[float], start: float, end: float) -> _Axis:
-    return _Axis(min(values, default=1.0), max(values, default=10.0), start, end)
-
-
-def _grid(across: _Axis, up: _Axis) -> Iterator[str]:
+def _grid(across: LogAxis, up: LogAxis) -> Iterator[str]:
     left, right, top, bottom = MARGINS[0], WIDTH - MARGINS[1], MARGINS[2], HEIGHT - MARGINS[3]
     for value in across.ticks():
-        yield _rule(across(value), top, across(value), bottom, "#ddd")
-        yield _text(across(value), bottom + 18, format_number(value), "middle")
+        yield _rule(across.at(value), top, across.at(value), bottom, "#ddd")
+        yield _text(across.at(value), bottom + 18, format_number(value), "middle")
     for value in up.ticks():
-        yield _rule(left, up(value), right, up(value), "#ddd")
-        yield _text(left - 8, up(value) + 4, format_number(value), "end")
+        yield _rule(left, up.at(value), right, up.at(value), "#ddd")
+        yield _text(left - 8, up.at(value) + 4, format_number(value), "end")
     yield _text((left + right) / 2, HEIGHT - 10, "CPU time of a frame with contact, ms", "middle")
     yield _text(left, top - 6, "error, px of the camera's picture", "start")
 
 
-def _dot(tuned: Tuned, one: Found, across: _Axis, up: _Axis) -> Iterator[str]:
+def _dot(tuned: Tuned, one: Found, across: LogAxis, up: LogAxis) -> Iterator[str]:
     error = one.error[tuned.goal.kind]
     special = one.name in (DEFAULT, ORIGINAL)
     color = "#999"
@@ -251,9 +228,9 @@ def _dot(tuned: Tuned, one: Found, across: _Axis, up: _Axis) -> Iterator[str]:
         color = "#d60"
     elif one.name in tuned.front:
         color = "#000"
-    x, y = across(one.ms.value), up(error.value)
-    yield _rule(across(one.ms.low), y, across(one.ms.high), y, color)
-    yield _rule(x, up(error.low), x, up(error.high), color)
+    x, y = across.at(one.ms.value), up.at(error.value)
+    yield _rule(across.at(one.ms.low), y, across.at(one.ms.high), y, color)
+    yield _rule(x, up.at(error.low), x, up.at(error.high), color)
     title = f"{one.name}: {one.ms.value:.2f} ms, {error.value:.3f} px"
     yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{color}"><title>{escape(title)}</title></circle>'
     if _is_chosen(tuned, one) or special:

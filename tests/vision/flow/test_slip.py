@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tactflow.sim import open_scene
-from tactflow.vision.flow import FieldModel, SlipTest, flow_of_field
+from tactflow.vision.flow import FieldModel, SlipTest
 from tactflow.vision.flow.slip import stick_ratio
 from tactflow.vision.geometry.preprocess import Preprocessor
 from tactflow.vision.types import Markers, MarkerStatus, Slip
@@ -32,7 +32,7 @@ def judged(spec: str, frames: range) -> Iterator[tuple[int, bool, float, Slip]]:
         field = model(markers)
         assert field is not None
         mask = np.uint8(255) * truth.contact_mask
-        slip = test(field, mask, flow_of_field(field, markers, mask))
+        slip = test(field, mask)
         if slip is not None:
             yield index, truth.slipping, truth.stick_ratio, slip
 
@@ -45,6 +45,21 @@ def test_a_contact_that_slides_is_noticed_within_three_frames_and_not_before(spe
     assert first <= found <= first + 3
     # From then on without a gap, for as long as it slides.
     assert all(slipping for index, true, slipping in told if true and index >= found)
+
+
+def test_a_slip_is_noticed_where_no_dot_is_in_the_contact() -> None:
+    told = [(index, true, slip) for index, true, _, slip in judged("stick_slip?seed=13", range(190, 226))]
+    first = next(index for index, true, _ in told if true)
+    scene = open_scene("stick_slip?seed=13").truth(first, MAPPING)
+    x, y = np.rint(scene.position).astype(int).T
+    assert not scene.contact_mask[y, x].any()
+    assert first <= next(index for index, _, slip in told if slip.slipping) <= first + 3
+
+
+def test_what_rolls_sticks_also_where_it_has_left_the_gel_that_it_touched_first() -> None:
+    told = [slip.stick_ratio for *_, slip in judged("roll?frames=140&seed=11", range(30, 110, 2))]
+    assert np.mean(told) > 0.85
+    assert min(told) > 0.5
 
 
 @pytest.mark.parametrize("spec", ["press?frames=150", "twist?frames=140", "roll?frames=140"])
@@ -97,5 +112,5 @@ def test_another_contact_starts_anew_and_what_moves_against_the_drag_is_no_slip(
     here, there = np.zeros((2, 200, 200), np.uint8)
     here[60:120, 40:100] = there[60:120, 80:140] = 255
     for mask, expected in ((here, False), (np.zeros_like(here), None), (there, False), (here, False)):
-        slip = test(field, mask, flow_of_field(field, markers, mask))
+        slip = test(field, mask)
         assert (None if slip is None else slip.slipping) == expected

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tactflow.sim import open_scene
-from tactflow.vision.geometry.valid_area import bounding_box, lit_area, polygon_area, valid_area
+from tactflow.vision.geometry.valid_area import bounding_box, lit_area, polygon_mask, valid_area
 
 GEL = np.full((240, 320, 3), (90, 120, 60), np.uint8)
 
@@ -78,7 +78,7 @@ def test_a_large_picture_has_the_area_of_a_small_one() -> None:
 
 
 def test_a_polygon_gives_its_pixels_and_their_bounding_box() -> None:
-    area = polygon_area([(10, 20), (30, 20), (30, 50), (10, 50)], width=80, height=60)
+    area = polygon_mask([(10, 20), (30, 20), (30, 50), (10, 50)], width=80, height=60)
     assert np.count_nonzero(area) == 21 * 31
     assert bounding_box(area) == (slice(20, 51), slice(10, 31))
 
@@ -86,4 +86,4 @@ def test_a_polygon_gives_its_pixels_and_their_bounding_box() -> None:
 @pytest.mark.parametrize("polygon", [[(1, 1), (2, 2)], [(100, 100), (120, 100), (110, 120)]])
 def test_a_polygon_without_corners_or_outside_is_refused(polygon: list[tuple[float, float]]) -> None:
     with pytest.raises(ValueError, match="polygon"):
-        polygon_area(polygon, width=80, height=60)
+        polygon_mask(polygon, width=80, height=60)

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from tactflow.stages.tracker import Tracker
 from tactflow.vision import compiled
-from tactflow.vision.markers import field, matching, template, tracking
+from tactflow.vision.markers import graph, matching, template, tracking
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.template import Alignment
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers
-from tests.oracles import field as plain_field
+from tests.oracles import graph as plain_graph
 from tests.oracles import matching as plain_matching
 from tests.oracles import template as plain_template
 from tests.oracles import tracking as plain_tracking
 from tests.oracles.plain import plain
 from tests.vision.dots import FloatArray, grid, render
 
-ORACLES = (plain_field, plain_matching, plain_template, plain_tracking)
+ORACLES = (plain_graph, plain_matching, plain_template, plain_tracking)
 SIZE = (150, 170)
 PITCH = 24.0
 TRUTH = grid(7, 6, PITCH, corner=(14.3, 13.8), jitter=0.4)
@@ -59,16 +59,16 @@ def test_marks_are_judged_alike(seed: int) -> None:
         np.testing.assert_array_equal(seen, expected[0])
         assert doubt == expected[2]
         doubts.add(doubt)
-        inliers = under_test._field.largest_component(seen, strain)
+        inliers = under_test._graph.largest_component(seen, strain)
         with plain(*ORACLES):
-            np.testing.assert_array_equal(inliers, under_test._field.largest_component(seen, strain))
+            np.testing.assert_array_equal(inliers, under_test._graph.largest_component(seen, strain))
     assert doubts == {0, 1, 2}
 
 
 def test_the_stage_has_its_loops_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     loops = [
         loop
-        for module in (field, matching, template, tracking)
+        for module in (graph, matching, template, tracking)
         for loop in vars(module).values()
         if isinstance(loop, compiled.Kernel)
     ]

@@ -294,20 +294,17 @@ def _cut_by_border(change: Float, rows: slice, columns: slice, shape: tuple[int,
 
     change : (3, 2h, 2w), of a window. rows, columns : the window, cells. shape : of the picture, cells.
     """
-    sides = [
-        line
-        for line, at_border in (
-            (change[:, 0], rows.start == 0),
-            (change[:, -1], rows.stop == shape[0]),
-            (change[:, :, 0], columns.start == 0),
-            (change[:, :, -1], columns.stop == shape[1]),
-        )
-        if at_border
-    ]
+    borders = (
+        (rows.start == 0, change[:, 0]),
+        (rows.stop == shape[0], change[:, -1]),
+        (columns.start == 0, change[:, :, 0]),
+        (columns.stop == shape[1], change[:, :, -1]),
+    )
+    sides = [side for reached, side in borders if reached]
     if not sides:
         return False
-    largest = cv2.norm(change.reshape(-1, change.shape[2]), cv2.NORM_INF)
-    return max(float(np.abs(line).max()) for line in sides) > CUT * largest
+    enough = CUT * cv2.norm(change.reshape(-1, change.shape[2]), cv2.NORM_INF)
+    return any(float(np.abs(side).max()) > enough for side in sides)
 
 
 def _planes(picture: NDArray[np.uint8]) -> Float:

@@ -33,18 +33,20 @@ NINTH: Final = np.float32(1 / 9)
 def smooth_cells(cells: Byte, smooth: Float) -> None:
     """Means over 3 x 3 cells, (h, 3 w), into the planes `smooth`, (3, h, w)."""
     high, wide = smooth.shape[1:]
-    sums = np.empty(3 * wide + 6, np.int32)
+    sums, squares = np.empty(3 * wide + 6, np.int16), np.empty(3 * wide, np.int16)
     for y in range(high):
         above = cells[min(1, high - 1) if y == 0 else y - 1]
         here, below = cells[y], cells[max(high - 2, 0) if y == high - 1 else y + 1]
         for x in range(3 * wide):
-            sums[x + 3] = np.int32(above[x]) + np.int32(here[x]) + np.int32(below[x])
+            sums[x + 3] = np.int16(above[x]) + np.int16(here[x]) + np.int16(below[x])
         for c in range(3):
             sums[c] = sums[3 * min(2, wide) + c]
             sums[3 * wide + 3 + c] = sums[3 * max(wide - 1, 1) + c]
-            row, line = smooth[c, y], sums[c:]
+        for x in range(3 * wide):
+            squares[x] = sums[x] + sums[x + 3] + sums[x + 6]
+        for c in range(3):
             for x in range(wide):
-                row[x] = np.float32(line[3 * x] + line[3 * x + 3] + line[3 * x + 6]) * NINTH
+                smooth[c, y, x] = np.float32(squares[3 * x + c]) * NINTH
 
 
 @kernel(

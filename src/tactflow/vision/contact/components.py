@@ -107,8 +107,9 @@ def contact_components(
             continue
         inside = filled.view(np.bool_)
         peak = cv2.minMaxLoc(squared[rows, columns], filled)[1]
-        stays = before is not None and peak >= stay and bool((before[rows, columns] & inside).any())
-        if peak >= start or stays:
+        if peak >= start or (
+            before is not None and peak >= stay and bool((before[rows, columns] & inside).any())
+        ):
             found.append(Component(rows, columns, inside))
     return _strongest(found, squared)
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import kernel
 
 Float = NDArray[np.float32]
 
@@ -103,18 +103,19 @@ class IlluminationModel:
         frame), and the offset, grey levels.
         """
         coefficients = np.zeros((3, 4), np.float32)
-        fit_light(
+        excess, limit = np.empty((2, *self._reference.shape), np.float32)
+        compare_blocks(
             cells,
             self._row_weights,
             self._column_weights,
             self._reference,
             self._per_brightness,
             self._limit,
-            self._basis,
-            self._step,
-            self._shrink,
+            excess,
+            limit,
             coefficients,
         )
+        fit_robustly(excess, self._basis, self._step, self._shrink, limit, coefficients)
         coefficients[:, :3] /= self._center
         return coefficients
 
@@ -156,93 +157,67 @@ def _block_weights(blocks: int, count: int) -> Float:
     return np.asarray(np.maximum(covered, 0) * (blocks / count), np.float32)
 
 
-@helper
-def _compare_blocks(
-    plane: Float,
-    row_weights: Float,
-    column_weights: Float,
-    reference: Float,
-    usual_limit: Float,
-    excess: Float,
-    limit: Float,
-) -> None:
-    """Fill `excess` (n,) with means over blocks less `reference`, and `limit`, 0 where they are saturated."""
-    line, at = np.empty(plane.shape[1], np.float32), 0
-    for block in range(len(row_weights)):
-        line[:] = 0
-        for y in range(len(plane)):
-            weight, row = row_weights[block, y], plane[y]
-            if weight > 0:
-                for x in range(line.size):
-                    line[x] += weight * row[x]
-        for weights in column_weights:
-            mean = np.float32(0)
-            for x in range(line.size):
-                mean += line[x] * weights[x]
-            excess[at] = mean - reference[at]
-            limit[at] = usual_limit[at] if mean < SATURATED else np.float32(0)
-            at += 1
-
-
-@helper
-def _typical_ratio(excess: Float, per_brightness: Float, limit: Float) -> np.float32:
-    """Median of the relative change of the blocks (n,) that are lit and not saturated.
-
-    Where all are saturated, the largest relative change; 0 in a channel without light.
-    """
-    ratios, count, most = np.empty(excess.size, np.float32), 0, np.float32(0)
-    for i in range(excess.size):
-        if per_brightness[i] > 0:
-            ratio = excess[i] * per_brightness[i]
-            most = max(most, ratio)
-            if limit[i] > 0:
-                ratios[count] = ratio
-                count += 1
-    for i in range(count):
-        below = up_to = 0
-        for j in range(count):
-            below += ratios[j] < ratios[i]
-            up_to += ratios[j] <= ratios[i]
-        if below <= count // 2 < up_to:
-            return np.float32(ratios[i])
-    return most
-
-
 @kernel(
     "void(float32[:, :, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1],"
-    " float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1])",
+    " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
     reorder=True,
 )
-def fit_light(
+def compare_blocks(
     cells: Float,
     row_weights: Float,
     column_weights: Float,
     reference: Float,
     per_brightness: Float,
     usual_limit: Float,
-    basis: Float,
-    step: Float,
-    shrink: Float,
+    excess: Float,
+    limit: Float,
     coefficients: Float,
 ) -> None:
-    """What `IlluminationModel.fit` does; `coefficients`, (3, 4), 0 at first, is filled.
+    """What a fit starts from: `excess` and `limit`, (3, n), and gains in `coefficients`, (3, 4), are filled.
 
-    cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. reference,
-    per_brightness, usual_limit : (3, n), of the blocks: what they are usually, one over their brightness
-    (0 where not lit), and where residuals are clipped. basis, step : (3, 4, n), the model and its
-    pseudo-inverse. shrink : (3, 4, 4), what the ridge takes from the coefficients in a step.
+    cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. reference :
+    (3, n), their means, which excess is beyond. usual_limit : (3, n); limit is 0 where a block is saturated.
+    per_brightness : (3, n), one over the brightness, 0 where it is not lit: a gain is the median of the
+    relative change of the blocks that are lit and not saturated, or the largest one where all are saturated.
     """
-    excess, limit = np.empty_like(reference), np.empty_like(reference)
+    high, wide = cells.shape[1:]
+    down, across = len(row_weights), len(column_weights)
+    line, ratios = np.empty(wide, np.float32), np.empty(down * across, np.float32)
     for c in range(3):
-        _compare_blocks(
-            cells[c], row_weights, column_weights, reference[c], usual_limit[c], excess[c], limit[c]
-        )
-        coefficients[c, 0] = _typical_ratio(excess[c], per_brightness[c], limit[c])
-    _fit_robustly(excess, basis, step, shrink, limit, coefficients)
+        count, most = 0, np.float32(0)
+        for row in range(down):
+            line[:] = 0
+            # A block takes no other lines and columns than those from its first to its last one.
+            for y in range(row * high // down, -(-(row + 1) * high // down)):
+                for x in range(wide):
+                    line[x] += row_weights[row, y] * cells[c, y, x]
+            for column in range(across):
+                mean, at = np.float32(0), row * across + column
+                for x in range(column * wide // across, -(-(column + 1) * wide // across)):
+                    mean += line[x] * column_weights[column, x]
+                excess[c, at] = mean - reference[c, at]
+                limit[c, at] = usual_limit[c, at] if mean < SATURATED else np.float32(0)
+                if per_brightness[c, at] > 0:
+                    ratios[count] = excess[c, at] * per_brightness[c, at]
+                    most = max(most, ratios[count])
+                    count += limit[c, at] > 0
+        for i in range(count):
+            below = up_to = 0
+            for j in range(count):
+                below += ratios[j] < ratios[i]
+                up_to += ratios[j] <= ratios[i]
+            if below <= count // 2 < up_to:
+                most = ratios[i]
+                break
+        coefficients[c, 0] = most
 
 
-@helper
-def _fit_robustly(
+@kernel(
+    "void(float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1],"
+    " float32[:, ::1])",
+    reorder=True,
+)
+def fit_robustly(
     excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
 ) -> None:
     """Least-squares steps with clipped residuals; `coefficients`, (3, 4), start and result.

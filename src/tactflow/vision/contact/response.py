@@ -74,12 +74,12 @@ def light_response(change: Float, inside: NDArray[np.bool_]) -> Response:
     elongation = (total + spread) / (total - spread)
     # LAPACK, called once a frame, takes eight times as long: nothing of it is in the caches.
     _, powers, directions = cv2.eigen(colours)
-    first, second, _ = powers.ravel().tolist()
+    first, second, third = powers.ravel().tolist()
     if second * elongation >= first:
         return EVEN
     raised = min(first / max(second * elongation, 1e-6 * first), LARGEST_GAIN**2)
     gain = raised ** min((LONG - elongation) / (LONG - ROUND), 1.0)
-    whole = float(powers.sum())
+    whole = first + second + third
     scale = whole / (gain * whole - (gain - 1) * first)
     strongest = directions[0] * np.float32(math.sqrt((gain - 1) * scale))
     return Response(np.float32(gain * scale), np.asarray(strongest, np.float32))

@@ -23,10 +23,6 @@ Bytes = NDArray[np.uint8]
 DIM: Final = 20.0
 """Grey levels that are added to the light at rest before a change is divided by it, so that the noise of a
 dark channel does not count as colour. Chosen by hand."""
-BLUR: Final = 0.7
-"""Standard deviation of the Gaussian over which colours are averaged, pixels at half resolution. It rounds
-edges and takes off depth: 1.0 makes the errors of `press`, `cable` and `long_edge` a third larger, and 0.5
-those under the light `mixed` a fifth. On wedge_ball the three differ by 2 %."""
 MARGIN: Final = 1.2
 """How far the gel may have sunk beyond the contact, relative to half of the contact's shorter axis. Chosen on
 the simulator: 0.8 makes the errors of `press` twice and those of `finger` three times as large."""
@@ -39,16 +35,16 @@ FADE: Final = 6
 """Pixels at half resolution over which slopes fade to 0 at the border of the window. Chosen by hand."""
 
 
-DEPTH_ROUNDED: Final = 0.05
-"""Part of the depth that averaging may take off, of any contact. This and the three below were chosen on 81
-contacts of nine simulated scenes under three lights, so that 78 % of the errors of the depth lie within one
-standard error and 94 % within two; on 162 others 73 and 97 % (docs/depth_table.py)."""
-DEPTH_STEEP: Final = 0.25
+DEPTH_ROUNDED: Final = 0.01
+"""Part of the depth that averaging may take off, of any contact. This and the three below were chosen on 162
+contacts of nine simulated scenes under three lights, so that of round and of sharp ones about 68 % of the
+errors lie within one standard error and 95 % within two; docs/depth_table.py tries them on 162 others."""
+DEPTH_STEEP: Final = 0.17
 """Error of the depth, relative, where all of the slope is steep; it grows with the root of the steep part."""
-VOLUME_ROUNDED: Final = 0.03
+VOLUME_ROUNDED: Final = 0.0075
 """As `DEPTH_ROUNDED`, of the volume."""
-VOLUME_STEEP: Final = 0.4
-"""As `DEPTH_STEEP`, of the volume (72 % within one, 90 % within two; others 70 and 91 %)."""
+VOLUME_STEEP: Final = 0.26
+"""As `DEPTH_STEEP`, of the volume."""
 STEEP: Final = 0.86
 """A slope is steep from this part of the steepest on that the ball has shown, by the horizontal part of the
 normal."""
@@ -93,21 +89,22 @@ class Surroundings(NamedTuple):
 class Rest:
     """The untouched gel, prepared for `colour_change`.
 
-    untouched : (H, W, 3) uint8, BGR, without markers; H and W at least 8.
+    untouched : (H, W, 3), BGR, without markers; H and W at least 8; of the dtype of the pictures that are
+    compared with it, so that both are rounded alike.
     """
 
-    def __init__(self, untouched: Bytes) -> None:
+    def __init__(self, untouched: Bytes | Float) -> None:
         whole = Window(0, untouched.shape[0] // 4 * 2, 0, untouched.shape[1] // 4 * 2)
         self.window = whole
         self.light: Float = np.stack(_halved(untouched, whole)).astype(np.float32)
         self.weight: Float = np.reciprocal(self.light + np.float32(DIM))
 
 
-def colour_change(image: Bytes, rest: Rest, window: Window) -> Float:
+def colour_change(image: Bytes | Float, rest: Rest, window: Window) -> Float:
     """(3, h, w) float32: change of the light at half resolution, relative to the light at rest.
 
-    image : (H, W, 3) uint8, BGR, without markers. What the window's border shows, a change of the light as a
-    whole, is taken out.
+    image : (H, W, 3) uint8 or float32, grey levels, BGR, without markers; means of 2 x 2 pixels of uint8 are
+    rounded. What the window's border shows, a change of the light as a whole, is taken out.
     """
     part = (slice(None), *window.part)
     light, weight = rest.light[part], rest.weight[part]
@@ -257,11 +254,10 @@ class Surface:
         return np.maximum(heights, 0, out=heights)
 
 
-def _halved(image: Bytes, window: Window) -> Sequence[Bytes]:
-    """Three (h, w) uint8: the channels of a window of a picture at half resolution, smoothed."""
+def _halved(image: Bytes | Float, window: Window) -> Sequence[Bytes | Float]:
+    """Three (h, w) of the picture's dtype: the channels of a window of it at half resolution."""
     size = (window.right - window.left, window.bottom - window.top)
-    half = cv2.resize(image[window.whole], size, interpolation=cv2.INTER_AREA)
-    return cv2.split(cv2.GaussianBlur(half, (0, 0), BLUR))  # type: ignore[return-value]
+    return cv2.split(cv2.resize(image[window.whole], size, interpolation=cv2.INTER_AREA))  # type: ignore[return-value]
 
 
 def _border(values: Float) -> Float:

@@ -114,6 +114,7 @@ class GelMotion:
     mean : (dx, dy), px: the integral of the displacement over the part, over its area at rest.
     stderr : of each component of the mean, px, for a region whose outline is exact.
     outline_stderr : what the outline of a contact adds to that, (dx, dy), px.
+    spread : RMS by which each component of the displacement differs from the mean within the part, px.
     gradient : of the affine motion that is nearest to the displacement; None for a part too small to tell.
     residual : RMS of what mean, turn and spread leave, px; None where gradient is None.
     unknown : share of what the mean could be that the markers leave open, 0 to 1: how far they are away.
@@ -122,6 +123,7 @@ class GelMotion:
     mean: tuple[float, float]
     stderr: float
     outline_stderr: tuple[float, float]
+    spread: float
     gradient: Gradient | None
     residual: float | None
     unknown: float
@@ -466,7 +468,7 @@ def _motion(over_cells: list[float], over_markers: list[float], spacing: float) 
         rest = squares - 2 * (spread * (xu + yv) + turn * (xv - yu)) + (spread**2 + turn**2) * (xx + yy)
         residual = math.sqrt(max(rest, 0.0))
     stderr = math.sqrt(scale * left + noise[0])
-    return GelMotion((u, v), stderr, outline, gradient, residual, left / prior[0])
+    return GelMotion((u, v), stderr, outline, math.sqrt(squares / 2), gradient, residual, left / prior[0])
 
 
 def _square(form: list[float], at: tuple[float, float]) -> float:

@@ -64,11 +64,18 @@ def flow_in_mask(markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0
 
 
 def flow_of_field(
-    field: DisplacementField, markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0.0
+    field: DisplacementField,
+    markers: Markers,
+    mask: NDArray[np.uint8],
+    *,
+    dilate: float = 0.0,
+    coarse: bool = False,
 ) -> Flow:
     """Summarise the displacement of the gel inside the contact, between its markers.
 
     field : of this frame. markers, mask, dilate : as `flow_in_mask` takes them; they tell `count`.
+    coarse : whether the mask is only where a contact is to be found, as one that markers alone show: then the
+        standard error of the mean is how much the displacement differs within it.
 
     The mean is an integral over the contact, each bit of gel counted by its area at rest. A marker at the
     outline in or out makes no jump: it counts as much as before. Rotation, divergence and shear are those of
@@ -92,7 +99,7 @@ def flow_of_field(
     motion = field.motion(mask) if count else None
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)
-    return _field_summary(motion, count)
+    return _field_summary(motion, count, coarse)
 
 
 def _inside(markers: Markers, mask: NDArray[np.uint8], dilate: float) -> NDArray[np.intp]:
@@ -100,8 +107,9 @@ def _inside(markers: Markers, mask: NDArray[np.uint8], dilate: float) -> NDArray
     return np.flatnonzero(inside_mask(markers.position, mask, dilate) & (markers.status != _LOST))
 
 
-def _field_summary(motion: GelMotion, count: int) -> Flow:
-    x, y = (math.hypot(motion.stderr, error) for error in motion.outline_stderr)
+def _field_summary(motion: GelMotion, count: int, coarse: bool) -> Flow:
+    outline = (motion.spread, motion.spread) if coarse else motion.outline_stderr
+    x, y = (math.hypot(motion.stderr, error) for error in outline)
     gradient = motion.gradient
     if gradient is None:
         return Flow(motion.mean, count, (x, y))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from enum import Enum
 from typing import Final, NamedTuple
 
 import cv2
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.flow.displacement_field import DisplacementField
-from tactflow.vision.types import Flow, Slip
+from tactflow.vision.flow.in_mask import UNKNOWN
+from tactflow.vision.types import Slip
 
 FloatArray = NDArray[np.float64]
 
@@ -28,7 +30,7 @@ GROWN: Final = 0.08
 harder or lets go moves the gel without slipping. Chosen by hand."""
 DRAGGED: Final = 3.0
 """Standard errors of the mean flow by which the gel must lie in the direction of the motion: friction drags
-it along. What rolls over the gel does not."""
+it along. What rolls over the gel does not: it presses one bit of gel after the other, and sticks."""
 SHIFTED: Final = 0.5
 """Part of the exchange that the shift of the contact's middle must explain: an outline that flickers comes
 and goes in other ways. Chosen on a simulated box of which the light shows a fifth, another one each frame."""
@@ -74,11 +76,11 @@ class SlipTest:
     >>> x, y = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
     >>> origin = np.column_stack([x.ravel(), y.ravel()])
     >>> still = Markers(origin, origin + [3.0, 0.0], np.zeros(100, np.uint8), np.full(100, 0.02))
-    >>> field, flow, test = FieldModel(origin, (200, 200))(still), Flow((3.0, 0.0), 4, (0.1, 0.1)), SlipTest()
+    >>> field, test = FieldModel(origin, (200, 200))(still), SlipTest()
     >>> for left in (60, 60, 68):
     ...     mask = np.zeros((200, 200), np.uint8)
     ...     mask[70:130, left : left + 60] = 255
-    ...     print(test(field, mask, flow).slipping)
+    ...     print(test(field, mask).slipping)
     False
     False
     True
@@ -93,10 +95,10 @@ class SlipTest:
         self._recent: deque[_Touched] = deque(maxlen=RECENT)
         self._slipping = False
 
-    def __call__(self, field: DisplacementField, mask: NDArray[np.uint8], flow: Flow | None) -> Slip | None:
+    def __call__(self, field: DisplacementField, mask: NDArray[np.uint8]) -> Slip | None:
         """Judge the next frame; None where the contact is too small or too far from markers to tell.
 
-        field, flow : of this frame. mask : (H, W) uint8, non-zero in contact.
+        field : of this frame. mask : (H, W) uint8, non-zero in contact.
         Raises ValueError if mask is not (H, W) uint8.
         """
         now = _touched(field, mask)
@@ -106,15 +108,14 @@ class SlipTest:
         start = self._start
         if start is None or abs(now.area - start.area) > GROWN * start.area:
             start = self._start = now
-        if self._slipping:
-            self._slipping = _exchanged(self._recent[0], now) > GOES_ON
-        else:
-            self._slipping = _exchanged(start, now) > EXCHANGED and _slid(start, now, field, flow)
+        slides = self._slipping and _exchanged(self._recent[0], now) > GOES_ON
+        travel = _Travel.SLID if slides else _travelled(start, now, field, mask)
+        self._slipping = travel is _Travel.SLID
         self._recent.append(now)
-        if self._slipping:
-            # Measured anew from where it comes to rest.
+        if travel is not _Travel.NONE:
+            # Measured anew: from where what slides comes to rest, and on the gel that what rolls has reached.
             self._start = now
-            return Slip(True, 0.0)
+            return Slip(self._slipping, 0.0 if self._slipping else 1.0)
         return Slip(
             False,
             stick_ratio(start.share, now.share, field.grid.points, now.moved - start.moved, field.noise),
@@ -137,20 +138,31 @@ def _exchanged(before: _Touched, now: _Touched) -> float:
     return float(min(gained, gained - now.area + before.area) / min(now.area, before.area))
 
 
-def _slid(before: _Touched, now: _Touched, field: DisplacementField, flow: Flow | None) -> bool:
-    """Whether the contact as a whole has moved over the gel, in the direction in which the gel is dragged."""
-    if flow is None or flow.mean is None or flow.stderr is None:
-        return False
+class _Travel(Enum):
+    """How a contact has moved over the gel."""
+
+    NONE = 0
+    SLID = 1
+    ROLLED = 2
+
+
+def _travelled(before: _Touched, now: _Touched, field: DisplacementField, mask: NDArray[np.uint8]) -> _Travel:
+    """Whether the contact as a whole has moved over the gel, and whether it drags the gel along."""
+    exchanged = _exchanged(before, now)
+    motion = field.motion(mask) if exchanged > EXCHANGED else None
+    if motion is None or motion.unknown > UNKNOWN:
+        return _Travel.NONE
     shares = now.share / now.area - before.share / before.area
     x, y = np.einsum("rc,rck->k", shares, field.grid.points).tolist()
-    along = (x * flow.mean[0] + y * flow.mean[1]) / max(math.hypot(x, y), 1e-9)
-    if along <= DRAGGED * max(flow.stderr):
-        return False
     spacing = field.grid.spacing
     shift = np.array([[1, 0, x / spacing], [0, 1, y / spacing]])
     rows, columns = before.share.shape
     share = np.asarray(cv2.warpAffine(before.share, shift, (columns, rows)), np.float64)
-    return _exchanged(before._replace(share=share), now) < SHIFTED * _exchanged(before, now)
+    if _exchanged(before._replace(share=share), now) >= SHIFTED * exchanged:
+        return _Travel.NONE
+    along = (x * motion.mean[0] + y * motion.mean[1]) / max(math.hypot(x, y), 1e-9)
+    stderr = math.hypot(motion.stderr, max(motion.outline_stderr))
+    return _Travel.SLID if along > DRAGGED * stderr else _Travel.ROLLED
 
 
 def stick_ratio(

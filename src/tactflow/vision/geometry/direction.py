@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -83,7 +84,8 @@ def anisotropy_limit(
         return limit
     xx, xy, yy = (value / (float(count) * count) for value in second)
     power = _outline_power(contours, center, xx, xy, yy)
-    rough = 4 * math.sqrt(_MEDIAN_RATIO * float(np.median(power)))
+    # Of seven numbers, `np.median` takes a hundred times as long.
+    rough = 4 * math.sqrt(_MEDIAN_RATIO * statistics.median(power.tolist()))
     return min(max(limit, rough), _LINEAR_LIMIT)
 
 

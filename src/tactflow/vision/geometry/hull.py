@@ -185,10 +185,13 @@ def _describe(seen: _Seen, min_confidence: float, evidence: Evidence = "light") 
 
 def _moments_inside(roi: NDArray[Any], contours: Contours, box: Box) -> Moments:
     """Moments of those pixels in the box that the outlines enclose, relative to its corner."""
-    filled = np.zeros(roi.shape, np.uint8)
-    cv2.drawContours(filled, contours, -1, 255, cv2.FILLED, offset=(-box.left, -box.top))
-    inside, moments = region_moments(np.asarray(cv2.bitwise_and(roi, roi, mask=filled), np.uint8))
-    return moments.moved(inside.left, inside.top)
+    left, top, wide, high = cv2.boundingRect(contours[0] if len(contours) == 1 else np.concatenate(contours))
+    filled = np.zeros((high, wide), np.uint8)
+    cv2.drawContours(filled, contours, -1, 255, cv2.FILLED, offset=(-left, -top))
+    left, top = left - box.left, top - box.top
+    seen = cv2.bitwise_and(roi[top : top + high, left : left + wide], filled)
+    inside, moments = region_moments(np.asarray(seen, np.uint8))
+    return moments.moved(left + inside.left, top + inside.top)
 
 
 def _filled_area(contour: NDArray[Any]) -> float:

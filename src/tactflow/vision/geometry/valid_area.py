@@ -91,14 +91,14 @@ def lit_area(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(cv2.blur(lit, (side, side)) >= MOST)
 
 
-def polygon_area(polygon: Sequence[Sequence[float]], width: int, height: int) -> Mask:
+def polygon_mask(polygon: Sequence[Sequence[float]], width: int, height: int) -> Mask:
     """The area inside a polygon.
 
     polygon : corners (x, y) in order, px, three at least. width, height : of the picture, px.
     Returns (height, width) uint8, 255 inside and on the border. Raises ValueError for fewer corners, or if no
     pixel is inside.
 
-    >>> polygon_area([(1, 1), (3, 1), (3, 2), (1, 2)], width=5, height=4)[:, 2].tolist()
+    >>> polygon_mask([(1, 1), (3, 1), (3, 2), (1, 2)], width=5, height=4)[:, 2].tolist()
     [0, 255, 255, 0]
     """
     corners = np.array(polygon, np.float64).reshape(-1, 2)
@@ -114,7 +114,7 @@ def polygon_area(polygon: Sequence[Sequence[float]], width: int, height: int) ->
 def bounding_box(valid: Mask) -> tuple[slice, slice]:
     """Rows and columns of the smallest rectangle that holds all of an area, (H, W) uint8, which is not empty.
 
-    >>> bounding_box(polygon_area([(1, 1), (3, 1), (3, 2), (1, 2)], width=5, height=4))
+    >>> bounding_box(polygon_mask([(1, 1), (3, 1), (3, 2), (1, 2)], width=5, height=4))
     (slice(1, 3, None), slice(1, 4, None))
     """
     left, top, width, height = cv2.boundingRect(valid)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.markers.detection import Detection, refine_centers, require_image, to_gray
-from tactflow.vision.markers.field import DisplacementField
+from tactflow.vision.markers.graph import MarkerGraph
 from tactflow.vision.markers.interpolation import Interpolator
 from tactflow.vision.markers.jump import common_displacement
 from tactflow.vision.markers.matching import choose_spots
@@ -181,7 +181,7 @@ class MarkerTracker:
             else SizedTemplates(mean, self._origin, detection.radii, dark)
         )
         self._spots = SpotFinder(np.rint(mean).astype(np.uint8), detection)
-        self._field = DisplacementField(self._origin, detection.edges)
+        self._graph = MarkerGraph(self._origin, detection.edges)
         self._nearness = NearPoints(self._shape, self._pitch)
         self._same, self._claimed = map(self._nearness.disc, (SAME_SPOT, CLAIMED_SPOT))
         self._interpolator = Interpolator(self._origin, self._pitch)
@@ -191,7 +191,7 @@ class MarkerTracker:
         """Forget what was tracked; the reference stays."""
         self._position = self._origin.copy()
         self._seen = np.ones(self._count, bool)
-        self._steepest = np.full(len(self._field.edges), STEEP_STRAIN)
+        self._steepest = np.full(len(self._graph.edges), STEEP_STRAIN)
         self._age = 0
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
@@ -212,7 +212,7 @@ class MarkerTracker:
         if doubt == DOUBTFUL or (doubt == INCOMPLETE and self._age >= SEARCH_INTERVAL):
             position, seen, stderr = self._search(image, found, seen, strain)
             # What this search has left strained is no reason for another, within bounds.
-            left = self._field.strain(position) + STRAIN_MARGIN
+            left = self._graph.strain(position) + STRAIN_MARGIN
             self._steepest = np.minimum(np.maximum(STEEP_STRAIN, left), MOST_STRAIN)
             self._age = 0
         status = np.full(self._count, _TRACKED)
@@ -227,13 +227,13 @@ class MarkerTracker:
     def _check(self, found: Alignment) -> tuple[BoolArray, FloatArray, int]:
         """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
         may have missed or mistaken one."""
-        seen, strain = np.empty(self._count, np.bool_), self._field.strain(found.position)
+        seen, strain = np.empty(self._count, np.bool_), self._graph.strain(found.position)
         doubt = check_marks(
             found.position,
             self._position,
             found.gain,
             found.r_squared,
-            self._field.edges,
+            self._graph.edges,
             strain,
             self._steepest,
             self._seen,
@@ -253,8 +253,8 @@ class MarkerTracker:
             found = self._templates.align(image, jumped)
             short = _lengths(found.position - jumped) < LONGEST_STEP * self._radius
             seen = trusted(found.gain, found.r_squared) & short
-            strain = self._field.strain(found.position)
-        inliers = self._field.largest_component(seen, strain)
+            strain = self._graph.strain(found.position)
+        inliers = self._graph.largest_component(seen, strain)
         free = np.flatnonzero(~inliers)
         if len(free) == 0:
             return found.position, seen, found.stderr
@@ -262,7 +262,7 @@ class MarkerTracker:
         expected = np.stack([self._position[free], self._origin[free] + _median(moved[inliers])])
         spots, strength = self._candidates(image, found.position, inliers, free[seen[free]], expected)
         chosen = choose_spots(
-            self._origin, self._field.edges, free, inliers, moved, expected, spots, strength,
+            self._origin, self._graph.edges, free, inliers, moved, expected, spots, strength,
             pitch=self._pitch, farthest=self._farthest,
         )  # fmt: skip
         result = _Result(found.position.copy(), inliers.copy(), found.stderr.copy())
@@ -280,8 +280,8 @@ class MarkerTracker:
         A grid apart from the others that is off by a pitch is as smooth as before. What tells is its border,
         where a row of marks is missing on one side, and that more of it is seen at its rest.
         """
-        border, spots, jumped = self._field.border, None, self._position.copy()
-        for grid in self._field.grids:
+        border, spots, jumped = self._graph.border, None, self._position.copy()
+        for grid in self._graph.grids:
             if seen[grid].all():
                 continue
             if self._is_at_rest(image, grid, seen):

@@ -20,7 +20,7 @@ class Headway:
     total: int | None = None
 
 
-class Engine(Protocol):
+class Executor(Protocol):
     """Works on tasks, several at a time. Every task that is submitted comes back as one outcome.
 
     description : for people. window : tasks that keep it busy.
@@ -36,7 +36,7 @@ class Engine(Protocol):
 
         Raises
         ------
-        StageError : the engine is gone.
+        StageError : the executor is gone.
         """
         ...
 
@@ -45,7 +45,7 @@ class Engine(Protocol):
 
         Raises
         ------
-        StageError : the engine is gone; what it had is lost, and may be done again.
+        StageError : the executor is gone; what it had is lost, and may be done again.
         """
         ...
 

@@ -1,11 +1,11 @@
-"""Plain versions of the kernels of the displacement field."""
+"""Plain versions of the kernels of the graph of neighbours."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.markers.field import LINKED_STRAIN, largest_components, link_strains
+from tactflow.vision.markers.graph import LINKED_STRAIN, largest_components, link_strains
 from tests.oracles.gains import Gain
 
 FloatArray = NDArray[np.float64]

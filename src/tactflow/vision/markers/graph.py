@@ -1,4 +1,4 @@
-"""The displacement field on the graph of neighbours: its strain, and its largest smooth component."""
+"""Marks and the links between neighbours: how the links are strained, and which marks move together."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LEAST_GRID: Final = 6
 """Marks of a grid beside others, at least: fewer are a group whose neighbours are hidden. Chosen by hand."""
 
 
-class DisplacementField:
+class MarkerGraph:
     """Marks and the links between neighbours.
 
     The strain of a link is the difference of the displacements of its two marks over their distance.
@@ -42,11 +42,11 @@ class DisplacementField:
     Examples
     --------
     >>> origin = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]])
-    >>> field = DisplacementField(origin, np.array([[0, 1], [1, 2]]))
-    >>> strain = field.strain(origin + [[1.0, 0.0], [1.0, 0.0], [6.0, 0.0]])
+    >>> graph = MarkerGraph(origin, np.array([[0, 1], [1, 2]]))
+    >>> strain = graph.strain(origin + [[1.0, 0.0], [1.0, 0.0], [6.0, 0.0]])
     >>> strain
     array([0. , 0.5])
-    >>> field.largest_component(np.ones(3, bool), strain)
+    >>> graph.largest_component(np.ones(3, bool), strain)
     array([ True,  True, False])
     """
 
@@ -112,7 +112,7 @@ def _grids(neighbours: list[list[tuple[int, int]]]) -> list[int]:
 def link_strains(
     position: FloatArray, origin: FloatArray, edges: IntArray, length: FloatArray, strain: FloatArray
 ) -> None:
-    """What `DisplacementField.strain` finds."""
+    """What `MarkerGraph.strain` finds."""
     for e in range(len(edges)):
         one, other = edges[e, 0], edges[e, 1]
         change_x = (position[one, 0] - origin[one, 0]) - (position[other, 0] - origin[other, 0])
@@ -130,7 +130,7 @@ def largest_components(
     grid: IntArray,
     inliers: BoolArray,
 ) -> None:
-    """What `DisplacementField.largest_component` finds.
+    """What `MarkerGraph.largest_component` finds.
 
     first : (N + 1,) where the links of each mark begin. links : (2 E, 2), the neighbour and the number of the
     edge.
