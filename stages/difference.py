@@ -88,7 +88,7 @@ class Difference(Stage):
         marker_mask: MarkerMask | None = None,
         valid: Valid | None = None,
     ) -> ContactPorts:
-        """The contact mask of this frame; below markers its outline is continued from what is seen.
+        """The contact mask of this frame; below markers its outline runs straight.
 
         Nothing outside of `valid` counts.
         """

@@ -16,6 +16,7 @@ from tactflow.vision.change import probe as change_probe
 from tactflow.vision.contact import (
     background,
     background_kernels,
+    border,
     components,
     contact_outline,
     illumination,
@@ -31,8 +32,8 @@ from tactflow.vision.markers import inpaint, template, tracking
 from tactflow.vision.markers import mask as marker_mask
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
 from tactflow.vision.types import Contact, Ellipse, Markers
-from tests.oracles import contact_outline as oracle
-from tests.oracles.contact_outline import change_of
+from tests.oracles import border as oracle
+from tests.oracles.border import change_of
 from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, SIZE, apart, axis_difference, gel
 from tests.stress.doubles import in_double
 
@@ -135,7 +136,7 @@ def both(compute: Callable[[], Any], *modules: Any) -> tuple[Any, Any]:
 def test_single_precision_costs_the_contact_nothing(method: str) -> None:
     pictures = gel(dots=False)
 
-    rooms = components, contact_outline, illumination, resolution, response
+    rooms = border, components, contact_outline, illumination, resolution, response
 
     def compute() -> contact.ContactResult:
         detector = DIFFERENCES[method]()
@@ -164,7 +165,7 @@ def test_single_precision_costs_the_outline_nothing(kind: str) -> None:
     def compute() -> NDArray[Any]:
         return contact_outline.contact_level(change_of(answer.astype(contact_outline.np.float32), inside))
 
-    single, double = both(compute, contact_outline, oracle)
+    single, double = both(compute, border, contact_outline, oracle)
     assert (single > 0).any()
     assert double.dtype == np.float64
     # The bound of the docstring.

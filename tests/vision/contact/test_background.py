@@ -15,9 +15,8 @@ from tactflow.vision.compiled import Kernel
 from tactflow.vision.contact import (
     ContactDetector,
     background,
+    border,
     components,
-    contact_outline,
-    continuation,
     illumination,
     resolution,
     response,
@@ -30,9 +29,8 @@ from tests.oracles.background import (
     plain_smooth_cells,
     plain_weigh_change,
 )
+from tests.oracles.border import plain_border_level
 from tests.oracles.components import plain_close_changes
-from tests.oracles.contact_outline import plain_border_depth
-from tests.oracles.continuation import plain_continue_outline
 from tests.oracles.illumination import plain_compare_blocks, plain_fit_robustly
 from tests.oracles.resolution import plain_halve_window, plain_raise_mask
 from tests.oracles.response import plain_sum_change
@@ -51,8 +49,7 @@ ORACLES = (
     (illumination, "compare_blocks", plain_compare_blocks),
     (illumination, "fit_robustly", plain_fit_robustly),
     (components, "close_changes", plain_close_changes),
-    (contact_outline, "border_depth", plain_border_depth),
-    (continuation, "continue_outline", plain_continue_outline),
+    (border, "border_level", plain_border_level),
     (resolution, "raise_mask", plain_raise_mask),
     (resolution, "halve_window", plain_halve_window),
 )

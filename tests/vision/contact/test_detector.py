@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
-from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold, contact_outline
+from tactflow.vision.contact import ContactDetector, ContactResult, border, chi_square_threshold
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.contact.filling import is_solid
 from tactflow.vision.geometry import Preprocessor
@@ -500,7 +500,7 @@ def test_looking_closely_only_around_a_contact_gives_what_looking_everywhere_giv
     scene: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The profile across the rim is taken from every line of a small region, but some of a large one.
-    monkeypatch.setattr(contact_outline, "ENOUGH_PIXELS", 10**9)
+    monkeypatch.setattr(border, "ENOUGH_PIXELS", 10**9)
     around, everywhere = _Sensor(scene, 90), _Sensor(scene, 90)
     windows = contact.contact_components
 

@@ -22,12 +22,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.contact.border import depth_of, inside_border
 from tactflow.vision.contact.components import STRAY
-from tactflow.vision.contact.filling import SQUARE, close_gaps, fill, fill_pockets, is_solid, outlined
+from tactflow.vision.contact.filling import (
+    SQUARE,
+    close_gaps,
+    fill,
+    fill_bay,
+    fill_pockets,
+    is_solid,
+    outlined,
+)
 
 Float = NDArray[np.float32]
-Double = NDArray[np.float64]
 Mask = NDArray[np.uint8]
 
 OUTER: Final = 0.45
@@ -35,21 +42,13 @@ OUTER: Final = 0.45
 surroundings of a contact and of gel that wrinkles; higher opens the ring where the light is faint. Chosen on
 mini_ball, handmade_dots, gelslim_ball and the simulator: 0.4 to 0.5 overlap as well within 0.04."""
 
+DIM: Final = 0.5
+"""Part of `OUTER` at which a change is seen in a bay of the outline, where lights hardly reach the border.
+Chosen by hand; 0.33 to 0.7 give the same outlines of real gels within 0.05."""
+
 FAINT: Final = 0.3
 """Fraction of the largest change of the whole contact that the largest one nearby counts for at least.
 Chosen by hand."""
-
-BORDER: Final = 0.85
-"""The contact ends where the mean profile reaches this fraction of its peak: outside a contact the slope is
-about 0.6 of that inside, and half way between the two, blurred, is the border of a small contact's narrow
-ridge."""
-
-FALLEN: Final = 0.9
-"""Fraction of a peak of the profile below which the peak is over, and what lies further in, such as the
-relief of an object, has none to do with the border. Chosen by hand."""
-
-TOP: Final = 0.9
-"""Fraction of its peak up to which the width of the profile's skirt is measured. Chosen by hand."""
 
 GLOSS: Final = 1.6
 """A change of more than so many times its typical value (the mean weighted by the change itself) is a mirror
@@ -59,26 +58,6 @@ EVEN: Final = 6.0
 """A change has brightened as a whole where its mean over the channels, squared and summed, is more than one
 part in so many of its length's: of three equal channels it is one in three. Chosen by hand, half of that."""
 
-SKIRT: Final = 0.6
-"""Fraction of its peak to which the mean profile has fallen in the surroundings of the contact.
-Chosen by hand."""
-
-SHARP_SKIRT: Final = 0.11
-"""Distance from there to the top where the slope breaks at the border, as on a half-space (Hertz), in half
-widths of the contact."""
-
-SKIRT_BLUR: Final = 0.9
-"""What smoothing adds to that distance, pixels at half resolution. Chosen by hand."""
-
-SOFTNESS: Final = 3.5
-"""Where the distance is larger, the gel is coated or soft and the slope has no break: the peak of the profile
-is as blunt as its skirt is wide, and `BORDER` is reached too early by so many times the excess. Chosen on
-mini_ball, whose radii are then 3 % too large in the median."""
-
-DEEPEST: Final = 0.4
-"""The border is sought no further in than this part of the way to the middle: where an object is not round,
-the profile is a mean of borders at several depths. Chosen by hand; a ball's border lies at 0.25 to 0.4."""
-
 LEAST: Final = 0.1
 """A contact that has changed as a whole ends half way, but no further out than where this fraction of the
 largest change nearby is left. Chosen by hand."""
@@ -86,19 +65,6 @@ largest change nearby is left. Chosen by hand."""
 COARSE: Final = 2
 """Pixels of which one is taken where the largest change nearby is sought, which varies little from one to the
 next: a quarter of the time."""
-
-BIN: Final = 0.5
-"""Width of the profile's bins, pixels at half resolution. Chosen by hand."""
-
-MIN_BIN_PIXELS: Final = 8
-"""Pixels from which on a bin of the profile counts. Chosen by hand."""
-
-ENOUGH_PIXELS: Final = 8000
-"""Pixels that are enough for the profile: of a window with n times as many, one row in n is taken.
-Chosen by hand."""
-
-_NOTHING: Final = np.zeros((0, 0), np.uint8)
-"""An empty mask."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +88,7 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     bridge : half the width of gaps that are closed in any case, px: what a removed marker can leave.
     hidden : (h, w) uint8, 1 where a marker was removed and the change belongs to the contact, else 0; None
         where that is not known. What was painted there smears the border outwards and leaves gaps in it; the
-        outline is continued below a marker as a cubic curve from what is seen on both sides.
+        outline runs straight below a marker, from what is seen on one side to what is seen on the other.
 
     Returns
     -------
@@ -217,6 +183,9 @@ def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float,
     changed = (local > OUTER).view(np.uint8)
     filled = fill_pockets(outlined(changed, hidden))
     solid = is_solid(filled)
+    if not solid:
+        closed = fill_bay(filled, (local > DIM * OUTER).view(np.uint8))
+        filled, solid = closed, closed is not filled and is_solid(closed)
     specks = None
     if not solid:
         # A wrinkle or what is left of a marker is no far side of the contact, to which a gap is closed.
@@ -228,13 +197,13 @@ def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float,
         filled = fill(close_gaps(ring, reach) | filled)
     if cv2.countNonZero(filled) == filled.size:
         return np.ones_like(strength), None
-    depth = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
-    parts = depth
+    region = depth_of(filled)
+    depth = parts = region.depth
     if specks is not None:
         parts = _without_specks(depth, strength)
         if specks.any():
             parts = np.where(specks & (parts <= 0), np.float32(-1), parts)
-    level = np.asarray(parts - np.float32(_border_depth(parts, local, hidden)), np.float32)
+    level = inside_border(region, parts, local, hidden)
     if parts is depth:
         return level if solid else _without_specks(level, strength), None
     away = cv2.distanceTransform((parts <= 0).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
@@ -252,71 +221,3 @@ def _without_specks(level: Float, strength: Float) -> Float:
     specks = squares < STRAY * squares[1:].max()
     specks[0] = False
     return np.where(specks[labels], -np.abs(level), level) if specks.any() else level
-
-
-def _border_depth(depth: Float, strength: Float, hidden: Mask | None) -> float:
-    """How far inside the outer edge of the change the contact ends, pixels at half resolution.
-
-    depth : (h, w), distance from the outer edge, 0 outside. strength : (h, w), relative to the largest
-    nearby. hidden : as for `contact_level`.
-    """
-    every = max(1, depth.size // ENOUGH_PIXELS)
-    size = int((depth.shape[0] + depth.shape[1]) / BIN) + 2
-    middle = float(cv2.minMaxLoc(depth)[1])
-    unseen = _NOTHING if hidden is None else hidden
-    return float(border_depth(depth, strength, unseen, every, middle, np.zeros((2, size))))
-
-
-@helper
-def _crossing(profile: Double, at: Double, wanted: float) -> float:
-    """Where, coming from outside, a profile first reaches a value."""
-    first = 0
-    while profile[first] < wanted:
-        first += 1
-    if first == 0:
-        return float(at[0])
-    fraction = (wanted - profile[first - 1]) / (profile[first] - profile[first - 1])
-    return float(at[first - 1] + fraction * (at[first] - at[first - 1]))
-
-
-@kernel("float64(float32[:, ::1], float32[:, ::1], uint8[:, ::1], int64, float64, float64[:, ::1])")
-def border_depth(
-    depth: Float, strength: Float, hidden: Mask, every: int, middle: float, bins: NDArray[np.float64]
-) -> float:
-    """What `_border_depth` finds, from one row in `every`.
-
-    hidden : not 0 where a pixel does not count; (0, 0) if all do. middle : the largest depth.
-    bins : (2, n), 0, changed: the number of pixels and the sum of their strengths in bins of depth.
-    """
-    counts, sums = bins[0], bins[1]
-    bins_per_pixel = np.float32(1 / BIN)
-    for y in range(0, depth.shape[0], every):
-        deep, strong = depth[y], strength[y]
-        for x in range(depth.shape[1]):
-            if deep[x] > 0 and (hidden.size == 0 or hidden[y, x] == 0):
-                place = int(deep[x] * bins_per_pixel)
-                counts[place] += 1
-                sums[place] += strong[x]
-    # Bins with enough pixels, and where they are; they take the place of the others.
-    known = 0
-    for k in range(counts.size):
-        if counts[k] >= MIN_BIN_PIXELS:
-            sums[known] = sums[k] / counts[k]
-            counts[known] = (k + 0.5) * BIN
-            known += 1
-    if known < 2:
-        return 0.5
-    at, profile = counts[:known], np.empty(known)
-    for k in range(known):
-        before, after = sums[max(k - 1, 0)], sums[min(k + 1, known - 1)]
-        profile[k] = before / 4 + sums[k] / 2 + after / 4
-    # The largest value before the profile falls clearly for the first time.
-    peak = profile[0]
-    for k in range(known):
-        if profile[k] > peak:
-            peak = profile[k]
-        elif profile[k] < FALLEN * peak:
-            break
-    border, top = _crossing(profile, at, BORDER * peak), _crossing(profile, at, TOP * peak)
-    soft = top - _crossing(profile, at, SKIRT * peak) - SHARP_SKIRT * (middle - top) - SKIRT_BLUR
-    return min(border + SOFTNESS * max(soft, 0.0), DEEPEST * middle)

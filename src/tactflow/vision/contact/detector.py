@@ -35,9 +35,8 @@ from numpy.typing import NDArray
 from tactflow.vision import compiled
 from tactflow.vision.contact import (
     background_kernels,
+    border,
     components,
-    contact_outline,
-    continuation,
     illumination,
     resolution,
     response,
@@ -186,9 +185,8 @@ class ContactDetector:
         if method == "noise":
             compiled.load(
                 background_kernels,
+                border,
                 components,
-                contact_outline,
-                continuation,
                 downsample,
                 illumination,
                 resolution,

@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.continuation import continued
-
 Mask = NDArray[np.uint8]
 
 BAY: Final = 2.5
@@ -18,7 +16,7 @@ narrower than the ring is thick, or than a marker, is closed. Chosen by hand."""
 
 POCKET: Final = 0.8
 """Part of an area between a region and the frame's border that the region's hull covers if it belongs to the
-region. Chosen by hand."""
+region; and of a bay that has changed, or is enclosed by what has, if the bay does. Chosen by hand."""
 
 SQUARE: Final = np.ones((3, 3), np.uint8)
 """A pixel and its neighbours."""
@@ -41,7 +39,8 @@ def fill(mask: Mask) -> Mask:
 def outlined(mask: Mask, hidden: Mask | None) -> Mask:
     """The parts of a region with their holes filled, fresh.
 
-    mask : (h, w) uint8, 0 or 1. hidden : the same: what is not known of the mask.
+    mask : (h, w) uint8, 0 or 1. hidden : the same: what is not known of the mask. There the outline runs
+    straight from what is known on one side to what is known on the other.
     """
     if hidden is None:
         return _without_holes(mask.copy())
@@ -49,9 +48,18 @@ def outlined(mask: Mask, hidden: Mask | None) -> Mask:
     found, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     # Smoothing has carried what was painted one pixel further.
     grown = np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
-    lines = (continued(np.asarray(outline[:, 0], np.int32), grown) for outline in found)
-    outlines = [line for line in lines if line is not None]
     filled = np.zeros_like(mask)
+    if not found:
+        return filled
+    points = np.concatenate(found)[:, 0]
+    seen = grown.ravel().take(points[:, 0] + points[:, 1] * grown.shape[1]) == 0
+    ends = np.cumsum([len(outline) for outline in found])
+    starts = ends - [len(outline) for outline in found]
+    some = np.add.reduceat(seen, starts) > 0
+    outlines = [
+        points[start:end][seen[start:end]]
+        for start, end in zip(starts[some].tolist(), ends[some].tolist(), strict=True)
+    ]
     if outlines:
         cv2.fillPoly(filled, outlines, (1.0,))
     return filled
@@ -81,6 +89,45 @@ def is_solid(filled: Mask) -> bool:
         return False
     # Depths come in 256ths of a pixel.
     return bays is None or bool(bays.reshape(-1, 4)[:, 3].max() <= BAY * 256)
+
+
+def fill_bay(filled: Mask, faint: Mask) -> Mask:
+    """Close a ring that is open on the side that lights hardly reach.
+
+    Where a region is one piece, its largest bay is filled with what has changed faintly there, and what that
+    encloses. If little of the bay is left then, it was no bay of the object.
+
+    filled, faint : (h, w) uint8, 0 or 1: the region without holes; what has changed, if only faintly. Returns
+    the region, fresh if it has grown.
+
+    >>> import numpy as np
+    >>> ring = np.ones((9, 9), np.uint8)
+    >>> ring[3:, 3:6] = 0
+    >>> faint = np.zeros_like(ring)
+    >>> int(fill_bay(ring, faint).sum())
+    63
+    >>> faint[8] = 1
+    >>> int(fill_bay(ring, faint).sum())
+    81
+    """
+    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if len(outlines) != 1:
+        return filled
+    hull = np.zeros_like(filled)
+    cv2.fillConvexPoly(hull, cv2.convexHull(outlines[0]), (1.0,))
+    bays = np.asarray(cv2.bitwise_xor(hull, filled), np.uint8)
+    missing = cv2.countNonZero(bays)
+    if (
+        cv2.countNonZero(_without_holes(filled | (faint & bays))) - cv2.countNonZero(filled)
+        <= POCKET * missing
+    ):
+        return filled
+    borders, _ = cv2.findContours(bays, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    bay = np.zeros_like(filled)
+    cv2.drawContours(bay, [max(borders, key=cv2.contourArea)], 0, 1, cv2.FILLED)
+    closed = fill_pockets(_without_holes(filled | (faint & bay)))
+    covered = cv2.countNonZero(np.asarray(cv2.bitwise_and(closed, bay), np.uint8))
+    return closed if covered > POCKET * cv2.countNonZero(bay) else filled
 
 
 def close_gaps(mask: Mask, reach: float) -> Mask:
