@@ -2,6 +2,7 @@
 
 python docs/flow_table.py          runs the default pipeline on the nominal scenes; three minutes
 python docs/flow_table.py stick    the stick ratio, from true outlines; half a minute
+python docs/flow_table.py honest   errors against their standard errors, from true outlines; a minute
 python docs/flow_table.py onset    when slip is said of what slips; three minutes
 python docs/flow_table.py false    slip that is said of what sticks or rolls, 20 000 frames; ten minutes
 """
@@ -29,6 +30,7 @@ from tactflow.bench.timing import BLOCK, CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.sim import Truth, open_scene
 from tactflow.vision.flow import FieldModel, SlipTest, flow_in_mask, flow_of_field
+from tactflow.vision.flow.in_mask import UNKNOWN
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Flow, Markers, MarkerStatus, Slip
 
@@ -40,6 +42,14 @@ SEEDS = (11, 12)
 DRAGGED = ("slide", "stick_slip")
 """Scenes in which contacts slip altogether, twice in each recording."""
 ONSET_SEEDS = (7, 11, 12, 13)
+KINDS = (
+    *(*STICKING, *DRAGGED, "mixed", "bright_cable", "bent_cable", "edge", "ring", "screw"),
+    *("strong_shear", "dense", "sparse", "finger"),
+)
+"""Scenes for standard errors: what moves the gel, and with it the dots."""
+KIND_SEEDS = range(21, 27)
+APART = 20
+"""Frames between two that are looked at: one contact's errors are alike."""
 STILL = (*STICKING, "mixed", "dense", "edge", "sparse", "border")
 """Scenes for slip that is not there."""
 STILL_FRAMES = 1650
@@ -174,6 +184,36 @@ def print_false_slips() -> None:
     print(f"| all | {total.touched} | {total.false} |")
 
 
+def errors_over_stated(spec: str) -> list[float]:
+    """Errors of the components of the mean, over their standard error, from the true outline."""
+    scene, rng = open_scene(spec), np.random.default_rng(1)
+    preprocess = Preprocessor((800, 600), rotate=90, downsample=2)
+    model = FieldModel(scene.truth(0, preprocess).origin, preprocess.mapping.size)
+    found: list[float] = []
+    for index in range(5, len(scene), APART):
+        truth = scene.truth(index, preprocess)
+        if not truth.touching or truth.contact_flow is None:
+            continue
+        markers, mask = seen_markers(truth, rng), np.uint8(255) * truth.contact_mask
+        gel = model(markers)
+        motion = None if gel is None else gel.motion(mask)
+        if motion is not None and motion.unknown <= UNKNOWN:
+            found += (np.abs(np.subtract(motion.mean, truth.contact_flow)) / motion.stderr).tolist()
+    return found
+
+
+def print_honesty() -> None:
+    """Kind of contact, errors, and how many are within one and two of their standard errors, %."""
+    ratios = {
+        name: [ratio for seed in KIND_SEEDS for ratio in errors_over_stated(f"{name}?seed={seed}")]
+        for name in KINDS
+    }
+    ratios["all"] = [ratio for found in ratios.values() for ratio in found]
+    for name, found in ratios.items():
+        within = (100 * float(np.mean(np.array(found) < bound)) for bound in (1, 2))
+        print(f"| {name} | {len(found)} | " + " | ".join(f"{share:.0f}" for share in within) + " |")
+
+
 def stick_ratios(spec: str) -> NDArray[np.float64]:
     """(n, 2): true and found share of the contact that sticks, of frames in which it is `LEAST` at least."""
     return np.array(
@@ -204,7 +244,12 @@ def _number(value: float | None, digits: int = 3) -> str:
 
 if __name__ == "__main__":
     cv2.setNumThreads(1)
-    others = {"stick": print_stick_ratios, "onset": print_onsets, "false": print_false_slips}
+    others = {
+        "stick": print_stick_ratios,
+        "honest": print_honesty,
+        "onset": print_onsets,
+        "false": print_false_slips,
+    }
     if sys.argv[1:]:
         others[sys.argv[1]]()
         sys.exit()

@@ -8,7 +8,7 @@ import pytest
 
 from tactflow.vision.depth.poisson import integrate
 from tactflow.vision.depth.slopes import STEEPEST, SlopeModel, place_terms
-from tactflow.vision.depth.surface import LEAST_MARGIN, Rest, Surface, surroundings
+from tactflow.vision.depth.surface import LEAST_MARGIN, Rest, Surface, colour_change, surroundings
 from tactflow.vision.types import Scale
 
 GEL = np.full((80, 120, 3), (90, 120, 100), np.uint8)
@@ -72,6 +72,15 @@ def test_no_change_of_colour_is_no_depth_and_neither_is_a_change_of_all_the_ligh
         assert depth.greatest == pytest.approx(0, abs=1e-6)
         assert depth.heights.shape == mask.shape
         assert depth.greatest_stderr is None
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_a_grainy_gel_that_is_not_touched_has_no_change_of_colour_however_its_means_are_rounded(
+    dtype: type,
+) -> None:
+    gel = np.random.default_rng(3).integers(80, 140, GEL.shape).astype(dtype)
+    rest = Rest(gel)
+    assert np.abs(colour_change(gel, rest, rest.window)).max() == 0
 
 
 def test_normals_are_the_polynomial_of_colour_and_place_and_never_too_steep() -> None:
