@@ -102,7 +102,8 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
             "small.npy: observation.images.main with pictures of 24 x 16 pixels; those before",
         ),
         ([odd], 3, "a video needs even numbers; give --pictures png"),
-        ([first, "--fps", "0"], 2, "--fps: required at least 1"),
+        ([first, "--fps", "0"], 2, "--fps: required 1 to 1000"),
+        ([first, "--fps", "9" * 20], 2, "--fps: required 1 to 1000"),
         ([str(tmp_path / "none.npy")], 4, "no such file"),
     ):
         assert main(["export", "lerobot", *arguments, "--out", str(out), "--pipeline", "markerless"]) == code

@@ -244,6 +244,25 @@ def test_a_late_answer_to_an_earlier_command_is_none_to_the_next() -> None:
             late.join()
 
 
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"[",
+        b"[]",
+        b'{"ok": true, "message": "here"}',
+        b'{"ok": true, "message": "here", "state": 5}',
+        b'{"ok": true, "message": null, "state": {"sensor": "main"}}',
+        b'{"ok": true, "message": "so far", "state": {"sensor": "main"}, "stats": "none"}',
+    ],
+)
+def test_an_answer_that_is_none_is_said_to_be_none(
+    answer: bytes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(RemoteControl, "ask", lambda run, _: run._understood(answer))
+    assert main(["control", "ping"]) == 3
+    assert "does not answer as tactflow does" in capsys.readouterr().err
+
+
 def test_the_command_says_what_happened_and_what_did_not(
     bare: ControlSocket, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

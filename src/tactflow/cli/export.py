@@ -13,6 +13,9 @@ from tactflow.cli.notes import say
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.files import claim_path, make_folder
 
+FASTEST = 1000
+"""Frames per second of a dataset at most; cameras of gels are slower. Chosen by hand."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `export`."""
@@ -54,9 +57,9 @@ def run(args: argparse.Namespace) -> int:
 
     if args.out.exists():
         raise ConfigError(f"--out: {args.out} is already there; give another folder")
-    if args.fps is not None and args.fps < 1:
-        raise ConfigError(f"--fps: required at least 1, got {args.fps}")
-    fps = args.fps or _rate(args.recordings[0])
+    fps = _rate(args.recordings[0]) if args.fps is None else args.fps
+    if not 1 <= fps <= FASTEST:
+        raise ConfigError(f"--fps: required 1 to {FASTEST}, got {fps}")
     settings: dict[str, object] = {"sinks": {}}
     recording = ""
     try:

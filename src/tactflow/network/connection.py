@@ -54,7 +54,9 @@ def _places(endpoint: str) -> list[tuple[int, Any]]:
     """Families and addresses of the sockets that an endpoint stands for; none if it is no such address."""
     scheme, _, place = endpoint.partition("://")
     if scheme == "ipc":
-        return [] if sys.platform == "win32" else [(system_socket.AF_UNIX, place)]
+        if sys.platform == "win32":
+            return []
+        return [(system_socket.AF_UNIX, place)]
     host, _, port = place.rpartition(":")
     try:
         found = system_socket.getaddrinfo(host.strip("[]"), int(port), type=system_socket.SOCK_STREAM)

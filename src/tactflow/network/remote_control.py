@@ -117,10 +117,22 @@ class RemoteControl(Connection):
     def _understood(self, received: bytes) -> Answer:
         """The answer that was received; RuntimeError if it says no, or is none."""
         try:
-            answer: Answer = orjson.loads(received)
-            done, message = answer["ok"], answer["message"]
-        except (ValueError, TypeError, KeyError):
-            raise RuntimeError(f"{self.endpoint} does not answer as tactflow does") from None
-        if not done:
-            raise RuntimeError(str(message))
+            answer = orjson.loads(received)
+        except ValueError:
+            answer = None
+        if not isinstance(answer, dict) or not _is_answer(answer):
+            raise RuntimeError(f"{self.endpoint} does not answer as tactflow does")
+        if not answer["ok"]:
+            raise RuntimeError(answer["message"])
         return answer
+
+
+def _is_answer(answer: Answer) -> bool:
+    """Whether what programs rely on is there and of its type; there may be more."""
+    state = answer.get("state")
+    return (
+        isinstance(answer.get("ok"), bool)
+        and isinstance(answer.get("message"), str)
+        and (not answer["ok"] or (isinstance(state, dict) and isinstance(state.get("sensor"), str)))
+        and isinstance(answer.get("stats", {}), dict)
+    )

@@ -154,10 +154,12 @@ def test_the_loops_halve_a_window_of_a_mask_as_the_plain_version(
     top, left = data.draw(st.integers(0, high - 1)), data.draw(st.integers(0, wide - 1))
     bottom, right = data.draw(st.integers(top + 1, high)), data.draw(st.integers(left + 1, wide))
     inside = rng.random((bottom - top, right - left)) < 0.7
-    fast = resolution.halve_mask(mask, CELL * top, CELL * left, inside)
+    fast = resolution.window_mask(mask, CELL * top, CELL * left, inside)
     slow = np.empty_like(fast)
     plain_halve_window(mask, CELL * top, CELL * left, inside.view(np.uint8), slow)
     assert np.array_equal(fast, slow)
+    whole = resolution.window_mask(mask, CELL * top, CELL * left, inside, side=1)
+    assert np.array_equal(whole.reshape(len(fast), 2, -1, 2).max(axis=(1, 3)), fast)
 
 
 @settings(max_examples=100, deadline=None)
@@ -174,6 +176,10 @@ def test_the_loops_draw_a_level_set_as_the_plain_version(
     resolution.draw_level(level, top, left, fast)
     plain_raise_mask(level, top, left, slow)
     assert np.array_equal(fast, slow)
+    drawn, shown = np.zeros(frame, np.uint8), level[: frame[0] - top, : frame[1] - left] > 0
+    resolution.draw_level(level, top, left, drawn, side=1)
+    assert np.array_equal(drawn[top:, left:][: shown.shape[0], : shown.shape[1]] == 255, shown)
+    assert cv2.countNonZero(drawn) == np.count_nonzero(shown)
 
 
 @settings(max_examples=60, deadline=None)

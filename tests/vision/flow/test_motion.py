@@ -109,6 +109,15 @@ def test_motion_that_fades_is_held_below_the_threshold_that_started_it() -> None
     ]
 
 
+def test_motion_that_lasts_is_clear_where_a_sudden_one_of_that_size_is_not() -> None:
+    """The error of a mean of n frames is smaller by the root of n; what fades is on its way to rest."""
+    lasting, fading = MotionTest(ORIGIN), MotionTest(ORIGIN)
+    assert [lasting(moved(press(1.0))).clearly for _ in range(5)] == [False, False, True, True, True]
+    assert not any(fading(moved(press(1.4 * 0.65**step))).clearly for step in range(5))
+    unsteady = [lasting(moved(press(depth))).clearly for depth in (0.0, 1.0, 0.0, 1.0)]
+    assert not any(unsteady)
+
+
 def test_the_most_stretched_markers_surround_the_contact() -> None:
     """In the middle of a pressed disc as well as at its rim, neighbours part."""
     test = MotionTest(ORIGIN)

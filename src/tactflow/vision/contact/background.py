@@ -1,7 +1,7 @@
 """Background model of a gel: what it looks like untouched, and how unusual a frame is beside that.
 
 Frames are compared as means over cells of 4 x 4 px, lightly smoothed; where a contact is to be outlined, as
-means over 2 x 2 px.
+means over 2 x 2 px, or pixel by pixel.
 """
 
 from __future__ import annotations
@@ -56,13 +56,15 @@ _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
 class Change:
     """How a frame differs from the background.
 
-    half : (2h, 2w, 3) uint8, the frame at half resolution. illumination : (3, 4) float32, coefficients of
-    `IlluminationModel.fit`. squared : (h, w) float32, squared deviation of each cell, chi-square with three
-    degrees of freedom where nothing touches. colour : the same of its colour alone, with two. evidence : the
-    larger of both. largest, largest_colour : of `squared` and `colour`. remaining : ratio of this change to
-    that of the previous frame, over the cells that were in contact then; 1 if none was.
+    whole, half : (4h, 4w, 3) and (2h, 2w, 3) uint8, the frame, also at half resolution. illumination : (3, 4)
+    float32, coefficients of `IlluminationModel.fit`. squared : (h, w) float32, squared deviation of each
+    cell, chi-square with three degrees of freedom where nothing touches. colour : the same of its colour
+    alone, with two. evidence : the larger of both. largest, largest_colour : of `squared` and `colour`.
+    remaining : ratio of this change to that of the previous frame, over the cells that were in contact then;
+    1 if none was.
     """
 
+    whole: NDArray[np.uint8]
     half: NDArray[np.uint8]
     illumination: Float
     squared: Float
@@ -74,13 +76,25 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
+class _Untouched:
+    """What outlines are compared with, (3, h, w) float32 each at some resolution.
+
+    mean : grey levels. scale : turns grey levels into standard deviations. pattern : part of such a change
+    that is left out, as `scaled_change` takes it.
+    """
+
+    mean: Float
+    scale: Float
+    pattern: Float
+
+
+@dataclass(frozen=True, slots=True)
 class _Derived:
-    """What follows from the frames learned: (3, h, w) float32 of cells, (3, 2h, 2w) at half resolution.
+    """What follows from the frames learned: (3, h, w) float32 of cells.
 
     weight : one over the standard deviation. brightness : weight of a change along the background's own
     colour. colour_factor : (h, w), how much more a change of colour counts than one of brightness.
-    half_scale : turns grey levels into standard deviations. pattern : part of such a change that is left out,
-    as `scaled_change` takes it.
+    noise : its variance.
     """
 
     illumination: IlluminationModel
@@ -88,9 +102,7 @@ class _Derived:
     weight: Float
     brightness: Float
     colour_factor: Float
-    half_mean: Float
-    half_scale: Float
-    pattern: Float
+    noise: Float
 
 
 class BackgroundModel:
@@ -125,8 +137,8 @@ class BackgroundModel:
         shift: float,
         valid: NDArray[np.uint8] | None = None,
     ) -> None:
-        half, cells = _cells(image)
-        self._half = _planes(half)
+        whole, half, cells = _cells(image)
+        self._pictures = {1: _planes(whole), 2: _planes(half)}
         self._mean: Float = _smoothed(cells)
         self._squares = np.zeros_like(self._mean)
         self._noise = _spatial_noise(cells)
@@ -134,20 +146,24 @@ class BackgroundModel:
         self._count = 1
         self._repeatability, self._tint, self._shift = repeatability, tint, shift
         self._known: _Derived | None = None
+        self._untouched: dict[int, _Untouched] = {}
 
     def add(self, image: NDArray[np.uint8]) -> None:
         """Learn from one more frame of the same size; the more, the better the noise is known."""
         known = self._derived()
-        half, cells = _cells(image)
+        whole, half, cells = _cells(image)
         smooth = _smoothed(cells)
         coefficients = known.illumination.fit(smooth)
         change: Float = smooth - under_illumination(known.mean, coefficients)
         count = self._count
         self._squares = self._squares + change * change * np.float32(count / (count + 1))
         self._mean = self._mean + change / np.float32(count + 1)
-        self._half = self._half + (_planes(half) - self._half) / np.float32(count + 1)
+        for side, picture in ((1, whole), (2, half)):
+            mean = self._pictures[side]
+            self._pictures[side] = mean + (_planes(picture) - mean) / np.float32(count + 1)
         self._count += 1
         self._known = None
+        self._untouched.clear()
 
     def compare(
         self, image: NDArray[np.uint8], before: NDArray[np.bool_] | None, evidence_before: Float | None
@@ -159,7 +175,7 @@ class BackgroundModel:
         """
         known = self._derived()
         high, wide = known.colour_factor.shape
-        half, cells = _cells(image)
+        whole, half, cells = _cells(image)
         smooth = _smoothed(cells)
         coefficients = known.illumination.fit(smooth)
         squared, colour, evidence = np.empty((3, high, wide), np.float32)
@@ -184,34 +200,39 @@ class BackgroundModel:
         )
         largest, largest_colour, now, was = summary.tolist()
         remaining = math.sqrt(now / was) if was > 0 else 1.0
-        return Change(half, coefficients, squared, colour, evidence, largest, largest_colour, remaining)
+        return Change(
+            whole, half, coefficients, squared, colour, evidence, largest, largest_colour, remaining
+        )
 
     def window_change(
-        self, change: Change, rows: slice, columns: slice, inside: NDArray[np.bool_]
+        self, change: Change, rows: slice, columns: slice, inside: NDArray[np.bool_], side: int = 2
     ) -> WindowChange:
-        """How strongly a window has changed, in standard deviations, at half resolution.
+        """How strongly a window has changed, in standard deviations.
 
         Slopes of all directions count alike, as far as `light_response` can tell how they show: not where the
         picture ends before the contact does.
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
-        count.
+        count. side : of the result's pixels, px: 2 for half resolution, 1 for the frame's own.
         """
-        known = self._derived()
+        untouched = self._untouched_at(side)
+        picture, each = (change.half if side == 2 else change.whole), CELL // side
+        if side == 1:
+            inside = inside.repeat(2, axis=0).repeat(2, axis=1)
         strength, brightness = np.empty((2, 2 * inside.shape[0], 2 * inside.shape[1]), np.float32)
         blurred = np.empty((3, *strength.shape), np.float32)
         scaled_change(
-            change.half.reshape(len(change.half), -1),
-            2 * rows.start,
-            2 * columns.start,
+            picture.reshape(len(picture), -1),
+            each * rows.start,
+            each * columns.start,
             change.illumination,
-            positions(change.half.shape[1]),
-            positions(len(change.half)),
-            known.half_mean,
-            known.half_scale,
-            known.pattern,
+            positions(picture.shape[1]),
+            positions(len(picture)),
+            untouched.mean,
+            untouched.scale,
+            untouched.pattern,
             blurred,
         )
-        whole = not _cut_by_border(blurred, rows, columns, known.colour_factor.shape)
+        whole = not _cut_by_border(blurred, rows, columns, change.squared.shape)
         response = light_response(blurred, inside) if whole else EVEN
         belongs = np.ascontiguousarray(inside).view(np.uint8)
         change_strength(blurred, belongs, *response, strength, brightness)
@@ -220,7 +241,7 @@ class BackgroundModel:
     def _derived(self) -> _Derived:
         if self._known is not None:
             return self._known
-        mean, half, count = self._mean, self._half, self._count
+        mean, count = self._mean, self._count
         noise = (PRIOR_FRAMES * self._noise**2 + self._squares) / (PRIOR_FRAMES + count - 1)
         steady = noise * (1 + 1 / count) + (self._shift / CELL * _steepness(mean)) ** 2
         variance = steady + (self._repeatability * mean) ** 2
@@ -230,39 +251,42 @@ class BackgroundModel:
         factor = (variance / (steady + (self._tint * mean) ** 2)).min(axis=0)
         direction = mean * weight
         direction /= np.linalg.norm(direction, axis=0) + np.float32(1e-6)
-        half_scale, pattern = self._half_scale(np.asarray(noise, np.float32))
         if self._counts is not None:
             weight = weight * self._counts
-            half_scale = half_scale * self._counts.repeat(2, axis=0).repeat(2, axis=1)
         self._known = _Derived(
             illumination=illumination,
             mean=np.ascontiguousarray(mean, np.float32),
             weight=np.asarray(weight, np.float32),
             brightness=np.asarray(direction * weight * np.sqrt(factor), np.float32),
             colour_factor=np.asarray(factor, np.float32),
-            half_mean=half,
-            half_scale=np.asarray(half_scale, np.float32),
-            pattern=pattern,
+            noise=np.asarray(noise, np.float32),
         )
         return self._known
 
-    def _half_scale(self, noise: Float) -> tuple[Float, Float]:
-        """What turns grey levels into deviations at half resolution, and the pattern in them.
+    def _untouched_at(self, side: int) -> _Untouched:
+        """What outlines in pixels of some px are compared with.
 
-        Both (3, 2h, 2w). noise : variance of cells.
         Half a cell, smoothed, is about as noisy as a smoothed cell. How far the light varies is taken from
         the brightness of the whole picture: relative to itself, a dark channel that a tilt lights up would
         outshine the others. Where a pattern on the gel has moved, all channels change in proportion: in that
         direction e, standard deviations, the variance is 1 + e^2, in others still 1.
         """
-        light = self._repeatability * self._half.mean()
-        together, apart = _steepness_of_pattern(self._half)
-        variance = noise.mean(axis=(1, 2), keepdims=True) + light**2 + (self._shift / 2 * apart) ** 2
+        if side in self._untouched:
+            return self._untouched[side]
+        mean, noise, shift = self._pictures[side], self._derived().noise, self._shift / side
+        light = self._repeatability * mean.mean()
+        together, apart = _steepness_of_pattern(mean)
+        variance = noise.mean(axis=(1, 2), keepdims=True) + light**2 + (shift * apart) ** 2
         scale = np.asarray(1 / np.sqrt(variance), np.float32)
-        pattern = (self._shift / 2) * together * scale
+        pattern = shift * together * scale
         square = (pattern * pattern).sum(axis=0)
         left_out = (1 - 1 / np.sqrt(1 + square)) / np.maximum(square, np.float32(1e-6))
-        return scale, np.asarray(pattern * np.sqrt(left_out), np.float32)
+        if self._counts is not None:
+            each = CELL // side
+            scale = scale * self._counts.repeat(each, axis=0).repeat(each, axis=1)
+        pattern = np.asarray(pattern * np.sqrt(left_out), np.float32)
+        self._untouched[side] = _Untouched(mean, np.asarray(scale, np.float32), pattern)
+        return self._untouched[side]
 
 
 def _cut_by_border(change: Float, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
@@ -295,14 +319,14 @@ def _smoothed(cells: NDArray[np.uint8]) -> Float:
     return planes
 
 
-def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Means over 2 x 2 px and over 4 x 4 px; the border is repeated to make whole cells."""
+def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Pixels, means over 2 x 2 px and over 4 x 4 px; the border is repeated to make whole cells."""
     bottom, right = -image.shape[0] % CELL, -image.shape[1] % CELL
     whole = np.ascontiguousarray(image)
     if bottom or right:
         whole = np.asarray(cv2.copyMakeBorder(whole, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
     half = halved(whole)
-    return half, halved(half)
+    return whole, half, halved(half)
 
 
 def _counting(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
@@ -311,7 +335,7 @@ def _counting(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArr
         return None
     counts = lit_area(half)[::2, ::2]
     if not valid.all():
-        counts = counts & (_cells(np.repeat(valid[:, :, None], 3, axis=2))[1][:, :, 0] >= CELL_VALID)
+        counts = counts & (_cells(np.repeat(valid[:, :, None], 3, axis=2))[2][:, :, 0] >= CELL_VALID)
     return None if counts.all() else np.asarray(counts)
 
 

@@ -34,10 +34,8 @@ MARGIN: Final = 0.125
 """How much wider than the hull of its markers a region is, pitches. Chosen by hand."""
 SPREAD: Final = 5.0
 """How far beyond a marker's border what is left of it may be drawn, px: a cell of `background`, and a pixel
-more for smoothing. Chosen by hand."""
-RIM: Final = 2.0
-"""Distance of a region from the centre of a marker, radii, up to which it may be what is left of it. Chosen
-by hand: on sts_640 and tactip_video such remains are 0 to 1.9 away."""
+more for smoothing. Chosen by hand. On sts_640 and tactip_video the middle of such remains is up to 4.4 px
+beyond it."""
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 
 
@@ -139,7 +137,7 @@ def _without_rims(light: Mask, markers: Markers) -> Mask:
     small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + SPREAD) ** 2)
     places = centers[small] + (left, top)
     away = np.hypot(*(places[:, None] - markers.position).transpose(2, 0, 1)).min(axis=1)
-    rims = small[(away <= RIM * radius) & (small > 0)]
+    rims = small[(away <= radius + SPREAD) & (small > 0)]
     if not len(rims):
         return light
     kept = np.ones(count, np.bool_)

@@ -1,4 +1,4 @@
-"""Between a frame's pixels and a contact's window at half their resolution."""
+"""Between a frame's pixels and those of a contact's window, which are as large or twice as large."""
 
 from __future__ import annotations
 
@@ -11,29 +11,36 @@ Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
 
 
-def halve_mask(mask: Mask, top: int, left: int, inside: NDArray[np.bool_]) -> Mask:
-    """A window of a mask at half resolution: 1 where any of 2 x 2 pixels is not 0 and counts, else 0.
+def window_mask(mask: Mask, top: int, left: int, inside: NDArray[np.bool_], side: int = 2) -> Mask:
+    """A window of a mask: 1 where any px below a pixel is not 0 and counts, else 0.
 
     mask : (H, W) uint8, over whose border the window may reach. top, left : of the window, px. inside :
-    (h, w) bool, which cells of 4 x 4 px count. Returns (2 h, 2 w) uint8.
+    (h, w) bool, which cells of 4 x 4 px count. side : of the window's pixels, px, 1 or 2. Returns
+    (4 h / side, 4 w / side) uint8.
 
     >>> import numpy as np
     >>> mask = np.zeros((8, 8), np.uint8)
     >>> mask[5, 2] = 255
-    >>> halve_mask(mask, 4, 0, np.ones((1, 1), np.bool_))
+    >>> window_mask(mask, 4, 0, np.ones((1, 1), np.bool_))
     array([[0, 1],
            [0, 0]], dtype=uint8)
     """
+    if side == 1:
+        inside = inside.repeat(4, axis=0).repeat(4, axis=1)
+        seen = mask[top:, left:][: inside.shape[0], : inside.shape[1]]
+        window = np.zeros(inside.shape, np.uint8)
+        window[: seen.shape[0], : seen.shape[1]] = seen != 0
+        return window & inside
     halved = np.empty((2 * inside.shape[0], 2 * inside.shape[1]), np.uint8)
     halve_window(np.ascontiguousarray(mask), top, left, inside.view(np.uint8), halved)
     return halved
 
 
-def draw_level(level: Float, top: int, left: int, mask: Mask) -> None:
-    """Set to 255 the pixels of a mask where a level set, interpolated to twice its size, is positive.
+def draw_level(level: Float, top: int, left: int, mask: Mask, side: int = 2) -> None:
+    """Set to 255 the pixels of a mask where a level set, interpolated to their resolution, is positive.
 
     level : (h, w) float32. top, left : its place in the mask, px, over whose border it may reach. mask :
-    (H, W) uint8, changed in place.
+    (H, W) uint8, changed in place. side : of the level's pixels, px, 1 or 2.
 
     >>> import numpy as np
     >>> mask = np.zeros((2, 4), np.uint8)
@@ -42,12 +49,16 @@ def draw_level(level: Float, top: int, left: int, mask: Mask) -> None:
     array([[255, 255,   0,   0],
            [255, 255,   0,   0]], dtype=uint8)
     """
-    raise_mask(level, top, left, mask)
+    if side == 1:
+        part = mask[top:, left:][: level.shape[0], : level.shape[1]]
+        part[level[: part.shape[0], : part.shape[1]] > 0] = 255
+    else:
+        raise_mask(level, top, left, mask)
 
 
 @kernel("void(float32[:, ::1], int64, int64, uint8[:, ::1])")
 def raise_mask(level: Float, top: int, left: int, mask: Mask) -> None:
-    """What `draw_level` does."""
+    """What `draw_level` does from half resolution."""
     high, wide = level.shape
     near, far = np.float32(0.75), np.float32(0.25)
     line = np.empty(2 * wide, np.float32)
@@ -67,7 +78,7 @@ def raise_mask(level: Float, top: int, left: int, mask: Mask) -> None:
 
 @kernel("void(uint8[:, ::1], int64, int64, uint8[:, ::1], uint8[:, ::1])")
 def halve_window(mask: Mask, top: int, left: int, inside: Mask, halved: Mask) -> None:
-    """What `halve_mask` does; `halved`, (2 h, 2 w), is filled."""
+    """What `window_mask` does at half resolution; `halved`, (2 h, 2 w), is filled."""
     high = min(halved.shape[0], (mask.shape[0] - top + 1) // 2)
     wide = min(halved.shape[1], (mask.shape[1] - left + 1) // 2)
     halved[:] = 0

@@ -25,6 +25,11 @@ ALONE: Final = 3.0
 """Times the threshold that markers must move for a contact that nothing else shows: their region is coarse,
 and where the light answers at all it shows most contacts before. Chosen on the simulator's press, whose first
 frames had a region of ten times the area, and sts_640 and tactip_video, of which no contact is lost."""
+LASTING: Final = 4
+"""Frames of motion in a row that count as one mean, at most: its error is smaller by the square root of their
+number, so less motion will do. Chosen on every second recording of franka_mini."""
+FADES: Final = 0.7
+"""Part of the motion of the frame before, below which a contact ends and does not last. Chosen by hand."""
 STILL: Final = 0.5
 """Part of the threshold up to which a marker is at rest. Chosen by hand."""
 FORGET: Final = 0.96
@@ -130,6 +135,7 @@ class MotionTest:
         self._limit = math.sqrt(-2 * math.log(alone))
         self._strongest = 0.0
         self._moving = self._clearly = False
+        self._lasted, self._largest = 1, 0.0
 
     def __call__(self, markers: Markers) -> Motion:
         """Test the markers of one frame, in order.
@@ -149,13 +155,16 @@ class MotionTest:
                 left[tracked] = _unexplained(moved, self._arms[:, tracked])
         remembered = self._relaxation * self._strongest
         bound = self._limit * np.sqrt(markers.stderr * markers.stderr + self._variance)
-        far = np.maximum(ALONE * (STAY if self._clearly else 1.0) * bound, remembered)
+        largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
+        self._lasted = min(self._lasted + 1, LASTING) if self._moving else 1
+        alone = ALONE if largest < FADES * self._largest else ALONE / math.sqrt(self._lasted)
+        self._largest = largest
+        far = np.maximum(alone * (STAY if self._clearly else 1.0) * bound, remembered)
         # Comparing with an unknown standard error, which is NaN, gives False. What is beyond the far bound is
         # beyond the near one as well.
         self._clearly = self._together(left > far)
         near = np.maximum(STAY * bound if self._moving else bound, remembered)
         self._moving = self._clearly or self._together(left > near)
-        largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
         return Motion(self._moving, self._clearly, largest, left, bound)
 
