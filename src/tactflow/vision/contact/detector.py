@@ -44,7 +44,6 @@ from tactflow.vision.contact import (
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.components import Component, contact_components, union, wide_change
 from tactflow.vision.contact.contact_outline import contact_level
-from tactflow.vision.contact.filling import SQUARE
 from tactflow.vision.contact.resolution import draw_level, window_mask
 from tactflow.vision.geometry import downsample
 
@@ -76,9 +75,11 @@ FEW_CELLS: Final = 200
 """Cells that have changed, below which a contact is outlined pixel by pixel, not at half resolution. Chosen
 on `press`, `dense` and `mini_ball` at several sizes: overlaps grow there by up to 0.9, further up by 0.02."""
 CROWDED: Final = 0.7
-"""Part of a picture at half resolution that lies below markers or next to them, from which on every contact
+"""Part of a picture that lies below markers or next to them, from which on every contact
 is outlined pixel by pixel: too little is seen between them otherwise. At 0.68 (`dense`, 300 x 400 px) that is
 no better, at 0.9 contacts overlap by 0.86 instead of 0.61 (`finger` with the dots of `dense`)."""
+NEXT_TO: Final = 5
+"""Side of the square around a pixel in which a marker is next to it, px: one pixel of half resolution."""
 COLOUR_BLUR: Final = 5
 """For `colour`: side of the square over which changes are averaged, px. Chosen by hand."""
 COLOUR_OPENING: Final = 7
@@ -362,8 +363,8 @@ def _check_mask(mask: NDArray[np.uint8] | None, image: NDArray[np.uint8]) -> Non
 
 def _is_crowded(hidden: NDArray[np.uint8]) -> bool:
     """Whether markers leave too little to see at half resolution."""
-    half = cv2.resize(hidden, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return cv2.countNonZero(cv2.dilate(half, SQUARE)) > CROWDED * half.size
+    near = cv2.dilate(hidden, np.ones((NEXT_TO, NEXT_TO), np.uint8))
+    return cv2.countNonZero(near) > CROWDED * hidden.size
 
 
 def _colour_distance(
