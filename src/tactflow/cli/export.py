@@ -74,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
         raise StageError(f"{recording}: {error}" if recording else str(error)) from error
     except OSError as error:
         raise StageError(f"{args.out}: cannot be written: {error.strerror or error}") from error
-    say(f"{args.out}: {len(args.recordings)} episodes at {fps} fps")
+    count = len(args.recordings)
+    say(f"{args.out}: {count} {'episode' if count == 1 else 'episodes'} at {fps} fps")
     return 0
 
 
