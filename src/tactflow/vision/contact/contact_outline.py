@@ -84,7 +84,7 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
 
     Parameters
     ----------
-    change : of the contact's window, at half resolution.
+    change : of the contact's window, at half resolution or pixel by pixel.
     bridge : half the width of gaps that are closed in any case, px: what a removed marker can leave.
     hidden : (h, w) uint8, 1 where a marker was removed and the change belongs to the contact, else 0; None
         where that is not known. What was painted there smears the border outwards and leaves gaps in it; the
