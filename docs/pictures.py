@@ -1,10 +1,11 @@
-"""The pictures of README.md and view.md: results.jpg, view-dark.jpg, view-phone.jpg.
+"""The pictures of README.md, view.md and accuracy.md.
 
-    python docs/pictures.py
+    python docs/pictures.py            results.jpg, view-dark.jpg, view-phone.jpg
+    python docs/pictures.py troubles   accuracy/troubles.jpg
 
-calibrates the simulated sensor, draws what it feels with the stage `visualize`, and takes pictures of the
-live page in Chromium. Needs what the browser tests need, and a quiet machine, whose latency the page shows;
-takes two minutes.
+The first calibrates the simulated sensor, draws what it feels with the stage `visualize`, and takes pictures
+of the live page in Chromium. Needs what the browser tests need, and a quiet machine: the page shows latency.
+The second draws the worst frames that `tactflow bench` finds. Each takes two minutes.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, sync_playwright
 
 import tactflow
+from tactflow.bench.scenes import TROUBLES
 
 DOCS = Path(__file__).resolve().parent
 PITCH: Final = 1.724
@@ -41,6 +43,10 @@ QUALITY: Final = 82
 """Of all pictures, as JPEG."""
 FULL_SECONDS: Final = 11
 """After so many seconds the plots of the page are full."""
+ACROSS: Final = 5
+"""Scenes of troubles beside each other."""
+SMALL: Final = (270, 380)
+"""Size of each, px."""
 DEEP: Final = "() => parseFloat(document.getElementById('value-depth').textContent) > 0.2"
 
 
@@ -57,6 +63,21 @@ def main() -> None:
         drawn = [_drawn(scene, calibration, *frames) for scene, frames in SHOWN.items()]
         cv2.imwrite(str(DOCS / "results.jpg"), np.hstack(drawn), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         _pages(calibration)
+
+
+def troubles() -> None:
+    """The worst frame of each scene with a real gel's trouble."""
+    names = [case.label for case in TROUBLES]
+    with tempfile.TemporaryDirectory() as folder:
+        scenes = [word for name in names for word in ("--scene", name)]
+        # It ends with 3 where a promise is missed.
+        command = [sys.executable, "-m", "tactflow", "bench", *scenes, "--pictures", folder]
+        subprocess.run([*command, "--json", os.devnull], check=False, stdout=subprocess.DEVNULL)
+        files = [next(Path(folder).glob(f"{name}-[dm]*.png")) for name in names]
+        pictures = [cv2.resize(cv2.imread(str(file)), SMALL, interpolation=cv2.INTER_AREA) for file in files]
+    rows = [np.hstack(pictures[first : first + ACROSS]) for first in range(0, len(pictures), ACROSS)]
+    path = DOCS / "accuracy" / "troubles.jpg"
+    cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
 def _drawn(scene: str, calibration: Path, first: int, last: int) -> NDArray[np.uint8]:
@@ -125,4 +146,7 @@ def _tactflow(*words: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:] == ["troubles"]:
+        troubles()
+    else:
+        main()
