@@ -102,14 +102,13 @@ class ControlSocket:
                 # What had come has been taken back as its connection ended.
                 continue
             except FloodError as flood:
-                log.warning(
-                    "zmq: %s on %s; all who send commands are disconnected", flood, self._bound.endpoint
-                )
+                endpoint = self._bound.endpoint
                 try:
                     self._bound.renew()
                 except StageError as error:
-                    log.warning("zmq: no commands are taken any more: %s", error)
+                    log.warning("zmq: %s on %s; no commands are taken any more: %s", flood, endpoint, error)
                     return
+                log.warning("zmq: %s on %s; all who send commands were disconnected", flood, endpoint)
 
     def _reply(self, socket: zmq.Socket[bytes], parts: list[bytes]) -> None:
         """Answer what a REQ socket sends: where it comes from, nothing, one part. Drop everything else."""
