@@ -174,6 +174,9 @@ class BackgroundModel:
         (h, w) float32, the previous frame's evidence.
         """
         known = self._derived()
+        if not self._untouched:
+            # At the reference: the first frame with contact shall not wait for it.
+            self._untouched = {side: self._untouched_at(side) for side in self._pictures}
         high, wide = known.colour_factor.shape
         whole, half, cells = _cells(image)
         smooth = _smoothed(cells)
@@ -214,7 +217,7 @@ class BackgroundModel:
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
         count. side : of the result's pixels, px: 2 for half resolution, 1 for the frame's own.
         """
-        untouched = self._untouched_at(side)
+        untouched = self._untouched[side]
         picture, each = (change.half if side == 2 else change.whole), CELL // side
         if side == 1:
             inside = inside.repeat(2, axis=0).repeat(2, axis=1)
@@ -271,8 +274,6 @@ class BackgroundModel:
         outshine the others. Where a pattern on the gel has moved, all channels change in proportion: in that
         direction e, standard deviations, the variance is 1 + e^2, in others still 1.
         """
-        if side in self._untouched:
-            return self._untouched[side]
         mean, noise, shift = self._pictures[side], self._derived().noise, self._shift / side
         light = self._repeatability * mean.mean()
         together, apart = _steepness_of_pattern(mean)
@@ -285,8 +286,7 @@ class BackgroundModel:
             each = CELL // side
             scale = scale * self._counts.repeat(each, axis=0).repeat(each, axis=1)
         pattern = np.asarray(pattern * np.sqrt(left_out), np.float32)
-        self._untouched[side] = _Untouched(mean, np.asarray(scale, np.float32), pattern)
-        return self._untouched[side]
+        return _Untouched(mean, np.asarray(scale, np.float32), pattern)
 
 
 def _cut_by_border(change: Float, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:

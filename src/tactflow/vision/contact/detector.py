@@ -251,10 +251,10 @@ class ContactDetector:
         _check_mask(hidden, image)
         if self._last is None:
             raise ValueError("required a reference frame first: call add_reference")
-        if self._crowded is None and hidden is not None:
-            self._crowded = _is_crowded(hidden)
         if self._method == "colour":
             return _colour_distance(image, self._last, self._distance)
+        if self._crowded is None and hidden is not None:
+            self._crowded = _is_crowded(hidden)
         return self._against_noise(image, hidden)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
