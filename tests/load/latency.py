@@ -142,7 +142,7 @@ def least(length: int) -> list[tuple[float, float, float]]:
 
 
 def computing(recording: Path, pause: float) -> float:
-    """CPU time of a frame with contact if frames come with this pause between them. pause : s. Returns the median, ms."""
+    """CPU time of a frame with contact, the median, ms, with a pause between frames, s."""
     pipeline = load_pipeline(REPOSITORY / "pipeline.yaml")
     run = LockstepPipeline(on_recording(pipeline, recording), None)
     times: list[float] = []
