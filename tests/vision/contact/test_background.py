@@ -335,3 +335,20 @@ def test_an_even_change_of_a_noisy_gel_is_even_pixel_by_pixel() -> None:
     inside = window.strength[36:60, 36:60]
     # Measured: 0.02, which is the noise of the two pictures; 0.075 were slopes told pixel by pixel.
     assert inside.std() < 0.04 * inside.mean()
+
+
+def test_blotches_wider_than_a_cell_are_no_noise_to_an_outline() -> None:
+    random = np.random.default_rng(4)
+    noise = random.normal(0, 2, (160, 160, 3))
+    blotches = cv2.GaussianBlur(random.normal(0, 1, (160, 160)), (0, 0), 4)[..., None]
+    strengths = []
+    for shade in (0.0, 0.3):
+        gel = 120 * (1 + shade * np.tanh(2 * blotches / blotches.std())) + noise
+        pressed = gel.copy()
+        pressed[60:100, 60:100] += [40, 0, -40]
+        model = BackgroundModel(gel.astype(np.uint8), repeatability=0.025, tint=0.01, shift=0.0)
+        change = model.compare(pressed.astype(np.uint8), None, None)
+        window = model.window_change(change, slice(0, 40), slice(0, 40), np.ones((40, 40), np.bool_))
+        strengths.append(float(window.strength[34:46, 34:46].mean()))
+    # Measured: 18.4 and 17.5; 7.8 on blotches with the noise by which it is told whether anything touches.
+    assert strengths[1] > 0.8 * strengths[0]
