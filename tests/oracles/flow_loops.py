@@ -77,7 +77,7 @@ def plain_sample_region(
     least, most = travelled.min(axis=1) - margin, travelled.max(axis=1) + margin
     corner = np.array([left, top]) - place[:2]
     begin = np.clip(np.floor((corner - most) / spacing), 0, to_markers.shape[1::-1])
-    end = np.clip(np.ceil((corner + size[::-1] - least) / spacing) + 1, 0, to_markers.shape[1::-1])
+    end = np.clip(np.floor((corner + size[::-1] - least) / spacing) + 2, 0, to_markers.shape[1::-1])
     columns, rows = np.ceil((end - begin) / step).astype(int).tolist()
     window[:] = *begin[::-1], step, rows, columns
     count = rows * columns

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
-from tactflow.vision.types import Evidence, Markers, MarkerStatus
+from tactflow.vision.types import Evidence, Markers, MarkerStatus, Outlines
 
 Mask = NDArray[np.uint8]
 
@@ -43,11 +43,13 @@ class FusedContact(NamedTuple):
 
     mask : (H, W) uint8, 255 in contact. evidence : what showed it; None where nothing touches.
     light_changed : whether there is a change of the light that is no contact.
+    outlines : of the mask; None where they were not needed.
     """
 
     mask: Mask
     evidence: Evidence | None
     light_changed: bool = False
+    outlines: Outlines | None = None
 
     @property
     def touching(self) -> bool:
@@ -84,7 +86,8 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
             return FusedContact(light, None)
         return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        return FusedContact(_without_reflections(light, markers, motion, test.pitch), "both")
+        outlines = _without_reflections(Outlines.of(light), markers, motion, test.pitch)
+        return FusedContact(outlines.mask, "both", outlines=outlines)
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
     light = _without_rims(light, markers)
@@ -99,12 +102,12 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     return len(resting) >= UNMOVED and bool(resting.all())
 
 
-def _without_reflections(light: Mask, markers: Markers, motion: Motion, reach: float) -> Mask:
-    """The regions around which markers move; the same array if these are all, or none.
+def _without_reflections(light: Outlines, markers: Markers, motion: Motion, reach: float) -> Outlines:
+    """The regions around which markers move; the same mask if these are all, or none.
 
     Whatever presses the gel moves the markers beside it. reach : how far around a region they are judged, px.
     """
-    outlines, _ = cv2.findContours(light, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    outlines = light.contours
     if len(outlines) < 2:
         return light
     seen = markers.status == _TRACKED
@@ -115,9 +118,10 @@ def _without_reflections(light: Mask, markers: Markers, motion: Motion, reach: f
     resting = (np.count_nonzero(beside, axis=1) >= UNMOVED) & ~(beside & ~unmoved).any(axis=1)
     if not resting.any() or resting.all():
         return light
-    kept = light.copy()
-    cv2.drawContours(kept, [outlines[index] for index in np.flatnonzero(resting).tolist()], -1, 0, cv2.FILLED)
-    return kept
+    kept = light.mask.copy()
+    gone = [outline for outline, rests in zip(outlines, resting, strict=True) if rests]
+    cv2.drawContours(kept, gone, -1, 0, cv2.FILLED)
+    return Outlines(kept, [outline for outline, rests in zip(outlines, resting, strict=True) if not rests])
 
 
 def _without_rims(light: Mask, markers: Markers) -> Mask:

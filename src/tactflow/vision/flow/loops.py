@@ -138,29 +138,21 @@ def sample_region(
     height, width = covered.shape[0] - 1, covered.shape[1] - 1
     window[2] = step = 1 if width * height < many else 2
     side = int(place[3 + step])
-    least_x = most_x = travelled[0, 0]
-    least_y = most_y = travelled[1, 0]
-    for n in range(1, travelled.shape[1]):
-        least_x, most_x = min(least_x, travelled[0, n]), max(most_x, travelled[0, n])
-        least_y, most_y = min(least_y, travelled[1, n]), max(most_y, travelled[1, n])
     # The cells whose gel may be in the part, and for each of them where its gel may be.
-    least_x, most_x, least_y, most_y = (
-        least_x - place[3],
-        most_x + place[3],
-        least_y - place[3],
-        most_y + place[3],
-    )
-    first_row = _clip(math.floor((top - place[1] - most_y) / place[2]), to_markers.shape[0])
-    first_column = _clip(math.floor((left - place[0] - most_x) / place[2]), to_markers.shape[1])
-    end_row = _clip(math.ceil((top + height - place[1] - least_y) / place[2]) + 1, to_markers.shape[0])
-    end_column = _clip(math.ceil((left + width - place[0] - least_x) / place[2]) + 1, to_markers.shape[1])
+    least_x, most_x = _extent(travelled, 0, place[3])
+    least_y, most_y = _extent(travelled, 1, place[3])
+    first_row = _within((top - place[1] - most_y) / place[2], to_markers.shape[0])
+    first_column = _within((left - place[0] - most_x) / place[2], to_markers.shape[1])
+    end_row = _within((top + height - place[1] - least_y) / place[2] + 2, to_markers.shape[0])
+    end_column = _within((left + width - place[0] - least_x) / place[2] + 2, to_markers.shape[1])
     rows, columns = (end_row - first_row + step - 1) // step, (end_column - first_column + step - 1) // step
     window[0], window[1], window[3], window[4] = first_row, first_column, rows, columns
     for k in range(rows * columns):
         i, j = first_row + step * (k // columns), first_column + step * (k % columns)
         x, y = place[0] + place[2] * j - left, place[1] + place[2] * i - top
         moved[k, 0] = moved[k, 1] = inside[k] = 0.0
-        if not _box(covered, int(y + least_y), int(x + least_x), int(y + most_y) + 1, int(x + most_x) + 1):
+        up, down = _within(y + least_y, height), _within(y + most_y + 1, height)
+        if not _box(covered, up, _within(x + least_x, width), down, _within(x + most_x + 1, width)):
             continue
         for n in range(travelled.shape[1]):
             moved[k, 0] += to_markers[i, j, n] * coefficients[0, n]
@@ -172,8 +164,18 @@ def sample_region(
 
 
 @helper
-def _clip(value: int, high: int) -> int:
-    return min(max(value, 0), high)
+def _extent(travelled: FloatArray, axis: int, margin: float) -> tuple[float, float]:
+    """Of all motions along an axis, wider by a margin."""
+    least = most = travelled[axis, 0]
+    for n in range(1, travelled.shape[1]):
+        least, most = min(least, travelled[axis, n]), max(most, travelled[axis, n])
+    return least - margin, most + margin
+
+
+@helper
+def _within(value: float, high: int) -> int:
+    """The whole number below, in 0 to `high`."""
+    return int(min(max(value, 0.0), float(high)))
 
 
 @helper
@@ -192,12 +194,8 @@ def _square(covered: Sums, x: float, y: float, side: int) -> float:
 def _box(covered: Sums, top: int, left: int, bottom: int, right: int) -> int:
     """The sum over whole pixels."""
     height, width = covered.shape[0] - 1, covered.shape[1] - 1
-    top, left, bottom, right = (
-        _clip(top, height),
-        _clip(left, width),
-        _clip(bottom, height),
-        _clip(right, width),
-    )
+    top, bottom = min(max(top, 0), height), min(max(bottom, 0), height)
+    left, right = min(max(left, 0), width), min(max(right, 0), width)
     upper = covered[top, right] - covered[top, left]
     return int(np.int32(covered[bottom, right] - covered[bottom, left] - upper))
 
