@@ -35,8 +35,9 @@ from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.sim import open_scene
 from tactflow.vision.depth.poisson import integrate
-from tactflow.vision.depth.slopes import SlopeModel, place_terms
-from tactflow.vision.depth.surface import Rest, Surface, Surroundings, colour_change, surroundings
+from tactflow.vision.depth.slopes import SlopeModel, coordinates
+from tactflow.vision.depth.surface import Rest, Surface, colour_change
+from tactflow.vision.depth.surroundings import Surroundings, surroundings
 from tactflow.vision.geometry import Preprocessor
 
 Values = NDArray[np.float64]
@@ -146,7 +147,7 @@ def integrated(true: Values, around: Surroundings, most: float) -> float:
         cv2.resize((part * cut)[around.window.whole], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         for part in (across, down)
     ]
-    low = integrate(*(np.asarray(slope * 4 * RAW_MM, np.float32) for slope in slopes))
+    low = integrate(np.asarray(slopes, np.float32), (4 * RAW_MM, 4 * RAW_MM))
     low -= np.median(np.concatenate([low[0], low[-1], low[:, 0], low[:, -1]]))
     found = np.zeros(true.shape)
     rows, columns = around.window.whole
@@ -198,10 +199,12 @@ class Ball:
         press, middle = self.session.presses[index], self.all.centers[index]
         label = self.labels[press.seq - 1]
         around = surroundings(press.mask, self.rest.window)
-        place = place_terms((self.rest.window.right, self.rest.window.bottom))[
-            (slice(None), *around.window.part)
-        ]
-        normal = model.normals(colour_change(press.image, self.rest, around.window), place)
+        x, y = coordinates((self.rest.window.right, self.rest.window.bottom))
+        rows, columns = around.window.part
+        change = colour_change(press.image, self.rest, around.window)
+        everywhere = np.ones(change.shape[:2], np.uint8)
+        slope = model.slopes(change, x[columns], y[rows], everywhere)
+        normal = slope / np.sqrt(1 + (slope**2).sum(axis=0))
         heights = Surface(model, WEDGE_SCALE).heights(press.image, self.rest, around)
         rows, columns = np.mgrid[around.window.part]
         points = np.stack([2 * columns + 0.5, 2 * rows + 0.5], axis=-1)
