@@ -350,11 +350,11 @@ def try_photometry(session: Session, model: SlopeModel, scale: Scale, ball_radiu
 
 
 def _heights(surface: Surface, press: Press, rest: Rest, window: Window) -> NDArray[np.float32]:
-    """(h, w): heights in a window, as a run finds them in its own, larger one."""
+    """(h, w): heights in a window, as a run finds them in its own, larger one; at rest beyond that."""
     around = surroundings(press.mask, rest.window)
-    top, left = window.top - around.window.top, window.left - around.window.left
-    rows, columns = window.bottom - window.top, window.right - window.left
-    return surface.heights(press.image, rest, around)[top : top + rows, left : left + columns]
+    whole = np.zeros((rest.window.height, rest.window.width), np.float32)
+    whole[around.window.part] = surface.heights(press.image, rest, around)
+    return whole[window.part]
 
 
 def _errors(

@@ -20,19 +20,24 @@ from tactflow.vision.types import Depth, Scale
 DIM: Final = 20.0
 """Grey levels that are added to the light at rest before a change is divided by it, so that the noise of a
 dark channel does not count as colour. Chosen by hand."""
-DEPTH_ROUNDED: Final = 0.01
-"""Part of the depth that averaging may take off, of any contact. This and the three below were chosen on 162
-contacts of nine simulated scenes under three lights, so that of round and of sharp ones about 68 % of the
-errors lie within one standard error and 95 % within two; docs/depth_table.py tries them on 162 others."""
-DEPTH_STEEP: Final = 0.17
+
+DEPTH_SHAPE: Final = 1.5
+"""Error of the depth of shapes that are no ball, over that of balls, on whose roundness a calibration relies.
+This and the five below were chosen on 324 contacts of nine simulated scenes under three lights, with three
+calibrations, so that of round and of sharp ones about 68 % of the errors lie within one standard error and
+95 % within two; docs/depth_table.py tries them on 162 others."""
+DEPTH_ROUNDED: Final = 0.005
+"""Part of the depth that averaging may take off, of any contact."""
+DEPTH_STEEP: Final = 0.24
 """Error of the depth, relative, where all of the slope is steep; it grows with the root of the steep part."""
-VOLUME_ROUNDED: Final = 0.0075
+VOLUME_ROUNDED: Final = 0.0085
 """As `DEPTH_ROUNDED`, of the volume."""
-VOLUME_STEEP: Final = 0.26
+VOLUME_STEEP: Final = 0.35
 """As `DEPTH_STEEP`, of the volume."""
-STEEP: Final = 0.86
+STEEP: Final = 0.95
 """A slope is steep from this part of the steepest on that the ball has shown, by the horizontal part of the
-normal."""
+normal. With 0.85 a cable counts as steep as an edge, and its stated errors are ten times too large under
+`photometric`."""
 
 
 class SurfaceErrors(NamedTuple):
@@ -115,9 +120,9 @@ class Surface:
         pressed = float(low[mask[window.whole][::2, ::2] > 0].sum()) * cell
         depth_error = volume_error = None
         if self._errors is not None:
-            root = math.sqrt(steep)
-            depth_error = greatest * math.hypot(self._errors.depth, DEPTH_ROUNDED, DEPTH_STEEP * root)
-            volume_error = volume * math.hypot(self._errors.volume, VOLUME_ROUNDED, VOLUME_STEEP * root)
+            root, balls = math.sqrt(steep), self._errors
+            depth_error = greatest * math.hypot(DEPTH_SHAPE * balls.depth, DEPTH_ROUNDED, DEPTH_STEEP * root)
+            volume_error = volume * math.hypot(balls.volume, VOLUME_ROUNDED, VOLUME_STEEP * root)
         return Depth(heights, greatest, depth_error, volume, volume_error, pressed)
 
     def heights(self, image: Bytes, rest: Rest, around: Surroundings) -> Float:
