@@ -8,6 +8,7 @@ One sensor at 60 Hz and a subscriber in a process of its own, on a machine that 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import subprocess
 import sys
@@ -22,9 +23,13 @@ from pathlib import Path
 import numpy as np
 import zmq
 
+from tactflow.bench.lockstep import LockstepPipeline
+from tactflow.bench.pipelines import on_recording
+from tactflow.bench.timing import BLOCK
 from tactflow.config.load import load_pipeline
 from tactflow.engine.run import Runner
 from tactflow.engine.trace import Trace
+from tactflow.sim import open_scene
 from tests.conftest import REPOSITORY
 from tests.load.workload import write_pipeline, write_section
 
@@ -35,6 +40,9 @@ FRAMES = 1200
 SETTLED = 300
 """Frames before the first one that counts: kernels, the reference, the subscription. Chosen by hand."""
 PORT = 5790
+PAUSES = (0, 3, 6, 15)
+"""Between two frames, ms."""
+PAUSED_FRAMES = 240
 TOPIC = b"tactflow.main "
 PAGE = REPOSITORY / "docs" / "tuning.md"
 PARTS = (
@@ -134,6 +142,32 @@ def least(length: int) -> list[tuple[float, float, float]]:
     return [(due, sent[seq], when) for seq, due, when in received if seq >= SETTLED]
 
 
+def computing(recording: Path, pause: float) -> float:
+    """CPU time of a frame with contact, the median, ms, with a pause between frames, s."""
+    pipeline = load_pipeline(REPOSITORY / "pipeline.yaml")
+    run = LockstepPipeline(on_recording(pipeline, recording), None)
+    times: list[float] = []
+    while outcomes := run.block(1 if pause else BLOCK):
+        times += [one.cpu for one in outcomes if one.contact is not None]
+        time.sleep(pause)
+    run.close()
+    return 1e3 * float(np.median(times))
+
+
+def with_pauses() -> str:
+    """What a frame costs if others, or nothing, ran before it."""
+    scene = open_scene(f"press?frames={PAUSED_FRAMES}")
+    with tempfile.TemporaryDirectory() as name:
+        recording = Path(name) / "press.npy"
+        np.save(recording, np.stack([scene.frame(index) for index in range(PAUSED_FRAMES)]))
+        took = [computing(recording, 1e-3 * pause) for pause in PAUSES]
+    told = ", ".join(f"{ms:.2f} ms with {pause}" for ms, pause in zip(took, PAUSES, strict=True))
+    return (
+        "The same frames from a recording, CPU time of all stages but the publisher, by the pause between "
+        f"two of them, ms: {told}."
+    )
+
+
 def report() -> str:
     """The section."""
     slices, times = run()
@@ -158,6 +192,8 @@ def report() -> str:
             "",
             f"A program that does nothing but wake and send 4 kB takes {np.median(bare):.2f} ms in the "
             f"median, {np.percentile(bare, 99):.2f} in 99 of 100.",
+            "",
+            with_pauses(),
         ]
     )
 
@@ -176,6 +212,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.subscribe:
         subscribe(args.subscribe, FRAMES)
     else:
+        # As the program does.
+        gc.freeze()
         write_section("age", report(), PAGE)
 
 

@@ -194,6 +194,23 @@ def test_a_kernel_calls_helpers_of_its_file_which_call_others() -> None:
     assert _moved.plain(2.0) == 7.0
 
 
+@pytest.mark.parametrize("passed_over", [True, False])
+def test_garbage_is_looked_for_in_loaded_kernels_only_where_it_is_looked_for_in_imports(
+    passed_over: bool, warm: Warm
+) -> None:
+    code = (
+        f"import gc, loops; from tactflow.vision import compiled; {passed_over} and gc.freeze();"
+        "before = gc.get_freeze_count(); compiled.load(loops);"
+        "print(gc.isenabled(), gc.get_freeze_count() > before)"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(warm.folder / "kept")}
+    command = [sys.executable, "-c", code]
+    assert subprocess.check_output(command, cwd=warm.folder, env=environment, text=True).split() == [
+        "True",
+        str(passed_over),
+    ]
+
+
 def test_compiling_is_announced_once_and_not_again_when_it_is_on_disk(warm: Warm) -> None:
     assert warm.first[0].split()[1:] == RESULTS
     assert warm.first[1].count("compiling") == 1

@@ -323,3 +323,32 @@ def test_the_first_contact_waits_for_nothing_that_the_untouched_gel_could_tell(
     assert window.strength.shape == (64 // side, 48 // side)
     # Measured: 20 against 3.6, what is left of the gain that is taken out.
     assert window.strength[30 // side, 30 // side] > 4 * window.strength[5 // side, 5 // side]
+
+
+def test_an_even_change_of_a_noisy_gel_is_even_pixel_by_pixel() -> None:
+    noise = np.random.default_rng(2).normal(0, 2, (2, 96, 96, 3))
+    gel, pressed = np.asarray(100 + noise, np.uint8)
+    pressed[32:64, 32:64] += 40
+    model = BackgroundModel(gel, repeatability=0.025, tint=0.01, shift=1.0)
+    change = model.compare(pressed, None, None)
+    window = model.window_change(change, slice(0, 24), slice(0, 24), np.ones((24, 24), np.bool_), side=1)
+    inside = window.strength[36:60, 36:60]
+    # Measured: 0.02, which is the noise of the two pictures; 0.075 were slopes told pixel by pixel.
+    assert inside.std() < 0.04 * inside.mean()
+
+
+def test_blotches_wider_than_a_cell_are_no_noise_to_an_outline() -> None:
+    random = np.random.default_rng(4)
+    noise = random.normal(0, 2, (160, 160, 3))
+    blotches = cv2.GaussianBlur(random.normal(0, 1, (160, 160)), (0, 0), 4)[..., None]
+    strengths = []
+    for shade in (0.0, 0.3):
+        gel = 120 * (1 + shade * np.tanh(2 * blotches / blotches.std())) + noise
+        pressed = gel.copy()
+        pressed[60:100, 60:100] += [40, 0, -40]
+        model = BackgroundModel(gel.astype(np.uint8), repeatability=0.025, tint=0.01, shift=0.0)
+        change = model.compare(pressed.astype(np.uint8), None, None)
+        window = model.window_change(change, slice(0, 40), slice(0, 40), np.ones((40, 40), np.bool_))
+        strengths.append(float(window.strength[34:46, 34:46].mean()))
+    # Measured: 18.4 and 17.5; 7.8 on blotches with the noise by which it is told whether anything touches.
+    assert strengths[1] > 0.8 * strengths[0]

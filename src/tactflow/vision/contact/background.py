@@ -102,7 +102,6 @@ class _Derived:
     weight: Float
     brightness: Float
     colour_factor: Float
-    noise: Float
 
 
 class BackgroundModel:
@@ -176,7 +175,7 @@ class BackgroundModel:
         known = self._derived()
         if not self._untouched:
             # At the reference: the first frame with contact shall not wait for it.
-            self._untouched = {side: self._untouched_at(side) for side in self._pictures}
+            self._untouched = self._compared_with()
         high, wide = known.colour_factor.shape
         whole, half, cells = _cells(image)
         smooth = _smoothed(cells)
@@ -262,31 +261,39 @@ class BackgroundModel:
             weight=np.asarray(weight, np.float32),
             brightness=np.asarray(direction * weight * np.sqrt(factor), np.float32),
             colour_factor=np.asarray(factor, np.float32),
-            noise=np.asarray(noise, np.float32),
         )
         return self._known
 
-    def _untouched_at(self, side: int) -> _Untouched:
-        """What outlines in pixels of some px are compared with.
+    def _compared_with(self) -> dict[int, _Untouched]:
+        """What outlines are compared with, by the side of its pixels, px.
 
-        Half a cell, smoothed, is about as noisy as a smoothed cell. How far the light varies is taken from
-        the brightness of the whole picture: relative to itself, a dark channel that a tilt lights up would
-        outshine the others. Where a pattern on the gel has moved, all channels change in proportion: in that
-        direction e, standard deviations, the variance is 1 + e^2, in others still 1.
+        How much a place counts is told at half resolution for both: pixel by pixel, the noise of the
+        reference and the grain of the gel have slopes of their own, and an even change would look uneven.
+        How far the light varies is taken from the brightness of the whole picture: relative to itself, a dark
+        channel that a tilt lights up would outshine the others. Where a pattern on the gel has moved, all
+        channels change in proportion: in that direction e, standard deviations, the variance is 1 + e^2, in
+        others still 1.
         """
-        mean, noise, shift = self._pictures[side], self._derived().noise, self._shift / side
+        mean, shift = self._pictures[2], self._shift / 2
         light = self._repeatability * mean.mean()
         together, apart = _steepness_of_pattern(mean)
-        variance = noise.mean(axis=(1, 2), keepdims=True) + light**2 + (shift * apart) ** 2
+        variance = _fine_noise(mean) + light**2 + (shift * apart) ** 2
         scale = np.asarray(1 / np.sqrt(variance), np.float32)
         pattern = shift * together * scale
         square = (pattern * pattern).sum(axis=0)
         left_out = (1 - 1 / np.sqrt(1 + square)) / np.maximum(square, np.float32(1e-6))
         if self._counts is not None:
-            each = CELL // side
-            scale = scale * self._counts.repeat(each, axis=0).repeat(each, axis=1)
-        pattern = np.asarray(pattern * np.sqrt(left_out), np.float32)
-        return _Untouched(mean, np.asarray(scale, np.float32), pattern)
+            scale = scale * self._counts.repeat(2, axis=0).repeat(2, axis=1)
+        half = _Untouched(
+            mean, np.asarray(scale, np.float32), np.asarray(pattern * np.sqrt(left_out), np.float32)
+        )
+        whole = _Untouched(self._pictures[1], _doubled(half.scale), _doubled(half.pattern))
+        return {1: whole, 2: half}
+
+
+def _doubled(planes: Float) -> Float:
+    """(3, 2 h, 2 w) of (3, h, w): each pixel four times."""
+    return planes.repeat(2, axis=1).repeat(2, axis=2)
 
 
 def _cut_by_border(change: Float, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
@@ -394,3 +401,17 @@ def _spatial_noise(picture: NDArray[np.uint8]) -> Float:
     # Smoothing 3 x 3 would divide by three were the cells independent; demosaicing and compression see to
     # it that they are not quite.
     return np.asarray(np.hypot(noise, QUANTISATION) * (NOISE_CORRELATION / 3), np.float32)
+
+
+def _fine_noise(planes: Float) -> Float:
+    """Variance of smoothed pixels at half resolution, guessed from a picture (3, 2 h, 2 w): (3, 1, 1).
+
+    Two pixels of a cell along one diagonal minus those along the other: noise differs between them, while
+    shading, and grain and blotches wider than a cell, hardly do. To tell whether anything touches the gel,
+    that is too little (docs/accuracy.md, `speckle`).
+    """
+    above, below = planes[:, ::2], planes[:, 1::2]
+    diagonal = np.abs(above[:, :, ::2] - above[:, :, 1::2] - below[:, :, ::2] + below[:, :, 1::2])
+    # Four independent pixels; their mean is as noisy as one that is smoothed.
+    noise = np.median(diagonal, axis=(1, 2), keepdims=True) * (MAD_TO_SIGMA / 4)
+    return np.asarray((noise**2 + QUANTISATION**2) * (NOISE_CORRELATION / 3) ** 2, np.float32)

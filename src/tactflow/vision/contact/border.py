@@ -76,10 +76,6 @@ MIN_BIN_PIXELS: Final = 8
 MIN_ARC_PIXELS: Final = 2
 """Pixels from which on a bin of the profile counts, of the whole outline and of an arc. Chosen by hand."""
 
-ENOUGH_PIXELS: Final = 8000
-"""Pixels that are enough for the profile: of a window with n times as many, one row in n is taken.
-Chosen by hand."""
-
 _NOTHING: Final = np.zeros((0, 0), np.uint8)
 """An empty mask."""
 
@@ -125,7 +121,6 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
     region : of the change. parts : (h, w), its depth, but below 0 where it does not belong to the contact.
     strength : (h, w), relative to the largest nearby. hidden : (h, w), 1 where a marker was removed; or None.
     """
-    every = max(1, parts.size // ENOUGH_PIXELS)
     middle = float(cv2.minMaxLoc(parts)[1])
     level = np.empty_like(parts)
     border_level(
@@ -135,7 +130,6 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
         region.starts,
         strength,
         _NOTHING if hidden is None else hidden,
-        every,
         middle,
         np.zeros((int(region.starts[-1]) + 1, 2, int(middle / BIN) + 2)),
         level,
@@ -211,7 +205,7 @@ def _step_depths(bins: Double, middle: float, whole: float, border: Double, weig
 
 
 @kernel(
-    "void(float32[:, ::1], int32[:, ::1], float32[:, ::1], int32[::1], float32[:, ::1], uint8[:, ::1], int64,"
+    "void(float32[:, ::1], int32[:, ::1], float32[:, ::1], int32[::1], float32[:, ::1], uint8[:, ::1],"
     " float64, float64[:, :, ::1], float32[:, ::1])"
 )
 def border_level(
@@ -221,12 +215,11 @@ def border_level(
     starts: Whole,
     strength: Float,
     hidden: Mask,
-    every: int,
     middle: float,
     bins: Double,
     level: Float,
 ) -> None:
-    """What `inside_border` finds, from one row in `every`; `level` is filled.
+    """What `inside_border` finds; `level` is filled.
 
     hidden : not 0 where a pixel does not count; (0, 0) if all do. middle : the largest depth.
     bins : (steps + 1, 2, n), 0, changed: for each step, then for all pixels, the number of pixels and the sum
@@ -240,7 +233,7 @@ def border_level(
         for x in range(wide):
             if parts[y, x] <= 0 and marks[y, x] > 0:
                 place[nearest[y, x]] = marks[y, x]
-    for y in range(0, high, every):
+    for y in range(high):
         for x in range(wide):
             if parts[y, x] > 0 and (hidden.size == 0 or hidden[y, x] == 0):
                 at, step = int(parts[y, x] * bins_per_pixel), int(place[nearest[y, x]]) - 1
