@@ -49,7 +49,6 @@ def plain_border_level(
     steps: NDArray[np.int32],
     strength: Float,
     hidden: Mask,
-    every: int,
     middle: float,
     bins: NDArray[np.float64],
     level: Float,
@@ -67,7 +66,6 @@ def plain_border_level(
     seen = parts > 0
     if hidden.size:
         seen &= hidden == 0
-    seen[np.arange(len(parts)) % every > 0] = False
     at = (parts * np.float32(1 / BIN)).astype(np.intp)
     for row, counted in ((step, seen & (step >= 0)), (np.full_like(step, len(bins) - 1), seen)):
         np.add.at(bins[:, 0], (row[counted], at[counted]), 1)

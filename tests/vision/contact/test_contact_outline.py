@@ -233,3 +233,12 @@ def test_a_wrinkle_beside_a_dented_contact_is_not_joined_to_it() -> None:
     wrinkled = dented.copy()
     wrinkled[80:82, 38:62] += np.float32(0.25) * ball.max()
     assert overlap(found(wrinkled), found(dented)) > 0.98
+
+
+def test_a_large_contact_has_the_same_outline_however_it_is_turned() -> None:
+    strip = cv2.resize(tilted(punch(40, 12), ring=20), None, fx=2, fy=2)
+    noise = np.random.default_rng(0).normal(0, 0.04, strip.shape)
+    change = np.asarray(strip + noise * (np.linalg.norm(strip, axis=2) > 0.05)[..., None], np.float32)
+    turned = np.ascontiguousarray(np.rot90(change))
+    # Measured: 0.999; 0.93 with the profile of one row in five.
+    assert overlap(np.rot90(found(change)), found(turned)) > 0.99

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
-from tactflow.vision.contact import ContactDetector, ContactResult, border, chi_square_threshold
+from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.contact.filling import is_solid, traced
 from tactflow.vision.geometry import Preprocessor
@@ -510,8 +510,6 @@ def test_in_a_small_picture_contacts_between_many_dots_keep_their_outline(scene:
 def test_looking_closely_only_around_a_contact_gives_what_looking_everywhere_gives(
     scene: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The profile across the rim is taken from every line of a small region, but some of a large one.
-    monkeypatch.setattr(border, "ENOUGH_PIXELS", 10**9)
     around, everywhere = _Sensor(scene, 90), _Sensor(scene, 90)
     windows = contact.contact_components
 

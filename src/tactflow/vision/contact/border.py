@@ -75,10 +75,6 @@ MIN_BIN_PIXELS: Final = 8
 MIN_ARC_PIXELS: Final = 2
 """Pixels from which on a bin of the profile counts, of the whole outline and of an arc. Chosen by hand."""
 
-ENOUGH_PIXELS: Final = 8000
-"""Pixels that are enough for the profile: of a window with n times as many, one row in n is taken.
-Chosen by hand."""
-
 _NOTHING: Final = np.zeros((0, 0), np.uint8)
 """An empty mask."""
 
@@ -126,7 +122,6 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
     region : of the change. parts : (h, w), its depth, but below 0 where it does not belong to the contact.
     strength : (h, w), relative to the largest nearby. hidden : (h, w), 1 where a marker was removed; or None.
     """
-    every = max(1, parts.size // ENOUGH_PIXELS)
     middle = float(cv2.minMaxLoc(parts)[1])
     level = np.empty_like(parts)
     border_level(
@@ -137,7 +132,6 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
         region.steps,
         strength,
         _NOTHING if hidden is None else hidden,
-        every,
         middle,
         np.zeros((int(region.steps[-1]) + 1, 2, int(middle / BIN) + 2)),
         level,
@@ -240,7 +234,7 @@ def _step_depths(bins: Double, steps: Whole, middle: float, whole: float, border
 
 @kernel(
     "void(float32[:, ::1], int32[:, ::1], int32[:, ::1], int32[::1], int32[::1], float32[:, ::1],"
-    " uint8[:, ::1], int64, float64, float64[:, :, ::1], float32[:, ::1])"
+    " uint8[:, ::1], float64, float64[:, :, ::1], float32[:, ::1])"
 )
 def border_level(
     parts: Float,
@@ -250,12 +244,11 @@ def border_level(
     steps: Whole,
     strength: Float,
     hidden: Mask,
-    every: int,
     middle: float,
     bins: Double,
     level: Float,
 ) -> None:
-    """What `inside_border` finds, from one row in `every`; `level` is filled.
+    """What `inside_border` finds; `level` is filled.
 
     nearest, points, ends, steps : of a `Depth`. hidden : not 0 where a pixel does not count; (0, 0) if all
     do. middle : the largest depth. bins : (steps + 1, 2, n), 0, changed: for each step, then for all pixels,
@@ -265,7 +258,7 @@ def border_level(
     all_pixels = bins.shape[0] - 1
     place = _place_beside(points, ends, steps, nearest, parts)
     bins_per_pixel = np.float32(1 / BIN)
-    for y in range(0, high, every):
+    for y in range(high):
         for x in range(wide):
             if parts[y, x] > 0 and (hidden.size == 0 or hidden[y, x] == 0):
                 at, step = int(parts[y, x] * bins_per_pixel), int(place[nearest[y, x]]) - 1
