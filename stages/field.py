@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Image
 from tactflow.vision import compiled
-from tactflow.vision.flow import region
+from tactflow.vision.flow import loops
 from tactflow.vision.flow.displacement_field import FEWEST, DisplacementField, FieldModel
 from tactflow.vision.types import Markers
 
@@ -28,19 +26,17 @@ class Field(Stage):
 
     def __init__(self, params: StageParams) -> None:
         super().__init__(params)
-        compiled.load(region)
+        compiled.load(loops)
         self._model: FieldModel | None = None
-        self._size = (0, 0)
+        self._reference = b"", (0, 0)
 
     def process(self, markers: Markers, image: Image) -> FieldPorts | Absent:
         """The field of this frame; absent where fewer than three markers are seen."""
-        size = image.shape[1], image.shape[0]
         if len(markers.origin) < FEWEST:
             return Absent("no_markers")
         # What the reference alone tells is kept; it is known again by its markers.
-        model = self._model
-        if model is None or self._size != size or not np.array_equal(model.origin, markers.origin):
-            model = FieldModel(markers.origin, size)
-            self._model, self._size = model, size
-        field = model(markers)
+        reference = markers.origin.tobytes(), (image.shape[1], image.shape[0])
+        if self._model is None or self._reference != reference:
+            self._model, self._reference = FieldModel(markers.origin, reference[1]), reference
+        field = self._model(markers)
         return Absent("no_markers") if field is None else FieldPorts(field)

@@ -8,8 +8,7 @@ than a marker, beside a marker, is what its removal has left.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -39,8 +38,7 @@ beyond it."""
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 
 
-@dataclass(frozen=True, slots=True)
-class FusedContact:
+class FusedContact(NamedTuple):
     """Where a frame shows contact.
 
     mask : (H, W) uint8, 255 in contact. evidence : what showed it; None where nothing touches.

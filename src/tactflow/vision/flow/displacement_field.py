@@ -9,8 +9,6 @@ markers, so that each answer has a standard error in closed form.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -19,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.flow.inside import check_mask
-from tactflow.vision.flow.region import sample_region, sum_markers, sum_region
+from tactflow.vision.flow.loops import sample_region, sum_markers, sum_region, weigh_markers
 from tactflow.vision.markers.family import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -51,6 +49,8 @@ OVERSHOOT: Final = 0.5
 POOR: Final = 3.0
 """Times the median standard error from which on a marker's own error has its weight. Chosen by hand."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
+_POOR: Final = 1
+"""Doubt of a marker that is seen, but poorly; see `weigh_markers`."""
 
 
 class Grid(NamedTuple):
@@ -68,18 +68,8 @@ class Grid(NamedTuple):
         y = self.first[1] + self.spacing * np.arange(rows)
         return np.stack(np.meshgrid(x, y), axis=-1)
 
-    def window(self, low: tuple[float, float], high: tuple[float, float]) -> tuple[slice, slice]:
-        """Rows and columns of all cells whose centres lie between two corners (x, y), px."""
-        along = []
-        for axis, count in enumerate(self.shape[::-1]):
-            begin = math.floor((low[axis] - self.first[axis]) / self.spacing)
-            end = math.ceil((high[axis] - self.first[axis]) / self.spacing) + 1
-            along.append(slice(min(max(begin, 0), count), min(max(end, 0), count)))
-        return along[1], along[0]
 
-
-@dataclass(frozen=True, slots=True)
-class Gradient:
+class Gradient(NamedTuple):
     """How a part of the gel is turned, pressed apart and sheared: its displacement gradient.
 
     dx, dy : (du/dx, dv/dx) and (du/dy, dv/dy), 1: what x and y at rest change the displacement (u, v) by.
@@ -107,8 +97,7 @@ class Gradient:
         return math.hypot(self.dx_stderr, self.dy_stderr) / 2
 
 
-@dataclass(frozen=True, slots=True)
-class GelMotion:
+class GelMotion(NamedTuple):
     """How a part of the gel has moved as a whole.
 
     mean : (dx, dy), px: the integral of the displacement over the part, over its area at rest.
@@ -173,6 +162,10 @@ class FieldModel:
         self.origin = np.array(origin, np.float64)
         self.pitch = max(pitch_of(self.origin), 1.0)
         self.grid = _grid(size, self.pitch)
+        spacing = self.grid.spacing
+        sides = [2 * round((step * spacing - 1) / 2) + 1 for step in (1, 2)]
+        self.place = np.array([*self.grid.first, spacing, OVERSHOOT * self.pitch + spacing, *sides])
+        """(6,), see `sample_region`."""
         self._length = LENGTH * self.pitch
         kernel = self._kernel(self.origin)
         self.inverse: FloatArray = np.asarray(
@@ -220,18 +213,6 @@ class _Update(NamedTuple):
     rows: FloatArray
     lost: FloatArray
 
-    @classmethod
-    def of(cls, inverse: FloatArray, chosen: IntArray, certainty: FloatArray) -> _Update:
-        """With more variance for some markers.
-
-        inverse : (N, N), of all markers. chosen : (S,), markers of which less is known. certainty : (S,), the
-        field's variance over the markers' own, 0 for those that are not seen at all.
-        """
-        rows = inverse[chosen]
-        # Of few markers; a third of the time of NumPy's, nothing of which is in the caches.
-        _, middle = cv2.invert(np.diag(certainty) + rows[:, chosen])
-        return cls(rows, np.asarray(middle, np.float64) @ rows)
-
     def taken(self, vectors: FloatArray) -> FloatArray:
         """What vectors (m, N) lose in their products with the inverse, (m, N)."""
         return np.asarray(vectors @ self.rows.T @ self.lost)
@@ -251,37 +232,45 @@ class DisplacementField:
     def __init__(self, model: FieldModel, markers: Markers, seen: NDArray[np.bool_]) -> None:
         self.grid = model.grid
         self._model, self._seen = model, seen
+        stderr = np.ascontiguousarray(markers.stderr, np.float64)
+        ordered = np.sort(stderr[seen & np.isfinite(stderr)])
+        self.noise = float(ordered[len(ordered) // 2]) if len(ordered) else 0.0
+        position = np.ascontiguousarray(markers.position, np.float64)
         # x and y apart: sums along contiguous rows. What is not seen counts as unmoved until it is left out.
-        moved = np.subtract(markers.position.T, model.rest, order="C")
-        moved *= seen
-        self._farthest = moved.min(axis=1).tolist(), moved.max(axis=1).tolist()
-        known = seen & np.isfinite(markers.stderr)
-        ordered = np.sort(markers.stderr[known])
-        typical = ordered[len(ordered) // 2] if len(ordered) else 0.0
-        self.noise = float(typical)
-        error = np.where(known, markers.stderr, typical)
-        self._variance = error * error
+        self._moved, self._coefficients = np.empty((2, len(seen))), np.empty((2, len(seen)))
+        self._variance, doubt = np.empty(len(seen)), np.empty(len(seen), np.uint8)
+        doubtful = weigh_markers(
+            position,
+            model.rest,
+            seen,
+            stderr,
+            self.noise,
+            POOR * self.noise,
+            model.inverse,
+            self._moved,
+            self._variance,
+            doubt,
+            self._coefficients,
+        )
         self._update: _Update | None = None
-        self._coefficients = moved @ model.inverse
-        poor = seen & (error > POOR * typical)
-        left_out = np.flatnonzero(~seen | poor)
-        if len(left_out):
-            self._leave_out(left_out, poor[left_out], moved)
+        if doubtful:
+            left_out = np.flatnonzero(doubt)
+            self._leave_out(left_out, doubt[left_out] == _POOR)
 
-    def _leave_out(self, left_out: IntArray, poor: NDArray[np.bool_], moved: FloatArray) -> None:
-        """Take markers (S,) out of the field, those that are `poor` (S,) only as far as their errors ask.
-
-        moved : (2, N), px.
-        """
-        whole = self._coefficients
-        self._update = _Update.of(self._model.inverse, left_out, np.zeros(len(left_out)))
-        self._coefficients = whole - self._update.taken(moved)
-        sure = moved.shape[1] - len(left_out)
-        if poor.any() and sure:
-            scale = float((moved * self._coefficients).sum()) / (2 * sure)
-            certainty = np.where(poor, scale / self._variance[left_out], 0.0)
-            self._update = _Update.of(self._model.inverse, left_out, certainty)
-            self._coefficients = whole - self._update.taken(moved)
+    def _leave_out(self, left_out: IntArray, poor: NDArray[np.bool_]) -> None:
+        """Take markers (S,) out of the field, those that are `poor` (S,) only as far as their errors ask."""
+        rows = self._model.inverse[left_out]
+        own, theirs = rows[:, left_out], self._coefficients[:, left_out]
+        # Of few markers; a third of the time of NumPy's, nothing of which is in the caches.
+        _, middle = cv2.invert(own)
+        sure = len(self._seen) - len(left_out)
+        if sure and poor.any():
+            # The variance of the field without all of them is what their own is to be compared with.
+            left = np.vdot(self._moved, self._coefficients) - np.vdot(theirs, theirs @ middle)
+            certainty = np.where(poor, left / (2 * sure) / self._variance[left_out], 0.0)
+            _, middle = cv2.invert(own + np.diag(certainty))
+        self._update = _Update(rows, np.asarray(middle, np.float64) @ rows)
+        self._coefficients = self._coefficients - theirs @ self._update.lost
 
     @cached_property
     def displacement(self) -> FloatArray:
@@ -305,27 +294,19 @@ class DisplacementField:
         mask : (H, W) uint8, 0 or 255 inside, in the current frame: what counts is where the gel is now.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
-        check_mask(mask, 0)
-        box = cv2.boundingRect(mask)
-        step = 1 if box[2] * box[3] < MANY * self.grid.spacing**2 else 2
-        cells = self._cells(mask, box, step)
+        cells = self._cells(mask, MANY * self.grid.spacing**2)
         if cells is None:
             return None
-        model, spacing = self._model, step * self.grid.spacing
-        over_cells, over_markers = np.zeros(17), np.zeros(9)
-        weights, (kernel, counts) = np.empty((3, cells.inside.size)), np.zeros((2, 3, len(model.origin)))
+        model, step = self._model, int(cells.window[2])
+        spacing = step * self.grid.spacing
+        sums, weights = np.zeros(26), np.empty((3, cells.inside.size))
+        kernel, counts = np.zeros((2, 3, len(model.origin)))
+        between = model.between[step]
         sum_region(
-            cells.inside,
-            cells.moved,
-            model.to_markers,
-            cells.window,
-            spacing,
-            model.between[step],
-            over_cells,
-            weights,
-            kernel,
+            cells.inside, cells.moved, model.to_markers, cells.window, spacing, between, sums, weights, kernel
         )
-        if over_cells[0] == 0:
+        numbers = sums.tolist()
+        if numbers[0] == 0:
             return None
         update = self._update or _Update(model.inverse[:0], model.inverse[:0])
         sum_markers(
@@ -336,43 +317,43 @@ class DisplacementField:
             self._precision,
             self._variance,
             counts,
-            over_markers,
+            sums,
         )
-        return _motion(over_cells.tolist(), over_markers.tolist(), spacing)
+        return _motion(sums.tolist(), spacing)
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
         """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
-        check_mask(mask, 0)
-        cells = self._cells(mask, cv2.boundingRect(mask), step=1)
+        cells = self._cells(mask, math.inf)
         total = 0.0 if cells is None else float(cells.inside.sum())
         if cells is None or total == 0:
             return None
-        top, left = cells.window[:2].tolist()
-        return Part(cells.inside.reshape(cells.shape), total, (top, left))
+        top, left, _, rows, columns = cells.window.tolist()
+        return Part(cells.inside.reshape(rows, columns), total, (top, left))
 
-    def _cells(self, mask: NDArray[np.uint8], box: Sequence[int], step: int) -> _Cells | None:
-        """Every so many cells around a region. box : (left, top, width, height) of the region."""
-        left, top, width, height = box
+    def _cells(self, mask: NDArray[np.uint8], many: float) -> _Cells | None:
+        """The cells around a region; of a region in a box of `many` px^2 every other one."""
+        check_mask(mask, 0)
+        left, top, width, height = cv2.boundingRect(mask)
         if width == 0:
             return None
-        model, grid = self._model, self.grid
-        least, most = self._farthest
-        margin = OVERSHOOT * model.pitch + grid.spacing
-        low = (left - most[0] - margin, top - most[1] - margin)
-        high = (left + width - least[0] + margin, top + height - least[1] + margin)
-        down, across = grid.window(low, high)
-        shape = len(range(down.start, down.stop, step)), len(range(across.start, across.stop, step))
-        if 0 in shape:
-            return None
-        spacing = step * grid.spacing
-        side = 2 * round((spacing - 1) / 2) + 1
-        x = grid.first[0] + grid.spacing * across.start - left
-        y = grid.first[1] + grid.spacing * down.start - top
-        place, window = np.array([x, y, spacing]), np.array([down.start, across.start, step, shape[1], side])
-        inside, moved = np.empty(shape[0] * shape[1]), np.empty((shape[0] * shape[1], 2))
-        covered = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
-        sample_region(covered, model.to_markers, self._coefficients, place, window, inside, moved)
-        return _Cells(shape, window, inside, moved)
+        model, (rows, columns) = self._model, self.grid.shape
+        window = np.empty(5, np.int64)
+        inside, moved = np.empty(rows * columns), np.empty((rows * columns, 2))
+        sample_region(
+            np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32),
+            left,
+            top,
+            model.place,
+            many,
+            self._moved,
+            model.to_markers,
+            self._coefficients,
+            window,
+            inside,
+            moved,
+        )
+        count = int(window[3] * window[4])
+        return _Cells(window, inside[:count], moved[:count]) if count else None
 
     @cached_property
     def _precision(self) -> FloatArray:
@@ -402,12 +383,8 @@ class Part(NamedTuple):
 
 
 class _Cells(NamedTuple):
-    """Cells around a region, as `sample_region` sees them.
+    """Cells around a region: window, inside and moved as `sample_region` fills them."""
 
-    shape : rows and columns. window, inside, moved : as there.
-    """
-
-    shape: tuple[int, int]
     window: NDArray[np.int64]
     inside: FloatArray
     moved: FloatArray
@@ -445,13 +422,13 @@ def _inverse(
     return (yy / determinant, -xy / determinant), (-xy / determinant, xx / determinant)
 
 
-def _motion(over_cells: list[float], over_markers: list[float], spacing: float) -> GelMotion:
-    """The motion of a region from sums over its cells, and over the markers, see `region`.
+def _motion(sums: list[float], spacing: float) -> GelMotion:
+    """The motion of a region from sums over its cells, and over the markers, see `loops`.
 
     spacing : of the cells, px.
     """
-    cells, u, v, xx, xy, yy, xu, xv, yu, yv, squares, at_x, at_y, *prior = over_cells
-    scale, told, noise = over_markers[0], over_markers[1:5], over_markers[5:]
+    cells, u, v, xx, xy, yy, xu, xv, yu, yv, squares, at_x, at_y = sums[:13]
+    prior, scale, told, noise = sums[13:17], sums[17], sums[18:22], sums[22:]
     left = max(prior[0] - told[0], 0.0)
     # An outline that is d too far out at s adds (m(s) - mean) d ds / area. Across it, the share of a cell
     # falls from 1 to 0 within its width: share (1 - share) is 1 / 6 for a whole side.

@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 _ROUNDING: Final = 1e-9
 """Added to a disc's radius, and to half the width of its rows, px, before they are cut to whole pixels: a
 whole number keeps its value where it was rounded down. Chosen by hand."""
+_LARGEST: Final = 2**15 - 1
+"""Side of a picture in which OpenCV looks up places, px, less than this. Given by OpenCV."""
+
+_X_AND_Y: Final[Any] = None
+"""What tells OpenCV that x and y come in one array."""
 
 
 def check_mask(mask: NDArray[np.uint8], dilate: float) -> None:
@@ -38,16 +43,15 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
     array([ True,  True, False])
     """
     check_mask(mask, dilate)
-    inside = np.zeros(len(points), np.bool_)
     if len(points) == 0 or mask.size == 0:
-        return inside
+        return np.zeros(len(points), np.bool_)
     reach = math.floor(dilate + _ROUNDING)
-    if reach == 0:
-        x, y = np.rint(points).T
-        height, width = mask.shape
-        seen = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
-        inside[seen] = mask[y[seen].astype(np.intp), x[seen].astype(np.intp)]
-        return inside
+    if reach == 0 and max(mask.shape) < _LARGEST:
+        # Whole numbers stay what they are in float32, and those that are no place in a picture are outside.
+        pixels = np.rint(points).astype(np.float32)[:, None]
+        found = cv2.remap(mask, pixels, _X_AND_Y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        return np.asarray(found[:, 0], np.bool_)
+    inside = np.zeros(len(points), np.bool_)
     left, top, width, height = cv2.boundingRect(mask)
     if width == 0:
         return inside

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.flow.loops import rate_motion
 from tactflow.vision.markers.family import LONGEST_LINK, pitch_of
 from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.types import Markers, MarkerStatus
@@ -41,8 +41,7 @@ where the region then overlaps the true one by 0.3 to 0.7 (IoU, medians), and le
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """What the markers say of one frame.
 
     moving : whether neighbouring markers have moved in a way that no motion of the whole gel explains.
@@ -153,20 +152,19 @@ class MotionTest:
             if number >= TOGETHER:
                 moved = markers.position[tracked].T - self._origin[:, tracked]
                 left[tracked] = _unexplained(moved, self._arms[:, tracked])
-        remembered = self._relaxation * self._strongest
-        bound = self._limit * np.sqrt(markers.stderr * markers.stderr + self._variance)
-        largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
+        limits = np.array([self._limit, self._variance, self._relaxation * self._strongest])
+        rated, found = np.empty((4, len(left))), np.empty(2)
+        stderr = np.ascontiguousarray(markers.stderr, np.float64)
+        rate_motion(left, stderr, self._links, limits, rated, found)
+        largest, chain = found.tolist()
         self._lasted = min(self._lasted + 1, LASTING) if self._moving else 1
         alone = ALONE if largest < FADES * self._largest else ALONE / math.sqrt(self._lasted)
         self._largest = largest
-        far = np.maximum(alone * (STAY if self._clearly else 1.0) * bound, remembered)
-        # Comparing with an unknown standard error, which is NaN, gives False. What is beyond the far bound is
-        # beyond the near one as well.
-        self._clearly = self._together(left > far)
-        near = np.maximum(STAY * bound if self._moving else bound, remembered)
-        self._moving = self._clearly or self._together(left > near)
+        # What is beyond the far bound is beyond the near one as well.
+        self._clearly = chain > alone * (STAY if self._clearly else 1.0)
+        self._moving = self._clearly or chain > (STAY if self._moving else 1.0)
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
-        return Motion(self._moving, self._clearly, largest, left, bound)
+        return Motion(self._moving, self._clearly, largest, left, rated[0])
 
     def stretched(self, markers: Markers) -> FloatArray:
         """Positions (K, 2), px, of the markers at the most strained links between tracked ones.
@@ -179,14 +177,6 @@ class MotionTest:
         strain = np.hypot(*(moved[self._one] - moved[self._other]).T) * seen / self._lengths
         most = self._links[seen & (strain >= STRETCHED * strain.max(initial=0.0))]
         return np.asarray(markers.position[np.unique(most)], np.float64)
-
-    def _together(self, moved: NDArray[np.bool_]) -> bool:
-        """Whether some of the markers that moved are a chain of three neighbours."""
-        if not moved.any():
-            return False
-        pair = moved[self._one] & moved[self._other]
-        beside = np.bincount(self._links[pair].ravel())
-        return bool(beside.max(initial=0) >= TOGETHER - 1)
 
 
 def _unexplained(moved: FloatArray, arms: FloatArray) -> FloatArray:

@@ -93,7 +93,6 @@ def measure_region(mask: NDArray[np.uint8], found: Whole) -> None:
         number = first = second = np.int64(0)
         for x in range(width):
             columns[x] |= row[x]
-        for x in range(width):
             number += 1 if row[x] != 0 else 0
             first += x if row[x] != 0 else 0
             second += squares[x] if row[x] != 0 else 0

@@ -1,4 +1,4 @@
-"""Plain versions of the kernels of the displacement field."""
+"""Plain versions of the kernels of the displacement field and of the motion of markers."""
 
 from __future__ import annotations
 
@@ -7,34 +7,91 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.flow.region import sample_region, sum_markers, sum_region
+from tactflow.vision.flow.loops import rate_motion, sample_region, sum_markers, sum_region, weigh_markers
 from tests.oracles.gains import Gain
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
+def plain_rate_motion(
+    left: FloatArray,
+    stderr: FloatArray,
+    links: IntArray,
+    limits: FloatArray,
+    rated: FloatArray,
+    found: FloatArray,
+) -> None:
+    """Each marker's neighbours in order: one that has two of its own rank is the middle of three."""
+    deviations, variance, rest = limits.tolist()
+    bound = deviations * np.sqrt(stderr**2 + variance)
+    ratio = np.nan_to_num(np.where(left > rest, left / bound, 0.0))
+    rated[:2], rated[2:] = (bound, ratio), 0.0
+    for marker in range(len(left)):
+        beside = np.concatenate([links[links[:, 0] == marker, 1], links[links[:, 1] == marker, 0]])
+        largest = np.sort(ratio[beside])[::-1][:2]
+        rated[2 : 2 + len(largest), marker] = largest
+    found[0] = np.sort(left)[-3] if len(left) >= 3 else 0.0
+    found[1] = np.minimum(ratio, rated[3]).max(initial=0.0)
+
+
+def plain_weigh_markers(
+    position: FloatArray,
+    rest: FloatArray,
+    seen: NDArray[np.bool_],
+    stderr: FloatArray,
+    usual: float,
+    largest: float,
+    inverse: FloatArray,
+    moved: FloatArray,
+    variance: FloatArray,
+    doubt: NDArray[np.uint8],
+    coefficients: FloatArray,
+) -> int:
+    """A product of matrices."""
+    moved[:] = np.where(seen, position.T - rest, 0.0)
+    error = np.where(seen & np.isfinite(stderr), stderr, usual)
+    variance[:] = error**2
+    doubt[:] = np.where(seen, error > largest, 2)
+    coefficients[:] = moved @ inverse
+    return int(np.count_nonzero(doubt))
+
+
 def plain_sample_region(
     covered: NDArray[np.int32],
+    left: int,
+    top: int,
+    place: FloatArray,
+    many: float,
+    travelled: FloatArray,
     to_markers: FloatArray,
     coefficients: FloatArray,
-    place: FloatArray,
     window: IntArray,
     inside: FloatArray,
     moved: FloatArray,
 ) -> None:
     """Each cell's motion as a product, and its share by sums over squares, interpolated between pixels."""
-    columns, side = window[3:].tolist()
-    kernel = _of_window(to_markers, window, len(inside) // columns)
-    moved[:] = kernel @ coefficients.T
+    size = np.array(covered.shape) - 1
+    step = 1 if size.prod() < many else 2
+    spacing, margin, side = place[2], place[3], int(place[3 + step])
+    low = (np.array([top, left]) - place[1::-1] - margin - travelled.max(axis=1)[::-1]) / spacing
+    high = (np.array([top, left]) + size - place[1::-1] + margin - travelled.min(axis=1)[::-1]) / spacing
+    begin, end = (np.clip(bound, 0, to_markers.shape[:2]) for bound in (np.floor(low), np.ceil(high) + 1))
+    window[:3] = *begin, step
+    window[3:] = np.ceil((end - begin) / step)
+    rows, columns = window[3:].tolist()
+    kernel = _of_window(to_markers, window, rows)
+    count = rows * columns
+    moved[:count] = kernel @ coefficients.T
     # Around the region there is nothing. Sums over the squares at each pixel of this.
     total = np.pad(covered.astype(np.int64), side + 1, "edge")
     total[: side + 1], total[:, : side + 1] = 0, 0
     boxes = total[side:, side:] - total[side:, :-side] - total[:-side, side:] + total[:-side, :-side]
-    down, across = np.divmod(np.arange(len(inside)), columns)
-    x = place[0] + place[2] * across + moved[:, 0] + (1 - side) / 2 + side + 1
-    y = place[1] + place[2] * down + moved[:, 1] + (1 - side) / 2 + side + 1
-    inside[:] = 0
+    down, across = np.divmod(np.arange(count), columns)
+    corner = place[:2] + spacing * begin[::-1] - (left, top)
+    x = corner[0] + step * spacing * across + moved[:count, 0] + (1 - side) / 2 + side + 1
+    y = corner[1] + step * spacing * down + moved[:count, 1] + (1 - side) / 2 + side + 1
+    inside[:count] = 0
     here = np.flatnonzero((x >= 0) & (y >= 0) & (x < boxes.shape[1] - 1) & (y < boxes.shape[0] - 1))
     column, row = x[here].astype(int), y[here].astype(int)
     right, below = x[here] - column, y[here] - row
@@ -45,7 +102,7 @@ def plain_sample_region(
 
 def _of_window(to_markers: FloatArray, window: IntArray, rows: int) -> FloatArray:
     """(n, N), kernel between the cells of a window and the markers."""
-    top, left, step, columns = window[:4].tolist()
+    top, left, step, _, columns = window.tolist()
     chosen: Any = to_markers[top : top + step * rows : step, left : left + step * columns : step]
     return np.asarray(chosen.reshape(rows * columns, -1))
 
@@ -62,8 +119,7 @@ def plain_sum_region(
     to_region: FloatArray,
 ) -> None:
     """Means and second moments as matrix products; the whole matrix of the kernel between all cells."""
-    columns = int(window[3])
-    rows = len(inside) // columns
+    rows, columns = window[3:].tolist()
     share = inside / inside.sum()
     down, across = np.divmod(np.arange(len(inside)), columns)
     points = spacing * np.column_stack([across, down])
@@ -78,7 +134,7 @@ def plain_sum_region(
     sums[11:13] = (inside * (1 - inside)) @ (rest * rest)
     kernel = table[abs(down[:, None] - down), table.shape[1] // 2 + across[:, None] - across]
     common = weights @ kernel @ weights.T
-    sums[13:] = common[0, 0], common[1, 1], common[1, 2], common[2, 2]
+    sums[13:17] = common[0, 0], common[1, 1], common[1, 2], common[2, 2]
     to_region[:] = weights @ _of_window(to_markers, window, rows)
 
 
@@ -96,13 +152,15 @@ def plain_sum_markers(
     """Matrix products."""
     weights[:] = to_region @ (inverse - rows.T @ lost)
     near = to_region[0] * (precision > 0)
-    sums[0] = near @ (precision * (coefficients**2).sum(axis=0)) / max(near.sum(), 1e-12)
-    for first, other in ((1, to_region), (5, weights * variance)):
+    sums[17] = near @ (precision * (coefficients**2).sum(axis=0)) / max(near.sum(), 1e-12)
+    for first, other in ((18, to_region), (22, weights * variance)):
         form = weights @ other.T
         sums[first : first + 4] = form[0, 0], form[1, 1], form[1, 2], form[2, 2]
 
 
 GAINS = [
+    Gain(rate_motion, plain_rate_motion, tolerance=1e-9),
+    Gain(weigh_markers, plain_weigh_markers, tolerance=1e-9),
     Gain(sample_region, plain_sample_region, tolerance=1e-9),
     Gain(sum_region, plain_sum_region, tolerance=1e-6),
     Gain(sum_markers, plain_sum_markers, tolerance=1e-6),

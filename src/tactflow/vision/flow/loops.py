@@ -1,4 +1,4 @@
-"""Compiled loops of `displacement_field`: which cells of the gel lie in a region, and sums over them."""
+"""Compiled loops over the markers of a frame, and over the cells of the gel that lie in a region."""
 
 from __future__ import annotations
 
@@ -13,21 +13,109 @@ from tactflow.vision.compiled import helper, kernel
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Sums = NDArray[np.int32]
+BoolArray = NDArray[np.bool_]
 
 _NOWHERE: Final = 1e-12
 """Kernel between a region and all markers, in sum, of a region that is far from each. Chosen by hand."""
 
 
+@kernel("void(float64[::1], float64[::1], int64[:, ::1], float64[::1], float64[:, ::1], float64[::1])")
+def rate_motion(
+    left: FloatArray,
+    stderr: FloatArray,
+    links: IntArray,
+    limits: FloatArray,
+    rated: FloatArray,
+    found: FloatArray,
+) -> None:
+    """How far beyond chance the markers of a chain of three neighbours have moved.
+
+    left : (N,), their motions, px. stderr : (N,), px, NaN where unknown. links : (L, 2), neighbours.
+    limits : (3,): standard deviations that are a motion; variance of markers of an untouched gel, px^2; the
+    motion up to which a marker of a released gel is at rest, px.
+    rated : (4, N), filled: what it takes to be a motion, px; each motion in this unit, 0 where it is at rest
+    or its error unknown; the largest and the second largest of these numbers among a marker's neighbours.
+    found : (2,), filled: the third largest motion, px; the largest number that each marker of a chain
+    reaches.
+    """
+    most = second = third = chain = 0.0
+    for i in range(left.size):
+        third = max(third, min(left[i], second))
+        second = max(second, min(left[i], most))
+        most = max(most, left[i])
+        bound = limits[0] * math.sqrt(stderr[i] * stderr[i] + limits[1])
+        # Nothing is larger than NaN.
+        rated[0, i], rated[1, i] = bound, left[i] / bound if left[i] > limits[2] and bound > 0 else 0.0
+        rated[2, i] = rated[3, i] = 0.0
+    for k in range(len(links)):
+        for end in range(2):
+            i, other = links[k, end], rated[1, links[k, 1 - end]]
+            rated[3, i] = max(rated[3, i], min(other, rated[2, i]))
+            rated[2, i] = max(rated[2, i], other)
+    for i in range(left.size):
+        chain = max(chain, min(rated[1, i], rated[3, i]))
+    found[0], found[1] = third, chain
+
+
 @kernel(
-    "void(int32[:, ::1], float64[:, :, ::1], float64[:, ::1], float64[::1], int64[::1], float64[::1],"
-    " float64[:, ::1])",
+    "int64(float64[:, ::1], float64[:, ::1], boolean[::1], float64[::1], float64, float64, float64[:, ::1],"
+    " float64[:, ::1], float64[::1], uint8[::1], float64[:, ::1])",
+    reorder=True,
+)
+def weigh_markers(
+    position: FloatArray,
+    rest: FloatArray,
+    seen: BoolArray,
+    stderr: FloatArray,
+    usual: float,
+    largest: float,
+    inverse: FloatArray,
+    moved: FloatArray,
+    variance: FloatArray,
+    doubt: NDArray[np.uint8],
+    coefficients: FloatArray,
+) -> int:
+    """The coefficients of a displacement field in which all markers count in full; how many should not.
+
+    position : (N, 2), px. rest : (2, N), in the reference, px. seen : (N,). stderr : (N,), px, NaN or
+    infinite where unknown. usual : what stands for an unknown one, px. largest : of one that is no doubt, px.
+    inverse : (N, N), of the kernel between markers, symmetric.
+    moved : (2, N), filled with the displacements, px, 0 where unseen. variance : (N,), filled with the
+    squares of the standard errors. doubt : (N,), filled: 0 for a marker that counts in full, 1 for one that
+    is seen poorly, 2 for one that is not seen. coefficients : (2, N), filled with moved times the inverse.
+    """
+    doubtful = 0
+    for i in range(seen.size):
+        known = seen[i] and math.isfinite(stderr[i])
+        error = stderr[i] if known else usual
+        variance[i] = error * error
+        doubt[i] = 2 if not seen[i] else 1 if error > largest else 0
+        doubtful += 1 if doubt[i] else 0
+        moved[0, i] = position[i, 0] - rest[0, i] if seen[i] else 0.0
+        moved[1, i] = position[i, 1] - rest[1, i] if seen[i] else 0.0
+    for i in range(seen.size):
+        x = y = 0.0
+        for n in range(seen.size):
+            x += inverse[i, n] * moved[0, n]
+            y += inverse[i, n] * moved[1, n]
+        coefficients[0, i], coefficients[1, i] = x, y
+    return doubtful
+
+
+@kernel(
+    "void(int32[:, ::1], int64, int64, float64[::1], float64, float64[:, ::1], float64[:, :, ::1],"
+    " float64[:, ::1], int64[::1], float64[::1], float64[:, ::1])",
     reorder=True,
 )
 def sample_region(
     covered: Sums,
+    left: int,
+    top: int,
+    place: FloatArray,
+    many: float,
+    travelled: FloatArray,
     to_markers: FloatArray,
     coefficients: FloatArray,
-    place: FloatArray,
     window: IntArray,
     inside: FloatArray,
     moved: FloatArray,
@@ -35,28 +123,44 @@ def sample_region(
     """How cells of a grid have moved, and how much of the surroundings of each is now in a region.
 
     covered : (h + 1, w + 1), sums over the pixels above and to the left in the part of a mask with 255 inside
-    that bounds the region. They may overflow: differences are right.
+    that bounds the region. They may overflow: differences are right. left, top : where that part begins, px.
+    place : (6,), of the grid: x and y of its first cell, the spacing of its cells, how much farther they may
+    have moved than any marker, and the side of the square that counts around each cell, and around every
+    other one, a whole number, px. many : px^2; in a part that is larger, every other cell stands for its
+    neighbours. travelled : (2, N), motion of the markers, px.
     to_markers : (R, C, N), kernel between the grid's cells and the markers. coefficients : (2, N), of the
-    field. place : of the first cell of a window, and the spacing of its cells: x and y from that part's
-    corner, px.
-    window : its first row and column in the grid, every how many cells, its columns, and the side of the
-    square around a cell that counts, px. inside, moved : (n,) and (n, 2), of its cells row by row, filled.
+    field.
+    window : (5,), filled: the first row and column of the cells that may be in the region, every how many
+    they are, and how many rows and columns of them.
+    inside, moved : (R C,) and (R C, 2), their beginning filled for these cells, row by row.
     """
-    columns, side = window[3], window[4]
-    along_x, along_y = coefficients[0], coefficients[1]
-    for k in range(inside.size):
-        i, j = k // columns, k % columns
-        near = to_markers[window[0] + window[2] * i, window[1] + window[2] * j]
+    height, width = covered.shape[0] - 1, covered.shape[1] - 1
+    step = 1 if width * height < many else 2
+    side = int(place[3 + step])
+    window[2] = step
+    for axis in range(len(travelled)):
+        least = most = travelled[1 - axis, 0]
+        for n in range(1, travelled.shape[1]):
+            least, most = min(least, travelled[1 - axis, n]), max(most, travelled[1 - axis, n])
+        low, cells = (left if axis else top) - place[1 - axis], to_markers.shape[axis]
+        begin = math.floor((low - most - place[3]) / place[2])
+        end = math.ceil((low + covered.shape[axis] - 1 - least + place[3]) / place[2]) + 1
+        window[axis] = min(max(begin, 0), cells)
+        window[3 + axis] = (min(max(end, 0), cells) - window[axis] + step - 1) // step
+    first_row, first_column, rows, columns = window[0], window[1], window[3], window[4]
+    for k in range(rows * columns):
+        i, j = first_row + step * (k // columns), first_column + step * (k % columns)
+        near = to_markers[i, j]
         x = y = 0.0
         for n in range(near.size):
-            x += near[n] * along_x[n]
-            y += near[n] * along_y[n]
+            x += near[n] * coefficients[0, n]
+            y += near[n] * coefficients[1, n]
         moved[k, 0], moved[k, 1] = x, y
         # The left and upper end of the square, from the outer corner of the part.
-        x = place[0] + place[2] * j + x + 0.5 - 0.5 * side
-        y = place[1] + place[2] * i + y + 0.5 - 0.5 * side
+        x += place[0] + place[2] * j - left + 0.5 - 0.5 * side
+        y += place[1] + place[2] * i - top + 0.5 - 0.5 * side
         inside[k] = 0.0
-        if -side < x < covered.shape[1] - 1 and -side < y < covered.shape[0] - 1:
+        if -side < x < width and -side < y < height:
             inside[k] = _square(covered, x, y, side) / (255.0 * side * side)
 
 
@@ -101,15 +205,15 @@ def sum_region(
 
     inside, moved, to_markers, window : of `sample_region`. spacing : of the window's cells, px.
     table : (R, 2 C - 1), kernel between cells so many rows and columns apart, the latter from 1 - C on.
-    sums : (17,) of 0, filled. Cells count by their share in the region, in sum 1; a is the way from the
-    region's middle to a cell, m a cell's motion, r what it has beyond the mean. The shares themselves; mean m
-    (x, y); a a' (xx, xy, yy); a r' (xx, xy, yx, yy); r r'; what cells at the outline have of r^2 (x, y); over
-    pairs of cells, the kernel times 1, and times a a' of the two (xx, xy, yy). All are 0 without a cell.
+    sums : (26,) of 0, filled up to the 17th. Cells count by their share in the region, in sum 1; a is the way
+    from the middle to a cell, m its motion, r what that is beyond the mean. The shares; mean m (x, y); a a'
+    (xx, xy, yy); a r' (xx, xy, yx, yy); r r'; what cells at the outline have of r^2 (x, y); over pairs of
+    cells, the kernel times 1, and times a a' of the two (xx, xy, yy). All are 0 without a cell.
     weights : (3, n), filled with the share of each cell, and that times a_x and a_y.
     to_region : (3, N) of 0, filled with the kernel between the region and the markers, times 1, a_x and a_y.
     """
     total = x = y = u = v = 0.0
-    columns = window[3]
+    columns = window[4]
     for k in range(inside.size):
         share = inside[k]
         total += share
@@ -145,7 +249,7 @@ def sum_region(
             to_region[0, n] += share * near[n]
             to_region[1, n] += at_x * near[n]
             to_region[2, n] += at_y * near[n]
-    _sum_pairs(weights, table, columns, sums[13:])
+    _sum_pairs(weights, table, columns, sums[13:17])
 
 
 @helper
@@ -200,8 +304,9 @@ def sum_markers(
     precision : (N,), 1 over twice the variance of each marker given all others, relative to the field's; 0
     for markers that are not seen. variance : (N,), of their own errors, px^2.
     weights : (3, N), filled with to_region times the inverse.
-    sums : (9,) of 0, filled. Variance of the field near the region, px^2; then of 1 and 1, x and x, x and y,
-    y and y: what the markers tell of the variance, relative; what their own errors add to it, px^2.
+    sums : (26,), from the 18th on filled. Variance of the field near the region, px^2; then of 1 and 1, x and
+    x, x and y, y and y: what the markers tell of the variance, relative; what their own errors add to it,
+    px^2.
     """
     count = variance.size
     for i in range(count + len(rows)):
@@ -224,12 +329,12 @@ def sum_markers(
         squares += to_region[0, i] * precision[i] * (x * x + y * y)
         near += to_region[0, i] if precision[i] > 0 else 0.0
         one, x, y = weights[0, i], weights[1, i], weights[2, i]
-        sums[1] += one * to_region[0, i]
-        sums[2] += x * to_region[1, i]
-        sums[3] += x * to_region[2, i]
-        sums[4] += y * to_region[2, i]
-        sums[5] += variance[i] * one * one
-        sums[6] += variance[i] * x * x
-        sums[7] += variance[i] * x * y
-        sums[8] += variance[i] * y * y
-    sums[0] = squares / max(near, _NOWHERE)
+        sums[18] += one * to_region[0, i]
+        sums[19] += x * to_region[1, i]
+        sums[20] += x * to_region[2, i]
+        sums[21] += y * to_region[2, i]
+        sums[22] += variance[i] * one * one
+        sums[23] += variance[i] * x * x
+        sums[24] += variance[i] * x * y
+        sums[25] += variance[i] * y * y
+    sums[17] = squares / max(near, _NOWHERE)
