@@ -8,6 +8,7 @@ than a marker, beside a marker, is what its removal has left.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -84,7 +85,7 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
             return FusedContact(light, None)
         return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        return FusedContact(_without_reflections(light, markers, motion, test.pitch), "both")
+        return FusedContact(_without_strays(light, markers, motion, test.pitch), "both")
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
     light = _without_rims(light, markers)
@@ -99,14 +100,26 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     return len(resting) >= UNMOVED and bool(resting.all())
 
 
-def _without_reflections(light: Mask, markers: Markers, motion: Motion, reach: float) -> Mask:
-    """The regions around which markers move; the same array if these are all, or none.
+def _without_strays(light: Mask, markers: Markers, motion: Motion, reach: float) -> Mask:
+    """Of several regions those that are neither reflections nor rims of markers; none is left out alone.
 
-    Whatever presses the gel moves the markers beside it. reach : how far around a region they are judged, px.
+    reach : how far around a region markers tell what it is, px.
     """
     outlines, _ = cv2.findContours(light, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     if len(outlines) < 2:
         return light
+    moved = _without_reflections(light, outlines, markers, motion, reach)
+    left = _without_rims(moved, markers)
+    return left if cv2.countNonZero(left) else moved
+
+
+def _without_reflections(
+    light: Mask, outlines: Sequence[cv2.typing.MatLike], markers: Markers, motion: Motion, reach: float
+) -> Mask:
+    """The regions around which markers move; the same array if these are all, or none.
+
+    Whatever presses the gel moves the markers beside it. outlines : of the regions.
+    """
     seen = markers.status == _TRACKED
     places, unmoved = markers.position[seen], motion.still(DRAGGED)[seen]
     boxes = np.array([cv2.boundingRect(outline) for outline in outlines], np.float64)[:, None]
