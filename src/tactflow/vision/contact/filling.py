@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.compiled import kernel
+
 Mask = NDArray[np.uint8]
 
 BAY: Final = 2.5
@@ -64,23 +66,42 @@ def outlined(mask: Mask, hidden: Mask | None) -> Mask:
         return _without_holes(mask.copy())
     known = np.asarray(cv2.bitwise_or(mask, hidden), np.uint8)
     found, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    # Smoothing has carried what was painted one pixel further.
-    grown = np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
     filled = np.zeros_like(mask)
     if not found:
         return filled
-    points = np.concatenate(found)[:, 0]
-    seen = grown.ravel().take(points[:, 0] + points[:, 1] * grown.shape[1]) == 0
-    ends = np.cumsum([len(outline) for outline in found])
-    starts = ends - [len(outline) for outline in found]
-    some = np.add.reduceat(seen, starts) > 0
-    outlines = [
-        points[start:end][seen[start:end]]
-        for start, end in zip(starts[some].tolist(), ends[some].tolist(), strict=True)
-    ]
-    if outlines:
-        cv2.fillPoly(filled, outlines, (1.0,))
+    points = np.asarray(np.concatenate(found)[:, 0], np.int32)
+    ends = np.cumsum([0, *map(len, found)], dtype=np.int64)
+    kept = np.empty(len(found), np.int64)
+    keep_seen(hidden, points, ends, kept)
+    spans = zip(ends[:-1].tolist(), kept.tolist(), strict=True)
+    parts = [points[start:end] for start, end in spans if end > start]
+    if parts:
+        cv2.fillPoly(filled, parts, (1.0,))
     return filled
+
+
+@kernel("void(uint8[:, ::1], int32[:, ::1], int64[::1], int64[::1])")
+def keep_seen(
+    hidden: Mask, points: NDArray[np.int32], ends: NDArray[np.int64], kept: NDArray[np.int64]
+) -> None:
+    """Keep those points of outlines that are not hidden, nor beside what is, where smoothing carries paint.
+
+    hidden : (h, w), not 0 where a pixel is not known. points : (n, 2), x and y, one outline after another;
+    those that are kept take the places of the first ones of their outline. ends : (outlines + 1,), 0, and
+    where each outline ends. kept : (outlines,), filled: where what is kept of each ends.
+    """
+    high, wide = hidden.shape
+    for outline in range(kept.size):
+        last = ends[outline]
+        for k in range(ends[outline], ends[outline + 1]):
+            x, y, seen = points[k, 0], points[k, 1], True
+            for row in range(max(y - 1, 0), min(y + 2, high)):
+                for column in range(max(x - 1, 0), min(x + 2, wide)):
+                    seen &= hidden[row, column] == 0
+            if seen:
+                points[last, 0], points[last, 1] = x, y
+                last += 1
+        kept[outline] = last
 
 
 def _without_holes(mask: Mask) -> Mask:
