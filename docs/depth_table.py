@@ -2,6 +2,7 @@
 
 python docs/depth_table.py            simulated contacts under three lights; a minute
 python docs/depth_table.py bound      what is left where the slopes are true, as far as the ball showed them
+python docs/depth_table.py cost       time of a height map, and of its parts; wants a quiet machine
 python docs/depth_table.py FOLDER     wedge_ball, in the folder that has its pictures and labels.csv
 """
 
@@ -29,14 +30,16 @@ from tactflow.bench.depth import (
 )
 from tactflow.bench.pipelines import on_recording
 from tactflow.bench.recordings import stack
+from tactflow.bench.timing import BLOCK, CopyUnit, interleaved
 from tactflow.calibration.photometric import fit_photometry, fit_sphere
 from tactflow.calibration.presses import find_presses
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.sim import open_scene
 from tactflow.vision.depth.poisson import integrate
-from tactflow.vision.depth.slopes import SlopeModel, place_terms
-from tactflow.vision.depth.surface import Rest, Surface, Surroundings, colour_change, surroundings
+from tactflow.vision.depth.slopes import SlopeModel, coordinates
+from tactflow.vision.depth.surface import Rest, Surface, colour_change
+from tactflow.vision.depth.surroundings import Surroundings, surroundings
 from tactflow.vision.geometry import Preprocessor
 
 Values = NDArray[np.float64]
@@ -146,7 +149,7 @@ def integrated(true: Values, around: Surroundings, most: float) -> float:
         cv2.resize((part * cut)[around.window.whole], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         for part in (across, down)
     ]
-    low = integrate(*(np.asarray(slope * 4 * RAW_MM, np.float32) for slope in slopes))
+    low = integrate(np.asarray(slopes, np.float32), (4 * RAW_MM, 4 * RAW_MM))
     low -= np.median(np.concatenate([low[0], low[-1], low[:, 0], low[:, -1]]))
     found = np.zeros(true.shape)
     rows, columns = around.window.whole
@@ -155,6 +158,71 @@ def integrated(true: Values, around: Surroundings, most: float) -> float:
     )
     sunk = true > 0.02 * true.max()
     return 100 * float(np.sqrt(np.mean((found - true)[sunk] ** 2)) / true.max())
+
+
+def cost() -> None:
+    """Print what a height map costs: copies of a raw frame in the median, and the parts of that time, %.
+
+    Of each scene the contacts at their deepest, each one 20 times in a row, as frames follow each other.
+    """
+    known = learn("ball?frames=600")
+    surface = Surface(known.model, scale(), known.found.errors())
+    preprocess = Preprocessor((800, 600), rotate=90, downsample=2)
+    unit = CopyUnit()
+    parts = {"all": Contact.depth, "where": Contact.where, "colour": Contact.colour}
+    parts |= {"slopes": Contact.slopes, "heights": Contact.heights}
+    for name in SCENES:
+        scene = open_scene(f"{name}?seed={SEEDS[0]}")
+        rest = Rest(scene.truth(0, preprocess).unmarked)
+        contacts = []
+        for index in deepest(scene)[:CONTACTS]:
+            truth = scene.truth(index, preprocess)
+            mask: NDArray[np.uint8] = np.uint8(255) * truth.contact_mask
+            contacts.append(Contact(surface, known.model, rest, noisy(truth.unmarked, index), mask))
+        unit.take(BLOCK)
+        times = interleaved(parts, [(name, contact) for contact in contacts for _ in range(BLOCK)])
+        ms = {part: 1e3 * float(np.median(found[name].cpu)) for part, found in times.items()}
+        size = " x ".join(str(side) for side in np.median([c.size for c in contacts], axis=0).astype(int))
+        shares = " | ".join(f"{100 * ms[part] / ms['all']:.0f}" for part in list(parts)[1:])
+        print(f"| {name} | {size} | {ms['all'] / unit.copy_ms:.1f} | {shares} |", flush=True)
+    print(f"a copy: {unit.copy_ms:.3f} ms")
+
+
+class Contact:
+    """What the height map of a contact is made of, step by step."""
+
+    def __init__(
+        self,
+        surface: Surface,
+        model: SlopeModel,
+        rest: Rest,
+        image: NDArray[np.uint8],
+        mask: NDArray[np.uint8],
+    ) -> None:
+        self._surface, self._model = surface, model
+        self._rest, self._image, self._mask = rest, image, mask
+        self._around = surroundings(mask, rest.window)
+        window = self._around.window
+        self.size = window.width, window.height
+        x, y = coordinates((rest.window.width, rest.window.height))
+        self._places = x[window.part[1]], y[window.part[0]]
+        self._change = colour_change(image, rest, window)
+        self._slope = self.slopes()
+
+    def depth(self) -> object:
+        return self._surface.depth(self._image, self._rest, self._mask)
+
+    def where(self) -> object:
+        return surroundings(self._mask, self._rest.window)
+
+    def colour(self) -> object:
+        return colour_change(self._image, self._rest, self._around.window)
+
+    def slopes(self) -> NDArray[np.float32]:
+        return self._model.slopes(self._change, *self._places, self._around.near)
+
+    def heights(self) -> object:
+        return integrate(self._slope, (-0.1, -0.1))
 
 
 class Ball:
@@ -198,10 +266,12 @@ class Ball:
         press, middle = self.session.presses[index], self.all.centers[index]
         label = self.labels[press.seq - 1]
         around = surroundings(press.mask, self.rest.window)
-        place = place_terms((self.rest.window.right, self.rest.window.bottom))[
-            (slice(None), *around.window.part)
-        ]
-        normal = model.normals(colour_change(press.image, self.rest, around.window), place)
+        x, y = coordinates((self.rest.window.right, self.rest.window.bottom))
+        rows, columns = around.window.part
+        change = colour_change(press.image, self.rest, around.window)
+        everywhere = np.ones(change.shape[:2], np.uint8)
+        slope = model.slopes(change, x[columns], y[rows], everywhere)
+        normal = slope / np.sqrt(1 + (slope**2).sum(axis=0))
         heights = Surface(model, WEDGE_SCALE).heights(press.image, self.rest, around)
         rows, columns = np.mgrid[around.window.part]
         points = np.stack([2 * columns + 0.5, 2 * rows + 0.5], axis=-1)
@@ -239,6 +309,8 @@ if __name__ == "__main__":
     cv2.setNumThreads(1)
     if sys.argv[1:] == ["bound"]:
         bound()
+    elif sys.argv[1:] == ["cost"]:
+        cost()
     elif len(sys.argv) > 1:
         Ball(Path(sys.argv[1])).print()
     else:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,8 +44,9 @@ def change_of(picture: Float, inside: Mask) -> WindowChange:
 def plain_border_level(
     parts: Float,
     nearest: NDArray[np.int32],
-    marks: Float,
-    starts: NDArray[np.int32],
+    points: NDArray[np.int32],
+    ends: NDArray[np.int32],
+    steps: NDArray[np.int32],
     strength: Float,
     hidden: Mask,
     middle: float,
@@ -50,6 +54,11 @@ def plain_border_level(
     level: Float,
 ) -> None:
     """Histograms of the depth over all pixels at once, smoothed along each outline by a convolution."""
+    marks = np.zeros(parts.shape, np.float32)
+    for (begin, end), (first, last) in zip(pairwise(ends.tolist()), pairwise(steps.tolist()), strict=True):
+        x, y = points[begin:end].T
+        marks[y, x] = 1 + first + np.arange(end - begin) * ((last - first) / (end - begin))
+    marks = np.asarray(cv2.dilate(marks, np.ones((3, 3), np.uint8)), np.float32)
     place = np.zeros(parts.size + 1, np.float32)
     beside = (parts <= 0) & (marks > 0)
     place[nearest[beside]] = marks[beside]
@@ -64,7 +73,7 @@ def plain_border_level(
     whole = _border_depth(bins[-1], MIN_BIN_PIXELS, middle, 0.5)
     offsets = np.arange(1 - STEPS, STEPS)
     borders, weights = [], []
-    for first, last in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+    for first, last in pairwise(steps.tolist()):
         varies = VARIES * min((last - first) / (STEPS * FEWEST_ARCS), LEANS)
         own = bins[first:last]
         for k in range(last - first):

@@ -27,14 +27,8 @@ from tactflow.calibration.file import PhotometricEntry
 from tactflow.calibration.presses import Press, Session
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel, colour_terms, place_terms
-from tactflow.vision.depth.surface import (
-    FADE,
-    Rest,
-    Surface,
-    Window,
-    colour_change,
-    surroundings,
-)
+from tactflow.vision.depth.surface import Rest, Surface, colour_change
+from tactflow.vision.depth.surroundings import Window, surroundings
 from tactflow.vision.types import Scale
 
 Double = NDArray[np.float64]
@@ -77,8 +71,9 @@ FEWEST_PIXELS: Final = 12
 """Pixels at half resolution inside a contact that a sphere can be fitted to. Chosen by hand."""
 EDGE: Final = 0.1
 """Half the width of the ring that counts as the rim of a contact, relative to its radius. Chosen by hand."""
-EVERY: Final = 9
-"""Of the pixels around the contact every ninth will do: the others cost time and tell the same."""
+RIM: Final = 6
+"""Pixels at half resolution along the border of a press's window that roundness is not asked of. Chosen by
+hand."""
 
 
 class _Sample(NamedTuple):
@@ -208,8 +203,8 @@ def _prepare(
     x = (2.0 * columns + 0.5 - scale.origin[0]) * scale.x
     y = (2.0 * rows + 0.5 - scale.origin[1]) * scale.y
     hidden = _halved(press.hidden, window)
-    inner = np.zeros(change.shape[1:], np.bool_)
-    inner[FADE:-FADE, FADE:-FADE] = True
+    inner = np.zeros(change.shape[:2], np.bool_)
+    inner[RIM:-RIM, RIM:-RIM] = True
     reach = min(INNER * press.radius * (scale.x * scale.y) ** 0.5, INNER * ball_radius)
     start = np.array(scale.point(press.center))
     return _Sample(
@@ -258,8 +253,8 @@ def _solve(presses: list[tuple[_Sample, Double]], ball_radius: float) -> tuple[D
         terms = np.column_stack([sample.terms[ball], np.ones(np.count_nonzero(ball), np.float32)])
         inside += terms.T @ terms
         aim += np.stack([dx[ball], dy[ball]]) / ball_radius @ terms
-        outer = np.flatnonzero(seen & ~ball & sample.inner)[::EVERY]
-        around += EVERY * _roundness(sample.terms[outer], dx[outer], dy[outer], distance[outer])
+        outer = np.flatnonzero(seen & ~ball & sample.inner)
+        around += _roundness(sample.terms[outer], dx[outer], dy[outer], distance[outer])
     matrix = np.kron(np.eye(2), inside)
     free = np.flatnonzero(np.arange(2 * count + 2) % (count + 1) < count)
     matrix[np.ix_(free, free)] += ROUND * around
@@ -355,11 +350,11 @@ def try_photometry(session: Session, model: SlopeModel, scale: Scale, ball_radiu
 
 
 def _heights(surface: Surface, press: Press, rest: Rest, window: Window) -> NDArray[np.float32]:
-    """(h, w): heights in a window, as a run finds them in its own, larger one."""
+    """(h, w): heights in a window, as a run finds them in its own, larger one; at rest beyond that."""
     around = surroundings(press.mask, rest.window)
-    top, left = window.top - around.window.top, window.left - around.window.left
-    rows, columns = window.bottom - window.top, window.right - window.left
-    return surface.heights(press.image, rest, around)[top : top + rows, left : left + columns]
+    whole = np.zeros((rest.window.height, rest.window.width), np.float32)
+    whole[around.window.part] = surface.heights(press.image, rest, around)
+    return whole[window.part]
 
 
 def _errors(

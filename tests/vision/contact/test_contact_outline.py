@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.contact import ContactDetector
 from tactflow.vision.contact.contact_outline import contact_level
-from tactflow.vision.contact.filling import fill, outlined
+from tactflow.vision.contact.filling import enclosed, outlined
 from tests.oracles.border import change_of
 
 Float = NDArray[np.float32]
@@ -147,19 +147,19 @@ def test_the_side_that_lights_do_not_reach_belongs_to_the_contact(dim: float) ->
 def test_holes_and_pockets_at_the_border_are_filled_and_bays_are_not() -> None:
     mask = np.zeros((60, 80), np.uint8)
     cv2.circle(mask, (40, 30), 12, 1, 2)
-    assert fill(mask)[30, 40]
+    assert enclosed(mask).filled[30, 40]
     # Two flanks of a cable that crosses the frame: what lies between them belongs to it.
     flanks = np.zeros((60, 80), np.uint8)
     flanks[20:23] = flanks[36:39] = 1
     flanks[22:37, 40] = 1
-    filled = fill(flanks)
+    filled = enclosed(flanks).filled
     assert filled[20:39].all()
     assert not filled[:20].any()
     assert not filled[39:].any()
     # A hook is open to the outside.
     hook = np.zeros((60, 80), np.uint8)
     hook[10:50, 10:13] = hook[10:13, 10:60] = hook[47:50, 10:60] = 1
-    assert np.array_equal(fill(hook), hook)
+    assert np.array_equal(enclosed(hook).filled, hook)
 
 
 @pytest.mark.parametrize("density", [0.3, 0.5, 0.6])

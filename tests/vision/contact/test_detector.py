@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tactflow.sim import open_scene
 from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
 from tactflow.vision.contact import detector as contact
-from tactflow.vision.contact.filling import is_solid
+from tactflow.vision.contact.filling import is_solid, traced
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import find_dot, marker_mask
@@ -582,8 +582,8 @@ def test_real_presses_of_a_ball_are_all_found_where_the_labels_say(shared_data: 
 
 def test_a_region_with_a_neck_of_one_pixel_is_not_solid() -> None:
     region = np.array([[0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1], [0, 0, 1, 1]], np.uint8)
-    assert not is_solid(region)
-    assert is_solid(np.ones((4, 4), np.uint8))
+    assert not is_solid(traced(region))
+    assert is_solid(traced(np.ones((4, 4), np.uint8)))
 
 
 def test_real_grasps_agree_with_the_force_of_the_grip(shared_data: Path) -> None:

@@ -90,5 +90,13 @@ def test_what_the_removal_of_a_marker_leaves_at_its_rim_is_no_contact() -> None:
     assert (fused.mask == light(125, 100, 140, 110)).all()
 
 
+def test_the_rim_of_a_marker_beside_a_contact_is_no_second_one() -> None:
+    pressed, rim, contact = light(120, 100, 170, 150), light(200, 117, 207, 123), light(190, 105, 215, 130)
+    for seen, kept in ((pressed | rim, pressed), (pressed | contact, pressed | contact), (rim, rim)):
+        fused = fuse_contact(seen, markers(3.0), MotionTest(ORIGIN))
+        assert fused.evidence == "both"
+        assert np.array_equal(fused.mask, kept)
+
+
 def test_a_touch_on_a_marker_that_is_larger_than_it_counts() -> None:
     assert fuse_contact(light(10, 10, 32, 32), markers(), MotionTest(ORIGIN)).evidence == "light"

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.compiled import helper, kernel
-from tactflow.vision.contact.filling import SQUARE
 
 Float = NDArray[np.float32]
 Double = NDArray[np.float64]
@@ -81,37 +80,39 @@ _NOTHING: Final = np.zeros((0, 0), np.uint8)
 
 
 class Depth(NamedTuple):
-    """How deep inside a region each pixel is, and beside which place of its outline; all (h, w).
+    """How deep inside a region each pixel is, and what its outlines pass.
 
-    depth : float32, distance to what is outside, px; 0 there. nearest : int32, label of the nearest pixel
-    outside. marks : float32, at pixels outside, beside the outline: 1 and the place on it, steps; else
-    anything. starts : (outlines + 1,) int32, the first step of each outline, and how many there are.
+    depth : (h, w) float32, distance to what is outside, px; 0 there. nearest : (h, w) int32, label of the
+    nearest pixel outside. points : (n, 2) int32, x and y of the outlines' pixels, one outline after another.
+    ends, steps : (outlines + 1,) int32, 0, and how many points and steps there are up to the end of each
+    outline.
     """
 
     depth: Float
     nearest: Whole
-    marks: Float
-    starts: Whole
+    points: Whole
+    ends: Whole
+    steps: Whole
 
 
 def depth_of(filled: Mask) -> Depth:
-    """Of a region without holes, (h, w) uint8, 0 or 1, with some 0."""
+    """Of a region without holes, (h, w) uint8, 0 or 1, with some of both."""
     depth, nearest = cv2.distanceTransformWithLabels(
         filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     middle = max(float(cv2.minMaxLoc(depth)[1]), 1.0)
-    marks = np.zeros(filled.shape, np.float32)
-    starts = [0]
-    for outline in cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
-        length = len(outline)
-        steps = STEPS * min(max(round(length / middle), FEWEST_ARCS), MOST_ARCS)
-        marks[outline[:, 0, 1], outline[:, 0, 0]] = starts[-1] + 1 + np.arange(length) * (steps / length)
-        starts.append(starts[-1] + steps)
+    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    ends, steps = [0], [0]
+    for outline in outlines:
+        arcs = min(max(round(len(outline) / middle), FEWEST_ARCS), MOST_ARCS)
+        ends.append(ends[-1] + len(outline))
+        steps.append(steps[-1] + STEPS * arcs)
     return Depth(
         np.asarray(depth, np.float32),
         np.asarray(nearest, np.int32),
-        np.asarray(cv2.dilate(marks, SQUARE), np.float32),
-        np.array(starts, np.int32),
+        np.asarray(np.concatenate(outlines)[:, 0], np.int32),
+        np.array(ends, np.int32),
+        np.array(steps, np.int32),
     )
 
 
@@ -126,12 +127,13 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
     border_level(
         parts,
         region.nearest,
-        region.marks,
-        region.starts,
+        region.points,
+        region.ends,
+        region.steps,
         strength,
         _NOTHING if hidden is None else hidden,
         middle,
-        np.zeros((int(region.starts[-1]) + 1, 2, int(middle / BIN) + 2)),
+        np.zeros((int(region.steps[-1]) + 1, 2, int(middle / BIN) + 2)),
         level,
     )
     return level
@@ -183,36 +185,63 @@ def _border_depth(bins: Double, least: int, middle: float, otherwise: float) -> 
 
 
 @helper
-def _step_depths(bins: Double, middle: float, whole: float, border: Double, weight: Double) -> None:
-    """How deep the border lies at each step along one outline.
+def _place_beside(points: Whole, ends: Whole, steps: Whole, nearest: Whole, parts: Float) -> Float:
+    """Label of a pixel outside -> 1 and the place on the outline that it is beside, steps; 0 if none."""
+    high, wide = parts.shape
+    place = np.zeros(parts.size + 1, np.float32)
+    for outline in range(steps.size - 1):
+        first, last = ends[outline], ends[outline + 1]
+        step = (steps[outline + 1] - steps[outline]) / (last - first)
+        for k in range(first, last):
+            mark = np.float32(1 + steps[outline] + (k - first) * step)
+            for y in range(max(points[k, 1] - 1, 0), min(points[k, 1] + 2, high)):
+                for x in range(max(points[k, 0] - 1, 0), min(points[k, 0] + 2, wide)):
+                    if parts[y, x] <= 0:
+                        place[nearest[y, x]] = max(mark, place[nearest[y, x]])
+    return place
 
-    bins : (steps, 2, n), as `border_level` takes them. whole : depth of the whole outline's border.
-    border, weight : (steps,), filled with the depth and the number of pixels that tell it.
+
+@helper
+def _step_depths(bins: Double, steps: Whole, middle: float, whole: float, border: Double) -> None:
+    """How deep the border lies at each step along the outlines, `whole` in the mean.
+
+    bins : as `border_level` fills them. steps : of a `Depth`. border : (steps,), filled.
     """
-    steps, _, size = bins.shape
-    varies = VARIES * min(steps / (STEPS * FEWEST_ARCS), LEANS)
+    size = bins.shape[2]
     around = np.empty((2, size))
-    for step in range(steps):
-        around[:] = 0
-        for beside in range(1 - STEPS, STEPS):
-            share, other = 1 - abs(beside) / STEPS, bins[(step + beside) % steps]
+    sums = weights = 0.0
+    for outline in range(steps.size - 1):
+        first, last = steps[outline], steps[outline + 1]
+        varies = VARIES * min((last - first) / (STEPS * FEWEST_ARCS), LEANS)
+        for step in range(first, last):
             for row in range(2):
                 for at in range(size):
-                    around[row, at] += share * other[row, at]
-        weight[step] = around[0].sum()
-        found = _border_depth(around, MIN_ARC_PIXELS, middle, whole)
-        border[step] = min(max(found, (1 - varies) * whole), (1 + varies) * whole)
+                    around[row, at] = 0
+            for beside in range(1 - STEPS, STEPS):
+                share, other = 1 - abs(beside) / STEPS, first + (step + beside - first) % (last - first)
+                for row in range(2):
+                    for at in range(size):
+                        around[row, at] += share * bins[other, row, at]
+            weight = 0.0
+            for at in range(size):
+                weight += around[0, at]
+            found = _border_depth(around, MIN_ARC_PIXELS, middle, whole)
+            border[step] = min(max(found, (1 - varies) * whole), (1 + varies) * whole)
+            sums, weights = sums + weight * border[step], weights + weight
+    for step in range(border.size):
+        border[step] += whole - sums / max(weights, 1e-9)
 
 
 @kernel(
-    "void(float32[:, ::1], int32[:, ::1], float32[:, ::1], int32[::1], float32[:, ::1], uint8[:, ::1],"
-    " float64, float64[:, :, ::1], float32[:, ::1])"
+    "void(float32[:, ::1], int32[:, ::1], int32[:, ::1], int32[::1], int32[::1], float32[:, ::1],"
+    " uint8[:, ::1], float64, float64[:, :, ::1], float32[:, ::1])"
 )
 def border_level(
     parts: Float,
     nearest: Whole,
-    marks: Float,
-    starts: Whole,
+    points: Whole,
+    ends: Whole,
+    steps: Whole,
     strength: Float,
     hidden: Mask,
     middle: float,
@@ -221,32 +250,26 @@ def border_level(
 ) -> None:
     """What `inside_border` finds; `level` is filled.
 
-    hidden : not 0 where a pixel does not count; (0, 0) if all do. middle : the largest depth.
-    bins : (steps + 1, 2, n), 0, changed: for each step, then for all pixels, the number of pixels and the sum
-    of their strengths in bins of depth.
+    nearest, points, ends, steps : of a `Depth`. hidden : not 0 where a pixel does not count; (0, 0) if all
+    do. middle : the largest depth. bins : (steps + 1, 2, n), 0, changed: for each step, then for all pixels,
+    the number of pixels and the sum of their strengths in bins of depth.
     """
     high, wide = parts.shape
     all_pixels = bins.shape[0] - 1
+    place = _place_beside(points, ends, steps, nearest, parts)
     bins_per_pixel = np.float32(1 / BIN)
-    place = np.zeros(parts.size + 1, np.float32)
-    for y in range(high):
-        for x in range(wide):
-            if parts[y, x] <= 0 and marks[y, x] > 0:
-                place[nearest[y, x]] = marks[y, x]
     for y in range(high):
         for x in range(wide):
             if parts[y, x] > 0 and (hidden.size == 0 or hidden[y, x] == 0):
                 at, step = int(parts[y, x] * bins_per_pixel), int(place[nearest[y, x]]) - 1
-                for row in (step, all_pixels):
-                    if row >= 0:
-                        bins[row, 0, at] += 1
-                        bins[row, 1, at] += strength[y, x]
-    border, weight = np.empty(all_pixels), np.empty(all_pixels)
+                bins[all_pixels, 0, at] += 1
+                bins[all_pixels, 1, at] += strength[y, x]
+                if step >= 0:
+                    bins[step, 0, at] += 1
+                    bins[step, 1, at] += strength[y, x]
     whole = _border_depth(bins[all_pixels], MIN_BIN_PIXELS, middle, 0.5)
-    for k in range(len(starts) - 1):
-        first, last = starts[k], starts[k + 1]
-        _step_depths(bins[first:last], middle, whole, border[first:last], weight[first:last])
-    border += whole - (weight * border).sum() / max(weight.sum(), 1e-9)
+    border = np.empty(all_pixels)
+    _step_depths(bins, steps, middle, whole, border)
     for y in range(high):
         for x in range(wide):
             depth = whole

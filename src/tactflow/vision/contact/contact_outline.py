@@ -26,12 +26,12 @@ from tactflow.vision.contact.border import depth_of, inside_border
 from tactflow.vision.contact.components import STRAY
 from tactflow.vision.contact.filling import (
     SQUARE,
+    Region,
     close_gaps,
-    fill,
+    enclosed,
     fill_bay,
-    fill_pockets,
     is_solid,
-    outlined,
+    traced,
 )
 
 Float = NDArray[np.float32]
@@ -64,7 +64,7 @@ largest change nearby is left. Chosen by hand."""
 
 COARSE: Final = 2
 """Pixels of which one is taken where the largest change nearby is sought, which varies little from one to the
-next: a quarter of the time."""
+next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,19 +143,17 @@ def _largest_nearby(values: Float) -> Float:
     "Around" reaches as far as the radius of a disc of as many pixels as have clearly changed: it holds a side
     of the contact, but not its other end.
     """
-    smooth = cv2.blur(values, (3, 3))
-    peak = max(float(cv2.minMaxLoc(smooth)[1]), 1e-9)
-    radius = math.sqrt(cv2.countNonZero((values > OUTER * peak).view(np.uint8)) / math.pi)
-    reach = round(radius / COARSE)
-    side = 2 * reach + 1
     high, wide = values.shape
     coarse = (-(-wide // COARSE), -(-high // COARSE))
-    largest = cv2.resize(smooth, coarse, interpolation=cv2.INTER_AREA)
+    largest = cv2.resize(cv2.blur(values, (3, 3)), coarse, interpolation=cv2.INTER_AREA)
+    peak = max(float(cv2.minMaxLoc(largest)[1]), 1e-9)
+    radius = math.sqrt(np.count_nonzero(largest > np.float32(OUTER * peak)) / math.pi)
+    reach = round(radius)
+    side = 2 * reach + 1
     largest = cv2.copyMakeBorder(largest, *(reach,) * 4, cv2.BORDER_CONSTANT, value=(0.0,))
     largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
-    largest = largest[reach:, reach:][: coarse[1], : coarse[0]]
-    largest = cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR)
-    return largest.clip(np.float32(FAINT * peak), np.float32(np.inf))
+    largest = np.maximum(largest[reach:, reach:][: coarse[1], : coarse[0]], np.float32(FAINT * peak))
+    return np.asarray(cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
@@ -171,7 +169,7 @@ def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
     if hidden is not None:
         # The change is smooth here: what is painted next to what is seen is nearly right.
         hidden = np.asarray(cv2.erode(hidden, SQUARE), np.uint8)
-    inside = fill_pockets(outlined((level > 0).view(np.uint8), hidden)).view(np.bool_)
+    inside = enclosed((level > 0).view(np.uint8), hidden).filled.view(np.bool_)
     # What is filled in is as deep inside as the middle of a plateau, what is left out as far outside.
     np.clip(level, -0.5, 0.5, out=level)
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
@@ -181,43 +179,49 @@ def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float,
     """`_level` of a contact that shows its slopes."""
     local = strength / _largest_nearby(strength)
     changed = (local > OUTER).view(np.uint8)
-    filled = fill_pockets(outlined(changed, hidden))
-    solid = is_solid(filled)
+    region = enclosed(changed, hidden)
+    solid = is_solid(region)
     if not solid:
-        closed = fill_bay(filled, (local > DIM * OUTER).view(np.uint8))
-        filled, solid = closed, closed is not filled and is_solid(closed)
-    specks = None
+        closed = fill_bay(region, (local > DIM * OUTER).view(np.uint8))
+        region, solid = closed, closed is not region and is_solid(closed)
+    wrinkles = None
     if not solid:
         # A wrinkle or what is left of a marker is no far side of the contact, to which a gap is closed.
-        kept = _without_specks(filled.astype(np.float32), strength)
-        specks, filled = kept < 0, (kept > 0).view(np.uint8)
+        wrinkles = _specks(region, strength)
+        kept = region.filled if wrinkles is None else (region.filled > wrinkles).view(np.uint8)
         ring = changed if hidden is None else changed | hidden
-        ring = np.asarray(cv2.bitwise_and(ring, filled), np.uint8)
+        ring = np.asarray(cv2.bitwise_and(ring, kept), np.uint8)
         reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
-        filled = fill(close_gaps(ring, reach) | filled)
-    if cv2.countNonZero(filled) == filled.size:
+        region = enclosed(close_gaps(ring, reach) | kept)
+    if cv2.countNonZero(region.filled) == region.filled.size:
         return np.ones_like(strength), None
-    region = depth_of(filled)
-    depth = parts = region.depth
-    if specks is not None:
-        parts = _without_specks(depth, strength)
-        if specks.any():
-            parts = np.where(specks & (parts <= 0), np.float32(-1), parts)
-    level = inside_border(region, parts, local, hidden)
-    if parts is depth:
+    inner = depth_of(region.filled)
+    specks = None if solid else _specks(region, strength)
+    if wrinkles is not None:
+        wrinkles &= region.filled == 0
+        specks = wrinkles if specks is None else specks | wrinkles
+    if specks is None:
+        level = inside_border(inner, inner.depth, local, hidden)
         return level if solid else _without_specks(level, strength), None
+    parts = np.where(specks, np.float32(-1), inner.depth)
     away = cv2.distanceTransform((parts <= 0).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    return level, np.asarray((away < parts.max()) & (parts >= 0), np.float32)
+    near = np.asarray((away < parts.max()) & ~specks, np.float32)
+    return inside_border(inner, parts, local, hidden), near
+
+
+def _specks(region: Region, strength: Float) -> NDArray[np.bool_] | None:
+    """(h, w): separate parts of a region that hold little of the clear change; None if there are none."""
+    if len(region.outlines) < 2:
+        return None
+    count, labels = cv2.connectedComponents(region.filled)
+    clear = np.where(strength > FAINT * strength.max(), strength, np.float32(0))
+    squares = np.bincount(labels.ravel(), np.square(clear).ravel(), count)
+    little = squares < STRAY * squares[1:].max()
+    little[0] = False
+    return np.asarray(little[labels], np.bool_) if little.any() else None
 
 
 def _without_specks(level: Float, strength: Float) -> Float:
-    """The level without those separate parts that hold little of the change that is not faint."""
-    inside = (level > 0).view(np.uint8)
-    if len(cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]) < 2:
-        return level
-    count, labels = cv2.connectedComponents(inside)
-    clear = np.where(strength > FAINT * strength.max(), strength, np.float32(0))
-    squares = np.bincount(labels.ravel(), np.square(clear).ravel(), count)
-    specks = squares < STRAY * squares[1:].max()
-    specks[0] = False
-    return np.where(specks[labels], -np.abs(level), level) if specks.any() else level
+    """The level, negative in specks, too."""
+    specks = _specks(traced((level > 0).view(np.uint8)), strength)
+    return level if specks is None else np.where(specks, -np.abs(level), level)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from tactflow.vision.compiled import kernel
 
 Mask = NDArray[np.uint8]
 
@@ -22,18 +25,35 @@ SQUARE: Final = np.ones((3, 3), np.uint8)
 """A pixel and its neighbours."""
 
 
-def fill(mask: Mask) -> Mask:
-    """Fill what a region encloses, alone or together with the border of the frame.
+class Region(NamedTuple):
+    """A region without holes, and its border.
 
-    mask : (h, w) uint8, 0 or 1. Returns the same, fresh.
+    filled : (h, w) uint8, 0 or 1. outlines : of each part of it, (n, 1, 2) int32, x and y of the pixels where
+    it turns, px.
+    """
+
+    filled: Mask
+    outlines: Sequence[NDArray[np.int32]]
+
+
+def traced(filled: Mask) -> Region:
+    """The region of a mask without holes, (h, w) uint8, 0 or 1."""
+    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    return Region(filled, [np.asarray(outline, np.int32) for outline in outlines])
+
+
+def enclosed(mask: Mask, hidden: Mask | None = None) -> Region:
+    """What a mask encloses, alone or together with the border of the frame.
+
+    mask, hidden : as for `outlined`.
 
     >>> import numpy as np
     >>> ring = np.ones((5, 5), np.uint8)
     >>> ring[1:4, 1:4] = 0
-    >>> int(fill(ring).sum())
+    >>> int(enclosed(ring).filled.sum())
     25
     """
-    return fill_pockets(outlined(mask, None))
+    return fill_pockets(traced(outlined(mask, hidden)))
 
 
 def outlined(mask: Mask, hidden: Mask | None) -> Mask:
@@ -46,23 +66,42 @@ def outlined(mask: Mask, hidden: Mask | None) -> Mask:
         return _without_holes(mask.copy())
     known = np.asarray(cv2.bitwise_or(mask, hidden), np.uint8)
     found, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    # Smoothing has carried what was painted one pixel further.
-    grown = np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
     filled = np.zeros_like(mask)
     if not found:
         return filled
-    points = np.concatenate(found)[:, 0]
-    seen = grown.ravel().take(points[:, 0] + points[:, 1] * grown.shape[1]) == 0
-    ends = np.cumsum([len(outline) for outline in found])
-    starts = ends - [len(outline) for outline in found]
-    some = np.add.reduceat(seen, starts) > 0
-    outlines = [
-        points[start:end][seen[start:end]]
-        for start, end in zip(starts[some].tolist(), ends[some].tolist(), strict=True)
-    ]
-    if outlines:
-        cv2.fillPoly(filled, outlines, (1.0,))
+    points = np.asarray(np.concatenate(found)[:, 0], np.int32)
+    ends = np.cumsum([0, *map(len, found)], dtype=np.int64)
+    kept = np.empty(len(found), np.int64)
+    keep_seen(hidden, points, ends, kept)
+    spans = zip(ends[:-1].tolist(), kept.tolist(), strict=True)
+    parts = [points[start:end] for start, end in spans if end > start]
+    if parts:
+        cv2.fillPoly(filled, parts, (1.0,))
     return filled
+
+
+@kernel("void(uint8[:, ::1], int32[:, ::1], int64[::1], int64[::1])")
+def keep_seen(
+    hidden: Mask, points: NDArray[np.int32], ends: NDArray[np.int64], kept: NDArray[np.int64]
+) -> None:
+    """Keep those points of outlines that are not hidden, nor beside what is, where smoothing carries paint.
+
+    hidden : (h, w), not 0 where a pixel is not known. points : (n, 2), x and y, one outline after another;
+    those that are kept take the places of the first ones of their outline. ends : (outlines + 1,), 0, and
+    where each outline ends. kept : (outlines,), filled: where what is kept of each ends.
+    """
+    high, wide = hidden.shape
+    for outline in range(kept.size):
+        last = ends[outline]
+        for k in range(ends[outline], ends[outline + 1]):
+            x, y, seen = points[k, 0], points[k, 1], True
+            for row in range(max(y - 1, 0), min(y + 2, high)):
+                for column in range(max(x - 1, 0), min(x + 2, wide)):
+                    seen &= hidden[row, column] == 0
+            if seen:
+                points[last, 0], points[last, 1] = x, y
+                last += 1
+        kept[outline] = last
 
 
 def _without_holes(mask: Mask) -> Mask:
@@ -76,10 +115,9 @@ def _without_holes(mask: Mask) -> Mask:
     return mask
 
 
-def is_solid(filled: Mask) -> bool:
-    """Whether a region, (h, w) uint8, 0 or 1, is one piece without bays."""
-    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    outlines = [outline for outline in outlines if len(outline) > 3]
+def is_solid(region: Region) -> bool:
+    """Whether a region is one piece without bays."""
+    outlines = [outline for outline in region.outlines if len(outline) > 3]
     if len(outlines) != 1:
         return not outlines
     try:
@@ -91,43 +129,46 @@ def is_solid(filled: Mask) -> bool:
     return bays is None or bool(bays.reshape(-1, 4)[:, 3].max() <= BAY * 256)
 
 
-def fill_bay(filled: Mask, faint: Mask) -> Mask:
+def fill_bay(region: Region, faint: Mask) -> Region:
     """Close a ring that is open on the side that lights hardly reach.
 
     Where a region is one piece, its largest bay is filled with what has changed faintly there, and what that
     encloses. If little of the bay is left then, it was no bay of the object.
 
-    filled, faint : (h, w) uint8, 0 or 1: the region without holes; what has changed, if only faintly. Returns
-    the region, fresh if it has grown.
+    faint : (h, w) uint8, 0 or 1: what has changed, if only faintly. Returns the region itself if it has not
+    grown.
 
     >>> import numpy as np
     >>> ring = np.ones((9, 9), np.uint8)
     >>> ring[3:, 3:6] = 0
     >>> faint = np.zeros_like(ring)
-    >>> int(fill_bay(ring, faint).sum())
+    >>> int(fill_bay(traced(ring), faint).filled.sum())
     63
     >>> faint[8] = 1
-    >>> int(fill_bay(ring, faint).sum())
+    >>> int(fill_bay(traced(ring), faint).filled.sum())
     81
     """
-    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    filled, outlines = region
     if len(outlines) != 1:
-        return filled
-    hull = np.zeros_like(filled)
-    cv2.fillConvexPoly(hull, cv2.convexHull(outlines[0]), (1.0,))
-    bays = np.asarray(cv2.bitwise_xor(hull, filled), np.uint8)
+        return region
+    bays = np.asarray(cv2.bitwise_xor(_hull(region), filled), np.uint8)
     missing = cv2.countNonZero(bays)
-    if (
-        cv2.countNonZero(_without_holes(filled | (faint & bays))) - cv2.countNonZero(filled)
-        <= POCKET * missing
-    ):
-        return filled
+    grown = _without_holes(filled | (faint & bays))
+    if cv2.countNonZero(grown) - cv2.countNonZero(filled) <= POCKET * missing:
+        return region
     borders, _ = cv2.findContours(bays, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     bay = np.zeros_like(filled)
     cv2.drawContours(bay, [max(borders, key=cv2.contourArea)], 0, 1, cv2.FILLED)
-    closed = fill_pockets(_without_holes(filled | (faint & bay)))
-    covered = cv2.countNonZero(np.asarray(cv2.bitwise_and(closed, bay), np.uint8))
-    return closed if covered > POCKET * cv2.countNonZero(bay) else filled
+    closed = enclosed(filled | (faint & bay))
+    covered = cv2.countNonZero(np.asarray(cv2.bitwise_and(closed.filled, bay), np.uint8))
+    return closed if covered > POCKET * cv2.countNonZero(bay) else region
+
+
+def _hull(region: Region) -> Mask:
+    """(h, w) uint8: 1 in the convex hull of a region that is not empty, else 0."""
+    hull = np.zeros_like(region.filled)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(region.outlines)), (1.0,))
+    return hull
 
 
 def close_gaps(mask: Mask, reach: float) -> Mask:
@@ -139,24 +180,21 @@ def close_gaps(mask: Mask, reach: float) -> Mask:
     return (inner > reach).view(np.uint8)
 
 
-def fill_pockets(filled: Mask) -> Mask:
-    """Fill, in place, what a region without holes encloses together with the border of the frame."""
+def fill_pockets(region: Region) -> Region:
+    """Fill, in place, what a region encloses together with the border of the frame."""
+    filled = region.filled
     height, width = filled.shape
-    left, top, wide, high = cv2.boundingRect(filled)
-    if left and top and left + wide < width and top + high < height:
-        return filled
     border = np.concatenate([filled[0], filled[1:, -1], filled[-1, -2::-1], filled[-2:0:-1, 0]])
+    if not border.any():
+        return region
     before = np.concatenate([border[-1:], border[:-1]])
     starts = np.flatnonzero(border < before).tolist()
     if len(starts) < 2:
-        return filled
+        return region
     ends = np.flatnonzero(border > before).tolist()
     if ends[0] < starts[0]:
         ends = [*ends[1:], ends[0] + len(border)]
-    corners, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    hull = np.zeros_like(filled)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(corners)), (1.0,))
-    closed = False
+    hull, closed = _hull(region), False
     for start, end in zip(starts, ends, strict=True):
         seed = _on_border((start + end) // 2 % len(border), width, height)
         if filled[seed[1], seed[0]] or not hull[seed[1], seed[0]]:
@@ -168,8 +206,7 @@ def fill_pockets(filled: Mask) -> Mask:
         if cv2.countNonZero(cv2.bitwise_and(pocket, hull[box])) > POCKET * area:
             filled[box] |= pocket
             closed = True
-    # What was open to both sides of a pocket is now a hole.
-    return _without_holes(filled) if closed else filled
+    return traced(filled) if closed else region
 
 
 def _on_border(index: int, width: int, height: int) -> tuple[int, int]:

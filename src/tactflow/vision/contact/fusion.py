@@ -8,6 +8,7 @@ than a marker, beside a marker, is what its removal has left.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -86,8 +87,9 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
             return FusedContact(light, None)
         return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        outlines = _without_reflections(Outlines.of(light), markers, motion, test.pitch)
-        return FusedContact(outlines.mask, "both", outlines=outlines)
+        outlines = Outlines.of(light)
+        mask = _without_strays(outlines, markers, motion, test.pitch)
+        return FusedContact(mask, "both", outlines=outlines if mask is light else None)
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
     light = _without_rims(light, markers)
@@ -102,14 +104,26 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     return len(resting) >= UNMOVED and bool(resting.all())
 
 
-def _without_reflections(light: Outlines, markers: Markers, motion: Motion, reach: float) -> Outlines:
-    """The regions around which markers move; the same mask if these are all, or none.
+def _without_strays(outlines: Outlines, markers: Markers, motion: Motion, reach: float) -> Mask:
+    """Of several regions those that are neither reflections nor rims of markers; none is left out alone.
 
-    Whatever presses the gel moves the markers beside it. reach : how far around a region they are judged, px.
+    reach : how far around a region markers tell what it is, px.
     """
-    outlines = light.contours
-    if len(outlines) < 2:
+    light = outlines.mask
+    if len(outlines.contours) < 2:
         return light
+    moved = _without_reflections(light, outlines.contours, markers, motion, reach)
+    left = _without_rims(moved, markers)
+    return left if cv2.countNonZero(left) else moved
+
+
+def _without_reflections(
+    light: Mask, outlines: Sequence[cv2.typing.MatLike], markers: Markers, motion: Motion, reach: float
+) -> Mask:
+    """The regions around which markers move; the same array if these are all, or none.
+
+    Whatever presses the gel moves the markers beside it. outlines : of the regions.
+    """
     seen = markers.status == _TRACKED
     places, unmoved = markers.position[seen], motion.still(DRAGGED)[seen]
     boxes = np.array([cv2.boundingRect(outline) for outline in outlines], np.float64)[:, None]
@@ -118,10 +132,9 @@ def _without_reflections(light: Outlines, markers: Markers, motion: Motion, reac
     resting = (np.count_nonzero(beside, axis=1) >= UNMOVED) & ~(beside & ~unmoved).any(axis=1)
     if not resting.any() or resting.all():
         return light
-    kept = light.mask.copy()
-    gone = [outline for outline, rests in zip(outlines, resting, strict=True) if rests]
-    cv2.drawContours(kept, gone, -1, 0, cv2.FILLED)
-    return Outlines(kept, [outline for outline, rests in zip(outlines, resting, strict=True) if not rests])
+    kept = light.copy()
+    cv2.drawContours(kept, [outlines[index] for index in np.flatnonzero(resting).tolist()], -1, 0, cv2.FILLED)
+    return kept
 
 
 def _without_rims(light: Mask, markers: Markers) -> Mask:
