@@ -59,8 +59,8 @@ Noise makes learned slopes too small, most of all those that the ball has hardly
 DARK: Final = 20.0
 """Grey levels: where a channel of a press is darker, its light does not reach the surface, and the slope
 shows in the two others alone. There colours are learned with their noise: what noise leaves open is then
-drawn to the mean, and not taken for a slope. With averages there, too, cables under `dark_channel` have errors
-of 5.6 % instead of 3.8, and those of edges are no smaller; with 12, coins have 19 % instead of 18."""
+drawn to the mean, and not taken for a slope. With averages there, too, cables under `dark_channel` have
+errors of 5.6 % instead of 3.8, and those of edges are no smaller; with 12, coins have 19 % instead of 18."""
 TURNS: Final = 3
 """How often fit and centres take turns; later ones move centres by less than 0.05 px on wedge_ball."""
 STRANGE: Final = 4.0
