@@ -10,15 +10,19 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Touching
 from tactflow.vision.contact.fusion import fuse_contact
 from tactflow.vision.flow.motion import MotionTest
-from tactflow.vision.types import Evidence, Markers
+from tactflow.vision.types import Evidence, Markers, Outlines
 
 
 class FusedPorts(NamedTuple):
-    """contact_mask : 255 in contact. touching : whether anything is. evidence : what showed it."""
+    """contact_mask : 255 in contact. touching : whether anything is. evidence : what showed it.
+
+    outlines : of the contact_mask, where they were needed to tell.
+    """
 
     contact_mask: ContactMask
     touching: Touching
     evidence: Evidence | None
+    outlines: Outlines | None = None
 
 
 class Fusion(Stage):
@@ -86,4 +90,4 @@ class Fusion(Stage):
         self._changed = self._changed + 1 if fused.light_changed else 0
         if self._changed == self.params.patience > 0:
             self.wants_reference = "light_changed"
-        return FusedPorts(fused.mask, fused.touching, fused.evidence)
+        return FusedPorts(fused.mask, fused.touching, fused.evidence, fused.outlines)

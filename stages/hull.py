@@ -13,7 +13,7 @@ from tactflow.ports import ContactMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import moments
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
-from tactflow.vision.types import Contact, Evidence
+from tactflow.vision.types import Contact, Evidence, Outlines
 
 
 class Hull(Stage):
@@ -57,11 +57,15 @@ class Hull(Stage):
         self._params = params
         compiled.load(moments)
 
-    def process(self, contact_mask: ContactMask, evidence: Evidence | None = None) -> Contact | Absent:
+    def process(
+        self, contact_mask: ContactMask, evidence: Evidence | None = None, outlines: Outlines | None = None
+    ) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
         params = self._params
+        if outlines is None or outlines.mask is not contact_mask:
+            outlines = Outlines.of(contact_mask)
         parts = contact_parts(
-            contact_mask,
+            outlines,
             min_area=params.min_area,
             max_gap=params.max_gap or 0.0,
             min_confidence=params.min_confidence,
@@ -73,8 +77,6 @@ class Hull(Stage):
         if len(parts) == 1:
             return contact
         if params.merge == "all" and params.max_gap is None:
-            whole = contact_geometry(
-                contact_mask, min_area=params.min_area, min_confidence=params.min_confidence
-            )
+            whole = contact_geometry(outlines, min_area=params.min_area, min_confidence=params.min_confidence)
             contact = whole or contact
         return replace(contact, evidence=parts[0].evidence, separate=tuple(parts))

@@ -71,28 +71,30 @@ def plain_sample_region(
     moved: FloatArray,
 ) -> None:
     """Each cell's motion as a product, and its share by sums over squares, interpolated between pixels."""
-    size = np.array(covered.shape) - 1
+    height, width = size = np.array(covered.shape) - 1
     step = 1 if size.prod() < many else 2
     spacing, margin, side = place[2], place[3], int(place[3 + step])
-    low = (np.array([top, left]) - place[1::-1] - margin - travelled.max(axis=1)[::-1]) / spacing
-    high = (np.array([top, left]) + size - place[1::-1] + margin - travelled.min(axis=1)[::-1]) / spacing
-    begin, end = (np.clip(bound, 0, to_markers.shape[:2]) for bound in (np.floor(low), np.ceil(high) + 1))
-    window[:3] = *begin, step
-    window[3:] = np.ceil((end - begin) / step)
-    rows, columns = window[3:].tolist()
-    kernel = _of_window(to_markers, window, rows)
+    least, most = travelled.min(axis=1) - margin, travelled.max(axis=1) + margin
+    corner = np.array([left, top]) - place[:2]
+    begin = np.clip(np.floor((corner - most) / spacing), 0, to_markers.shape[1::-1])
+    end = np.clip(np.floor((corner + size[::-1] - least) / spacing) + 2, 0, to_markers.shape[1::-1])
+    columns, rows = np.ceil((end - begin) / step).astype(int).tolist()
+    window[:] = *begin[::-1], step, rows, columns
     count = rows * columns
-    moved[:count] = kernel @ coefficients.T
+    down, across = np.divmod(np.arange(count), columns)
+    at = begin * spacing - corner + step * spacing * np.column_stack([across, down])
+    (first, top), (last, bottom) = (
+        np.clip((at + way).astype(int) + more, 0, (width, height)).T for way, more in ((least, 0), (most, 1))
+    )
+    there = covered[bottom, last] - covered[bottom, first] - covered[top, last] + covered[top, first] != 0
+    moved[:count] = _of_window(to_markers, window, rows) @ coefficients.T * there[:, None]
     # Around the region there is nothing. Sums over the squares at each pixel of this.
     total = np.pad(covered.astype(np.int64), side + 1, "edge")
     total[: side + 1], total[:, : side + 1] = 0, 0
     boxes = total[side:, side:] - total[side:, :-side] - total[:-side, side:] + total[:-side, :-side]
-    down, across = np.divmod(np.arange(count), columns)
-    corner = place[:2] + spacing * begin[::-1] - (left, top)
-    x = corner[0] + step * spacing * across + moved[:count, 0] + (1 - side) / 2 + side + 1
-    y = corner[1] + step * spacing * down + moved[:count, 1] + (1 - side) / 2 + side + 1
+    x, y = (at + moved[:count] + (1 - side) / 2 + side + 1).T
     inside[:count] = 0
-    here = np.flatnonzero((x >= 0) & (y >= 0) & (x < boxes.shape[1] - 1) & (y < boxes.shape[0] - 1))
+    here = np.flatnonzero(there & (x >= 0) & (y >= 0) & (x < boxes.shape[1] - 1) & (y < boxes.shape[0] - 1))
     column, row = x[here].astype(int), y[here].astype(int)
     right, below = x[here] - column, y[here] - row
     upper = boxes[row, column] * (1 - right) + boxes[row, column + 1] * right

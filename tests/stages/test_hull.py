@@ -31,6 +31,7 @@ def test_it_takes_a_contact_mask_and_may_give_a_contact() -> None:
     assert [(port.name, port.optional) for port in ports.inputs] == [
         ("contact_mask", False),
         ("evidence", True),
+        ("outlines", True),
     ]
     assert [(port.name, port.optional) for port in ports.outputs] == [("contact", True)]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
-from tactflow.vision.types import Evidence, Markers, MarkerStatus
+from tactflow.vision.types import Evidence, Markers, MarkerStatus, Outlines
 
 Mask = NDArray[np.uint8]
 
@@ -44,11 +44,13 @@ class FusedContact(NamedTuple):
 
     mask : (H, W) uint8, 255 in contact. evidence : what showed it; None where nothing touches.
     light_changed : whether there is a change of the light that is no contact.
+    outlines : of the mask; None where they were not needed.
     """
 
     mask: Mask
     evidence: Evidence | None
     light_changed: bool = False
+    outlines: Outlines | None = None
 
     @property
     def touching(self) -> bool:
@@ -85,7 +87,9 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
             return FusedContact(light, None)
         return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        return FusedContact(_without_strays(light, markers, motion, test.pitch), "both")
+        outlines = Outlines.of(light)
+        mask = _without_strays(outlines, markers, motion, test.pitch)
+        return FusedContact(mask, "both", outlines=outlines if mask is light else None)
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
     light = _without_rims(light, markers)
@@ -100,15 +104,15 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     return len(resting) >= UNMOVED and bool(resting.all())
 
 
-def _without_strays(light: Mask, markers: Markers, motion: Motion, reach: float) -> Mask:
+def _without_strays(outlines: Outlines, markers: Markers, motion: Motion, reach: float) -> Mask:
     """Of several regions those that are neither reflections nor rims of markers; none is left out alone.
 
     reach : how far around a region markers tell what it is, px.
     """
-    outlines, _ = cv2.findContours(light, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    if len(outlines) < 2:
+    light = outlines.mask
+    if len(outlines.contours) < 2:
         return light
-    moved = _without_reflections(light, outlines, markers, motion, reach)
+    moved = _without_reflections(light, outlines.contours, markers, motion, reach)
     left = _without_rims(moved, markers)
     return left if cv2.countNonZero(left) else moved
 

@@ -48,7 +48,8 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
     reach = math.floor(dilate + _ROUNDING)
     if reach == 0 and max(mask.shape) < _LARGEST:
         # Whole numbers stay what they are in float32, and those that are no place in a picture are outside.
-        pixels = np.rint(points).astype(np.float32)[:, None]
+        with np.errstate(over="ignore"):
+            pixels = np.rint(points).astype(np.float32)[:, None]
         found = cv2.remap(mask, pixels, _X_AND_Y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(found[:, 0], np.bool_)
     inside = np.zeros(len(points), np.bool_)

@@ -132,57 +132,72 @@ def sample_region(
     field.
     window : (5,), filled: the first row and column of the cells that may be in the region, every how many
     they are, and how many rows and columns of them.
-    inside, moved : (R C,) and (R C, 2), their beginning filled for these cells, row by row.
+    inside, moved : (R C,) and (R C, 2), their beginning filled for these cells, row by row; 0 for those whose
+    gel cannot be in the region.
     """
     height, width = covered.shape[0] - 1, covered.shape[1] - 1
-    step = 1 if width * height < many else 2
+    window[2] = step = 1 if width * height < many else 2
     side = int(place[3 + step])
-    window[2] = step
-    for axis in range(len(travelled)):
-        least = most = travelled[1 - axis, 0]
-        for n in range(1, travelled.shape[1]):
-            least, most = min(least, travelled[1 - axis, n]), max(most, travelled[1 - axis, n])
-        low, cells = (left if axis else top) - place[1 - axis], to_markers.shape[axis]
-        begin = math.floor((low - most - place[3]) / place[2])
-        end = math.ceil((low + covered.shape[axis] - 1 - least + place[3]) / place[2]) + 1
-        window[axis] = min(max(begin, 0), cells)
-        window[3 + axis] = (min(max(end, 0), cells) - window[axis] + step - 1) // step
-    first_row, first_column, rows, columns = window[0], window[1], window[3], window[4]
+    # The cells whose gel may be in the part, and for each of them where its gel may be.
+    least_x, most_x = _extent(travelled, 0, place[3])
+    least_y, most_y = _extent(travelled, 1, place[3])
+    first_row = _within((top - place[1] - most_y) / place[2], to_markers.shape[0])
+    first_column = _within((left - place[0] - most_x) / place[2], to_markers.shape[1])
+    end_row = _within((top + height - place[1] - least_y) / place[2] + 2, to_markers.shape[0])
+    end_column = _within((left + width - place[0] - least_x) / place[2] + 2, to_markers.shape[1])
+    rows, columns = (end_row - first_row + step - 1) // step, (end_column - first_column + step - 1) // step
+    window[0], window[1], window[3], window[4] = first_row, first_column, rows, columns
     for k in range(rows * columns):
         i, j = first_row + step * (k // columns), first_column + step * (k % columns)
-        near = to_markers[i, j]
-        x = y = 0.0
-        for n in range(near.size):
-            x += near[n] * coefficients[0, n]
-            y += near[n] * coefficients[1, n]
-        moved[k, 0], moved[k, 1] = x, y
+        x, y = place[0] + place[2] * j - left, place[1] + place[2] * i - top
+        moved[k, 0] = moved[k, 1] = inside[k] = 0.0
+        up, down = _within(y + least_y, height), _within(y + most_y + 1, height)
+        if not _box(covered, up, _within(x + least_x, width), down, _within(x + most_x + 1, width)):
+            continue
+        for n in range(travelled.shape[1]):
+            moved[k, 0] += to_markers[i, j, n] * coefficients[0, n]
+            moved[k, 1] += to_markers[i, j, n] * coefficients[1, n]
         # The left and upper end of the square, from the outer corner of the part.
-        x += place[0] + place[2] * j - left + 0.5 - 0.5 * side
-        y += place[1] + place[2] * i - top + 0.5 - 0.5 * side
-        inside[k] = 0.0
+        x, y = x + moved[k, 0] + 0.5 - 0.5 * side, y + moved[k, 1] + 0.5 - 0.5 * side
         if -side < x < width and -side < y < height:
             inside[k] = _square(covered, x, y, side) / (255.0 * side * side)
 
 
 @helper
-def _square(covered: Sums, x: float, y: float, side: int) -> float:
-    """The sum over a square that cuts through pixels; each counts by what of it lies in the square."""
-    column, row = math.floor(x), math.floor(y)
-    right, below = x - column, y - row
-    upper = _box(covered, row, column, side) * (1 - right) + _box(covered, row, column + 1, side) * right
-    row += 1
-    lower = _box(covered, row, column, side) * (1 - right) + _box(covered, row, column + 1, side) * right
-    return float(upper * (1 - below) + lower * below)
+def _extent(travelled: FloatArray, axis: int, margin: float) -> tuple[float, float]:
+    """Of all motions along an axis, wider by a margin."""
+    least = most = travelled[axis, 0]
+    for n in range(1, travelled.shape[1]):
+        least, most = min(least, travelled[axis, n]), max(most, travelled[axis, n])
+    return least - margin, most + margin
 
 
 @helper
-def _box(covered: Sums, row: int, column: int, side: int) -> float:
+def _within(value: float, high: int) -> int:
+    """The whole number below, in 0 to `high`."""
+    return int(min(max(value, 0.0), float(high)))
+
+
+@helper
+def _square(covered: Sums, x: float, y: float, side: int) -> float:
+    """The sum over a square that cuts through pixels; each counts by what of it lies in the square."""
+    column, row, total = math.floor(x), math.floor(y), 0.0
+    for down in range(2):
+        for across in range(2):
+            part = abs(1 - down - (y - row)) * abs(1 - across - (x - column))
+            top, left = row + down, column + across
+            total += part * _box(covered, top, left, top + side, left + side)
+    return total
+
+
+@helper
+def _box(covered: Sums, top: int, left: int, bottom: int, right: int) -> int:
     """The sum over whole pixels."""
     height, width = covered.shape[0] - 1, covered.shape[1] - 1
-    top, bottom = min(max(row, 0), height), min(max(row + side, 0), height)
-    left, right = min(max(column, 0), width), min(max(column + side, 0), width)
+    top, bottom = min(max(top, 0), height), min(max(bottom, 0), height)
+    left, right = min(max(left, 0), width), min(max(right, 0), width)
     upper = covered[top, right] - covered[top, left]
-    return float(np.int32(covered[bottom, right] - covered[bottom, left] - upper))
+    return int(np.int32(covered[bottom, right] - covered[bottom, left] - upper))
 
 
 @kernel(

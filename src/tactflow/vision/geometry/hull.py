@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.geometry.direction import anisotropy_limit, axis_direction
 from tactflow.vision.geometry.moments import Box, Moments, region_moments
-from tactflow.vision.types import Contact, Ellipse, Evidence
+from tactflow.vision.types import Contact, Ellipse, Evidence, Outlines
 
 Contours = Sequence[NDArray[Any]]
 
@@ -24,7 +24,7 @@ _WIDTH_OF_A_LINE: Final = 1 / 12 + 1e-9
 
 
 def contact_geometry(
-    mask: NDArray[np.uint8],
+    mask: NDArray[np.uint8] | Outlines,
     *,
     min_area: float = 1.0,
     max_gap: float | None = None,
@@ -32,7 +32,7 @@ def contact_geometry(
 ) -> Contact | None:
     """Describe the contact region of a mask; None where there is none.
 
-    mask : (H, W) uint8, non-zero inside the contact.
+    mask : (H, W) uint8, non-zero inside the contact; or its outlines, where they are known.
     min_area : px^2; components (8-connected, holes filled) with fewer pixels are ignored. Larger is safer
         against specks and misses small contacts.
     max_gap : px; components whose nearest pixels are at most this far apart (to within 1 px and 2 %) belong
@@ -61,8 +61,8 @@ def contact_geometry(
     >>> contact.center, contact.area, contact.angle
     ((29.5, 24.5), 400.0, 0.0)
     """
-    _check(mask, min_area, max_gap, min_confidence)
-    seen = _components(mask, min_area)
+    outlines = _outlines(mask, min_area, max_gap, min_confidence)
+    seen = _components(outlines, min_area)
     if seen is None:
         return None
     if max_gap is not None and len(seen.contours) > 1:
@@ -72,7 +72,7 @@ def contact_geometry(
 
 
 def contact_parts(
-    mask: NDArray[np.uint8],
+    mask: NDArray[np.uint8] | Outlines,
     *,
     min_area: float = 1.0,
     max_gap: float = 0.0,
@@ -89,8 +89,8 @@ def contact_parts(
     >>> [contact.region_area for contact in contact_parts(mask)]
     [400.0, 50.0]
     """
-    _check(mask, min_area, max_gap, min_confidence)
-    seen = _components(mask, min_area)
+    outlines = _outlines(mask, min_area, max_gap, min_confidence)
+    seen = _components(outlines, min_area)
     if seen is None:
         return []
     groups = _groups(seen.contours, seen.box, max_gap) if len(seen.contours) > 1 else [seen.contours]
@@ -112,17 +112,15 @@ class _Seen(NamedTuple):
     moments: Moments
 
 
-def _components(mask: NDArray[np.uint8], min_area: float) -> _Seen | None:
+def _components(outlines: Outlines, min_area: float) -> _Seen | None:
     """The components of a mask that are large enough; None where there is none."""
-    if mask.size == 0:
+    mask, contours = outlines
+    if not contours:
         return None
     box, moments = region_moments(mask)
-    if box.width == 0:
-        return None
-    roi: NDArray[Any] = mask[box.top : box.top + box.height, box.left : box.left + box.width]
-    contours: Contours
-    contours, _ = cv2.findContours(roi, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(box.left, box.top))
-    seen = _Seen(roi, box, contours, moments)
+    seen = _Seen(
+        mask[box.top : box.top + box.height, box.left : box.left + box.width], box, contours, moments
+    )
     if len(contours) > 1 or moments.pixels < min_area:
         kept = [contour for contour in contours if _filled_area(contour) >= min_area]
         if not kept:
@@ -137,15 +135,21 @@ def _part(seen: _Seen, contours: Contours) -> _Seen:
     return seen._replace(contours=contours, moments=_moments_inside(seen.roi, contours, seen.box))
 
 
-def _check(mask: NDArray[np.uint8], min_area: float, max_gap: float | None, min_confidence: float) -> None:
-    if mask.ndim != 2 or mask.dtype != np.uint8:
-        raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
+def _outlines(
+    mask: NDArray[np.uint8] | Outlines, min_area: float, max_gap: float | None, min_confidence: float
+) -> Outlines:
+    """Those of a mask; ValueError if anything is out of its range."""
     if not (min_area >= 0 and math.isfinite(min_area)):
         raise ValueError(f"required min_area >= 0 px^2, got {min_area}")
     if max_gap is not None and not max_gap >= 0:
         raise ValueError(f"required max_gap >= 0 px or None, got {max_gap}")
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
+    if isinstance(mask, Outlines):
+        return mask
+    if mask.ndim != 2 or mask.dtype != np.uint8:
+        raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
+    return Outlines.of(mask) if mask.size else Outlines(mask, ())
 
 
 def _describe(seen: _Seen, min_confidence: float, evidence: Evidence = "light") -> Contact:
