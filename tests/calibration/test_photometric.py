@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactflow.bench.depth import BALL, RAW_MM, deepest, scale, session_of
+from tactflow.bench.depth import BALL, RAW_MM, deepest, noisy, scale, session_of
 from tactflow.calibration.photometric import Photometry, fit_photometry, try_photometry
 from tactflow.calibration.presses import Session
 from tactflow.engine.errors import ConfigError
@@ -73,6 +73,21 @@ def test_heights_of_other_contacts_are_right_to_a_few_hundredths_of_the_depth(
         assert found.volume == pytest.approx(sunk.sum() * SCALE.area(1.0), rel=0.15)
         assert found.greatest_stderr is not None
         assert abs(found.greatest - sunk.max()) < found.greatest_stderr < 0.15 * sunk.max()
+
+
+def test_heights_are_right_where_one_of_the_lights_does_not_reach_every_slope() -> None:
+    learned = fit_photometry(session_of(open_scene("ball?frames=260&light=dark_channel")), SCALE, BALL)
+    shown = open_scene("cable?seed=11&frames=200&light=dark_channel")
+    rest = Rest(shown.truth(0, PREPROCESS).unmarked)
+    surface, errors = Surface(learned.model, SCALE), []
+    for index in deepest(shown):
+        truth = shown.truth(index, PREPROCESS)
+        sunk = truth.sunk * RAW_MM
+        mask = np.where(truth.contact_mask, 255, 0).astype(np.uint8)
+        off = surface.depth(noisy(truth.unmarked, index), rest, mask).heights - sunk
+        errors.append(np.sqrt(np.mean(off[sunk > 0.02 * sunk.max()] ** 2)) / sunk.max())
+    # With colours that are averaged there, too, it is 0.06.
+    assert max(errors) < 0.053
 
 
 def test_stated_errors_of_the_depth_grow_where_slopes_are_steeper_than_the_ball_has_shown(

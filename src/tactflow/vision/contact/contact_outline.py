@@ -117,9 +117,8 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
 
 def _level(change: WindowChange, bridge: float, hidden: Mask | None) -> tuple[Float, Float | None]:
     """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0."""
-    cap = GLOSS * _typical(
-        change.strength, None if hidden is None else 1 - np.asarray(cv2.dilate(hidden, SQUARE), np.uint8)
-    )
+    seen = None if hidden is None else np.asarray(1 - cv2.dilate(hidden, SQUARE), np.uint8)
+    cap = GLOSS * _typical(change.strength, seen)
     strength = np.asarray(cv2.threshold(change.strength, cap, 0.0, cv2.THRESH_TRUNC)[1], np.float32)
     even = cv2.norm(strength, cv2.NORM_L2SQR) / EVEN
     # What is cut is no larger than before: where it is too little then, there is no need to cut it.
@@ -145,11 +144,12 @@ def _largest_nearby(values: Float) -> Float:
     """
     high, wide = values.shape
     coarse = (-(-wide // COARSE), -(-high // COARSE))
-    largest = cv2.resize(cv2.blur(values, (3, 3)), coarse, interpolation=cv2.INTER_AREA)
-    peak = max(float(cv2.minMaxLoc(largest)[1]), 1e-9)
-    radius = math.sqrt(np.count_nonzero(largest > np.float32(OUTER * peak)) / math.pi)
-    reach = round(radius)
+    smooth = cv2.blur(values, (3, 3))
+    peak = max(float(cv2.minMaxLoc(smooth)[1]), 1e-9)
+    radius = math.sqrt(np.count_nonzero(values > np.float32(OUTER * peak)) / math.pi)
+    reach = round(radius / COARSE)
     side = 2 * reach + 1
+    largest = cv2.resize(smooth, coarse, interpolation=cv2.INTER_AREA)
     largest = cv2.copyMakeBorder(largest, *(reach,) * 4, cv2.BORDER_CONSTANT, value=(0.0,))
     largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
     largest = np.maximum(largest[reach:, reach:][: coarse[1], : coarse[0]], np.float32(FAINT * peak))
@@ -178,28 +178,10 @@ def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
 def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float, Float | None]:
     """`_level` of a contact that shows its slopes."""
     local = strength / _largest_nearby(strength)
-    changed = (local > OUTER).view(np.uint8)
-    region = enclosed(changed, hidden)
-    solid = is_solid(region)
-    if not solid:
-        closed = fill_bay(region, (local > DIM * OUTER).view(np.uint8))
-        region, solid = closed, closed is not region and is_solid(closed)
-    wrinkles = None
-    if not solid:
-        # A wrinkle or what is left of a marker is no far side of the contact, to which a gap is closed.
-        wrinkles = _specks(region, strength)
-        kept = region.filled if wrinkles is None else (region.filled > wrinkles).view(np.uint8)
-        ring = changed if hidden is None else changed | hidden
-        ring = np.asarray(cv2.bitwise_and(ring, kept), np.uint8)
-        reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
-        region = enclosed(close_gaps(ring, reach) | kept)
+    region, solid, specks = _sloping_region(local, strength, bridge, hidden)
     if cv2.countNonZero(region.filled) == region.filled.size:
         return np.ones_like(strength), None
     inner = depth_of(region.filled)
-    specks = None if solid else _specks(region, strength)
-    if wrinkles is not None:
-        wrinkles &= region.filled == 0
-        specks = wrinkles if specks is None else specks | wrinkles
     if specks is None:
         level = inside_border(inner, inner.depth, local, hidden)
         return level if solid else _without_specks(level, strength), None
@@ -207,6 +189,34 @@ def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float,
     away = cv2.distanceTransform((parts <= 0).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     near = np.asarray((away < parts.max()) & ~specks, np.float32)
     return inside_border(inner, parts, local, hidden), near
+
+
+def _sloping_region(
+    local: Float, strength: Float, bridge: float, hidden: Mask | None
+) -> tuple[Region, bool, NDArray[np.bool_] | None]:
+    """What slopes enclose; whether that is one piece without bays; and (h, w), specks in it or beside it.
+
+    local : (h, w), the strength, relative to the largest nearby.
+    """
+    changed = (local > OUTER).view(np.uint8)
+    region = enclosed(changed, hidden)
+    if is_solid(region):
+        return region, True, None
+    closed = fill_bay(region, (local > DIM * OUTER).view(np.uint8))
+    if closed is not region and is_solid(closed):
+        return closed, True, None
+    # A wrinkle or what is left of a marker is no far side of the contact, to which a gap is closed.
+    left_out = _specks(closed, strength)
+    kept = closed.filled if left_out is None else (closed.filled > left_out).view(np.uint8)
+    ring = changed if hidden is None else changed | hidden
+    ring = np.asarray(cv2.bitwise_and(ring, kept), np.uint8)
+    reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
+    region = enclosed(close_gaps(ring, reach) | kept)
+    specks = _specks(region, strength)
+    if left_out is not None:
+        beside = left_out & (region.filled == 0)
+        specks = beside if specks is None else specks | beside
+    return region, False, specks
 
 
 def _specks(region: Region, strength: Float) -> NDArray[np.bool_] | None:

@@ -30,9 +30,9 @@ DEPTH_ROUNDED: Final = 0.005
 """Part of the depth that averaging may take off, of any contact."""
 DEPTH_STEEP: Final = 0.24
 """Error of the depth, relative, where all of the slope is steep; it grows with the root of the steep part."""
-VOLUME_ROUNDED: Final = 0.0085
+VOLUME_ROUNDED: Final = 0.01
 """As `DEPTH_ROUNDED`, of the volume."""
-VOLUME_STEEP: Final = 0.35
+VOLUME_STEEP: Final = 0.33
 """As `DEPTH_STEEP`, of the volume."""
 STEEP: Final = 0.95
 """A slope is steep from this part of the steepest on that the ball has shown, by the horizontal part of the
