@@ -73,7 +73,7 @@ def colour_change(image: Bytes | Float, rest: Rest, window: Window, out: Float |
     change = np.empty(light.shape, np.float32) if out is None else out
     cv2.subtract(_halved(image, window), light, change, dtype=cv2.CV_32F)
     change *= weight
-    # In numpy this takes seven times as long, for the three channels are the inner loop.
+    # In numpy this takes nine times as long, for the three channels are the inner loop.
     cv2.subtract(change, (*_median(_border(change)).tolist(), 0.0), change)  # type: ignore[call-overload]
     return change
 
