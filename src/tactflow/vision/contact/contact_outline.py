@@ -144,11 +144,12 @@ def _largest_nearby(values: Float) -> Float:
     """
     high, wide = values.shape
     coarse = (-(-wide // COARSE), -(-high // COARSE))
-    largest = cv2.resize(cv2.blur(values, (3, 3)), coarse, interpolation=cv2.INTER_AREA)
-    peak = max(float(cv2.minMaxLoc(largest)[1]), 1e-9)
-    radius = math.sqrt(np.count_nonzero(largest > np.float32(OUTER * peak)) / math.pi)
-    reach = round(radius)
+    smooth = cv2.blur(values, (3, 3))
+    peak = max(float(cv2.minMaxLoc(smooth)[1]), 1e-9)
+    radius = math.sqrt(np.count_nonzero(values > np.float32(OUTER * peak)) / math.pi)
+    reach = round(radius / COARSE)
     side = 2 * reach + 1
+    largest = cv2.resize(smooth, coarse, interpolation=cv2.INTER_AREA)
     largest = cv2.copyMakeBorder(largest, *(reach,) * 4, cv2.BORDER_CONSTANT, value=(0.0,))
     largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
     largest = np.maximum(largest[reach:, reach:][: coarse[1], : coarse[0]], np.float32(FAINT * peak))
