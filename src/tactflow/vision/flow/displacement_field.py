@@ -50,8 +50,6 @@ OVERSHOOT: Final = 0.5
 POOR: Final = 3.0
 """Times the median standard error from which on a marker's own error has its weight. Chosen by hand."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
-_POOR: Final = 1
-"""Doubt of a marker that is seen, but poorly; see `weigh_markers`."""
 
 
 class Grid(NamedTuple):
@@ -172,8 +170,6 @@ class FieldModel:
         self.inverse: FloatArray = np.asarray(
             np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64
         )
-        self.precision = 0.5 / np.diagonal(self.inverse)
-        """(N,): 1 over twice the variance of each marker given all others, relative to the field's."""
         self.rest = np.ascontiguousarray(self.origin.T)
         """(2, N), x and y of each marker in the reference, px."""
         rows, columns = self.grid.shape
@@ -208,17 +204,6 @@ class FieldModel:
         return DisplacementField(self, markers, seen)
 
 
-class _Update(NamedTuple):
-    """What the inverse of a kernel matrix loses where less is known of S markers: rows.T @ lost, (S, N)."""
-
-    rows: FloatArray
-    lost: FloatArray
-
-    def taken(self, vectors: FloatArray) -> FloatArray:
-        """What vectors (m, N) lose in their products with the inverse, (m, N)."""
-        return np.asarray(vectors @ self.rows.T @ self.lost)
-
-
 class DisplacementField:
     """The displacement of the gel everywhere, in one frame. What is not asked for is not computed.
 
@@ -237,10 +222,11 @@ class DisplacementField:
         ordered = np.sort(stderr[seen & np.isfinite(stderr)])
         self.noise = float(ordered[len(ordered) // 2]) if len(ordered) else 0.0
         position = np.ascontiguousarray(markers.position, np.float64)
-        # x and y apart: sums along contiguous rows. What is not seen counts as unmoved until it is left out.
+        # x and y apart: sums along contiguous rows.
         self._moved, self._coefficients = np.empty((2, len(seen))), np.empty((2, len(seen)))
-        self._variance, doubt = np.empty(len(seen)), np.empty(len(seen), np.uint8)
-        doubtful = weigh_markers(
+        self._variance, self._precision = np.empty(len(seen)), np.empty(len(seen))
+        removed = np.empty_like(model.inverse)
+        count = weigh_markers(
             position,
             model.rest,
             seen,
@@ -250,28 +236,11 @@ class DisplacementField:
             model.inverse,
             self._moved,
             self._variance,
-            doubt,
             self._coefficients,
+            self._precision,
+            removed,
         )
-        self._update: _Update | None = None
-        if doubtful:
-            left_out = np.flatnonzero(doubt)
-            self._leave_out(left_out, doubt[left_out] == _POOR)
-
-    def _leave_out(self, left_out: IntArray, poor: NDArray[np.bool_]) -> None:
-        """Take markers (S,) out of the field, those that are `poor` (S,) only as far as their errors ask."""
-        rows = self._model.inverse[left_out]
-        own, theirs = rows[:, left_out], self._coefficients[:, left_out]
-        # Of few markers; a third of the time of NumPy's, nothing of which is in the caches.
-        _, middle = cv2.invert(own)
-        sure = len(self._seen) - len(left_out)
-        if sure and poor.any():
-            # The variance of the field without all of them is what their own is to be compared with.
-            left = np.vdot(self._moved, self._coefficients) - np.vdot(theirs, theirs @ middle)
-            certainty = np.where(poor, left / (2 * sure) / self._variance[left_out], 0.0)
-            _, middle = cv2.invert(own + np.diag(certainty))
-        self._update = _Update(rows, np.asarray(middle, np.float64) @ rows)
-        self._coefficients = self._coefficients - theirs @ self._update.lost
+        self._removed = removed[:count].copy()
 
     @cached_property
     def displacement(self) -> FloatArray:
@@ -282,9 +251,7 @@ class DisplacementField:
     def stderr(self) -> FloatArray:
         """(rows, columns) float64, standard error of each component of `displacement`, px."""
         kernel = self._model.to_markers.reshape(-1, len(self._seen))
-        weights = self._model.weights
-        if self._update is not None:
-            weights = weights - self._update.taken(kernel)
+        weights = self._model.weights - kernel @ self._removed.T @ self._removed
         unknown = np.maximum(1 - np.einsum("gn,gn->g", weights, kernel), 0)
         squares = self._scale(kernel) * unknown + (weights * weights) @ self._variance
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
@@ -311,11 +278,10 @@ class DisplacementField:
         numbers = sums.tolist()
         if numbers[0] == 0:
             return None
-        update = self._update or _Update(model.inverse[:0], model.inverse[:0])
         sum_markers(
             kernel,
             model.inverse,
-            *update,
+            self._removed,
             self._coefficients,
             self._precision,
             self._variance,
@@ -357,15 +323,6 @@ class DisplacementField:
         )
         count = int(window[3] * window[4])
         return _Cells(window, inside[:count], moved[:count]) if count else None
-
-    @cached_property
-    def _precision(self) -> FloatArray:
-        """(N,), see `sum_markers`."""
-        if self._update is None:
-            return self._model.precision
-        rows, lost = self._update
-        left = 0.5 / self._model.precision - (rows * lost).sum(axis=0)
-        return np.asarray(np.where(self._seen, 0.5 / np.maximum(left, NUGGET), 0.0))
 
     def _scale(self, kernel: FloatArray) -> FloatArray:
         """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""

@@ -15,6 +15,9 @@ IntArray = NDArray[np.int64]
 Sums = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
 
+_LEAST: Final = 1e-5
+"""What the inverse of the kernel must be, 1, at least: a marker whose place all others leave open. Chosen by
+hand."""
 _NOWHERE: Final = 1e-12
 """Kernel between a region and all markers, in sum, of a region that is far from each. Chosen by hand."""
 
@@ -59,7 +62,7 @@ def rate_motion(
 
 @kernel(
     "int64(float64[:, ::1], float64[:, ::1], boolean[::1], float64[::1], float64, float64, float64[:, ::1],"
-    " float64[:, ::1], float64[::1], uint8[::1], float64[:, ::1])",
+    " float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], float64[:, ::1])",
     reorder=True,
 )
 def weigh_markers(
@@ -72,25 +75,26 @@ def weigh_markers(
     inverse: FloatArray,
     moved: FloatArray,
     variance: FloatArray,
-    doubt: NDArray[np.uint8],
     coefficients: FloatArray,
+    precision: FloatArray,
+    removed: FloatArray,
 ) -> int:
-    """The coefficients of a displacement field in which all markers count in full; how many should not.
+    """The coefficients of a displacement field; how many rows of `removed` there are, S.
 
     position : (N, 2), px. rest : (2, N), in the reference, px. seen : (N,). stderr : (N,), px, NaN or
-    infinite where unknown. usual : what stands for an unknown one, px. largest : of one that is no doubt, px.
-    inverse : (N, N), of the kernel between markers, symmetric.
+    infinite where unknown. usual : what stands for an unknown one, px. largest : of a marker that counts in
+    full, px. inverse : (N, N), of the kernel between markers, symmetric.
     moved : (2, N), filled with the displacements, px, 0 where unseen. variance : (N,), filled with the
-    squares of the standard errors. doubt : (N,), filled: 0 for a marker that counts in full, 1 for one that
-    is seen poorly, 2 for one that is not seen. coefficients : (2, N), filled with moved times the inverse.
+    squares of the standard errors. coefficients : (2, N), filled with moved times the inverse, which is
+    without the markers that are not seen, and with the variance of those that are seen poorly. precision :
+    (N,), filled with 1 over twice the variance of each marker given all others, relative to the field's; 0
+    where unseen. removed : (N, N), of which S rows are filled: the inverse is less by their squares,
+    removed.T @ removed.
     """
-    doubtful = 0
+    energy, along = 0.0, np.empty((2, seen.size))
     for i in range(seen.size):
-        known = seen[i] and math.isfinite(stderr[i])
-        error = stderr[i] if known else usual
+        error = stderr[i] if seen[i] and math.isfinite(stderr[i]) else usual
         variance[i] = error * error
-        doubt[i] = 2 if not seen[i] else 1 if error > largest else 0
-        doubtful += 1 if doubt[i] else 0
         moved[0, i] = position[i, 0] - rest[0, i] if seen[i] else 0.0
         moved[1, i] = position[i, 1] - rest[1, i] if seen[i] else 0.0
     for i in range(seen.size):
@@ -98,8 +102,59 @@ def weigh_markers(
         for n in range(seen.size):
             x += inverse[i, n] * moved[0, n]
             y += inverse[i, n] * moved[1, n]
-        coefficients[0, i], coefficients[1, i] = x, y
-    return doubtful
+        coefficients[0, i], coefficients[1, i], precision[i] = x, y, inverse[i, i]
+        energy += x * moved[0, i] + y * moved[1, i]
+    # First without all that are left out: that tells the variance of the field, which errors are compared with.
+    count, scale = 0, 0.0
+    for _ in range(2):
+        count = _remove(inverse, seen, variance, largest, scale, removed)
+        scale = energy
+        for s in range(count):
+            x = y = 0.0
+            for n in range(seen.size):
+                x += removed[s, n] * moved[0, n]
+                y += removed[s, n] * moved[1, n]
+            along[0, s], along[1, s] = x, y
+            scale -= x * x + y * y
+        scale = scale / (2 * (seen.size - count)) if count < seen.size else 0.0
+    for s in range(count):
+        for n in range(seen.size):
+            coefficients[0, n] -= along[0, s] * removed[s, n]
+            coefficients[1, n] -= along[1, s] * removed[s, n]
+            precision[n] -= removed[s, n] * removed[s, n]
+    for i in range(seen.size):
+        precision[i] = 0.5 / max(precision[i], _LEAST) if seen[i] else 0.0
+    return count
+
+
+@helper
+def _remove(
+    inverse: FloatArray,
+    seen: BoolArray,
+    variance: FloatArray,
+    largest: float,
+    scale: float,
+    removed: FloatArray,
+) -> int:
+    """Fill rows of `removed`, see `weigh_markers`, by Cholesky's factors; how many.
+
+    scale : variance of the field, px^2, for markers that are seen poorly; 0 leaves them out altogether.
+    """
+    count = 0
+    for i in range(seen.size):
+        if seen[i] and variance[i] <= largest * largest:
+            continue
+        for n in range(seen.size):
+            removed[count, n] = inverse[i, n]
+        for s in range(count):
+            factor = removed[s, i]
+            for n in range(seen.size):
+                removed[count, n] -= factor * removed[s, n]
+        factor = 1 / math.sqrt(removed[count, i] + (scale / variance[i] if seen[i] else 0.0))
+        for n in range(seen.size):
+            removed[count, n] *= factor
+        count += 1
+    return count
 
 
 @kernel(
@@ -297,15 +352,14 @@ def _sum_pairs(weights: FloatArray, table: FloatArray, columns: int, sums: Float
 
 
 @kernel(
-    "void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],"
-    " float64[::1], float64[:, ::1], float64[::1])",
+    "void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1],"
+    " float64[:, ::1], float64[::1])",
     reorder=True,
 )
 def sum_markers(
     to_region: FloatArray,
     inverse: FloatArray,
-    rows: FloatArray,
-    lost: FloatArray,
+    removed: FloatArray,
     coefficients: FloatArray,
     precision: FloatArray,
     variance: FloatArray,
@@ -315,7 +369,7 @@ def sum_markers(
     """Sums over the markers, for the standard errors of a region's mean motion and slopes.
 
     to_region : (3, N), of `sum_region`. inverse : (N, N), of the kernel between markers, symmetric; it is
-    less by rows.T @ lost, each (S, N), S >= 0. coefficients : (2, N), of the field.
+    less by removed.T @ removed, (S, N), S >= 0. coefficients : (2, N), of the field.
     precision : (N,), 1 over twice the variance of each marker given all others, relative to the field's; 0
     for markers that are not seen. variance : (N,), of their own errors, px^2.
     weights : (3, N), filled with to_region times the inverse.
@@ -324,8 +378,8 @@ def sum_markers(
     px^2.
     """
     count = variance.size
-    for i in range(count + len(rows)):
-        row = inverse[i] if i < count else rows[i - count]
+    for i in range(count + len(removed)):
+        row = inverse[i] if i < count else removed[i - count]
         one = x = y = 0.0
         for n in range(count):
             one += row[n] * to_region[0, n]
@@ -335,9 +389,9 @@ def sum_markers(
             weights[0, i], weights[1, i], weights[2, i] = one, x, y
         else:
             for n in range(count):
-                weights[0, n] -= one * lost[i - count, n]
-                weights[1, n] -= x * lost[i - count, n]
-                weights[2, n] -= y * lost[i - count, n]
+                weights[0, n] -= one * removed[i - count, n]
+                weights[1, n] -= x * removed[i - count, n]
+                weights[2, n] -= y * removed[i - count, n]
     near = squares = 0.0
     for i in range(variance.size):
         x, y = coefficients[0, i], coefficients[1, i]
