@@ -102,8 +102,9 @@ def solve_columns(values: Float, stiffness: Float, turn: Float) -> None:
     _mirror(values, turn)
     for y in range(height):
         line, pivot = values[y], pivots[y]
-        # The last row has no neighbour below, which alone makes its pivot smaller by 1.
-        more = one if y < height - 1 else np.float32(0)
+        # The last row has no neighbour below, so its pivot is smaller by 1; a trace of it is left where there
+        # is nothing else to divide by.
+        more = one if y < height - 1 else np.float32(1e-9)
         for x in range(width):
             rest = beyond[x] + stiffness[x]
             pivot[x] = one / (more + rest)

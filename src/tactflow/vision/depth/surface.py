@@ -73,13 +73,13 @@ def colour_change(image: Bytes | Float, rest: Rest, window: Window, out: Float |
     change = np.empty(light.shape, np.float32) if out is None else out
     cv2.subtract(_halved(image, window), light, change, dtype=cv2.CV_32F)
     change *= weight
-    # In numpy this takes seven times as long, for the three channels are the inner loop.
+    # In numpy this takes nine times as long, for the three channels are the inner loop.
     cv2.subtract(change, (*_median(_border(change)).tolist(), 0.0), change)  # type: ignore[call-overload]
     return change
 
 
 class Surface:
-    """Height maps of a gel.
+    """Height maps of a gel; not to be asked by two threads at once.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class Surface:
         self._model = model
         self._scale = scale
         self._errors = errors
-        self._kept: _Room | None = None
+        self._kept: _Memory | None = None
 
     def depth(self, image: Bytes, rest: Rest, mask: Bytes) -> Depth:
         """The height map of a frame.
@@ -131,16 +131,16 @@ class Surface:
 
     def _slopes(self, image: Bytes, rest: Rest, around: Surroundings) -> tuple[Float, float]:
         """(2, h, w) float32, and the part of all slope that is steeper than the ball has shown, 0 to 1."""
-        room = self._room(rest.window)
-        change, slope = room.arrays(around.window)
+        memory = self._memory(rest.window)
+        change, slope = memory.arrays(around.window)
         colour_change(image, rest, around.window, out=change)
         rows, columns = around.window.part
-        self._model.slopes(change, room.x[columns], room.y[rows], around.near, out=slope)
+        self._model.slopes(change, memory.x[columns], memory.y[rows], around.near, out=slope)
         return slope, 0.0 if self._errors is None else _steep_part(slope, self._errors.steepest)
 
-    def _room(self, whole: Window) -> _Room:
+    def _memory(self, whole: Window) -> _Memory:
         if self._kept is None or self._kept.whole != whole:
-            self._kept = _Room(whole)
+            self._kept = _Memory(whole)
         return self._kept
 
     def _integrated(self, slope: Float) -> Float:
@@ -150,7 +150,7 @@ class Surface:
         return np.maximum(heights, 0, out=heights)
 
 
-class _Room:
+class _Memory:
     """Memory for pictures of one size, which every frame uses again: to get new memory from the system can
     take as long as to compute what it holds.
 
