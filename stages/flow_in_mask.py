@@ -9,7 +9,7 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
 from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field
-from tactflow.vision.types import Evidence, Flow, Markers
+from tactflow.vision.types import Evidence, Flow, Markers, Outlines
 
 
 class FlowInMask(Stage):
@@ -43,9 +43,12 @@ class FlowInMask(Stage):
         contact_mask: ContactMask,
         field: DisplacementField | None = None,
         evidence: Evidence | None = None,
+        outlines: Outlines | None = None,
     ) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside, or none near."""
         dilate = self._params.dilate
         if field is None or self._params.method == "mean":
             return flow_in_mask(markers, contact_mask, dilate=dilate)
-        return flow_of_field(field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots")
+        return flow_of_field(
+            field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots", outlines=outlines
+        )

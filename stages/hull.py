@@ -62,8 +62,7 @@ class Hull(Stage):
     ) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
         params = self._params
-        if outlines is None or outlines.mask is not contact_mask:
-            outlines = Outlines.of(contact_mask)
+        outlines = Outlines.of(contact_mask, outlines)
         parts = contact_parts(
             outlines,
             min_area=params.min_area,

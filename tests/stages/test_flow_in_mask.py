@@ -25,7 +25,13 @@ def run(**params: Any) -> Flow:
 
 def test_it_takes_markers_and_a_contact_mask_and_gives_a_flow() -> None:
     ports = read_ports(FlowInMask, "process")
-    assert [port.name for port in ports.inputs] == ["markers", "contact_mask", "field", "evidence"]
+    assert [port.name for port in ports.inputs] == [
+        "markers",
+        "contact_mask",
+        "field",
+        "evidence",
+        "outlines",
+    ]
     assert [(port.name, port.optional) for port in ports.outputs] == [("flow", False)]
 
 

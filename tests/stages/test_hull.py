@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from tactflow.engine.frame import Absent
 from tactflow.engine.ports import read_ports
 from tactflow.stages.hull import Hull
-from tactflow.vision.types import Contact
+from tactflow.vision.types import Contact, Outlines
 
 
 def run(mask: NDArray[np.uint8], **params: Any) -> Contact | Absent:
@@ -34,6 +34,18 @@ def test_it_takes_a_contact_mask_and_may_give_a_contact() -> None:
         ("outlines", True),
     ]
     assert [(port.name, port.optional) for port in ports.outputs] == [("contact", True)]
+
+
+def test_outlines_serve_for_the_mask_that_they_are_of_and_for_no_other() -> None:
+    mask, other = bar(), bar(30)
+    hull = Hull(Hull.Params())
+    alone, known, stale = (
+        hull.process(mask, None, of) for of in (None, Outlines.of(mask), Outlines.of(other))
+    )
+    for contact in (alone, known, stale):
+        assert isinstance(contact, Contact)
+        assert contact.region_area == 500
+        assert contact.hull.tolist() == alone.hull.tolist()
 
 
 def test_an_empty_mask_is_no_contact() -> None:

@@ -66,9 +66,17 @@ class Outlines(NamedTuple):
     contours: Sequence[NDArray[Any]]
 
     @classmethod
-    def of(cls, mask: NDArray[np.uint8]) -> Outlines:
-        """Look for them."""
+    def of(cls, mask: NDArray[np.uint8], known: Outlines | None = None) -> Outlines:
+        """Look for them, unless those that are known are of this very mask."""
+        if known is not None and known.mask is mask:
+            return known
         return cls(mask, cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
+
+    @property
+    def box(self) -> Sequence[int]:
+        """Left, top, width and height of all regions, px; 0 where there is none."""
+        one = len(self.contours) == 1
+        return cv2.boundingRect(self.contours[0] if one else self.mask)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ markers, so that each answer has a standard error in closed form.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -288,13 +289,15 @@ class DisplacementField:
         squares = self._scale(kernel) * unknown + (weights * weights) @ self._variance
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
 
-    def motion(self, mask: NDArray[np.uint8]) -> GelMotion | None:
+    def motion(self, mask: NDArray[np.uint8], box: Sequence[int] | None = None) -> GelMotion | None:
         """How the gel inside a region has moved, each bit of it counted by its area at rest.
 
         mask : (H, W) uint8, 0 or 255 inside, in the current frame: what counts is where the gel is now.
+        box : (left, top, width, height) of the region, px, where it is known.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
-        cells = self._cells(mask, MANY * self.grid.spacing**2)
+        check_mask(mask, 0)
+        cells = self._cells(mask, box or cv2.boundingRect(mask), MANY * self.grid.spacing**2)
         if cells is None:
             return None
         model, step = self._model, int(cells.window[2])
@@ -323,17 +326,17 @@ class DisplacementField:
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
         """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
-        cells = self._cells(mask, math.inf)
+        check_mask(mask, 0)
+        cells = self._cells(mask, cv2.boundingRect(mask), math.inf)
         total = 0.0 if cells is None else float(cells.inside.sum())
         if cells is None or total == 0:
             return None
         top, left, _, rows, columns = cells.window.tolist()
         return Part(cells.inside.reshape(rows, columns), total, (top, left))
 
-    def _cells(self, mask: NDArray[np.uint8], many: float) -> _Cells | None:
+    def _cells(self, mask: NDArray[np.uint8], box: Sequence[int], many: float) -> _Cells | None:
         """The cells around a region; of a region in a box of `many` px^2 every other one."""
-        check_mask(mask, 0)
-        left, top, width, height = cv2.boundingRect(mask)
+        left, top, width, height = box
         if width == 0:
             return None
         model, (rows, columns) = self._model, self.grid.shape
