@@ -242,3 +242,11 @@ def test_a_large_contact_has_the_same_outline_however_it_is_turned() -> None:
     turned = np.ascontiguousarray(np.rot90(change))
     # Measured: 0.999; 0.93 with the profile of one row in five.
     assert overlap(np.rot90(found(change)), found(turned)) > 0.99
+
+
+def test_a_brightened_contact_ends_at_half_of_the_plateau_beside_its_border() -> None:
+    away, across = disc(32), (np.arange(SIZE) - 49.5) / 32
+    uneven = (0.5 - 0.5 * np.tanh(away / 4)) * np.clip(0.65 + 0.35 * across, 0.3, 1.0)
+    mask = found(np.repeat(uneven[..., None], 3, axis=2).astype(np.float32))
+    # Measured: 28.5 px on the dim side; 26.5 px if its height were sought a whole radius around.
+    assert 49.5 - np.flatnonzero(mask[50])[0] > 28
