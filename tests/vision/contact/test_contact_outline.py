@@ -178,6 +178,21 @@ def test_holes_are_filled_as_by_filling_the_outlines_of_all_parts(density: float
     assert np.array_equal(mask, before)
 
 
+def test_pockets_that_are_filled_leave_no_holes() -> None:
+    random = np.random.default_rng(0)
+    filled_more = 0
+    for _ in range(40):
+        # Blobs that touch the border in several places, and each other.
+        blurred = cv2.GaussianBlur(random.random((60, 80)), (0, 0), 4)
+        mask = (blurred > np.quantile(blurred, 0.6)).astype(np.uint8)
+        region = enclosed(mask)
+        filled_more += int(region.filled.sum() > outlined(mask, None).sum())
+        assert np.array_equal(outlined(region.filled, None), region.filled)
+        parts = cv2.findContours(region.filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]
+        assert [part.tolist() for part in region.outlines] == [part.tolist() for part in parts]
+    assert filled_more > 5
+
+
 def test_masks_are_left_as_they_are() -> None:
     painted, hidden = without_markers(tilted(disc()), [(79.5, 49.5)])
     inside = (np.linalg.norm(painted, axis=2) > 0.02).astype(np.uint8)
