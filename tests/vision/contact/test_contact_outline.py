@@ -178,6 +178,21 @@ def test_holes_are_filled_as_by_filling_the_outlines_of_all_parts(density: float
     assert np.array_equal(mask, before)
 
 
+def test_pockets_that_are_filled_leave_no_holes() -> None:
+    random = np.random.default_rng(0)
+    filled_more = 0
+    for _ in range(40):
+        # Blobs that touch the border in several places, and each other.
+        blurred = cv2.GaussianBlur(random.random((60, 80)), (0, 0), 4)
+        mask = (blurred > np.quantile(blurred, 0.6)).astype(np.uint8)
+        region = enclosed(mask)
+        filled_more += int(region.filled.sum() > outlined(mask, None).sum())
+        assert np.array_equal(outlined(region.filled, None), region.filled)
+        parts = cv2.findContours(region.filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]
+        assert [part.tolist() for part in region.outlines] == [part.tolist() for part in parts]
+    assert filled_more > 5
+
+
 def test_masks_are_left_as_they_are() -> None:
     painted, hidden = without_markers(tilted(disc()), [(79.5, 49.5)])
     inside = (np.linalg.norm(painted, axis=2) > 0.02).astype(np.uint8)
@@ -242,3 +257,11 @@ def test_a_large_contact_has_the_same_outline_however_it_is_turned() -> None:
     turned = np.ascontiguousarray(np.rot90(change))
     # Measured: 0.999; 0.93 with the profile of one row in five.
     assert overlap(np.rot90(found(change)), found(turned)) > 0.99
+
+
+def test_a_brightened_contact_ends_at_half_of_the_plateau_beside_its_border() -> None:
+    away, across = disc(32), (np.arange(SIZE) - 49.5) / 32
+    uneven = (0.5 - 0.5 * np.tanh(away / 4)) * np.clip(0.65 + 0.35 * across, 0.3, 1.0)
+    mask = found(np.repeat(uneven[..., None], 3, axis=2).astype(np.float32))
+    # Measured: 28.5 px on the dim side; 26.5 px if its height were sought a whole radius around.
+    assert 49.5 - np.flatnonzero(mask[50])[0] > 28
