@@ -104,7 +104,7 @@ def weigh_markers(
             y += inverse[i, n] * moved[1, n]
         coefficients[0, i], coefficients[1, i], precision[i] = x, y, inverse[i, i]
         energy += x * moved[0, i] + y * moved[1, i]
-    # First without all that are left out: that tells the variance of the field, which errors are compared with.
+    # First without all that are left out: that tells the variance of the field to compare errors with.
     count, scale = 0, 0.0
     for _ in range(2):
         count = _remove(inverse, seen, variance, largest, scale, removed)
