@@ -8,7 +8,7 @@ than a marker, beside a marker, is what its removal has left.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -113,8 +113,30 @@ def _without_strays(outlines: Outlines, markers: Markers, motion: Motion, reach:
     if len(outlines.contours) < 2:
         return light
     moved = _without_reflections(light, outlines.contours, markers, motion, reach)
+    if all(pixels > _largest_rim(markers) for pixels in _fewest_pixels(outlines)):
+        return moved
     left = _without_rims(moved, markers)
     return left if cv2.countNonZero(left) else moved
+
+
+def _largest_rim(markers: Markers) -> float:
+    """Pixels of what removing a marker may leave, at most; 0 where the size of markers is not known."""
+    return 0.0 if markers.radius is None else np.pi * (markers.radius + SPREAD) ** 2
+
+
+def _fewest_pixels(outlines: Outlines) -> Iterator[int]:
+    """How many pixels each region has at least: those in its box, less where boxes of others overlap it.
+
+    To tell the regions apart pixel by pixel takes fifty times as long.
+    """
+    boxes = [cv2.boundingRect(outline) for outline in outlines.contours]
+    for number, (left, top, width, height) in enumerate(boxes):
+        pixels = cv2.countNonZero(outlines.mask[top : top + height, left : left + width])
+        for x, y, wide, high in boxes[:number] + boxes[number + 1 :]:
+            across = min(left + width, x + wide) - max(left, x)
+            down = min(top + height, y + high) - max(top, y)
+            pixels -= max(across, 0) * max(down, 0)
+        yield pixels
 
 
 def _without_reflections(
@@ -149,7 +171,7 @@ def _without_rims(light: Mask, markers: Markers) -> Mask:
     left, top, width, height = cv2.boundingRect(light)
     window = light[top : top + height, left : left + width]
     count, labels, boxes, centers = cv2.connectedComponentsWithStats(window)
-    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + SPREAD) ** 2)
+    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= _largest_rim(markers))
     places = centers[small] + (left, top)
     away = np.hypot(*(places[:, None] - markers.position).transpose(2, 0, 1)).min(axis=1)
     rims = small[(away <= radius + SPREAD) & (small > 0)]
