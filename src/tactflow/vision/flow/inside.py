@@ -13,7 +13,7 @@ _ROUNDING: Final = 1e-9
 """Added to a disc's radius, and to half the width of its rows, px, before they are cut to whole pixels: a
 whole number keeps its value where it was rounded down. Chosen by hand."""
 _LARGEST: Final = 2**15 - 1
-"""Side of a picture in which OpenCV looks up places, px, less than this. Given by OpenCV."""
+"""OpenCV looks up fewer places at once than this, in a picture with shorter sides, px. Given by OpenCV."""
 
 _X_AND_Y: Final[Any] = None
 """What tells OpenCV that x and y come in one array."""
@@ -46,7 +46,7 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
     if len(points) == 0 or mask.size == 0:
         return np.zeros(len(points), np.bool_)
     reach = math.floor(dilate + _ROUNDING)
-    if reach == 0 and max(mask.shape) < _LARGEST:
+    if reach == 0 and max(len(points), *mask.shape) < _LARGEST:
         # Whole numbers stay what they are in float32, and those that are no place in a picture are outside.
         with np.errstate(over="ignore"):
             pixels = np.rint(points).astype(np.float32)[:, None]
