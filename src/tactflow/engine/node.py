@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from inspect import signature, unwrap
+from inspect import signature
 from itertools import islice
 from operator import is_
 from typing import Any
@@ -232,7 +232,7 @@ def _by_position(function: Callable[..., Any], names: Sequence[str]) -> Callable
 
     That is the function itself, unless a decorator stands around it, which may take names only.
     """
-    if unwrap(function) is function:
+    if not hasattr(function, "__wrapped__"):
         parameters = signature(function).parameters.values()
         if [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD] == list(names):
             return function
