@@ -357,7 +357,6 @@ class _References:
 
 
 def _read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if image.flags.writeable:
-        image = image.view()
-        image.flags.writeable = False
+    image = image.view()
+    image.setflags(write=False)
     return image

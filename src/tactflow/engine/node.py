@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
+from itertools import islice
 from operator import is_
 from typing import Any
 
@@ -84,6 +86,7 @@ class RunningNode:
         self.ports = ports.inputs
         refs = [node.inputs.get(port.name) for port in self.ports]
         self.input_slots = [slots[ref.node, ref.port] if ref else UNCONNECTED for ref in refs]
+        self._named_slots = [(p.name, slot) for p, slot in zip(self.ports, self.input_slots, strict=True)]
         self.slots = [slots[node.id, port.name] for port in ports.outputs]
         self.gates = [RunningGate(gate, slots) for gate in node.gates] if skipping else []
         self.signals = {
@@ -95,7 +98,8 @@ class RunningNode:
         self.rate_limit = RateLimit(node.max_rate)
         self.stats = NodeStats()
         self.check = ArrayCheck(node) if check else None
-        self._function: Callable[..., Any] = getattr(instance, METHODS[node.component.kind])
+        function = getattr(instance, METHODS[node.component.kind])
+        self._function = _by_position(function, [parameter.name for parameter in ports.parameters])
         self._parameters = ports.parameters
         self._one_port_each = all(len(p.ports) == 1 and p.group is None for p in ports.parameters)
         repeats = any(gate.repeats for gate in self.gates)
@@ -145,8 +149,8 @@ class RunningNode:
         """Run it; one value per output port, `Absent` where there is none."""
         check = self.check
         given = inputs if check is None else [check.read_only(value) for value in inputs]
-        # By name, so that any decorator may stand around the function.
-        outputs = _outputs(self._function(**self._arguments(given, tick)), len(self.slots))
+        arguments = given if self._one_port_each else self._arguments(given, tick)
+        outputs = _outputs(self._function(*arguments), len(self.slots))
         if check is not None:
             check.outputs(inputs, outputs)
         self.last = outputs
@@ -154,28 +158,24 @@ class RunningNode:
             self._last_inputs = inputs
         return outputs
 
-    def _arguments(self, values: Sequence[Any], tick: TickState) -> dict[str, Any]:
-        """Parameter -> its argument: a port's value, a group of them, or the tick."""
-        if self._one_port_each:
-            return {parameter.name: value for parameter, value in zip(self._parameters, values, strict=True)}
-        arguments: dict[str, Any] = {}
+    def _arguments(self, values: Sequence[Any], tick: TickState) -> Sequence[Any]:
+        """One argument for each parameter: a port's value, a group of them, or the tick."""
+        arguments: list[Any] = []
         left = iter(values)
         for parameter in self._parameters:
-            mine = [next(left) for _ in parameter.ports]
             if parameter.group is not None:
-                arguments[parameter.name] = parameter.group(*mine)
+                arguments.append(parameter.group(*islice(left, len(parameter.ports))))
             else:
-                arguments[parameter.name] = mine[0] if mine else Tick(tick.frame, self.skipped(tick))
+                arguments.append(next(left) if parameter.ports else Tick(tick.frame, self.skipped(tick)))
         return arguments
 
     def skipped(self, tick: TickState) -> dict[str, str]:
         """Input port -> why it was not computed, for those that were not; `reference` -> why it is new."""
         reasons = tick.reasons
-        renewed = {} if tick.renewed is None else {"reference": tick.renewed}
-        if not reasons:
-            return renewed
-        ports = zip(self.ports, self.input_slots, strict=True)
-        return {port.name: reasons[slot] for port, slot in ports if slot in reasons} | renewed
+        found = {name: reasons[slot] for name, slot in self._named_slots if slot in reasons}
+        if tick.renewed is not None:
+            found["reference"] = tick.renewed
+        return found
 
     def inherited_reason(self, tick: TickState) -> str | None:
         """Why its outputs are repeated ones: the reason of its inputs, where all that are connected have one.
@@ -191,8 +191,8 @@ class RunningNode:
     def publish(self, tick: TickState, outputs: Sequence[Any]) -> None:
         """Enter its outputs into the tick's table."""
         inherited = self.inherited_reason(tick)
-        for slot, value in zip(self.slots, outputs, strict=True):
-            tick.values[slot] = value
+        for number, slot in enumerate(self.slots):
+            tick.values[slot] = value = outputs[number]
             if isinstance(value, Absent):
                 tick.reasons[slot] = value.reason
             elif inherited is not None:
@@ -225,3 +225,15 @@ def _outputs(result: Any, count: int) -> Sequence[Any]:
     if len(values) != count:
         raise TypeError(f"required {count} outputs, got {len(values)}")
     return [_NONE if value is None else value for value in values]
+
+
+def _by_position(function: Callable[..., Any], names: Sequence[str]) -> Callable[..., Any]:
+    """A function that takes by position, in the order of `names`, what another one takes by name.
+
+    That is the function itself, unless a decorator stands around it, which may take names only.
+    """
+    if not hasattr(function, "__wrapped__"):
+        parameters = signature(function).parameters.values()
+        if [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD] == list(names):
+            return function
+    return lambda *values: function(**dict(zip(names, values, strict=True)))

@@ -57,7 +57,8 @@ class _RunningStep:
             return True
         table, demand = tick.values, tick.demand
         for sinks, signals in self.needs:
-            if (sinks is None or not sinks.isdisjoint(demand)) and all(table[s] is True for s in signals):
+            asked = sinks is None or not sinks.isdisjoint(demand)
+            if asked and (not signals or all(table[s] is True for s in signals)):
                 return True
         return False
 
