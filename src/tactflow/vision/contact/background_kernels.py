@@ -149,11 +149,7 @@ def scaled_change(
     high, wide = len(blurred), blurred.shape[1] // 3
     side = high // len(inside)
     _find_spans(inside, side, spans)
-    light = np.empty((3, 3 * wide), np.float32)
-    for x in range(wide):
-        for c in range(3):
-            light[0, 3 * x + c] = coefficients[c, 0] + coefficients[c, 1] * across[left + x]
-            light[1, 3 * x + c], light[2, 3 * x + c] = coefficients[c, 2], coefficients[c, 3]
+    light = _light_along(coefficients, across[left : left + wide])
     # With a pixel more on both sides.
     line, most = np.empty(3 * wide + 6, np.float32), np.zeros(3 * wide, np.float32)
     begin = end = 0
@@ -164,21 +160,10 @@ def scaled_change(
         if begin >= end:
             continue
         first, last, count = max(begin - 1, 0), min(end + 1, wide), 3 * (end - begin)
-        at = 3 * (left + first)
-        values, usual, unit = picture[top + y, at:], mean[top + y, at:], scale[top + y, at:]
-        toward, changes = pattern[top + y, at:], line[3 * (first - begin + 1) :]
-        gain, slope, offset = light[0, 3 * first :], light[1, 3 * first :], light[2, 3 * first :]
-        for i in range(3 * (last - first)):
-            value = np.float32(values[i])
-            change = value - usual[i] - (usual[i] * (gain[i] + slope[i] * down[top + y]) + offset[i])
-            least = value - WHITE
-            changes[i] = (change if change > least else least) * unit[i]
-        for x in range(last - first):
-            blue, green, red = changes[3 * x], changes[3 * x + 1], changes[3 * x + 2]
-            along = blue * toward[3 * x] + green * toward[3 * x + 1] + red * toward[3 * x + 2]
-            changes[3 * x] = blue - along * toward[3 * x]
-            changes[3 * x + 1] = green - along * toward[3 * x + 1]
-            changes[3 * x + 2] = red - along * toward[3 * x + 2]
+        row, part = top + y, slice(3 * (left + first), 3 * (left + last))
+        usual, unit, toward = mean[row, part], scale[row, part], pattern[row, part]
+        changes = line[3 * (first - begin + 1) :]
+        _scale_line(picture[row, part], usual, unit, toward, light, first, down[row], changes)
         for c in range(3):
             if begin == 0:
                 line[c] = line[3 * min(2, wide) + c]
@@ -192,9 +177,8 @@ def scaled_change(
         if y == 0:
             peaks[0] = _largest(most)
     peaks[2], peaks[3], peaks[4] = _largest(most[:3]), _largest(most[3 * wide - 3 :]), _largest(most)
-    if begin < end:
-        for i in range(3 * (end - begin)):
-            peaks[1] = max(peaks[1], abs(blurred[high - 1, 3 * begin + i]))
+    for i in range(3 * begin, 3 * end):
+        peaks[1] = max(peaks[1], abs(blurred[high - 1, i]))
 
 
 @helper
@@ -207,6 +191,43 @@ def _find_spans(inside: Byte, side: int, spans: Index) -> None:
         while first < end and not inside[row, first]:
             first += 1
         spans[row, 0], spans[row, 1] = side * first, side * end
+
+
+@helper
+def _light_along(coefficients: Float, places: Float) -> Float:
+    """(3, 3 w) float32: gain in the frame's middle row, its slope along y, offset; of each channel."""
+    light = np.empty((3, 3 * places.size), np.float32)
+    for x in range(places.size):
+        for c in range(3):
+            light[0, 3 * x + c] = coefficients[c, 0] + coefficients[c, 1] * places[x]
+            light[1, 3 * x + c], light[2, 3 * x + c] = coefficients[c, 2], coefficients[c, 3]
+    return light
+
+
+@helper
+def _scale_line(
+    values: Byte,
+    mean: Float,
+    scale: Float,
+    pattern: Float,
+    light: Float,
+    first: int,
+    place: np.float32,
+    changes: Float,
+) -> None:
+    """Fill `changes` with the change of a line from pixel `first` of the window on, standard deviations."""
+    gain, slope, offset = light[0, 3 * first :], light[1, 3 * first :], light[2, 3 * first :]
+    for i in range(values.size):
+        value, usual = np.float32(values[i]), mean[i]
+        change = value - usual - (usual * (gain[i] + slope[i] * place) + offset[i])
+        least = value - WHITE
+        changes[i] = (change if change > least else least) * scale[i]
+    for x in range(values.size // 3):
+        blue, green, red = changes[3 * x], changes[3 * x + 1], changes[3 * x + 2]
+        along = blue * pattern[3 * x] + green * pattern[3 * x + 1] + red * pattern[3 * x + 2]
+        changes[3 * x] = blue - along * pattern[3 * x]
+        changes[3 * x + 1] = green - along * pattern[3 * x + 1]
+        changes[3 * x + 2] = red - along * pattern[3 * x + 2]
 
 
 @helper
