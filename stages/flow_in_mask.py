@@ -9,7 +9,8 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
 from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field
-from tactflow.vision.types import Evidence, Flow, Markers, Outlines
+from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.types import Evidence, Flow, Markers
 
 
 class FlowInMask(Stage):

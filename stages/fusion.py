@@ -8,9 +8,13 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Touching
+from tactflow.vision import compiled
 from tactflow.vision.contact.fusion import fuse_contact
+from tactflow.vision.flow import loops
 from tactflow.vision.flow.motion import MotionTest
-from tactflow.vision.types import Evidence, Markers, Outlines
+from tactflow.vision.geometry import moments
+from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.types import Evidence, Markers
 
 
 class FusedPorts(NamedTuple):
@@ -65,6 +69,7 @@ class Fusion(Stage):
 
     def __init__(self, params: Params) -> None:
         super().__init__(params)
+        compiled.load(loops, moments)
         self.reset()
 
     def reset(self) -> None:

@@ -13,7 +13,8 @@ from tactflow.ports import ContactMask
 from tactflow.vision import compiled
 from tactflow.vision.geometry import moments
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
-from tactflow.vision.types import Contact, Evidence, Outlines
+from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.types import Contact, Evidence
 
 
 class Hull(Stage):

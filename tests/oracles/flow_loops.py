@@ -17,24 +17,34 @@ IntArray = NDArray[np.int64]
 
 
 def plain_rate_motion(
-    left: FloatArray,
+    position: FloatArray,
+    status: NDArray[np.uint8],
     stderr: FloatArray,
+    rest: FloatArray,
     links: IntArray,
     limits: FloatArray,
     rated: FloatArray,
     found: FloatArray,
 ) -> None:
-    """Each marker's neighbours in order: one that has two of its own rank is the middle of three."""
-    deviations, variance, rest = limits.tolist()
+    """Medians as complex numbers. A neighbour that has two of its own rank is the middle of three."""
+    tracked = np.flatnonzero(status == 0)
+    left = np.zeros(len(status))
+    if len(tracked) >= 3:
+        arms = (rest[2] + 1j * rest[3])[tracked]
+        moved = (position @ [1, 1j] - rest[0] - 1j * rest[1])[tracked]
+        moved -= np.median(moved.real) + 1j * np.median(moved.imag)
+        turn = np.median((moved * arms.conj()).imag / np.maximum(abs(arms) ** 2, 1.0))
+        left[tracked] = abs(moved - 1j * turn * arms)
+    deviations, variance, resting = limits.tolist()
     bound = deviations * np.sqrt(stderr**2 + variance)
-    ratio = np.nan_to_num(np.where(left > rest, left / bound, 0.0))
-    rated[:2], rated[2:] = (bound, ratio), 0.0
+    ratio = np.nan_to_num(np.where(left > resting, left / bound, 0.0))
+    rated[:3], rated[3:] = (left, bound, ratio), 0.0
     for marker in range(len(left)):
         beside = np.concatenate([links[links[:, 0] == marker, 1], links[links[:, 1] == marker, 0]])
         largest = np.sort(ratio[beside])[::-1][:2]
-        rated[2 : 2 + len(largest), marker] = largest
+        rated[3 : 3 + len(largest), marker] = largest
     found[0] = np.sort(left)[-3] if len(left) >= 3 else 0.0
-    found[1] = np.minimum(ratio, rated[3]).max(initial=0.0)
+    found[1] = np.minimum(ratio, rated[4]).max(initial=0.0)
 
 
 def plain_weigh_markers(

@@ -12,7 +12,8 @@ from pydantic import ValidationError
 from tactflow.engine.frame import Absent
 from tactflow.engine.ports import read_ports
 from tactflow.stages.hull import Hull
-from tactflow.vision.types import Contact, Outlines
+from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.types import Contact
 
 
 def run(mask: NDArray[np.uint8], **params: Any) -> Contact | Absent:

@@ -7,12 +7,10 @@ Coordinates are pixels of the processed frame, x right, y down, with the centre 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,35 +46,6 @@ class Ellipse:
     center: tuple[float, float]
     axes: tuple[float, float]
     angle: float | None
-
-
-class Outlines(NamedTuple):
-    """The outlines of a mask's regions, which one stage may have looked for and another can use.
-
-    mask : (H, W) uint8, the mask itself: they are of no other. contours : of each region (8-connected) that
-    around its outside, (n, 1, 2) int32, px, every pixel of it, as `cv2.findContours` returns them.
-
-    >>> mask = np.zeros((20, 20), np.uint8)
-    >>> mask[5:8, 5:8] = 255
-    >>> [len(contour) for contour in Outlines.of(mask).contours]
-    [8]
-    """
-
-    mask: NDArray[np.uint8]
-    contours: Sequence[NDArray[Any]]
-
-    @classmethod
-    def of(cls, mask: NDArray[np.uint8], known: Outlines | None = None) -> Outlines:
-        """Look for them, unless those that are known are of this very mask."""
-        if known is not None and known.mask is mask:
-            return known
-        return cls(mask, cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
-
-    @property
-    def box(self) -> Sequence[int]:
-        """Left, top, width and height of all regions, px; 0 where there is none."""
-        one = len(self.contours) == 1
-        return cv2.boundingRect(self.contours[0] if one else self.mask)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tactflow.vision.flow.loops import rate_motion
 from tactflow.vision.flow.motion import MotionTest
 from tactflow.vision.types import Markers, MarkerStatus
+from tests.oracles.flow_loops import plain_rate_motion
 
 ORIGIN = np.array([[x, y] for y in range(20, 220, 25) for x in range(20, 300, 25)], np.float64)
 PRESSED = np.linalg.norm(ORIGIN - [147, 118], axis=1) < 40
@@ -143,3 +145,21 @@ def test_the_markers_must_be_those_of_the_reference() -> None:
 def test_parameters_out_of_range_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="required"):
         MotionTest(ORIGIN, **values)
+
+
+@pytest.mark.parametrize("count", [0, 2, 3, 4, 5, 60, 61])
+@pytest.mark.parametrize("digits", [0, 15])
+def test_medians_are_right_for_even_and_odd_numbers_and_for_equal_motions(count: int, digits: int) -> None:
+    rng = np.random.default_rng(count)
+    for _ in range(20):
+        rest = rng.uniform(0, 300, (4, count))
+        position = rest[:2].T + np.round(rng.normal(0, 2, (count, 2)), digits)
+        status = (rng.random(count) < 0.2).astype(np.uint8)
+        links = rng.integers(0, max(count, 1), (count, 2))
+        given = position, status, np.full(count, 0.02), rest, links, np.array([3.0, 0.02, 0.1])
+        rated, expected = np.empty((2, 5, count))
+        found, expected_found = np.empty((2, 2))
+        rate_motion(*given, rated, found)
+        plain_rate_motion(*given, expected, expected_found)
+        np.testing.assert_allclose(rated, expected, atol=1e-9)
+        np.testing.assert_allclose(found, expected_found, atol=1e-9)

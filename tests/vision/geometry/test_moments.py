@@ -1,45 +1,65 @@
-"""Moments of a region: whole numbers, equal to those of OpenCV."""
+"""Shape of a mask's regions: whole numbers, equal to those of OpenCV."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from tactflow.vision.geometry.moments import Moments, measure_region, region_moments
-from tests.oracles.moments import plain_measure_region
+from tactflow.vision.geometry.moments import Outlines, measure_region, wrap_rows
+from tests.oracles.moments import plain_measure_region, plain_wrap_rows
+
+SIZES = [(1, 1), (1, 37), (41, 1), (2, 3), (63, 65), (150, 180), (260, 333)]
 
 
-@pytest.mark.parametrize(
-    "size", [(1, 1), (1, 37), (41, 1), (2, 3), (63, 65), (150, 180), (260, 333)], ids=str
-)
-def test_box_and_sums_are_those_of_opencv(size: tuple[int, int]) -> None:
+def masks(size: tuple[int, int]) -> Iterator[NDArray[np.uint8]]:
+    """Some of one region, some of several, some with holes and specks, some empty."""
     rng = np.random.default_rng(9)
-    for _ in range(12):
+    for number in range(16):
         mask = np.zeros(size, np.uint8)
         for _ in range(rng.integers(0, 4)):
             center = int(rng.integers(-3, size[1] + 3)), int(rng.integers(-3, size[0] + 3))
             axes = int(rng.integers(0, size[1])), int(rng.integers(0, size[0]))
             value, thick = int(rng.choice([0, 1, 2, 128, 255])), int(rng.choice([-1, 2]))
             cv2.ellipse(mask, center, axes, float(rng.uniform(0, 180)), 0, 360, value, thick)
-        mask[rng.random(size) < 0.001] = 7
-        found, expected = np.empty(10, np.int64), np.empty(10, np.int64)
-        measure_region(mask, found)
-        plain_measure_region(mask, expected)
+        if number % 2:
+            mask[rng.random(size) < 0.001] = 7
+        yield mask
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_box_sums_and_ends_of_rows_are_those_of_opencv(size: tuple[int, int]) -> None:
+    for mask in masks(size):
+        found, expected = np.empty((2, 11), np.int64)
+        ends, expected_ends = np.empty((2, size[0], 2), np.int32)
+        measure_region(mask, found, ends)
+        plain_measure_region(mask, expected, expected_ends)
         np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(ends, expected_ends)
         for other in (np.asfortranarray(mask), mask[::1]):
             other.setflags(write=False)
-            box, moments = region_moments(other)
-            assert [*box, *moments] == expected.tolist()
+            outlines = Outlines(other)
+            assert [*outlines.box, *outlines.moments, outlines.connected] == expected.tolist()
 
 
-def test_moved_moments_are_those_of_the_moved_region() -> None:
-    y, x = np.array([3, 4, 9]), np.array([1, 7, 2])
-
-    def about(right: int, down: int) -> Moments:
-        u, v = x + right, y + down
-        sums = (len(u), u.sum(), v.sum(), (u * u).sum(), (u * v).sum(), (v * v).sum())
-        return Moments(*(int(value) for value in sums))
-
-    assert about(0, 0).moved(-5, 11) == about(-5, 11)
-    assert about(0, 0).central() == about(-5, 11).central()
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_the_hull_of_rows_is_that_of_opencv_and_so_are_contours(size: tuple[int, int]) -> None:
+    for mask in masks(size):
+        outlines = Outlines(mask, (5, -3))
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(5, -3))
+        assert [part.tolist() for part in outlines.contours] == [part.tolist() for part in contours]
+        if not contours:
+            continue
+        polygon, pixels = outlines.hull()
+        hull = cv2.convexHull(np.concatenate(contours))[:, 0].tolist()
+        start = hull.index(polygon[0].tolist())
+        assert polygon.tolist() == hull[start:] + hull[:start]
+        found, ends = np.empty(11, np.int64), np.empty((size[0], 2), np.int32)
+        measure_region(mask, found, ends)
+        corners, expected = np.empty((2, 2 * size[0] + 2, 2))
+        count, _ = wrap_rows(ends, 5, -3, corners)
+        assert (count, pixels) == plain_wrap_rows(ends, 5, -3, expected)
+        np.testing.assert_array_equal(corners[:count], expected[:count])

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
-from tactflow.vision.types import Evidence, Markers, MarkerStatus, Outlines
+from tactflow.vision.geometry.moments import Box, Outlines
+from tactflow.vision.types import Evidence, Markers, MarkerStatus
 
 Mask = NDArray[np.uint8]
 
@@ -81,19 +82,20 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
     >>> fused.evidence, fused.mask[20, 40]
     ('dots', np.uint8(255))
     """
-    motion = test(markers)
-    if not cv2.countNonZero(light):
+    motion, outlines = test(markers), Outlines(light)
+    if not outlines.moments.pixels:
         if not motion.clearly:
             return FusedContact(light, None)
         return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        outlines = Outlines.of(light)
         mask = _without_strays(outlines, markers, motion, test.pitch)
         return FusedContact(mask, "both", outlines=outlines if mask is light else None)
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
-    light = _without_rims(light, markers)
-    return FusedContact(light, "light" if cv2.countNonZero(light) else None)
+    mask = _without_rims(light, outlines.box, markers)
+    if mask is light:
+        return FusedContact(light, "light", outlines=outlines)
+    return FusedContact(mask, "light" if cv2.countNonZero(mask) else None)
 
 
 def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
@@ -110,12 +112,12 @@ def _without_strays(outlines: Outlines, markers: Markers, motion: Motion, reach:
     reach : how far around a region markers tell what it is, px.
     """
     light = outlines.mask
-    if len(outlines.contours) < 2:
+    if outlines.connected or len(outlines.contours) < 2:
         return light
     moved = _without_reflections(light, outlines.contours, markers, motion, reach)
     if all(pixels > _largest_rim(markers) for pixels in _fewest_pixels(outlines)):
         return moved
-    left = _without_rims(moved, markers)
+    left = _without_rims(moved, outlines.box, markers)
     return left if cv2.countNonZero(left) else moved
 
 
@@ -159,16 +161,17 @@ def _without_reflections(
     return kept
 
 
-def _without_rims(light: Mask, markers: Markers) -> Mask:
+def _without_rims(light: Mask, box: Box, markers: Markers) -> Mask:
     """The regions that are more than what removing a marker leaves at its rim; the same array if all are.
 
+    box : around all regions.
     A marker that has moved by a part of a pixel is not quite where it is painted over.
     """
     radius = markers.radius
     if radius is None or not len(markers.position):
         return light
     # OpenCV takes twenty times as long for the whole frame as for the box around a first touch.
-    left, top, width, height = cv2.boundingRect(light)
+    left, top, width, height = box
     window = light[top : top + height, left : left + width]
     count, labels, boxes, centers = cv2.connectedComponentsWithStats(window)
     small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= _largest_rim(markers))

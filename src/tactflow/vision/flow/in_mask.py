@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from tactflow.vision.flow.displacement_field import DisplacementField, GelMotion
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.similarity import Similarity, fit_similarity
-from tactflow.vision.types import Flow, Markers, MarkerStatus, Outlines
+from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 UNKNOWN: Final = 0.1
 """Share of what the mean flow could be that markers may leave open. Simulated contacts within the grid of

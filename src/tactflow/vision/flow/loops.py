@@ -9,12 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.types import MarkerStatus
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Sums = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 
+_TRACKED: Final = int(MarkerStatus.TRACKED)
 _LEAST: Final = 1e-5
 """What the inverse of the kernel must be, 1, at least: a marker whose place all others leave open. Chosen by
 hand."""
@@ -22,25 +25,35 @@ _NOWHERE: Final = 1e-12
 """Kernel between a region and all markers, in sum, of a region that is far from each. Chosen by hand."""
 
 
-@kernel("void(float64[::1], float64[::1], int64[:, ::1], float64[::1], float64[:, ::1], float64[::1])")
+@kernel(
+    "void(float64[:, ::1], uint8[::1], float64[::1], float64[:, ::1], int64[:, ::1], float64[::1],"
+    " float64[:, ::1], float64[::1])"
+)
 def rate_motion(
-    left: FloatArray,
+    position: FloatArray,
+    status: Bytes,
     stderr: FloatArray,
+    rest: FloatArray,
     links: IntArray,
     limits: FloatArray,
     rated: FloatArray,
     found: FloatArray,
 ) -> None:
-    """How far beyond chance the markers of a chain of three neighbours have moved.
+    """How far beyond chance the markers of a chain of three neighbours have moved against the whole gel.
 
-    left : (N,), their motions, px. stderr : (N,), px, NaN where unknown. links : (L, 2), neighbours.
-    limits : (3,): standard deviations that are a motion; variance of markers of an untouched gel, px^2; the
-    motion up to which a marker of a released gel is at rest, px.
-    rated : (4, N), filled: what it takes to be a motion, px; each motion in this unit, 0 where it is at rest
-    or its error unknown; the largest and the second largest of these numbers among a marker's neighbours.
+    position : (N, 2), px. status : (N,), of `MarkerStatus`. stderr : (N,), px, NaN where unknown.
+    rest : (4, N), of each marker in the reference: x and y, and x and y from the middle of all, px.
+    links : (L, 2), neighbours. limits : (3,): standard deviations that are a motion; variance of markers of
+    an untouched gel, px^2; the motion up to which a marker of a released gel is at rest, px.
+    rated : (5, N), filled: what a shift and a turn of the whole gel leave of each tracked marker's motion,
+    px, 0 of others, and of all where fewer than three are; what it takes to be a motion, px; each motion in
+    this unit, 0 where it is at rest or its error unknown; the largest and the second largest of these
+    numbers among a marker's neighbours.
     found : (2,), filled: the third largest motion, px; the largest number that each marker of a chain
     reaches.
     """
+    _take_out_whole(position, status, rest, rated)
+    left, bounds, ratio, largest, second_largest = rated[0], rated[1], rated[2], rated[3], rated[4]
     most = second = third = chain = 0.0
     for i in range(left.size):
         third = max(third, min(left[i], second))
@@ -48,16 +61,68 @@ def rate_motion(
         most = max(most, left[i])
         bound = limits[0] * math.sqrt(stderr[i] * stderr[i] + limits[1])
         # Nothing is larger than NaN.
-        rated[0, i], rated[1, i] = bound, left[i] / bound if left[i] > limits[2] and bound > 0 else 0.0
-        rated[2, i] = rated[3, i] = 0.0
+        bounds[i], ratio[i] = bound, left[i] / bound if left[i] > limits[2] and bound > 0 else 0.0
+        largest[i] = second_largest[i] = 0.0
     for k in range(len(links)):
         for end in range(2):
-            i, other = links[k, end], rated[1, links[k, 1 - end]]
-            rated[3, i] = max(rated[3, i], min(other, rated[2, i]))
-            rated[2, i] = max(rated[2, i], other)
+            i, other = links[k, end], ratio[links[k, 1 - end]]
+            second_largest[i] = max(second_largest[i], min(other, largest[i]))
+            largest[i] = max(largest[i], other)
     for i in range(left.size):
-        chain = max(chain, min(rated[1, i], rated[3, i]))
+        chain = max(chain, min(ratio[i], second_largest[i]))
     found[0], found[1] = third, chain
+
+
+@helper
+def _take_out_whole(position: FloatArray, status: Bytes, rest: FloatArray, rated: FloatArray) -> None:
+    """Fill the first row of `rated`, see `rate_motion`; the others are for scratch."""
+    left, values = rated[0], rated[1]
+    shift_x = shift_y = 0.0
+    # The shift by x and by y, then the turn: each marker's motion across its arm, over the arm's length.
+    for part in range(3):
+        count = 0
+        for i in range(status.size):
+            if status[i] == _TRACKED:
+                x, y = position[i, 0] - rest[0, i] - shift_x, position[i, 1] - rest[1, i] - shift_y
+                arm_x, arm_y = rest[2, i], rest[3, i]
+                values[count] = x if part == 0 else y
+                if part == 2:
+                    values[count] = (y * arm_x - x * arm_y) / max(arm_x * arm_x + arm_y * arm_y, 1.0)
+                count += 1
+        middle = _median(values, count) if count >= 3 else 0.0
+        shift_x = middle if part == 0 else shift_x
+        shift_y = middle if part == 1 else shift_y
+    for i in range(status.size):
+        left[i] = 0.0
+        if status[i] == _TRACKED and count >= 3:
+            x = position[i, 0] - rest[0, i] - shift_x + middle * rest[3, i]
+            y = position[i, 1] - rest[1, i] - shift_y - middle * rest[2, i]
+            left[i] = math.sqrt(x * x + y * y)
+
+
+@helper
+def _median(values: FloatArray, count: int) -> float:
+    """The median of the first ones, of which it changes the order."""
+    upper = count // 2
+    first, last = 0, count - 1
+    # Hoare's selection: what is smaller than the value in the middle goes to its left, what is larger to its
+    # right, until nothing is left to be told apart there.
+    while first < last:
+        middle, i, j = values[upper], first, last
+        while i <= j:
+            while values[i] < middle:
+                i += 1
+            while values[j] > middle:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        first, last = i if j < upper else first, j if i > upper else last
+    lower = values[upper if count % 2 else 0]
+    for i in range(0 if count % 2 else upper):
+        lower = max(lower, values[i])
+    return float(lower + values[upper]) / 2
 
 
 @kernel(

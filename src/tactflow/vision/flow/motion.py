@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 TOGETHER: Final = 3
 """Neighbouring markers that must have moved: a single one may be mistaken for its neighbour."""
@@ -119,10 +118,10 @@ class MotionTest:
             raise ValueError(f"steadiness: required > 0 px, got {steadiness}")
         if not 0 <= relaxation < 1:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
-        origin = np.asarray(origin, np.float64)
-        self._origin = _complex(origin)
-        self._arms = self._origin - (self._origin.mean() if len(origin) else 0)
-        self._levers = self._arms.conj() / np.maximum(np.abs(self._arms) ** 2, 1.0)
+        origin = np.array(origin, np.float64)
+        self._origin = origin
+        middle = origin.mean(axis=0) if len(origin) else 0.0
+        self._rest = np.ascontiguousarray(np.hstack([origin, origin - middle]).T)
         self._variance = steadiness**2
         self._relaxation = relaxation
         self.pitch = pitch_of(origin) if len(origin) > 1 else 0.0
@@ -142,21 +141,14 @@ class MotionTest:
 
         Raises ValueError if they are not as many as in the reference.
         """
-        if len(markers.position) != len(self._origin):
-            raise ValueError(f"required {len(self._origin)} markers, got {len(markers.position)}")
-        tracked = markers.status == _TRACKED
-        number = np.count_nonzero(tracked)
-        if number == len(tracked) >= TOGETHER:
-            left = _unexplained(_complex(markers.position) - self._origin, self._arms, self._levers)
-        else:
-            left = np.zeros(len(tracked))
-            if number >= TOGETHER:
-                moved = _complex(markers.position)[tracked] - self._origin[tracked]
-                left[tracked] = _unexplained(moved, self._arms[tracked], self._levers[tracked])
+        count = len(self._origin)
+        if len(markers.position) != count:
+            raise ValueError(f"required {count} markers, got {len(markers.position)}")
         limits = np.array([self._limit, self._variance, self._relaxation * self._strongest])
-        rated, found = np.empty((4, len(left))), np.empty(2)
+        rated, found = np.empty((5, count)), np.empty(2)
+        position = np.ascontiguousarray(markers.position, np.float64)
         stderr = np.ascontiguousarray(markers.stderr, np.float64)
-        rate_motion(left, stderr, self._links, limits, rated, found)
+        rate_motion(position, markers.status, stderr, self._rest, self._links, limits, rated, found)
         largest, chain = found.tolist()
         self._lasted = min(self._lasted + 1, LASTING) if self._moving else 1
         alone = ALONE if largest < FADES * self._largest else ALONE / math.sqrt(self._lasted)
@@ -165,7 +157,7 @@ class MotionTest:
         self._clearly = chain > alone * (STAY if self._clearly else 1.0)
         self._moving = self._clearly or chain > (STAY if self._moving else 1.0)
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
-        return Motion(self._moving, self._clearly, largest, left, rated[0])
+        return Motion(self._moving, self._clearly, largest, rated[0], rated[1])
 
     def stretched(self, markers: Markers) -> FloatArray:
         """Positions (K, 2), px, of the markers at the most strained links between tracked ones.
@@ -174,29 +166,7 @@ class MotionTest:
         """
         tracked = markers.status == _TRACKED
         seen = tracked[self._one] & tracked[self._other]
-        moved = _complex(markers.position) - self._origin
-        strain = np.abs(moved[self._one] - moved[self._other]) * seen / self._lengths
+        moved = markers.position - self._origin
+        strain = np.hypot(*(moved[self._one] - moved[self._other]).T) * seen / self._lengths
         most = self._links[seen & (strain >= STRETCHED * strain.max(initial=0.0))]
         return np.asarray(markers.position[np.unique(most)], np.float64)
-
-
-def _complex(points: NDArray[Any]) -> Complex:
-    """Points (N, 2) as N numbers: x is the real part, y the imaginary one."""
-    return np.ascontiguousarray(points, np.float64).view(np.complex128)[:, 0]
-
-
-def _unexplained(moved: Complex, arms: Complex, levers: Complex) -> FloatArray:
-    """What a shift and a small turn of the whole gel leave of the motions of markers: (n,), px.
-
-    moved : (n,), px. arms : (n,), from the middle to each, px. levers : conjugate arms over their squares.
-    """
-    left = moved - complex(_median(moved.real), _median(moved.imag))
-    # Each marker gives an estimate of the turn: its motion across the arm, over the arm's length.
-    turn = _median((left * levers).imag)
-    return np.asarray(np.abs(left - arms * complex(0, turn)), np.float64)
-
-
-def _median(values: FloatArray) -> float:
-    """A fifth of the time of `np.median` for a hundred values."""
-    ordered, count = np.sort(values), len(values)
-    return float(ordered[(count - 1) // 2] + ordered[count // 2]) / 2

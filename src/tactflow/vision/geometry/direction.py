@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tactflow.vision.geometry.moments import Outlines
 
 FALSE_DIRECTION: Final = 1e-3
 """Share of directionless regions that may be given a direction by chance. Chosen by hand."""
@@ -51,18 +52,10 @@ def axis_direction(theta: float) -> tuple[float, float | None]:
     return angle + 0.0, slope
 
 
-def anisotropy_limit(
-    contours: Sequence[NDArray[Any]],
-    count: int,
-    center: tuple[float, float],
-    second: tuple[int, int, int],
-    confidence: float,
-) -> float:
+def anisotropy_limit(region: Outlines, confidence: float) -> float:
     """Anisotropy that a directionless region reaches by chance in a share `FALSE_DIRECTION` of cases.
 
-    contours : outlines of the region, (n, 1, 2) int32 each, px. count : its number of pixels.
-    center : its centroid, px. second : its second central moments xx, xy, yy times count^2, px^2.
-    confidence : its anisotropy, in [0, 1].
+    confidence : the region's anisotropy, in [0, 1].
 
     Two causes are known, and the larger limit counts.
 
@@ -78,28 +71,29 @@ def anisotropy_limit(
     median, because a polygon has a few strong harmonics and is not rough. For n = 7 exponential variables,
     the chance that an eighth exceeds t times their median is the product of j / (j + t) for j = 4 ... 7.
     """
+    count = region.moments.pixels
     radius = math.sqrt(count / math.pi)
     limit = math.sqrt(-2 * math.log(FALSE_DIRECTION) * _GRID_NOISE / radius**3)
     if confidence > _LINEAR_LIMIT or confidence <= limit:
         return limit
-    xx, xy, yy = (value / (float(count) * count) for value in second)
-    power = _outline_power(contours, center, xx, xy, yy)
+    power = _outline_power(region)
     # Of seven numbers, `np.median` takes a hundred times as long.
     rough = 4 * math.sqrt(_MEDIAN_RATIO * statistics.median(power.tolist()))
     return min(max(limit, rough), _LINEAR_LIMIT)
 
 
-def _outline_power(
-    contours: Sequence[NDArray[Any]], center: tuple[float, float], xx: float, xy: float, yy: float
-) -> NDArray[np.float64]:
-    """Power of the outline's `_HARMONICS`, relative to the ellipse with the variances xx, xy and yy, px^2."""
+def _outline_power(region: Outlines) -> NDArray[np.float64]:
+    """Power of the outline's `_HARMONICS`, relative to the ellipse with the region's second moments."""
+    moments, count = region.moments, region.moments.pixels
+    center = moments.x / count + region.box.left, moments.y / count + region.box.top
+    xx, xy, yy = (value / (float(count) * count) for value in moments.central())
     # Whitening by the Cholesky factor: in these coordinates the ellipse of second moments is a circle.
     l11 = math.sqrt(xx)
     l21 = xy / l11
     l22 = math.sqrt(max(yy - l21 * l21, _LEAST_VARIANCE))
     deviations = []
     turns = []
-    for contour in contours:
+    for contour in region.contours:
         z = np.empty(len(contour), np.complex128)
         z.real = (contour[:, 0, 0] - center[0]) / l11
         z.imag = (contour[:, 0, 1] - center[1] - l21 * z.real) / l22

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.geometry.direction import anisotropy_limit, axis_direction
-from tactflow.vision.geometry.moments import Box, Moments, region_moments
-from tactflow.vision.types import Contact, Ellipse, Evidence, Outlines
+from tactflow.vision.geometry.moments import Box, Outlines
+from tactflow.vision.types import Contact, Ellipse, Evidence
 
 Contours = Sequence[NDArray[Any]]
 
@@ -61,13 +61,12 @@ def contact_geometry(
     >>> contact.center, contact.area, contact.angle
     ((29.5, 24.5), 400.0, 0.0)
     """
-    outlines = _outlines(mask, min_area, max_gap, min_confidence)
-    seen = _components(outlines, min_area)
+    seen = _large_enough(_outlines(mask, min_area, max_gap, min_confidence), min_area)
     if seen is None:
         return None
-    if max_gap is not None and len(seen.contours) > 1:
+    if max_gap is not None and not seen.connected:
         groups = _groups(seen.contours, seen.box, max_gap)
-        seen = _part(seen, max(groups, key=_pixels)) if len(groups) > 1 else seen
+        seen = _only(seen, max(groups, key=_pixels))
     return _describe(seen, min_confidence)
 
 
@@ -89,50 +88,33 @@ def contact_parts(
     >>> [contact.region_area for contact in contact_parts(mask)]
     [400.0, 50.0]
     """
-    outlines = _outlines(mask, min_area, max_gap, min_confidence)
-    seen = _components(outlines, min_area)
+    seen = _large_enough(_outlines(mask, min_area, max_gap, min_confidence), min_area)
     if seen is None:
         return []
-    groups = _groups(seen.contours, seen.box, max_gap) if len(seen.contours) > 1 else [seen.contours]
-    if len(groups) == 1:
+    if seen.connected:
         return [_describe(seen, min_confidence, evidence)]
-    ordered = sorted(groups, key=_pixels, reverse=True)
-    return [_describe(_part(seen, group), min_confidence, evidence) for group in ordered]
+    groups = sorted(_groups(seen.contours, seen.box, max_gap), key=_pixels, reverse=True)
+    return [_describe(_only(seen, group), min_confidence, evidence) for group in groups]
 
 
-class _Seen(NamedTuple):
-    """Components of a mask. roi : the mask inside `box`. contours : their outlines, in pixels of the mask.
-
-    moments : of their pixels, relative to the corner of the box.
-    """
-
-    roi: NDArray[Any]
-    box: Box
-    contours: Contours
-    moments: Moments
+def _large_enough(outlines: Outlines, min_area: float) -> Outlines | None:
+    """The regions of a mask that are large enough; None where there is none."""
+    if outlines.connected and outlines.moments.pixels >= min_area:
+        return outlines
+    kept = [contour for contour in outlines.contours if _filled_area(contour) >= min_area]
+    return _only(outlines, kept) if kept else None
 
 
-def _components(outlines: Outlines, min_area: float) -> _Seen | None:
-    """The components of a mask that are large enough; None where there is none."""
-    mask, contours = outlines
-    if not contours:
-        return None
-    box, moments = region_moments(mask)
-    seen = _Seen(
-        mask[box.top : box.top + box.height, box.left : box.left + box.width], box, contours, moments
-    )
-    if len(contours) > 1 or moments.pixels < min_area:
-        kept = [contour for contour in contours if _filled_area(contour) >= min_area]
-        if not kept:
-            return None
-        if len(kept) < len(contours):
-            seen = _part(seen, kept)
-    return seen
-
-
-def _part(seen: _Seen, contours: Contours) -> _Seen:
-    """Some of the components."""
-    return seen._replace(contours=contours, moments=_moments_inside(seen.roi, contours, seen.box))
+def _only(outlines: Outlines, contours: Contours) -> Outlines:
+    """Those regions that some of the contours are of, with what lies in their holes."""
+    if len(contours) == len(outlines.contours):
+        return outlines
+    left, top, width, height = cv2.boundingRect(np.concatenate(contours))
+    filled = np.zeros((height, width), np.uint8)
+    cv2.drawContours(filled, contours, -1, 255, cv2.FILLED, offset=(-left, -top))
+    x, y = left - outlines.corner[0], top - outlines.corner[1]
+    seen = cv2.bitwise_and(outlines.mask[y : y + height, x : x + width], filled)
+    return Outlines(np.asarray(seen, np.uint8), (left, top), contours)
 
 
 def _outlines(
@@ -149,15 +131,14 @@ def _outlines(
         return mask
     if mask.ndim != 2 or mask.dtype != np.uint8:
         raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
-    return Outlines.of(mask) if mask.size else Outlines(mask, ())
+    return Outlines(mask)
 
 
-def _describe(seen: _Seen, min_confidence: float, evidence: Evidence = "light") -> Contact:
-    """The contact that these components are together."""
-    _, box, contours, moments = seen
-    outline = contours[0] if len(contours) == 1 else np.concatenate(contours)
-    polygon = cv2.convexHull(outline)
+def _describe(seen: Outlines, min_confidence: float, evidence: Evidence = "light") -> Contact:
+    """The contact that these regions are together."""
+    polygon, area = seen.hull()
     # Whole numbers: no cancellation, a vertical bar is exactly vertical.
+    moments = seen.moments
     xx, xy, yy = moments.central()
     count = moments.pixels
     spread = math.hypot(xx - yy, 2 * xy)
@@ -165,55 +146,19 @@ def _describe(seen: _Seen, min_confidence: float, evidence: Evidence = "light") 
     major = (xx + yy + spread) / (2 * square)
     minor = (xx * yy - xy * xy) / (square * square * major) if major > 0 else 0.0
     confidence = min(1.0, spread / (xx + yy)) if xx + yy > 0 else 0.0
-    center = (moments.x / count + box.left, moments.y / count + box.top)
+    center = (moments.x / count + seen.box.left, moments.y / count + seen.box.top)
     angle = slope = None
-    if confidence > min_confidence and confidence > anisotropy_limit(
-        contours, count, center, (xx, xy, yy), confidence
-    ):
+    if confidence > min_confidence and confidence > anisotropy_limit(seen, confidence):
         angle, slope = axis_direction(0.5 * math.atan2(2 * xy, xx - yy))
     ellipse = None
     if count >= _FEWEST_PIXELS and minor > _WIDTH_OF_A_LINE:
         ellipse = Ellipse(center, (4 * math.sqrt(major), 4 * math.sqrt(minor)), angle)
-    return Contact(
-        area=_pixels_in_hull(polygon),
-        center=center,
-        angle=angle,
-        slope=slope,
-        hull=polygon[:, 0].astype(np.float64),
-        ellipse=ellipse,
-        confidence=confidence,
-        region_area=float(count),
-        evidence=evidence,
-    )
-
-
-def _moments_inside(roi: NDArray[Any], contours: Contours, box: Box) -> Moments:
-    """Moments of those pixels in the box that the outlines enclose, relative to its corner."""
-    left, top, wide, high = cv2.boundingRect(contours[0] if len(contours) == 1 else np.concatenate(contours))
-    filled = np.zeros((high, wide), np.uint8)
-    cv2.drawContours(filled, contours, -1, 255, cv2.FILLED, offset=(-left, -top))
-    left, top = left - box.left, top - box.top
-    seen = cv2.bitwise_and(roi[top : top + high, left : left + wide], filled)
-    inside, moments = region_moments(np.asarray(seen, np.uint8))
-    return moments.moved(left + inside.left, top + inside.top)
+    return Contact(area, center, angle, slope, polygon, ellipse, confidence, float(count), evidence)
 
 
 def _filled_area(contour: NDArray[Any]) -> float:
     """Pixels of a component from its outline of pixel centres, holes filled (Pick's theorem)."""
     return cv2.contourArea(contour) + len(contour) / 2 + 1 if len(contour) > 1 else 1.0
-
-
-def _pixels_in_hull(polygon: NDArray[Any]) -> float:
-    """Grid points in or on a polygon (n, 1, 2) of grid points (Pick's theorem); exact."""
-    # Of a few vertices, numbers are quicker than arrays.
-    places: list[list[int]] = polygon[:, 0].tolist()
-    twice = on_border = 0
-    x, y = places[-1]
-    for next_x, next_y in places:
-        twice += x * next_y - next_x * y
-        on_border += math.gcd(next_x - x, next_y - y)
-        x, y = next_x, next_y
-    return (abs(twice) + on_border) / 2 + 1
 
 
 def _pixels(contours: Contours) -> float:
@@ -226,7 +171,7 @@ def _groups(contours: Contours, box: Box, max_gap: float) -> list[Contours]:
 
     box : the window that holds them.
     """
-    if max_gap == 0:
+    if max_gap == 0 or len(contours) == 1:
         return [[contour] for contour in contours]
     reach = min(max_gap, float(box.height + box.width))
     border = math.ceil(reach / 2) + 1
