@@ -297,7 +297,7 @@ def sum_windows(
         weight = out[3 * long // 4 :]
         for x in range(width):
             few = np.uint8(few | (weight[x] < least))
-    return few != 0
+    return bool(few)
 
 
 @kernel(f"void({_READ}, boolean[::1], float32[:, ::1], float32[::1], uint8[::1], uint8[:, ::1])")
