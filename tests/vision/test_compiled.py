@@ -11,14 +11,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision import kernel_cache
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision import compiled, kernel_cache
+from tactflow.vision.compiled import helper, kernel, prefetch
 
 MODULE = """
 from tactflow.vision.compiled import helper, kernel
@@ -90,6 +91,15 @@ def _shifted(value: float) -> float:
 @kernel("float64(float64)")
 def _moved(value: float) -> float:
     return _shifted(value)
+
+
+@kernel("int64(uint8[::1], int64)")
+def _sum_ahead(values: NDArray[np.uint8], ahead: int) -> int:
+    total = 0
+    for index in range(values.size):
+        prefetch(values, index + ahead)
+        total += values[index]
+    return total
 
 
 FACTOR = 3.0
@@ -192,6 +202,20 @@ def test_a_kernel_refuses_what_its_signature_does_not_name() -> None:
 def test_a_kernel_calls_helpers_of_its_file_which_call_others() -> None:
     assert _moved(2.0) == 7.0
     assert _moved.plain(2.0) == 7.0
+
+
+@pytest.mark.parametrize("ahead", [0, 64, -10_000, 10**9])
+def test_to_ask_for_values_ahead_changes_no_result_even_beyond_the_array(ahead: int) -> None:
+    values = np.arange(256, dtype=np.uint8)
+    prefetch(values, ahead)
+    assert _sum_ahead(values, ahead) == 255 * 128
+
+
+def test_to_ask_for_values_ahead_is_an_instruction_of_the_compiled_loop() -> None:
+    # One that comes from the disk cannot be looked into.
+    fresh: Any = numba.njit("int64(uint8[::1], int64)")(compiled._with_helpers(_sum_ahead.plain, {}))
+    (code,) = fresh.inspect_llvm().values()
+    assert "call void @llvm.prefetch" in code
 
 
 @pytest.mark.parametrize("passed_over", [True, False])

@@ -304,13 +304,16 @@ class Runner:
 
     def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
         """Wait for the threads: as long as it takes until the source has ended, not for ever after a stop."""
-        headway, since = self._headway(), time.perf_counter()
+        headway: list[int] | None = None
+        since = time.perf_counter()
         while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
             self._threads[alive[0]].join(interval_s)
             if on_progress is not None:
                 on_progress(self.progress())
+            if not self._hurried:
+                continue
             now, before, headway = time.perf_counter(), headway, self._headway()
-            if not self._hurried or headway != before:
+            if headway != before:
                 since = now
             if now - since > CLOSE_SECONDS:
                 hanging = ", ".join(

@@ -241,6 +241,8 @@ class Segment:
 
     def next_tick(self) -> TickState | None:
         """The next tick that all links into this segment have; None at the end of the stream."""
+        if len(self.inputs) == 1:
+            return self.inputs[0].get()
         heads = [link.get() for link in self.inputs]
         while True:
             newest = max((tick.index for tick in heads if tick is not None), default=-1)

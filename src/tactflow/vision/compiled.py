@@ -44,6 +44,7 @@ from types import FunctionType, ModuleType
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.vision.kernel_cache import POLL_S, claimed, dispatcher_of
 
@@ -236,6 +237,14 @@ def helper(function: Callable[P, R]) -> Helper[P, R]:
     return Helper(function)
 
 
+@helper
+def prefetch(values: NDArray[np.uint8], index: int) -> None:
+    """Have a value brought into the caches before it is needed; only a compiled loop can ask for that.
+
+    values : (n,) uint8, C-contiguous. index : may lie outside, where nothing is brought.
+    """
+
+
 def load(*modules: ModuleType) -> None:
     """Make all kernels of some modules ready."""
     _make_ready([value for module in modules for value in vars(module).values() if isinstance(value, Kernel)])
@@ -421,7 +430,7 @@ def _with_helpers(function: Callable[P, R], options: dict[str, Any]) -> Callable
     # A helper needs no entry for Python either: compiling takes 0.9 times as long without.
     compiled = import_module("numba").njit(forceinline=True, no_cpython_wrapper=True, **options)
     helpers = {
-        name: compiled(_with_helpers(value.plain, options))
+        name: _prefetch_instruction() if value is prefetch else compiled(_with_helpers(value.plain, options))
         for name, value in function.__globals__.items()
         if name in function.__code__.co_names and isinstance(value, Helper)
     }
@@ -431,6 +440,27 @@ def _with_helpers(function: Callable[P, R], options: dict[str, Any]) -> Callable
         function.__code__, {**function.__globals__, **helpers}, function.__name__, function.__defaults__
     )
     return linked
+
+
+@cache
+def _prefetch_instruction() -> Any:
+    """What `prefetch` is compiled to: the instruction of the processor, if it has one."""
+    ir, numba = import_module("llvmlite.ir"), import_module("numba.extending")
+    number = ir.IntType(32)
+
+    def typed(_: Any, values: Any, index: Any) -> tuple[Any, Callable[..., Any]]:
+        def build(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+            array = context.make_array(signature.args[0])(context, builder, arguments[0])
+            place = builder.gep(array.data, [arguments[1]])
+            takes = ir.FunctionType(ir.VoidType(), [place.type, number, number, number])
+            ask = builder.module.declare_intrinsic("llvm.prefetch", (place.type,), takes)
+            # To read it, soon and more than once; it is data.
+            builder.call(ask, [place, number(0), number(3), number(1)])
+            return context.get_dummy_value()
+
+        return import_module("numba").void(values, index), build
+
+    return numba.intrinsic(typed)
 
 
 @cache

@@ -5,13 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel, prefetch
 
 Bytes = NDArray[np.uint8]
 
-_BAND = 4
-"""Output lines computed at a time. Derived: their eight input lines fit into the nearest cache (800 px wide:
-19 kB of 32 kB)."""
+_STEP = 16
+"""Columns of a line computed at a time. Measured: a number that the compiler knows saves a sixth of the time,
+and of 16, 32, 48, 64 and 80 none is faster."""
+_CACHE_LINE = 64
+"""Bytes that memory gives at a time, on most processors."""
+_AHEAD = 4
+"""Lines of the picture from those that are read to those that are asked for. Measured: 2 are as good, 8 take
+a fifth more time."""
 
 
 @kernel(
@@ -34,36 +39,40 @@ def halve_block(
 
     picture : (H, 3 W) uint8. top, left : first row and column of the block, px.
     half : (h, 3 w) uint8; height x width px from half_top and half_left on are written.
-    far : whether the picture is not in the caches, or its memory not even mapped, as in a recording.
+    far : whether the picture is not in the caches. Then what comes next is asked for ahead of its use, which
+        takes a bit more than half of the time.
     upside_down : whether the block's first line becomes the last one.
     The caller sees to it that both blocks lie inside their pictures.
     """
     stride = picture.shape[1]
     values = picture.reshape(-1)
-    for band in range(0, height, _BAND):
-        end = min(band + _BAND, height)
-        if far:
-            # Memory is mapped in half the time if it is read in order once before two lines are read side by
-            # side.
-            start = (top + 2 * band) * stride + 3 * left
-            read = values[start : start + (2 * (end - band) - 1) * stride + 6 * width]
-            any_bits = np.uint8(0)
-            for x in range(read.size):
-                any_bits = np.uint8(any_bits | read[x])
-            # The compiler drops a result that goes nowhere; this one is written over below.
-            half[half_top + (height - 1 - band if upside_down else band), 3 * half_left] = any_bits
-        for y in range(band, end):
-            upper, lower = picture[top + 2 * y, 3 * left :], picture[top + 2 * y + 1, 3 * left :]
-            line = half[half_top + (height - 1 - y if upside_down else y), 3 * half_left :]
-            # The channels one by one: so the compiler turns the line into whole vectors.
-            for x in range(width):
-                line[3 * x] = (upper[6 * x] + upper[6 * x + 3] + lower[6 * x] + lower[6 * x + 3] + 2) >> 2
-                line[3 * x + 1] = (
-                    upper[6 * x + 1] + upper[6 * x + 4] + lower[6 * x + 1] + lower[6 * x + 4] + 2
-                ) >> 2
-                line[3 * x + 2] = (
-                    upper[6 * x + 2] + upper[6 * x + 5] + lower[6 * x + 2] + lower[6 * x + 5] + 2
-                ) >> 2
+    # Bytes that a step asks for, of two whole lines: memory is faster in its own order, without gaps.
+    share = 2 * stride * _STEP // max(width, 1)
+    for y in range(height):
+        start = (top + 2 * y) * stride + 3 * left
+        line = half[half_top + (height - 1 - y if upside_down else y), 3 * half_left :]
+        if width < _STEP:
+            _halve_line(values[start:], values[start + stride :], line, width)
+            continue
+        ahead = start + _AHEAD * stride
+        for step in range(0, width, _STEP):
+            if far:
+                for place in range(ahead, ahead + share, _CACHE_LINE):
+                    prefetch(values, place)
+                ahead += share
+            # The last step takes as many columns as the others, and some of them again.
+            x = min(step, width - _STEP)
+            upper = values[start + 6 * x :]
+            _halve_line(upper, upper[stride:], line[3 * x :], _STEP)
+
+
+@helper
+def _halve_line(upper: Bytes, lower: Bytes, line: Bytes, width: int) -> None:
+    """Means over 2 x 2 px of two lines, (6 width,) each, into one of (3 width,)."""
+    for x in range(width):
+        for c in range(3):
+            left, right = 6 * x + c, 6 * x + c + 3
+            line[3 * x + c] = (upper[left] + upper[right] + lower[left] + lower[right] + 2) >> 2
 
 
 def halved(
@@ -79,7 +88,7 @@ def halved(
     picture : (H, W, 3) uint8.
     block : rows and columns, slices with start and stop inside the picture; None takes all of it.
     into : (h // 2, w // 2, 3) uint8, C-contiguous; is written and returned, if given.
-    far : whether the picture has not been read before; a matter of speed.
+    far : whether the picture is not in the caches; a matter of speed.
     upside_down : whether the block's first line becomes the last one.
     Returns (h // 2, w // 2, 3) uint8; an odd last row or column of the block is left out.
 
