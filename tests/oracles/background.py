@@ -60,7 +60,7 @@ def plain_weigh_change(
 
 
 def plain_scaled_change(
-    half: NDArray[np.uint8],
+    picture: NDArray[np.uint8],
     top: int,
     left: int,
     coefficients: Float,
@@ -69,38 +69,57 @@ def plain_scaled_change(
     mean: Float,
     scale: Float,
     pattern: Float,
+    inside: NDArray[np.uint8],
     blurred: Float,
+    spans: NDArray[np.int64],
+    peaks: Float,
 ) -> None:
     """The change less that of light and pattern, in standard deviations, smoothed along x."""
-    high, wide = blurred.shape[1:]
+    high, wide = len(blurred), blurred.shape[1] // 3
     rows, columns = slice(top, top + high), slice(left, left + wide)
-    planes = half.reshape(len(half), -1, 3)[rows, columns].transpose(2, 0, 1)
-    window = slice(None), rows, columns
-    change = _change(planes, mean[window], coefficients, across[columns], down[rows])
-    change *= scale[window]
-    change -= pattern[window] * (pattern[window] * change).sum(axis=0)
+    planes, usual, unit, toward = (
+        array.reshape(len(array), -1, 3)[rows, columns].transpose(2, 0, 1)
+        for array in (picture, mean, scale, pattern)
+    )
+    change = _change(planes, usual, coefficients, across[columns], down[rows]) * unit
+    change -= toward * (toward * change).sum(axis=0)
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
-    for plane, smooth in zip(change, blurred, strict=True):
-        smooth[:] = cv2.sepFilter2D(plane, cv2.CV_32F, weights, np.ones(1)).reshape(smooth.shape)
+    smooth = cv2.sepFilter2D(np.stack(list(change), axis=2), cv2.CV_32F, weights, np.ones(1))
+    wanted, filled = smooth.reshape(high, wide, 3), np.zeros((high, wide, 3), np.float32)
+    side = high // len(inside)
+    padded = np.pad(inside > 0, ((1, 1), (0, 0)))
+    for row in range(len(inside)):
+        counts = np.flatnonzero(inside[row])
+        spans[row] = (side * counts[0], side * (counts[-1] + 1)) if counts.size else 0
+        near = np.flatnonzero(padded[row : row + 3].any(axis=0))
+        if near.size:
+            part = slice(side * row, side * row + side), slice(side * near[0], side * (near[-1] + 1))
+            blurred.reshape(high, wide, 3)[part] = filled[part] = wanted[part]
+    parts = filled[0], filled[-1], filled[:, 0], filled[:, -1], filled
+    peaks[:] = [np.abs(part).max() for part in parts]
 
 
 def plain_change_strength(
     blurred: Float,
     inside: NDArray[np.uint8],
+    spans: NDArray[np.int64],
     gain: np.float32,
     strongest: Float,
     strength: Float,
     common: Float,
 ) -> None:
     """Smoothed along y, weighed length and mean over the channels, 0 outside."""
+    del spans  # They follow from `inside`.
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
-    planes = [
-        cv2.sepFilter2D(plane, cv2.CV_32F, np.ones(1), weights).reshape(plane.shape) for plane in blurred
-    ]
-    change = np.stack(planes) * (inside != 0).repeat(2, axis=0).repeat(2, axis=1)
-    square = gain * (change**2).sum(axis=0) - np.tensordot(strongest, change, 1) ** 2
+    side = len(strength) // len(inside)
+    counts = (inside != 0).repeat(side, axis=0).repeat(side, axis=1)
+    # What is not filled may hold anything.
+    known = np.nan_to_num(blurred).reshape(*strength.shape, 3)
+    smooth = cv2.sepFilter2D(known, cv2.CV_32F, np.ones(1), weights).reshape(known.shape)
+    change = np.where(counts[..., None], smooth, np.float32(0))
+    square = gain * (change**2).sum(axis=2) - (change @ strongest) ** 2
     strength[:] = np.sqrt(np.maximum(square, 0))
-    common[:] = change.mean(axis=0)
+    common[:] = change.mean(axis=2)
 
 
 GAINS = [
@@ -108,6 +127,7 @@ GAINS = [
     Gain(smooth_cells, plain_smooth_cells, tolerance=2e-5),
     # Squared deviations up to some thousands, to the rounding of float32; sums of thousands of them.
     Gain(weigh_change, plain_weigh_change, tolerance=2.0),
+    # Where nothing counts, `blurred` is what it was.
     Gain(scaled_change, plain_scaled_change, tolerance=1e-5),
     Gain(change_strength, plain_change_strength, tolerance=1e-3),
 ]

@@ -5,24 +5,34 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.response import sum_change
+from tactflow.vision.contact.response import LARGEST_GAIN, LEAST, LONG, ROUND, weigh_colours
 from tests.oracles.gains import Gain
 
-
-def plain_sum_change(
-    change: NDArray[np.float32],
-    inside: NDArray[np.uint8],
-    moments: NDArray[np.float64],
-    colours: NDArray[np.float64],
-) -> None:
-    """Moments of the lengths over the channels, and products of the channels."""
-    seen = change[:, ::2, ::2] * inside
-    size = np.linalg.norm(seen, axis=0).astype(np.float64)
-    y, x = np.indices(size.shape)
-    moments[:] = [(size * power).sum() for power in (1, x, y, x * x, x * y, y * y)]
-    flat = seen.reshape(3, -1).astype(np.float64)
-    colours[:] = flat @ flat.T
+Float = NDArray[np.float32]
 
 
-# Sums up to 1e7, to the rounding of float32.
-GAINS = [Gain(sum_change, plain_sum_change, tolerance=5.0)]
+def plain_weigh_colours(change: Float, inside: NDArray[np.uint8], response: Float) -> None:
+    """Covariances of the places, weighed by the length of the change, and of its channels."""
+    each = len(change) // (2 * len(inside))
+    counts = (inside > 0).repeat(each, axis=0).repeat(each, axis=1)
+    seen = change.reshape(len(change), -1, 3)[::2, ::2][counts].astype(np.float64)
+    size = np.linalg.norm(seen, axis=1)
+    response[:] = 1, 0, 0, 0
+    if not size.sum() > 0:
+        return
+    across, along = np.linalg.eigvalsh(np.cov(np.nonzero(counts), aweights=size, ddof=0))
+    if not LEAST / 2 < along < LONG * across:
+        return
+    elongation = along / across
+    powers, directions = np.linalg.eigh(seen.T @ seen)
+    second, first = powers[1:]
+    if second * elongation >= first:
+        return
+    raised = min(first / max(second * elongation, 1e-6 * first), LARGEST_GAIN**2)
+    gain = raised ** min((LONG - elongation) / (LONG - ROUND), 1)
+    scale = powers.sum() / (gain * powers.sum() - (gain - 1) * first)
+    strongest = directions[:, 2] * np.copysign(1, directions[2, 2])
+    response[0], response[1:] = gain * scale, strongest * np.sqrt((gain - 1) * scale)
+
+
+GAINS = [Gain(weigh_colours, plain_weigh_colours, tolerance=1e-4)]

@@ -33,7 +33,7 @@ from tests.oracles.border import plain_border_level
 from tests.oracles.components import plain_close_changes
 from tests.oracles.illumination import plain_compare_blocks, plain_fit_robustly
 from tests.oracles.resolution import plain_halve_window, plain_raise_mask
-from tests.oracles.response import plain_sum_change
+from tests.oracles.response import plain_weigh_colours
 
 Image = NDArray[np.uint8]
 
@@ -45,7 +45,7 @@ ORACLES = (
     (background, "scaled_change", plain_scaled_change),
     (background, "change_strength", plain_change_strength),
     (background, "smooth_cells", plain_smooth_cells),
-    (response, "sum_change", plain_sum_change),
+    (response, "weigh_colours", plain_weigh_colours),
     (illumination, "compare_blocks", plain_compare_blocks),
     (illumination, "fit_robustly", plain_fit_robustly),
     (components, "close_changes", plain_close_changes),

@@ -77,7 +77,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class _Untouched:
-    """What outlines are compared with, (3, h, w) float32 each at some resolution.
+    """What outlines are compared with, (h, 3 w) float32 each at some resolution.
 
     mean : grey levels. scale : turns grey levels into standard deviations. pattern : part of such a change
     that is left out, as `scaled_change` takes it.
@@ -218,10 +218,10 @@ class BackgroundModel:
         """
         untouched = self._untouched[side]
         picture, each = (change.half if side == 2 else change.whole), CELL // side
-        if side == 1:
-            inside = inside.repeat(2, axis=0).repeat(2, axis=1)
-        strength, brightness = np.empty((2, 2 * inside.shape[0], 2 * inside.shape[1]), np.float32)
-        blurred = np.empty((3, *strength.shape), np.float32)
+        high, wide = inside.shape
+        blurred = np.empty((each * high, 3 * each * wide), np.float32)
+        spans, peaks = np.empty((high, 2), np.int64), np.empty(5, np.float32)
+        belongs = inside.view(np.uint8)
         scaled_change(
             picture.reshape(len(picture), -1),
             each * rows.start,
@@ -232,12 +232,15 @@ class BackgroundModel:
             untouched.mean,
             untouched.scale,
             untouched.pattern,
+            belongs,
             blurred,
+            spans,
+            peaks,
         )
-        whole = not _cut_by_border(blurred, rows, columns, change.squared.shape)
-        response = light_response(blurred, inside) if whole else EVEN
-        belongs = np.ascontiguousarray(inside).view(np.uint8)
-        change_strength(blurred, belongs, *response, strength, brightness)
+        cut = _cut_by_border(peaks, rows, columns, change.squared.shape)
+        response = EVEN if cut else light_response(blurred, inside)
+        strength, brightness = np.empty((2, each * high, each * wide), np.float32)
+        change_strength(blurred, belongs, spans, *response, strength, brightness)
         return WindowChange(strength, brightness)
 
     def _derived(self) -> _Derived:
@@ -284,34 +287,28 @@ class BackgroundModel:
         left_out = (1 - 1 / np.sqrt(1 + square)) / np.maximum(square, np.float32(1e-6))
         if self._counts is not None:
             scale = scale * self._counts.repeat(2, axis=0).repeat(2, axis=1)
-        half = _Untouched(
-            mean, np.asarray(scale, np.float32), np.asarray(pattern * np.sqrt(left_out), np.float32)
-        )
-        whole = _Untouched(self._pictures[1], _doubled(half.scale), _doubled(half.pattern))
-        return {1: whole, 2: half}
+        half = mean, scale, pattern * np.sqrt(left_out)
+        whole = self._pictures[1], *(planes.repeat(2, axis=1).repeat(2, axis=2) for planes in half[1:])
+        return {1: _Untouched(*map(_interleaved, whole)), 2: _Untouched(*map(_interleaved, half))}
 
 
-def _doubled(planes: Float) -> Float:
-    """(3, 2 h, 2 w) of (3, h, w): each pixel four times."""
-    return planes.repeat(2, axis=1).repeat(2, axis=2)
+def _interleaved(planes: Float) -> Float:
+    """(h, 3 w) float32 of (3, h, w)."""
+    return np.ascontiguousarray(planes.transpose(1, 2, 0), np.float32).reshape(planes.shape[1], -1)
 
 
-def _cut_by_border(change: Float, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
+def _cut_by_border(peaks: Float, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
     """Whether a contact, not only what is left of its change further out, reaches the picture's border.
 
-    change : (3, 2h, 2w), of a window. rows, columns : the window, cells. shape : of the picture, cells.
+    peaks : (5,), of the window's change, from `scaled_change`. rows, columns : the window, cells. shape : of
+    the picture, cells.
     """
-    borders = (
-        (rows.start == 0, change[:, 0]),
-        (rows.stop == shape[0], change[:, -1]),
-        (columns.start == 0, change[:, :, 0]),
-        (columns.stop == shape[1], change[:, :, -1]),
+    above, below, before, after, largest = peaks.tolist()
+    enough = CUT * largest
+    by_row = (above > enough and rows.start == 0) or (below > enough and rows.stop == shape[0])
+    return bool(
+        by_row or (before > enough and columns.start == 0) or (after > enough and columns.stop == shape[1])
     )
-    sides = [side for reached, side in borders if reached]
-    if not sides:
-        return False
-    enough = CUT * cv2.norm(change.reshape(-1, change.shape[2]), cv2.NORM_INF)
-    return any(float(np.abs(side).max()) > enough for side in sides)
 
 
 def _planes(picture: NDArray[np.uint8]) -> Float:

@@ -12,12 +12,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.contact.illumination import WHITE
 
 Float = NDArray[np.float32]
 Double = NDArray[np.float64]
 Byte = NDArray[np.uint8]
+Index = NDArray[np.int64]
 
 BLUR_SIGMA: Final = 0.8
 """Standard deviation by which changes are smoothed, pixels at half resolution. Chosen by hand."""
@@ -115,12 +116,12 @@ def weigh_change(
 
 
 @kernel(
-    "void(uint8[:, ::1], int64, int64, float32[:, ::1], float32[::1], float32[::1], float32[:, :, ::1],"
-    " float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1])",
+    "void(uint8[:, ::1], int64, int64, float32[:, ::1], float32[::1], float32[::1], float32[:, ::1],"
+    " float32[:, ::1], float32[:, ::1], uint8[:, ::1], float32[:, ::1], int64[:, ::1], float32[::1])",
     reorder=True,
 )
 def scaled_change(
-    half: Byte,
+    picture: Byte,
     top: int,
     left: int,
     coefficients: Float,
@@ -129,74 +130,166 @@ def scaled_change(
     mean: Float,
     scale: Float,
     pattern: Float,
+    inside: Byte,
     blurred: Float,
+    spans: Index,
+    peaks: Float,
 ) -> None:
-    """How a window has changed at half resolution, in standard deviations, smoothed along x.
+    """How a window has changed where it counts, in standard deviations, smoothed along x.
 
-    half : (H, 3 W), the frame. top, left : of the window. coefficients, across, down : as for
-    `weigh_change`, at this resolution. mean, scale : (3, H, W). pattern : (3, H, W), direction p in which the
-    channels change where the gel's pattern moves: of a change v, (p . v) p is left out.
-    blurred : (3, h, w), filled.
+    picture : (H, 3 W), the frame at the window's resolution. top, left : of the window. coefficients, across,
+    down : as for `weigh_change`, at this resolution. mean, scale : (H, 3 W). pattern : (H, 3 W), direction
+    p in which the channels change where the gel's pattern moves: of a change v, (p . v) p is left out.
+    inside : (r, s), not 0 where a block of the window counts. blurred : (h, 3 w), filled in each row of
+    blocks where it, the one above or the one below count, and between; elsewhere left as it is. spans :
+    (r, 2), filled for each row of blocks with the first pixel that counts and that after the last. peaks :
+    (5,), filled with the largest changes of a channel in there: of the first row, of the last, of the first
+    column, of the last, of all.
     """
-    high, wide = blurred.shape[1:]
-    lines, place = np.empty((3, wide), np.float32), across[left:]
-    along = np.empty(wide, np.float32)
-    second, last = min(1, wide - 1), wide - 1
+    high, wide = len(blurred), blurred.shape[1] // 3
+    side = high // len(inside)
+    _find_spans(inside, side, spans)
+    light = _light_along(coefficients, across[left : left + wide])
+    # With a pixel more on both sides.
+    line, most = np.empty(3 * wide + 6, np.float32), np.zeros(3 * wide, np.float32)
+    begin = end = 0
+    peaks[:2] = 0
     for y in range(high):
-        picture = half[top + y, 3 * left :]
+        if y % side == 0:
+            begin, end = _neighbours(spans, y // side, wide)
+        if begin >= end:
+            continue
+        first, last, count = max(begin - 1, 0), min(end + 1, wide), 3 * (end - begin)
+        row, part = top + y, slice(3 * (left + first), 3 * (left + last))
+        usual, unit, toward = mean[row, part], scale[row, part], pattern[row, part]
+        changes = line[3 * (first - begin + 1) :]
+        _scale_line(picture[row, part], usual, unit, toward, light, first, down[row], changes)
         for c in range(3):
-            gain = coefficients[c, 0] + coefficients[c, 2] * down[top + y]
-            slope, offset = coefficients[c, 1], coefficients[c, 3]
-            usual, unit = mean[c, top + y, left:], scale[c, top + y, left:]
-            line, toward = lines[c], pattern[c, top + y, left:]
-            for x in range(wide):
-                light = usual[x] * (gain + slope * place[x]) + offset
-                value = np.float32(picture[3 * x + c])
-                change, least = value - usual[x] - light, value - WHITE
-                change = change if change > least else least
-                line[x] = change * unit[x]
-                along[x] = line[x] * toward[x] + (along[x] if c else np.float32(0))
+            if begin == 0:
+                line[c] = line[3 * min(2, wide) + c]
+            if end == wide:
+                line[count + 3 + c] = line[max(count - 3, 3) + c]
+        smooth, largest = blurred[y, 3 * begin :], most[3 * begin :]
+        for i in range(count):
+            smooth[i] = (line[i] + line[i + 6]) * BESIDE + line[i + 3] * MIDDLE
+            size = abs(smooth[i])
+            largest[i] = largest[i] if largest[i] > size else size
+        if y == 0:
+            peaks[0] = _largest(most)
+    peaks[2], peaks[3], peaks[4] = _largest(most[:3]), _largest(most[3 * wide - 3 :]), _largest(most)
+    for i in range(3 * begin, 3 * end):
+        peaks[1] = max(peaks[1], abs(blurred[high - 1, i]))
+
+
+@helper
+def _find_spans(inside: Byte, side: int, spans: Index) -> None:
+    """Fill `spans` as `scaled_change` does; both 0 where nothing in a row of blocks counts."""
+    for row in range(len(inside)):
+        first, end = 0, inside.shape[1]
+        while end > 0 and not inside[row, end - 1]:
+            end -= 1
+        while first < end and not inside[row, first]:
+            first += 1
+        spans[row, 0], spans[row, 1] = side * first, side * end
+
+
+@helper
+def _light_along(coefficients: Float, places: Float) -> Float:
+    """(3, 3 w) float32: gain in the frame's middle row, its slope along y, offset; of each channel."""
+    light = np.empty((3, 3 * places.size), np.float32)
+    for x in range(places.size):
         for c in range(3):
-            line, row, toward = lines[c], blurred[c, y], pattern[c, top + y, left:]
-            for x in range(wide):
-                line[x] -= along[x] * toward[x]
-            for x in range(1, wide - 1):
-                row[x] = (line[x - 1] + line[x + 1]) * BESIDE + line[x] * MIDDLE
-            row[0] = (line[second] + line[second]) * BESIDE + line[0] * MIDDLE
-            before = line[max(last - 1, 0)]
-            row[last] = (before + before) * BESIDE + line[last] * MIDDLE
+            light[0, 3 * x + c] = coefficients[c, 0] + coefficients[c, 1] * places[x]
+            light[1, 3 * x + c], light[2, 3 * x + c] = coefficients[c, 2], coefficients[c, 3]
+    return light
+
+
+@helper
+def _scale_line(
+    values: Byte,
+    mean: Float,
+    scale: Float,
+    pattern: Float,
+    light: Float,
+    first: int,
+    place: np.float32,
+    changes: Float,
+) -> None:
+    """Fill `changes` with the change of a line from pixel `first` of the window on, standard deviations."""
+    gain, slope, offset = light[0, 3 * first :], light[1, 3 * first :], light[2, 3 * first :]
+    for i in range(values.size):
+        value, usual = np.float32(values[i]), mean[i]
+        change = value - usual - (usual * (gain[i] + slope[i] * place) + offset[i])
+        least = value - WHITE
+        changes[i] = (change if change > least else least) * scale[i]
+    for x in range(values.size // 3):
+        blue, green, red = changes[3 * x], changes[3 * x + 1], changes[3 * x + 2]
+        along = blue * pattern[3 * x] + green * pattern[3 * x + 1] + red * pattern[3 * x + 2]
+        changes[3 * x] = blue - along * pattern[3 * x]
+        changes[3 * x + 1] = green - along * pattern[3 * x + 1]
+        changes[3 * x + 2] = red - along * pattern[3 * x + 2]
+
+
+@helper
+def _neighbours(spans: Index, row: int, wide: int) -> tuple[int, int]:
+    """The first pixel in the spans of a row and of those above and below, and that after the last."""
+    begin, end = wide, 0
+    for near in range(max(row - 1, 0), min(row + 2, len(spans))):
+        if spans[near, 1]:
+            begin, end = min(begin, spans[near, 0]), max(end, spans[near, 1])
+    return begin, end
+
+
+@helper
+def _largest(values: Float) -> np.float32:
+    """The largest of some numbers that are not negative."""
+    largest = np.float32(0)
+    for value in values:
+        largest = max(largest, value)
+    return largest
 
 
 @kernel(
-    "void(float32[:, :, ::1], uint8[:, ::1], float32, float32[::1], float32[:, ::1], float32[:, ::1])",
+    "void(float32[:, ::1], uint8[:, ::1], int64[:, ::1], float32, float32[::1], float32[:, ::1],"
+    " float32[:, ::1])",
     reorder=True,
 )
 def change_strength(
-    blurred: Float, inside: Byte, gain: np.float32, strongest: Float, strength: Float, common: Float
+    blurred: Float,
+    inside: Byte,
+    spans: Index,
+    gain: np.float32,
+    strongest: Float,
+    strength: Float,
+    common: Float,
 ) -> None:
     """Smooth a change along y, and reduce its channels to one.
 
-    blurred : (3, h, w), from `scaled_change`. inside : (h / 2, w / 2), cells that count. gain, strongest : a
-    `Response`. strength : (h, w), filled with the length of the change over the channels, so weighed.
-    common : (h, w), filled with their mean.
+    blurred, inside, spans : from `scaled_change`. gain, strongest : a `Response`. strength : (h, w), filled
+    with the length of the change over the channels, so weighed. common : (h, w), filled with their mean. Both
+    0 where nothing counts.
     """
     high, wide = strength.shape
-    counts, third = np.empty(wide, np.float32), np.float32(1 / 3)
-    along = np.empty(wide, np.float32)
+    side = high // len(inside)
+    smooth = np.empty(3 * wide, np.float32)
     for y in range(high):
+        row = y // side
+        first, count = spans[row, 0], spans[row, 1] - spans[row, 0]
         above = min(1, high - 1) if y == 0 else y - 1
         below = max(high - 2, 0) if y == high - 1 else y + 1
-        for x in range(wide // 2):
-            counts[2 * x] = counts[2 * x + 1] = np.float32(inside[y // 2, x] != 0)
-        length, tone = strength[y], common[y]
-        for c in range(3):
-            upper, here, lower = blurred[c, above], blurred[c, y], blurred[c, below]
-            for x in range(wide):
-                value = ((upper[x] + lower[x]) * BESIDE + here[x] * MIDDLE) * counts[x]
-                length[x] = value * value + (length[x] if c else np.float32(0))
-                along[x] = value * strongest[c] + (along[x] if c else np.float32(0))
-                tone[x] = value + (tone[x] if c else np.float32(0))
-        for x in range(wide):
-            square = gain * length[x] - along[x] * along[x]
+        upper, here, lower = blurred[above, 3 * first :], blurred[y, 3 * first :], blurred[below, 3 * first :]
+        for i in range(3 * count):
+            smooth[i] = (upper[i] + lower[i]) * BESIDE + here[i] * MIDDLE
+        strength[y], common[y] = 0, 0
+        length, tone = strength[y, first:], common[y, first:]
+        for x in range(count):
+            blue, green, red = smooth[3 * x], smooth[3 * x + 1], smooth[3 * x + 2]
+            along = blue * strongest[0] + green * strongest[1] + red * strongest[2]
+            square = gain * (blue * blue + green * green + red * red) - along * along
             length[x] = np.sqrt(square if square > 0 else np.float32(0))
-            tone[x] *= third
+            tone[x] = (blue + green + red) * np.float32(1 / 3)
+        cells = inside[row, first // side :]
+        for cell in range(count // side):
+            if not cells[cell]:
+                length[side * cell : side * cell + side] = 0
+                tone[side * cell : side * cell + side] = 0

@@ -61,19 +61,19 @@ def raise_mask(level: Float, top: int, left: int, mask: Mask) -> None:
     """What `draw_level` does from half resolution."""
     high, wide = level.shape
     near, far = np.float32(0.75), np.float32(0.25)
-    line = np.empty(2 * wide, np.float32)
-    mixed = np.empty(wide, np.float32)
+    # With a pixel more on both sides, as its neighbour.
+    mixed, line = np.empty(wide + 2, np.float32), np.empty(2 * wide, np.uint8)
     for y in range(min(2 * high, mask.shape[0] - top)):
         here, other = level[y // 2], level[min(max(y // 2 + 2 * (y & 1) - 1, 0), high - 1)]
         for x in range(wide):
-            mixed[x] = here[x] * near + other[x] * far
-        for x in range(1, wide):
-            line[2 * x] = mixed[x] * near + mixed[x - 1] * far
-            line[2 * x - 1] = mixed[x - 1] * near + mixed[x] * far
-        line[0], line[2 * wide - 1] = mixed[0], mixed[wide - 1]
+            mixed[x + 1] = here[x] * near + other[x] * far
+        mixed[0], mixed[wide + 1] = mixed[1], mixed[wide]
+        for x in range(wide):
+            line[2 * x] = np.uint8(255 if mixed[x + 1] * near + mixed[x] * far > 0 else 0)
+            line[2 * x + 1] = np.uint8(255 if mixed[x + 1] * near + mixed[x + 2] * far > 0 else 0)
         row = mask[top + y, left:]
         for x in range(min(2 * wide, row.size)):
-            row[x] |= np.uint8(255) if line[x] > 0 else np.uint8(0)
+            row[x] |= line[x]
 
 
 @kernel("void(uint8[:, ::1], int64, int64, uint8[:, ::1], uint8[:, ::1])")
@@ -82,13 +82,18 @@ def halve_window(mask: Mask, top: int, left: int, inside: Mask, halved: Mask) ->
     high = min(halved.shape[0], (mask.shape[0] - top + 1) // 2)
     wide = min(halved.shape[1], (mask.shape[1] - left + 1) // 2)
     halved[:] = 0
+    any_of = np.empty(wide, np.uint8)
     for y in range(high):
         first, row = top + 2 * y, halved[y]
         upper, lower = mask[first, left:], mask[min(first + 1, mask.shape[0] - 1), left:]
-        cells = inside[y // 2]
         whole = min(wide, upper.size // 2)
         for x in range(whole):
-            any_of = upper[2 * x] | upper[2 * x + 1] | lower[2 * x] | lower[2 * x + 1]
-            row[x] = np.uint8((any_of != 0) & (cells[x // 2] != 0))
+            any_of[x] = upper[2 * x] | upper[2 * x + 1] | lower[2 * x] | lower[2 * x + 1]
         for x in range(whole, wide):
-            row[x] = np.uint8(((upper[2 * x] | lower[2 * x]) != 0) & (cells[x // 2] != 0))
+            any_of[x] = upper[2 * x] | lower[2 * x]
+        cells = inside[y // 2]
+        for x in range(wide // 2):
+            row[2 * x] = np.uint8((any_of[2 * x] != 0) & (cells[x] != 0))
+            row[2 * x + 1] = np.uint8((any_of[2 * x + 1] != 0) & (cells[x] != 0))
+        if wide % 2:
+            row[wide - 1] = np.uint8((any_of[wide - 1] != 0) & (cells[wide // 2] != 0))
