@@ -1,27 +1,40 @@
-"""Plain version of the kernel that leaves out what is not seen of outlines."""
+"""Plain version of the kernel that traces outlines as far as they are seen."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.filling import keep_seen
+from tactflow.vision.contact.filling import trace_outlines
 from tests.oracles.gains import Gain
 
-
-def plain_keep_seen(
-    hidden: NDArray[np.uint8], points: NDArray[np.int32], ends: NDArray[np.int64], kept: NDArray[np.int64]
-) -> None:
-    """What is hidden, grown by a pixel, looked up at all points at once."""
-    near = np.asarray(cv2.dilate(hidden, np.ones((3, 3), np.uint8)), np.uint8)
-    seen = near[points[:, 1], points[:, 0]] == 0
-    for outline, (start, end) in enumerate(pairwise(ends.tolist())):
-        found = points[start:end][seen[start:end]]
-        kept[outline] = start + len(found)
-        points[start : kept[outline]] = found
+Mask = NDArray[np.uint8]
 
 
-GAINS = [Gain(keep_seen, plain_keep_seen)]
+def plain_trace_outlines(
+    mask: Mask,
+    hidden: Mask,
+    beside: Mask,
+    marks: Mask,  # noqa: ARG001
+    points: NDArray[np.int32],
+    ends: NDArray[np.int32],
+) -> int:
+    """OpenCV's outlines, of whose pixels those are kept that are seen and between others not on a line."""
+    found, _ = cv2.findContours(mask | hidden, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    spans = [0]
+    for outline in found[::-1]:
+        x, y = outline[:, 0].T
+        seen = beside[y, x] == 0
+        before, after = np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0)
+        straight = np.all(outline - before == after - outline, axis=(1, 2)) & (len(outline) > 1)
+        between = straight & np.roll(seen, 1) & np.roll(seen, -1)
+        kept = outline[seen & ~between]
+        if len(kept):
+            points[spans[-1] : spans[-1] + len(kept)] = kept
+            spans.append(spans[-1] + len(kept))
+    ends[: len(spans)] = spans
+    return len(spans)
+
+
+GAINS = [Gain(trace_outlines, plain_trace_outlines, scratch=("marks",))]

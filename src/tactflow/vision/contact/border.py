@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.contact.filling import Region
 
 Float = NDArray[np.float32]
 Double = NDArray[np.float64]
@@ -95,13 +96,13 @@ class Depth(NamedTuple):
     steps: Whole
 
 
-def depth_of(filled: Mask) -> Depth:
-    """Of a region without holes, (h, w) uint8, 0 or 1, with some of both."""
+def depth_of(region: Region) -> Depth:
+    """Of a region with something outside."""
     depth, nearest = cv2.distanceTransformWithLabels(
-        filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        region.filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     middle = max(float(cv2.minMaxLoc(depth)[1]), 1.0)
-    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outlines, _ = cv2.findContours(region.filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     ends, steps = [0], [0]
     for outline in outlines:
         arcs = min(max(round(len(outline) / middle), FEWEST_ARCS), MOST_ARCS)

@@ -26,6 +26,7 @@ from tactflow.vision.contact.border import depth_of, inside_border
 from tactflow.vision.contact.components import STRAY
 from tactflow.vision.contact.filling import (
     SQUARE,
+    Hidden,
     Region,
     close_gaps,
     enclosed,
@@ -111,18 +112,22 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     >>> bool(abs((contact_level(change) > 0).sum() / np.pi - 8**2) < 3)
     True
     """
-    if hidden is not None and not cv2.countNonZero(hidden):
-        hidden = None
-    level, near = _level(change, bridge, hidden)
+    below = None if hidden is None or not cv2.countNonZero(hidden) else _hidden(hidden)
+    level, near = _level(change, bridge, below)
     if near is not None:
         # Faint changes that only touch the contact's, such as bands of light, have pulled what is typical.
-        level, _ = _level(WindowChange(change.strength * near, change.brightness * near), bridge, hidden)
+        level, _ = _level(WindowChange(change.strength * near, change.brightness * near), bridge, below)
     return level
 
 
-def _level(change: WindowChange, bridge: float, hidden: Mask | None) -> tuple[Float, Float | None]:
+def _hidden(pixels: Mask) -> Hidden:
+    """What is hidden of a mask, (h, w) uint8, 0 or 1, and what is beside it."""
+    return Hidden(pixels, np.asarray(cv2.dilate(pixels, SQUARE), np.uint8))
+
+
+def _level(change: WindowChange, bridge: float, hidden: Hidden | None) -> tuple[Float, Float | None]:
     """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0."""
-    seen = None if hidden is None else np.asarray(1 - cv2.dilate(hidden, SQUARE), np.uint8)
+    seen = None if hidden is None else 1 - hidden.beside
     cap = GLOSS * _typical(change.strength, seen)
     strength = np.asarray(cv2.threshold(change.strength, cap, 0.0, cv2.THRESH_TRUNC)[1], np.float32)
     even = cv2.norm(strength, cv2.NORM_L2SQR) / EVEN
@@ -161,7 +166,7 @@ def _largest_nearby(values: Float, part: float = 1.0) -> Float:
     return np.asarray(cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
+def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
     """Level set of a contact that has brightened or darkened as a whole, whichever is stronger."""
     brighter = np.clip(brightness, np.float32(0), np.float32(np.inf))
     darker = brighter - brightness
@@ -173,31 +178,31 @@ def _changed_as_a_whole(brightness: Float, hidden: Mask | None) -> Float:
     level = (brightness - half_way) / nearby
     if hidden is not None:
         # The change is smooth here: what is painted next to what is seen is nearly right.
-        hidden = np.asarray(cv2.erode(hidden, SQUARE), np.uint8)
+        hidden = _hidden(np.asarray(cv2.erode(hidden.pixels, SQUARE), np.uint8))
     inside = enclosed((level > 0).view(np.uint8), hidden).filled.view(np.bool_)
     # What is filled in is as deep inside as the middle of a plateau, what is left out as far outside.
     np.clip(level, -0.5, 0.5, out=level)
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
-def _tilted(strength: Float, bridge: float, hidden: Mask | None) -> tuple[Float, Float | None]:
+def _tilted(strength: Float, bridge: float, hidden: Hidden | None) -> tuple[Float, Float | None]:
     """`_level` of a contact that shows its slopes."""
     local = strength / _largest_nearby(strength)
     region, solid, specks = _sloping_region(local, strength, bridge, hidden)
     if cv2.countNonZero(region.filled) == region.filled.size:
         return np.ones_like(strength), None
-    inner = depth_of(region.filled)
+    inner, below = depth_of(region), None if hidden is None else hidden.pixels
     if specks is None:
-        level = inside_border(inner, inner.depth, local, hidden)
+        level = inside_border(inner, inner.depth, local, below)
         return level if solid else _without_specks(level, strength), None
     parts = np.where(specks, np.float32(-1), inner.depth)
     away = cv2.distanceTransform((parts <= 0).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     near = np.asarray((away < parts.max()) & ~specks, np.float32)
-    return inside_border(inner, parts, local, hidden), near
+    return inside_border(inner, parts, local, below), near
 
 
 def _sloping_region(
-    local: Float, strength: Float, bridge: float, hidden: Mask | None
+    local: Float, strength: Float, bridge: float, hidden: Hidden | None
 ) -> tuple[Region, bool, NDArray[np.bool_] | None]:
     """What slopes enclose; whether that is one piece without bays; and (h, w), specks in it or beside it.
 
@@ -213,7 +218,7 @@ def _sloping_region(
     # A wrinkle or what is left of a marker is no far side of the contact, to which a gap is closed.
     left_out = _specks(closed, strength)
     kept = closed.filled if left_out is None else (closed.filled > left_out).view(np.uint8)
-    ring = changed if hidden is None else changed | hidden
+    ring = changed if hidden is None else changed | hidden.pixels
     ring = np.asarray(cv2.bitwise_and(ring, kept), np.uint8)
     reach = max(float(cv2.distanceTransform(ring, cv2.DIST_L2, cv2.DIST_MASK_3).max()) + 1, bridge)
     region = enclosed(close_gaps(ring, reach) | kept)

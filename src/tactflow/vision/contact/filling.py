@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel
 
 Mask = NDArray[np.uint8]
 
@@ -23,6 +24,31 @@ region; and of a bay that has changed, or is enclosed by what has, if the bay do
 
 SQUARE: Final = np.ones((3, 3), np.uint8)
 """A pixel and its neighbours."""
+
+PIXEL: Final = 1
+PASSED: Final = 2
+RIGHT: Final = 4
+BESIDE: Final = 8
+"""Marks of a pixel where outlines are traced: it belongs to the region; an outline passes it; one that has
+what is outside to its right does; it is hidden, or next to what is."""
+
+ACROSS: Final = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+DOWN: Final = np.array([0, -1, -1, -1, 0, 1, 1, 1])
+"""Steps to the eight neighbours of a pixel, counterclockwise from the right, y down."""
+
+_GAP: Final = re.compile(b"\0+")
+"""Pixels of the frame's border that do not belong to a region."""
+
+
+class Hidden(NamedTuple):
+    """What is not known of a mask.
+
+    pixels : (h, w) uint8, 1 where a marker was removed, else 0. beside : 1 there and next to it, where
+    smoothing has carried paint.
+    """
+
+    pixels: Mask
+    beside: Mask
 
 
 class Region(NamedTuple):
@@ -38,11 +64,10 @@ class Region(NamedTuple):
 
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
-    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return Region(filled, [np.asarray(outline, np.int32) for outline in outlines])
+    return Region(filled, _outlines(filled, Hidden(filled, np.zeros_like(filled))))
 
 
-def enclosed(mask: Mask, hidden: Mask | None = None) -> Region:
+def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:
     """What a mask encloses, alone or together with the border of the frame.
 
     mask, hidden : as for `outlined`.
@@ -56,52 +81,93 @@ def enclosed(mask: Mask, hidden: Mask | None = None) -> Region:
     return fill_pockets(traced(outlined(mask, hidden)))
 
 
-def outlined(mask: Mask, hidden: Mask | None) -> Mask:
+def outlined(mask: Mask, hidden: Hidden | None) -> Mask:
     """The parts of a region with their holes filled, fresh.
 
-    mask : (h, w) uint8, 0 or 1. hidden : the same: what is not known of the mask. There the outline runs
-    straight from what is known on one side to what is known on the other.
+    mask : (h, w) uint8, 0 or 1. hidden : what is not known of it. There the outline runs straight from what
+    is known on one side to what is known on the other.
     """
     if hidden is None:
         return _without_holes(mask.copy())
-    known = np.asarray(cv2.bitwise_or(mask, hidden), np.uint8)
-    found, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     filled = np.zeros_like(mask)
-    if not found:
-        return filled
-    points = np.asarray(np.concatenate(found)[:, 0], np.int32)
-    ends = np.cumsum([0, *map(len, found)], dtype=np.int64)
-    kept = np.empty(len(found), np.int64)
-    keep_seen(hidden, points, ends, kept)
-    spans = zip(ends[:-1].tolist(), kept.tolist(), strict=True)
-    parts = [points[start:end] for start, end in spans if end > start]
+    parts = _outlines(mask, hidden)
     if parts:
         cv2.fillPoly(filled, parts, (1.0,))
     return filled
 
 
-@kernel("void(uint8[:, ::1], int32[:, ::1], int64[::1], int64[::1])")
-def keep_seen(
-    hidden: Mask, points: NDArray[np.int32], ends: NDArray[np.int64], kept: NDArray[np.int64]
-) -> None:
-    """Keep those points of outlines that are not hidden, nor beside what is, where smoothing carries paint.
+def _outlines(mask: Mask, hidden: Hidden) -> list[NDArray[np.int32]]:
+    """What `trace_outlines` finds, the last outline first, as OpenCV has it."""
+    high, wide = mask.shape
+    marks = np.zeros((high + 2, wide + 2), np.uint8)
+    # A pixel is passed at most once for each of its four neighbours that is outside.
+    points = np.empty((2 * (high + 1) * (wide + 1), 1, 2), np.int32)
+    ends = np.empty((high + 1) * (wide + 1) // 2, np.int32)
+    spans = ends[: trace_outlines(mask, *hidden, marks, points, ends)].tolist()
+    return [points[start:end] for start, end in zip(spans[-2::-1], spans[:0:-1], strict=True)]
 
-    hidden : (h, w), not 0 where a pixel is not known. points : (n, 2), x and y, one outline after another;
-    those that are kept take the places of the first ones of their outline. ends : (outlines + 1,), 0, and
-    where each outline ends. kept : (outlines,), filled: where what is kept of each ends.
+
+@kernel("int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], int32[:, :, ::1], int32[::1])")
+def trace_outlines(
+    mask: Mask, hidden: Mask, beside: Mask, marks: Mask, points: NDArray[np.int32], ends: NDArray[np.int32]
+) -> int:
+    """Outer borders of a region's parts, counterclockwise, as far as they are seen; returns how many ends.
+
+    Border following after S. Suzuki and K. Abe, "Topological structural analysis of digitized binary images
+    by border following", CVGIP 30 (1985); parts within holes are left out.
+
+    mask : (h, w), 0 or 1. hidden, beside : of a `Hidden`; what is hidden is traced as if it belonged to the
+    region, and what is beside it left out. marks : (h + 2, w + 2), 0, changed. points : (n, 1, 2), filled: x
+    and y of the pixels where outlines turn or come out of what is hidden, one outline after another. ends :
+    (outlines + 1,), filled: 0, and where the points of each outline end.
     """
-    high, wide = hidden.shape
-    for outline in range(kept.size):
-        last = ends[outline]
-        for k in range(ends[outline], ends[outline + 1]):
-            x, y, seen = points[k, 0], points[k, 1], True
-            for row in range(max(y - 1, 0), min(y + 2, high)):
-                for column in range(max(x - 1, 0), min(x + 2, wide)):
-                    seen &= hidden[row, column] == 0
-            if seen:
-                points[last, 0], points[last, 1] = x, y
-                last += 1
-        kept[outline] = last
+    high, wide = mask.shape
+    for y in range(high):
+        for x in range(wide):
+            marks[y + 1, x + 1] = mask[y, x] | hidden[y, x] | beside[y, x] * BESIDE
+    found = ends[0] = 0
+    for y in range(1, high + 1):
+        x, outside = 1, True
+        while x <= wide:
+            if marks[y, x] & PIXEL == 0:
+                x += 1
+                continue
+            if outside and marks[y, x] & PASSED == 0:
+                end = _follow(marks, x, y, points, ends[found])
+                if end > ends[found]:
+                    found += 1
+                    ends[found] = end
+            while marks[y, x] & PIXEL:
+                x += 1
+            # To the right of a part lies a hole of it, or what is outside.
+            outside = marks[y, x - 1] & RIGHT != 0
+    return found + 1
+
+
+@helper
+def _follow(marks: Mask, x: int, y: int, points: NDArray[np.int32], end: int) -> int:
+    """Follow one outline of `trace_outlines` from its first pixel; returns where its points end.
+
+    marks : (h + 2, w + 2) uint8, changed. end : where the points before end.
+    """
+    back = 3
+    while back != 4 and marks[y + DOWN[back], x + ACROSS[back]] & PIXEL == 0:
+        back = (back - 1) & 7
+    alone, first_x, first_y, first_back = back == 4, x, y, back
+    while True:
+        turn = (back + 1) & 7
+        while marks[y + DOWN[turn], x + ACROSS[turn]] & PIXEL == 0 and not alone:
+            turn = (turn + 1) & 7
+        near = marks[y + DOWN[back], x + ACROSS[back]] | marks[y + DOWN[turn], x + ACROSS[turn]]
+        straight = turn == back ^ 4 and near & BESIDE == 0
+        if not straight and marks[y, x] & BESIDE == 0:
+            points[end, 0, 0], points[end, 0, 1] = x - 1, y - 1
+            end += 1
+        # What lies to the right has been looked at, and is outside.
+        marks[y, x] |= PASSED | RIGHT if alone or 0 < turn <= back else PASSED
+        x, y, back = x + ACROSS[turn], y + DOWN[turn], turn ^ 4
+        if alone or (x == first_x and y == first_y and back == first_back):
+            return end
 
 
 def _without_holes(mask: Mask) -> Mask:
@@ -126,7 +192,7 @@ def is_solid(region: Region) -> bool:
         # OpenCV refuses an outline that touches itself, at a neck of one pixel.
         return False
     # Depths come in 256ths of a pixel.
-    return bays is None or bool(bays.reshape(-1, 4)[:, 3].max() <= BAY * 256)
+    return bays is None or bool(bays.ravel()[3::4].max() <= BAY * 256)
 
 
 def fill_bay(region: Region, faint: Mask) -> Region:
@@ -181,31 +247,25 @@ def close_gaps(mask: Mask, reach: float) -> Mask:
 
 
 def fill_pockets(region: Region) -> Region:
-    """Fill, in place, what a region encloses together with the border of the frame."""
+    """A region with what it encloses together with the border of the frame."""
     filled = region.filled
     height, width = filled.shape
-    border = np.concatenate([filled[0], filled[1:, -1], filled[-1, -2::-1], filled[-2:0:-1, 0]])
-    if not border.any():
+    sides = filled[0], filled[1:, -1], filled[-1, -2::-1], filled[-2:0:-1, 0]
+    border = b"".join([side.tobytes() for side in sides])
+    first = border.find(1)
+    gaps = list(_GAP.finditer(border[first:] + border[:first])) if first >= 0 else []
+    if len(gaps) < 2:
         return region
-    before = np.concatenate([border[-1:], border[:-1]])
-    starts = np.flatnonzero(border < before).tolist()
-    if len(starts) < 2:
-        return region
-    ends = np.flatnonzero(border > before).tolist()
-    if ends[0] < starts[0]:
-        ends = [*ends[1:], ends[0] + len(border)]
     hull, closed = _hull(region), False
-    for start, end in zip(starts, ends, strict=True):
-        seed = _on_border((start + end) // 2 % len(border), width, height)
+    for gap in gaps:
+        seed = _on_border((first + sum(gap.span()) // 2) % len(border), width, height)
         if filled[seed[1], seed[0]] or not hull[seed[1], seed[0]]:
             continue
-        other = filled.copy()
-        area, _, _, (left, top, wide, high) = cv2.floodFill(other, None, seed, (2.0,))
-        box = slice(top, top + high), slice(left, left + wide)
-        pocket = (other[box] == 2).view(np.uint8)
-        if cv2.countNonZero(cv2.bitwise_and(pocket, hull[box])) > POCKET * area:
-            filled[box] |= pocket
-            closed = True
+        grown = filled.copy()
+        area = cv2.floodFill(grown, None, seed, (1.0,))[0]
+        covered = cv2.countNonZero(cv2.bitwise_and(cv2.bitwise_xor(grown, filled), hull))
+        if covered > POCKET * area:
+            filled, closed = grown, True
     return traced(filled) if closed else region
 
 
