@@ -102,6 +102,8 @@ def weigh_change(
     now = was = 0.0
     for y in range(high):
         total, rest, both = squared[y], colour[y], evidence[y]
+        for x in range(wide):
+            total[x] = along[x] = 0
         for c in range(3):
             gain = coefficients[c, 0] + coefficients[c, 2] * down[y]
             slope, offset = coefficients[c, 1], coefficients[c, 3]
@@ -112,8 +114,8 @@ def weigh_change(
                 change, least = line[x] - usual[x] - light, line[x] - WHITE
                 change = change if change > least else least
                 deviation = change * scale[x]
-                total[x] = deviation * deviation + (total[x] if c else np.float32(0))
-                along[x] = deviation * scale[x] * usual[x] + (along[x] if c else np.float32(0))
+                total[x] = deviation * deviation + total[x]
+                along[x] += deviation * scale[x] * usual[x]
         for x in range(wide):
             rest[x] = (total[x] - along[x] * along[x] * brightness[y, x]) * colour_factor[y, x]
             both[x] = total[x] if total[x] > rest[x] else rest[x]
@@ -121,9 +123,9 @@ def weigh_change(
             largest_colour[x] = largest_colour[x] if largest_colour[x] > rest[x] else rest[x]
         if before.size:
             for x in range(wide):
-                inside = np.float32(before[y, x])
-                now += inside * both[x]
-                was += inside * evidence_before[y, x]
+                if before[y, x]:
+                    now += both[x]
+                    was += evidence_before[y, x]
     summary[0] = summary[1] = -np.inf
     for x in range(wide):
         summary[0] = max(summary[0], largest[x])
