@@ -77,8 +77,8 @@ def weigh_colours(change: Float, inside: NDArray[np.uint8], response: Float) -> 
     """What `light_response` does; response : (4,), filled with the gain and the strongest colour."""
     each, zero = len(change) // (2 * len(inside)), np.float32(0)
     # Over every second pixel: moments of the change's length, in two pixels, and products of the channels.
-    mass = sum_x = sum_y = sum_xx = sum_xy = sum_yy = 1e-9
-    bb = bg = br = gg = gr = rr = 0.0
+    mass = sum_x = sum_y = sum_xx = sum_xy = sum_yy = np.float64(1e-9)
+    bb = bg = br = gg = gr = rr = np.float64(0)
     for y in range(each * len(inside)):
         cells, line = inside[y // each], change[2 * y]
         size = size_x = size_xx = zero
