@@ -8,7 +8,8 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
-from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field
+from tactflow.vision import compiled
+from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field, loops
 from tactflow.vision.geometry.moments import Outlines
 from tactflow.vision.types import Evidence, Flow, Markers
 
@@ -37,6 +38,7 @@ class FlowInMask(Stage):
 
     def __init__(self, params: Params) -> None:
         self._params = params
+        compiled.load(loops)
 
     def process(
         self,

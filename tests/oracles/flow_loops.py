@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.flow.displacement_field import matern
-from tactflow.vision.flow.loops import rate_motion, sample_region, sum_markers, sum_region, weigh_markers
+from tactflow.vision.flow.loops import (
+    look_up,
+    rate_motion,
+    sample_region,
+    sum_markers,
+    sum_region,
+    weigh_markers,
+)
 from tests.oracles.gains import Gain
 from tests.oracles.typical import Arguments
 
@@ -55,16 +63,13 @@ def plain_weigh_markers(
     usual: float,
     largest: float,
     inverse: FloatArray,
-    moved: FloatArray,
-    variance: FloatArray,
-    coefficients: FloatArray,
-    precision: FloatArray,
+    planes: FloatArray,
     removed: FloatArray,
 ) -> int:
     """Products of matrices, and Cholesky's factors of what is left out."""
-    moved[:] = np.where(seen, position.T - rest, 0.0)
+    moved = np.where(seen, position.T - rest, 0.0)
     error = np.where(seen & np.isfinite(stderr), stderr, usual)
-    variance[:] = error**2
+    variance = error**2
     left_out = np.flatnonzero(~seen | (error > largest))
     count, rows = len(left_out), inverse[left_out]
     scale = 0.0
@@ -74,8 +79,8 @@ def plain_weigh_markers(
         removed[:count] = np.linalg.solve(factors, rows)
         less = inverse - removed[:count].T @ removed[:count]
         scale = float((moved @ less * moved).sum()) / (2 * max(len(seen) - count, 1))
-    coefficients[:] = moved @ less
-    precision[:] = np.where(seen, 0.5 / np.maximum(np.diagonal(less), 1e-5), 0.0)
+    planes[:2], planes[2:4], planes[4] = moved, moved @ less, variance
+    planes[5] = np.where(seen, 0.5 / np.maximum(np.diagonal(less), 1e-5), 0.0)
     return count
 
 
@@ -87,8 +92,7 @@ def poorly_seen() -> Arguments:
     seen, stderr = np.ones(40, np.bool_), np.full(40, 0.02)
     seen[[3, 30]], stderr[[7, 11, 20]], stderr[[1, 30]] = False, (0.1, 0.5, 1.0), np.nan
     inverse = np.linalg.inv(matern(distance / 60) + 1e-5 * np.eye(40))
-    numbers = np.empty((2, 40)), np.empty(40), np.empty((2, 40)), np.empty(40), np.zeros((40, 40))
-    return (rest.T + moved, rest, seen, stderr, 0.02, 0.06, inverse, *numbers)
+    return (rest.T + moved, rest, seen, stderr, 0.02, 0.06, inverse, np.empty((6, 40)), np.zeros((40, 40)))
 
 
 def plain_sample_region(
@@ -97,18 +101,16 @@ def plain_sample_region(
     top: int,
     place: FloatArray,
     many: float,
-    travelled: FloatArray,
+    planes: FloatArray,
     to_markers: FloatArray,
-    coefficients: FloatArray,
     window: IntArray,
-    inside: FloatArray,
-    moved: FloatArray,
+    cells: FloatArray,
 ) -> None:
     """Each cell's motion as a product, and its share by sums over squares, interpolated between pixels."""
     height, width = size = np.array(covered.shape) - 1
     step = 1 if size.prod() < many else 2
     spacing, margin, side = place[2], place[3], int(place[3 + step])
-    least, most = travelled.min(axis=1) - margin, travelled.max(axis=1) + margin
+    least, most = planes[:2].min(axis=1) - margin, planes[:2].max(axis=1) + margin
     corner = np.array([left, top]) - place[:2]
     begin = np.clip(np.floor((corner - most) / spacing), 0, to_markers.shape[1::-1])
     end = np.clip(np.floor((corner + size[::-1] - least) / spacing) + 2, 0, to_markers.shape[1::-1])
@@ -121,19 +123,19 @@ def plain_sample_region(
         np.clip((at + way).astype(int) + more, 0, (width, height)).T for way, more in ((least, 0), (most, 1))
     )
     there = covered[bottom, last] - covered[bottom, first] - covered[top, last] + covered[top, first] != 0
-    moved[:count] = _of_window(to_markers, window, rows) @ coefficients.T * there[:, None]
+    moved = _of_window(to_markers, window, rows) @ planes[2:4].T * there[:, None]
+    cells[0, :count], cells[1:3, :count] = 0, moved.T
     # Around the region there is nothing. Sums over the squares at each pixel of this.
     total = np.pad(covered.astype(np.int64), side + 1, "edge")
     total[: side + 1], total[:, : side + 1] = 0, 0
     boxes = total[side:, side:] - total[side:, :-side] - total[:-side, side:] + total[:-side, :-side]
-    x, y = (at + moved[:count] + (1 - side) / 2 + side + 1).T
-    inside[:count] = 0
+    x, y = (at + moved + (1 - side) / 2 + side + 1).T
     here = np.flatnonzero(there & (x >= 0) & (y >= 0) & (x < boxes.shape[1] - 1) & (y < boxes.shape[0] - 1))
     column, row = x[here].astype(int), y[here].astype(int)
     right, below = x[here] - column, y[here] - row
     upper = boxes[row, column] * (1 - right) + boxes[row, column + 1] * right
     lower = boxes[row + 1, column] * (1 - right) + boxes[row + 1, column + 1] * right
-    inside[here] = (upper * (1 - below) + lower * below) / (255 * side**2)
+    cells[0, here] = (upper * (1 - below) + lower * below) / (255 * side**2)
 
 
 def _of_window(to_markers: FloatArray, window: IntArray, rows: int) -> FloatArray:
@@ -144,18 +146,18 @@ def _of_window(to_markers: FloatArray, window: IntArray, rows: int) -> FloatArra
 
 
 def plain_sum_region(
-    inside: FloatArray,
-    moved: FloatArray,
+    cells: FloatArray,
     to_markers: FloatArray,
     window: IntArray,
     spacing: float,
     table: FloatArray,
     sums: FloatArray,
-    weights: FloatArray,
     to_region: FloatArray,
 ) -> None:
     """Means and second moments as matrix products; the whole matrix of the kernel between all cells."""
     rows, columns = window[3:].tolist()
+    chosen = cells[:, : rows * columns]
+    inside, moved, weights = chosen[0], chosen[1:3].T, chosen[3:]
     share = inside / inside.sum()
     down, across = np.divmod(np.arange(len(inside)), columns)
     points = spacing * np.column_stack([across, down])
@@ -178,13 +180,12 @@ def plain_sum_markers(
     to_region: FloatArray,
     inverse: FloatArray,
     removed: FloatArray,
-    coefficients: FloatArray,
-    precision: FloatArray,
-    variance: FloatArray,
+    planes: FloatArray,
     weights: FloatArray,
     sums: FloatArray,
 ) -> None:
     """Matrix products."""
+    coefficients, variance, precision = planes[2:4], planes[4], planes[5]
     weights[:] = to_region @ (inverse - removed.T @ removed)
     near = to_region[0] * (precision > 0)
     sums[17] = near @ (precision * (coefficients**2).sum(axis=0)) / max(near.sum(), 1e-12)
@@ -193,7 +194,15 @@ def plain_sum_markers(
         sums[first : first + 4] = form[0, 0], form[1, 1], form[1, 2], form[2, 2]
 
 
+def plain_look_up(points: FloatArray, mask: NDArray[np.uint8], inside: NDArray[np.bool_]) -> None:
+    """OpenCV's lookup."""
+    pixels = np.rint(points).astype(np.float32)
+    found = cv2.remap(mask, pixels[:, :1], pixels[:, 1:], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+    inside[:] = found[:, 0]
+
+
 GAINS = [
+    Gain(look_up, plain_look_up),
     Gain(rate_motion, plain_rate_motion, tolerance=1e-9),
     Gain(weigh_markers, plain_weigh_markers, tolerance=1e-6, arguments=poorly_seen),
     Gain(sample_region, plain_sample_region, tolerance=1e-9),

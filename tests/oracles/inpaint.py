@@ -10,71 +10,90 @@ from tests.oracles.gains import Gain
 
 Bytes = NDArray[np.uint8]
 Float = NDArray[np.float32]
+Sums = NDArray[np.uint16]
 Places = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 def plain_sum_valid(
-    mask: Bytes, either: Bytes, valid: Bytes, half: Bytes, cells: Float, reach: int, masked: Places
+    mask: Bytes,
+    half: Bytes,
+    columns: Places,
+    either: Bytes,
+    valid: Bytes,
+    sums: Sums,
+    cells: Sums,
+    masked: Flags,
 ) -> None:
     """Sums over blocks, of what no masked pixel is in."""
-    del either
+    del either, valid, sums
     high, wide = mask.shape
     kept = ~(mask.reshape(high // 2, 2, wide // 2, 2) > 0).any(axis=(1, 3))
-    valid[:] = 255 * kept.ravel().astype(np.uint8)
-    half.reshape(high // 2, wide // 2, 3)[~kept] = 0
-    four = np.dstack([half.reshape(high // 2, wide // 2, 3), valid.reshape(high // 2, wide // 2)])
-    sums = four.reshape(high // 4, 2, wide // 4, 2, 4).sum(axis=(1, 3), dtype=np.float32)
-    sections = cells.reshape(len(cells), 4, -1)
-    sections[reach : reach + high // 4, :, reach : reach + wide // 4] = sums.transpose(0, 2, 1)
-    masked[:] = (sums[:, :, 3] < 4 * 255).sum(axis=1)
+    four = np.dstack([half.reshape(high // 2, wide // 2, 3), np.full(kept.shape, 255)]) * kept[:, :, None]
+    blocks = four.reshape(high // 4, 2, wide // 4, 2, 4).sum(axis=(1, 3)).transpose(0, 2, 1)
+    reach = (columns.size - wide // 4) // 2
+    cells.reshape(high // 4, 4, -1)[:, :, : columns.size] = blocks[:, :, columns - reach]
+    masked[:] = (mask.reshape(high // 4, -1) > 0).any(axis=1)
 
 
 def plain_sum_windows(
-    cells: Float,
-    reach: int,
+    cells: Sums,
+    masked: Flags,
     rows: Places,
-    columns: Places,
+    reach: int,
+    width: int,
     far: float,
     least: float,
-    lines: Float,
-    sums: Float,
-) -> int:
-    """Sums of shifted copies of the lines, which are long enough to run over their sections."""
-    del lines
-    height, section = len(sums), columns.size
-    cells[:] = cells.reshape(len(cells), 4, section)[rows][:, :, columns].reshape(len(cells), -1)
-    count = cells.shape[1] - 2 * reach
-    wide = np.lib.stride_tricks.sliding_window_view(cells, 2 * reach + 1, axis=0).sum(axis=2)
-    wide = np.lib.stride_tricks.sliding_window_view(wide, 2 * reach + 1, axis=1).sum(axis=2)
-    near = cells[reach - 1 :][:height] + 2 * cells[reach:][:height] + cells[reach + 1 :][:height]
-    near = near[:, reach - 1 :][:, :count] + 2 * near[:, reach:][:, :count] + near[:, reach + 1 :][:, :count]
-    sums[:, :count] = near + np.float32(far) * wide
-    return int((sums[:, 3 * section : 4 * section - 2 * reach] < np.float32(least)).sum())
+    tall: Sums,
+    near: Sums,
+    windows: Float,
+) -> bool:
+    """Sums of shifted copies of the lines, where a line or one beside it is masked."""
+    del tall, near
+    long = cells.shape[1]
+    lines = np.pad(cells[rows].astype(np.int64), ((0, 0), (0, 2 * reach)))
+    far_sums = np.lib.stride_tricks.sliding_window_view(lines[1:-1], 2 * reach + 1, axis=0).sum(axis=2)
+    far_sums = np.lib.stride_tricks.sliding_window_view(far_sums, 2 * reach + 1, axis=1).sum(axis=2)
+    around = lines[reach:-reach]
+    around = (around[:-2] + 2 * around[1:-1] + around[2:])[:, reach - 1 :]
+    near_sums = around[:, :long] + 2 * around[:, 1 : long + 1] + around[:, 2 : long + 2]
+    sums = near_sums.astype(np.float32) + np.float32(far) * far_sums.astype(np.float32)
+    looked_at = _or_beside(masked)
+    windows[looked_at] = sums[looked_at]
+    return bool((sums[looked_at, 3 * long // 4 :][:, :width] < np.float32(least)).any())
 
 
 def plain_fill_masked(
-    mask: Bytes, masked: Places, sums: Float, section: int, line: Float, fill: Bytes, picture: Bytes
+    mask: Bytes, masked: Flags, windows: Float, line: Float, fill: Bytes, picture: Bytes
 ) -> None:
     """Quotients, interpolated linearly to twice their number, every pixel four times, under the mask."""
-    del masked, line, fill
-    height, width = sums.shape[0], mask.shape[1] // 4
-    sections = sums.reshape(height, 4, section)[:, :, :width]
-    sections[:, :3] *= np.float32(255) / sections[:, 3:]
-    filled = sections[:, :3].transpose(0, 2, 1)
-    for axis in (0, 1):
-        filled = np.moveaxis(filled, axis, 0)
-        before, after = np.concatenate([filled[:1], filled[:-1]]), np.concatenate([filled[1:], filled[-1:]])
-        most = np.float32(0.75) * filled
-        finer = np.stack([most + np.float32(0.25) * before, most + np.float32(0.25) * after], axis=1)
-        filled = np.moveaxis(finer.reshape(-1, *filled.shape[1:]), 0, axis)
-    large = np.rint(filled).astype(np.uint8).repeat(2, axis=0).repeat(2, axis=1)
+    del line, fill
+    height, width = len(windows), mask.shape[1] // 4
+    sections, looked_at = windows.reshape(height, 4, -1), _or_beside(masked)
+    # What lies between two sections means nothing, and what is not looked at is of another frame.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sections[looked_at, :3] *= np.float32(255) / sections[looked_at, 3:]
+        filled = sections[:, :3, :width].transpose(0, 2, 1)
+        for axis in (0, 1):
+            filled = np.moveaxis(filled, axis, 0)
+            before = np.concatenate([filled[:1], filled[:-1]])
+            after = np.concatenate([filled[1:], filled[-1:]])
+            most = np.float32(0.75) * filled
+            finer = np.stack([most + np.float32(0.25) * before, most + np.float32(0.25) * after], axis=1)
+            filled = np.moveaxis(finer.reshape(-1, *filled.shape[1:]), 0, axis)
     hidden = mask > 0
-    picture.reshape(*mask.shape, 3)[hidden] = large[hidden]
+    large = np.rint(filled.repeat(2, axis=0).repeat(2, axis=1)[hidden])
+    picture.reshape(*mask.shape, 3)[hidden] = large.astype(np.uint8)
+
+
+def _or_beside(masked: Flags) -> Flags:
+    """Which lines are masked, or beside one that is."""
+    wide = np.pad(masked, 1)
+    return np.asarray(wide[:-2] | wide[1:-1] | wide[2:], np.bool_)
 
 
 GAINS = [
-    Gain(sum_valid, plain_sum_valid, scratch=("either",)),
-    # Sums below 1e6 in float32.
-    Gain(sum_windows, plain_sum_windows, tolerance=0.1, scratch=("lines",)),
+    Gain(sum_valid, plain_sum_valid, scratch=("either", "valid", "sums")),
+    Gain(sum_windows, plain_sum_windows, scratch=("tall", "near")),
     Gain(fill_masked, plain_fill_masked, scratch=("line", "fill")),
 ]

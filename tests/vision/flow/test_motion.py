@@ -152,7 +152,8 @@ def test_parameters_out_of_range_are_refused(values: dict[str, float]) -> None:
 def test_medians_are_right_for_even_and_odd_numbers_and_for_equal_motions(count: int, digits: int) -> None:
     rng = np.random.default_rng(count)
     for _ in range(20):
-        rest = rng.uniform(0, 300, (4, count))
+        rest = rng.uniform(0, 300, (6, count))
+        rest[4:] = rest[2:4] / np.maximum((rest[2:4] ** 2).sum(axis=0), 1.0)
         position = rest[:2].T + np.round(rng.normal(0, 2, (count, 2)), digits)
         status = (rng.random(count) < 0.2).astype(np.uint8)
         links = rng.integers(0, max(count, 1), (count, 2))

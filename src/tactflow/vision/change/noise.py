@@ -88,7 +88,7 @@ class NoiseModel:
         self.tests = len(self._windows[0]) * self._unit.shape[1] * self._windows[1].shape[1]
         self.pairs = 0
         self.ssd = SsdNoise(tiling.count)
-        self.coarse_ssd = SsdNoise(math.prod(tiling.coarse_shape))
+        self.coarse_ssd = SsdNoise(tiling.coarse_count)
         self._taught = 0
         # Of each sum, for one frame: as seen in its tile, and as used.
         self._seen = np.zeros_like(self._unit)

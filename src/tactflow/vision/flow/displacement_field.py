@@ -43,6 +43,9 @@ is five pitches wide or more, and the field varies over one and a half. Chosen b
 OUTLINE: Final = 4.0
 """How uncertain a contact's outline is: the square of its error times the length over which it errs alike,
 px^3; 0.5 px over 16 px. Measured on 22 simulated recordings, by what it does to the mean."""
+BLOCK: Final = 32
+"""Points whose kernel with all markers is computed at once, so that what is computed in between stays in the
+caches. Chosen by time, of 16 to 128."""
 FEWEST: Final = 3
 """Markers that must be seen for a field. Chosen by hand."""
 OVERSHOOT: Final = 0.5
@@ -183,8 +186,11 @@ class FieldModel:
 
     def _kernel(self, points: FloatArray) -> FloatArray:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
-        offset = points[:, None] - self.origin
-        return matern(np.sqrt(np.einsum("mnk,mnk->mn", offset, offset)) / self._length)
+        kernel = np.empty((len(points), len(self.origin)))
+        for first in range(0, len(points), BLOCK):
+            x, y = points[first : first + BLOCK].T[:, :, None] - self.origin.T[:, None]
+            kernel[first : first + BLOCK] = matern(np.sqrt(x * x + y * y) / self._length)
+        return kernel
 
     @cached_property
     def weights(self) -> FloatArray:
@@ -222,30 +228,18 @@ class DisplacementField:
         ordered = np.sort(stderr[seen & np.isfinite(stderr)])
         self.noise = float(ordered[len(ordered) // 2]) if len(ordered) else 0.0
         position = np.ascontiguousarray(markers.position, np.float64)
-        # x and y apart: sums along contiguous rows.
-        self._moved, self._coefficients = np.empty((2, len(seen))), np.empty((2, len(seen)))
-        self._variance, self._precision = np.empty(len(seen)), np.empty(len(seen))
+        self._planes = np.empty((6, len(seen)))
         removed = np.empty_like(model.inverse)
+        usual, inverse = self.noise, model.inverse
         count = weigh_markers(
-            position,
-            model.rest,
-            seen,
-            stderr,
-            self.noise,
-            POOR * self.noise,
-            model.inverse,
-            self._moved,
-            self._variance,
-            self._coefficients,
-            self._precision,
-            removed,
+            position, model.rest, seen, stderr, usual, POOR * usual, inverse, self._planes, removed
         )
         self._removed = removed[:count].copy()
 
     @cached_property
     def displacement(self) -> FloatArray:
         """(rows, columns, 2) float64, px."""
-        return np.asarray(self._model.to_markers @ self._coefficients.T)
+        return np.asarray(self._model.to_markers @ self._planes[2:4].T)
 
     @cached_property
     def stderr(self) -> FloatArray:
@@ -253,7 +247,7 @@ class DisplacementField:
         kernel = self._model.to_markers.reshape(-1, len(self._seen))
         weights = self._model.weights - kernel @ self._removed.T @ self._removed
         unknown = np.maximum(1 - np.einsum("gn,gn->g", weights, kernel), 0)
-        squares = self._scale(kernel) * unknown + (weights * weights) @ self._variance
+        squares = self._scale(kernel) * unknown + (weights * weights) @ self._planes[4]
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
 
     def motion(self, mask: NDArray[np.uint8], box: Sequence[int] | None = None) -> GelMotion | None:
@@ -264,69 +258,52 @@ class DisplacementField:
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
         check_mask(mask, 0)
-        cells = self._cells(mask, box or cv2.boundingRect(mask), MANY * self.grid.spacing**2)
-        if cells is None:
-            return None
-        model, step = self._model, int(cells.window[2])
+        window, cells = self._cells(mask, box or cv2.boundingRect(mask), MANY * self.grid.spacing**2)
+        model, step = self._model, int(window[2])
         spacing = step * self.grid.spacing
-        sums, weights = np.zeros(26), np.empty((3, cells.inside.size))
+        # Between region and markers, and how much each marker counts.
         kernel, counts = np.zeros((2, 3, len(model.origin)))
-        between = model.between[step]
-        sum_region(
-            cells.inside, cells.moved, model.to_markers, cells.window, spacing, between, sums, weights, kernel
-        )
+        sums = np.zeros(26)
+        sum_region(cells, model.to_markers, window, spacing, model.between[step], sums, kernel)
+        sum_markers(kernel, model.inverse, self._removed, self._planes, counts, sums)
         numbers = sums.tolist()
-        if numbers[0] == 0:
-            return None
-        sum_markers(
-            kernel,
-            model.inverse,
-            self._removed,
-            self._coefficients,
-            self._precision,
-            self._variance,
-            counts,
-            sums,
-        )
-        return _motion(sums.tolist(), spacing)
+        return _motion(numbers, spacing) if numbers[0] > 0 else None
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
         """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
         check_mask(mask, 0)
-        cells = self._cells(mask, cv2.boundingRect(mask), math.inf)
-        total = 0.0 if cells is None else float(cells.inside.sum())
-        if cells is None or total == 0:
-            return None
-        top, left, _, rows, columns = cells.window.tolist()
-        return Part(cells.inside.reshape(rows, columns), total, (top, left))
+        window, cells = self._cells(mask, cv2.boundingRect(mask), math.inf)
+        top, left, _, rows, columns = window.tolist()
+        inside = cells[0, : rows * columns]
+        total = float(inside.sum())
+        return Part(inside.reshape(rows, columns), total, (top, left)) if total > 0 else None
 
-    def _cells(self, mask: NDArray[np.uint8], box: Sequence[int], many: float) -> _Cells | None:
-        """The cells around a region; of a region in a box of `many` px^2 every other one."""
+    def _cells(
+        self, mask: NDArray[np.uint8], box: Sequence[int], many: float
+    ) -> tuple[NDArray[np.int64], FloatArray]:
+        """The cells around a region, of a region in a box of `many` px^2 every other one.
+
+        Returns window and cells of `sample_region`.
+        """
         left, top, width, height = box
-        if width == 0:
-            return None
         model, (rows, columns) = self._model, self.grid.shape
-        window = np.empty(5, np.int64)
-        inside, moved = np.empty(rows * columns), np.empty((rows * columns, 2))
+        window, cells = np.empty(5, np.int64), np.empty((6, rows * columns))
         sample_region(
             np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32),
             left,
             top,
             model.place,
             many,
-            self._moved,
+            self._planes,
             model.to_markers,
-            self._coefficients,
             window,
-            inside,
-            moved,
+            cells,
         )
-        count = int(window[3] * window[4])
-        return _Cells(window, inside[:count], moved[:count]) if count else None
+        return window, cells
 
     def _scale(self, kernel: FloatArray) -> FloatArray:
         """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""
-        squares = (self._coefficients * self._coefficients).sum(axis=0) * self._precision
+        squares = (self._planes[2:4] ** 2).sum(axis=0) * self._planes[5]
         return np.asarray(kernel @ squares / np.maximum(kernel @ self._seen, 1e-12))
 
 
@@ -340,14 +317,6 @@ class Part(NamedTuple):
     inside: FloatArray
     cells: float
     begin: tuple[int, int]
-
-
-class _Cells(NamedTuple):
-    """Cells around a region: window, inside and moved as `sample_region` fills them."""
-
-    window: NDArray[np.int64]
-    inside: FloatArray
-    moved: FloatArray
 
 
 def matern(distance: FloatArray) -> FloatArray:
@@ -369,19 +338,6 @@ def _grid(size: tuple[int, int], pitch: float) -> Grid:
     return Grid((rows, columns), first, spacing)
 
 
-def _inverse(
-    xx: float, xy: float, yy: float, spacing: float
-) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """The inverse of a part's second moments, px^-2; None for a part too small to have slopes.
-
-    spacing : of its cells, px: a single one has the second moment spacing^2 / 12 along each axis.
-    """
-    determinant = xx * yy - xy * xy
-    if determinant <= (xx + yy) * spacing * spacing / 12:
-        return None
-    return (yy / determinant, -xy / determinant), (-xy / determinant, xx / determinant)
-
-
 def _motion(sums: list[float], spacing: float) -> GelMotion:
     """The motion of a region from sums over its cells, and over the markers, see `loops`.
 
@@ -394,21 +350,23 @@ def _motion(sums: list[float], spacing: float) -> GelMotion:
     # falls from 1 to 0 within its width: share (1 - share) is 1 / 6 for a whole side.
     unit = OUTLINE * 6 * spacing / (cells * spacing * spacing) ** 2
     outline = math.sqrt(unit * at_x), math.sqrt(unit * at_y)
-    gradient = residual = None
-    inverse = _inverse(xx, xy, yy, spacing)
-    if inverse is not None:
-        dx, dy = ((p * xu + q * yu, p * xv + q * yv) for p, q in inverse)
-        unknown = [scale * max(_square(prior, at) - _square(told, at), 0.0) for at in inverse]
-        errors = [math.sqrt(part + _square(noise, at)) for part, at in zip(unknown, inverse, strict=True)]
-        gradient = Gradient(dx, dy, *errors)
-        spread, turn = gradient.growth
-        rest = squares - 2 * (spread * (xu + yv) + turn * (xv - yu)) + (spread**2 + turn**2) * (xx + yy)
-        residual = math.sqrt(max(rest, 0.0))
-    stderr = math.sqrt(scale * left + noise[0])
-    return GelMotion((u, v), stderr, outline, math.sqrt(squares / 2), gradient, residual, left / prior[0])
+    stderr, spread = math.sqrt(scale * left + noise[0]), math.sqrt(squares / 2)
+    determinant = xx * yy - xy * xy
+    # A single cell has the second moment spacing^2 / 12 along each axis: too small to have slopes.
+    if determinant <= (xx + yy) * spacing * spacing / 12:
+        return GelMotion((u, v), stderr, outline, spread, None, None, left / prior[0])
+    x, y, z = yy / determinant, -xy / determinant, xx / determinant
+    unknown = [form - known for form, known in zip(prior, told, strict=True)]
+    dx_stderr = math.sqrt(scale * max(_square(unknown, x, y), 0.0) + _square(noise, x, y))
+    dy_stderr = math.sqrt(scale * max(_square(unknown, y, z), 0.0) + _square(noise, y, z))
+    dx, dy = (x * xu + y * yu, x * xv + y * yv), (y * xu + z * yu, y * xv + z * yv)
+    gradient = Gradient(dx, dy, dx_stderr, dy_stderr)
+    growth, turn = gradient.growth
+    rest = squares - 2 * (growth * (xu + yv) + turn * (xv - yu)) + (growth**2 + turn**2) * (xx + yy)
+    residual = math.sqrt(max(rest, 0.0))
+    return GelMotion((u, v), stderr, outline, spread, gradient, residual, left / prior[0])
 
 
-def _square(form: list[float], at: tuple[float, float]) -> float:
+def _square(form: list[float], x: float, y: float) -> float:
     """The square of a vector by a form, of which the last three numbers are xx, xy and yy."""
-    x, y = at
     return x * x * form[1] + 2 * x * y * form[2] + y * y * form[3]

@@ -9,14 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.flow.loops import look_up
+
 _ROUNDING: Final = 1e-9
 """Added to a disc's radius, and to half the width of its rows, px, before they are cut to whole pixels: a
 whole number keeps its value where it was rounded down. Chosen by hand."""
-_LARGEST: Final = 2**15 - 1
-"""OpenCV looks up fewer places at once than this, in a picture with shorter sides, px. Given by OpenCV."""
-
-_X_AND_Y: Final[Any] = None
-"""What tells OpenCV that x and y come in one array."""
 
 
 def check_mask(mask: NDArray[np.uint8], dilate: float) -> None:
@@ -43,16 +40,13 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
     array([ True,  True, False])
     """
     check_mask(mask, dilate)
-    if len(points) == 0 or mask.size == 0:
-        return np.zeros(len(points), np.bool_)
-    reach = math.floor(dilate + _ROUNDING)
-    if reach == 0 and max(len(points), *mask.shape) < _LARGEST:
-        # Whole numbers stay what they are in float32, and those that are no place in a picture are outside.
-        with np.errstate(over="ignore"):
-            pixels = np.rint(points).astype(np.float32)[:, None]
-        found = cv2.remap(mask, pixels, _X_AND_Y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-        return np.asarray(found[:, 0], np.bool_)
     inside = np.zeros(len(points), np.bool_)
+    reach = math.floor(dilate + _ROUNDING)
+    if reach == 0:
+        look_up(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(mask), inside)
+        return inside
+    if len(points) == 0 or mask.size == 0:
+        return inside
     left, top, width, height = cv2.boundingRect(mask)
     if width == 0:
         return inside

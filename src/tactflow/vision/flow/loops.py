@@ -42,7 +42,8 @@ def rate_motion(
     """How far beyond chance the markers of a chain of three neighbours have moved against the whole gel.
 
     position : (N, 2), px. status : (N,), of `MarkerStatus`. stderr : (N,), px, NaN where unknown.
-    rest : (4, N), of each marker in the reference: x and y, and x and y from the middle of all, px.
+    rest : (6, N), of each marker in the reference: x and y, and its arm, x and y from the middle of all, px;
+    the arm over its square, 1/px.
     links : (L, 2), neighbours. limits : (3,): standard deviations that are a motion; variance of markers of
     an untouched gel, px^2; the motion up to which a marker of a released gel is at rest, px.
     rated : (5, N), filled: what a shift and a turn of the whole gel leave of each tracked marker's motion,
@@ -52,10 +53,24 @@ def rate_motion(
     found : (2,), filled: the third largest motion, px; the largest number that each marker of a chain
     reaches.
     """
-    _take_out_whole(position, status, rest, rated)
     left, bounds, ratio, largest, second_largest = rated[0], rated[1], rated[2], rated[3], rated[4]
+    shift_x = shift_y = middle = 0.0
+    # The shift by x and by y, then the turn: each marker's motion across its arm, over the arm's length.
+    for part in range(3):
+        count = 0
+        for i in range(status.size):
+            if status[i] == _TRACKED:
+                x, y = position[i, 0] - rest[0, i] - shift_x, position[i, 1] - rest[1, i] - shift_y
+                turn = y * rest[4, i] - x * rest[5, i]
+                bounds[count] = x if part == 0 else y if part == 1 else turn
+                count += 1
+        middle = _median(bounds, count) if count else 0.0
+        shift_x, shift_y = middle if part == 0 else shift_x, middle if part == 1 else shift_y
     most = second = third = chain = 0.0
     for i in range(left.size):
+        x = position[i, 0] - rest[0, i] - shift_x + middle * rest[3, i]
+        y = position[i, 1] - rest[1, i] - shift_y - middle * rest[2, i]
+        left[i] = math.sqrt(x * x + y * y) if status[i] == _TRACKED and count >= 3 else 0.0
         third = max(third, min(left[i], second))
         second = max(second, min(left[i], most))
         most = max(most, left[i])
@@ -71,33 +86,6 @@ def rate_motion(
     for i in range(left.size):
         chain = max(chain, min(ratio[i], second_largest[i]))
     found[0], found[1] = third, chain
-
-
-@helper
-def _take_out_whole(position: FloatArray, status: Bytes, rest: FloatArray, rated: FloatArray) -> None:
-    """Fill the first row of `rated`, see `rate_motion`; the others are for scratch."""
-    left, values = rated[0], rated[1]
-    shift_x = shift_y = 0.0
-    # The shift by x and by y, then the turn: each marker's motion across its arm, over the arm's length.
-    for part in range(3):
-        count = 0
-        for i in range(status.size):
-            if status[i] == _TRACKED:
-                x, y = position[i, 0] - rest[0, i] - shift_x, position[i, 1] - rest[1, i] - shift_y
-                arm_x, arm_y = rest[2, i], rest[3, i]
-                values[count] = x if part == 0 else y
-                if part == 2:
-                    values[count] = (y * arm_x - x * arm_y) / max(arm_x * arm_x + arm_y * arm_y, 1.0)
-                count += 1
-        middle = _median(values, count) if count >= 3 else 0.0
-        shift_x = middle if part == 0 else shift_x
-        shift_y = middle if part == 1 else shift_y
-    for i in range(status.size):
-        left[i] = 0.0
-        if status[i] == _TRACKED and count >= 3:
-            x = position[i, 0] - rest[0, i] - shift_x + middle * rest[3, i]
-            y = position[i, 1] - rest[1, i] - shift_y - middle * rest[2, i]
-            left[i] = math.sqrt(x * x + y * y)
 
 
 @helper
@@ -127,7 +115,7 @@ def _median(values: FloatArray, count: int) -> float:
 
 @kernel(
     "int64(float64[:, ::1], float64[:, ::1], boolean[::1], float64[::1], float64, float64, float64[:, ::1],"
-    " float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], float64[:, ::1])",
+    " float64[:, ::1], float64[:, ::1])",
     reorder=True,
 )
 def weigh_markers(
@@ -138,10 +126,7 @@ def weigh_markers(
     usual: float,
     largest: float,
     inverse: FloatArray,
-    moved: FloatArray,
-    variance: FloatArray,
-    coefficients: FloatArray,
-    precision: FloatArray,
+    planes: FloatArray,
     removed: FloatArray,
 ) -> int:
     """The coefficients of a displacement field; how many rows of `removed` there are, S.
@@ -149,46 +134,45 @@ def weigh_markers(
     position : (N, 2), px. rest : (2, N), in the reference, px. seen : (N,). stderr : (N,), px, NaN or
     infinite where unknown. usual : what stands for an unknown one, px. largest : of a marker that counts in
     full, px. inverse : (N, N), of the kernel between markers, symmetric.
-    moved : (2, N), filled with the displacements, px, 0 where unseen. variance : (N,), filled with the
-    squares of the standard errors. coefficients : (2, N), filled with moved times the inverse, which is
-    without the markers that are not seen, and with the variance of those that are seen poorly. precision :
-    (N,), filled with 1 over twice the variance of each marker given all others, relative to the field's; 0
-    where unseen. removed : (N, N), of which S rows are filled: the inverse is less by their squares,
-    removed.T @ removed.
+    planes : (6, N), filled. The displacements, x and y, px, 0 where unseen; their products with the inverse,
+    which is without the markers that are not seen, and with the variance of those that are seen poorly; the
+    squares of the standard errors; 1 over twice the variance of each marker given all others, relative to the
+    field's, 0 where unseen.
+    removed : (N, N), of which S rows are filled: the inverse is less by their squares, removed.T @ removed.
     """
     energy, along = 0.0, np.empty((2, seen.size))
     for i in range(seen.size):
         error = stderr[i] if seen[i] and math.isfinite(stderr[i]) else usual
-        variance[i] = error * error
-        moved[0, i] = position[i, 0] - rest[0, i] if seen[i] else 0.0
-        moved[1, i] = position[i, 1] - rest[1, i] if seen[i] else 0.0
+        planes[0, i] = position[i, 0] - rest[0, i] if seen[i] else 0.0
+        planes[1, i] = position[i, 1] - rest[1, i] if seen[i] else 0.0
+        planes[4, i] = error * error
     for i in range(seen.size):
         x = y = 0.0
         for n in range(seen.size):
-            x += inverse[i, n] * moved[0, n]
-            y += inverse[i, n] * moved[1, n]
-        coefficients[0, i], coefficients[1, i], precision[i] = x, y, inverse[i, i]
-        energy += x * moved[0, i] + y * moved[1, i]
+            x += inverse[i, n] * planes[0, n]
+            y += inverse[i, n] * planes[1, n]
+        planes[2, i], planes[3, i], planes[5, i] = x, y, inverse[i, i]
+        energy += x * planes[0, i] + y * planes[1, i]
     # First without all that are left out: that tells the variance of the field to compare errors with.
     count, scale = 0, 0.0
     for _ in range(2):
-        count = _remove(inverse, seen, variance, largest, scale, removed)
+        count = _remove(inverse, seen, planes, largest, scale, removed)
         scale = energy
         for s in range(count):
             x = y = 0.0
             for n in range(seen.size):
-                x += removed[s, n] * moved[0, n]
-                y += removed[s, n] * moved[1, n]
+                x += removed[s, n] * planes[0, n]
+                y += removed[s, n] * planes[1, n]
             along[0, s], along[1, s] = x, y
             scale -= x * x + y * y
         scale = scale / (2 * (seen.size - count)) if count < seen.size else 0.0
     for s in range(count):
         for n in range(seen.size):
-            coefficients[0, n] -= along[0, s] * removed[s, n]
-            coefficients[1, n] -= along[1, s] * removed[s, n]
-            precision[n] -= removed[s, n] * removed[s, n]
+            planes[2, n] -= along[0, s] * removed[s, n]
+            planes[3, n] -= along[1, s] * removed[s, n]
+            planes[5, n] -= removed[s, n] * removed[s, n]
     for i in range(seen.size):
-        precision[i] = 0.5 / max(precision[i], _LEAST) if seen[i] else 0.0
+        planes[5, i] = 0.5 / max(planes[5, i], _LEAST) if seen[i] else 0.0
     return count
 
 
@@ -196,7 +180,7 @@ def weigh_markers(
 def _remove(
     inverse: FloatArray,
     seen: BoolArray,
-    variance: FloatArray,
+    planes: FloatArray,
     largest: float,
     scale: float,
     removed: FloatArray,
@@ -207,7 +191,7 @@ def _remove(
     """
     count = 0
     for i in range(seen.size):
-        if seen[i] and variance[i] <= largest * largest:
+        if seen[i] and planes[4, i] <= largest * largest:
             continue
         for n in range(seen.size):
             removed[count, n] = inverse[i, n]
@@ -215,7 +199,7 @@ def _remove(
             factor = removed[s, i]
             for n in range(seen.size):
                 removed[count, n] -= factor * removed[s, n]
-        factor = 1 / math.sqrt(removed[count, i] + (scale / variance[i] if seen[i] else 0.0))
+        factor = 1 / math.sqrt(removed[count, i] + (scale / planes[4, i] if seen[i] else 0.0))
         for n in range(seen.size):
             removed[count, n] *= factor
         count += 1
@@ -224,7 +208,7 @@ def _remove(
 
 @kernel(
     "void(int32[:, ::1], int64, int64, float64[::1], float64, float64[:, ::1], float64[:, :, ::1],"
-    " float64[:, ::1], int64[::1], float64[::1], float64[:, ::1])",
+    " int64[::1], float64[:, ::1])",
     reorder=True,
 )
 def sample_region(
@@ -233,12 +217,10 @@ def sample_region(
     top: int,
     place: FloatArray,
     many: float,
-    travelled: FloatArray,
+    planes: FloatArray,
     to_markers: FloatArray,
-    coefficients: FloatArray,
     window: IntArray,
-    inside: FloatArray,
-    moved: FloatArray,
+    cells: FloatArray,
 ) -> None:
     """How cells of a grid have moved, and how much of the surroundings of each is now in a region.
 
@@ -247,20 +229,19 @@ def sample_region(
     place : (6,), of the grid: x and y of its first cell, the spacing of its cells, how much farther they may
     have moved than any marker, and the side of the square that counts around each cell, and around every
     other one, a whole number, px. many : px^2; in a part that is larger, every other cell stands for its
-    neighbours. travelled : (2, N), motion of the markers, px.
-    to_markers : (R, C, N), kernel between the grid's cells and the markers. coefficients : (2, N), of the
-    field.
+    neighbours. planes : (6, N), of `weigh_markers`.
+    to_markers : (R, C, N), kernel between the grid's cells and the markers.
     window : (5,), filled: the first row and column of the cells that may be in the region, every how many
     they are, and how many rows and columns of them.
-    inside, moved : (R C,) and (R C, 2), their beginning filled for these cells, row by row; 0 for those whose
-    gel cannot be in the region.
+    cells : (6, R C), of which the beginning of the first three rows is filled for these cells, row by row:
+    their share in the region, and their motion, x and y, px; 0 for those whose gel cannot be in the region.
     """
     height, width = covered.shape[0] - 1, covered.shape[1] - 1
     window[2] = step = 1 if width * height < many else 2
     side = int(place[3 + step])
     # The cells whose gel may be in the part, and for each of them where its gel may be.
-    least_x, most_x = _extent(travelled, 0, place[3])
-    least_y, most_y = _extent(travelled, 1, place[3])
+    least_x, most_x = _extent(planes, 0, place[3])
+    least_y, most_y = _extent(planes, 1, place[3])
     first_row = _within((top - place[1] - most_y) / place[2], to_markers.shape[0])
     first_column = _within((left - place[0] - most_x) / place[2], to_markers.shape[1])
     end_row = _within((top + height - place[1] - least_y) / place[2] + 2, to_markers.shape[0])
@@ -270,17 +251,19 @@ def sample_region(
     for k in range(rows * columns):
         i, j = first_row + step * (k // columns), first_column + step * (k % columns)
         x, y = place[0] + place[2] * j - left, place[1] + place[2] * i - top
-        moved[k, 0] = moved[k, 1] = inside[k] = 0.0
+        cells[0, k] = cells[1, k] = cells[2, k] = 0.0
         up, down = _within(y + least_y, height), _within(y + most_y + 1, height)
         if not _box(covered, up, _within(x + least_x, width), down, _within(x + most_x + 1, width)):
             continue
-        for n in range(travelled.shape[1]):
-            moved[k, 0] += to_markers[i, j, n] * coefficients[0, n]
-            moved[k, 1] += to_markers[i, j, n] * coefficients[1, n]
+        u = v = 0.0
+        for n in range(planes.shape[1]):
+            u += to_markers[i, j, n] * planes[2, n]
+            v += to_markers[i, j, n] * planes[3, n]
+        cells[1, k], cells[2, k] = u, v
         # The left and upper end of the square, from the outer corner of the part.
-        x, y = x + moved[k, 0] + 0.5 - 0.5 * side, y + moved[k, 1] + 0.5 - 0.5 * side
+        x, y = x + u + 0.5 - 0.5 * side, y + v + 0.5 - 0.5 * side
         if -side < x < width and -side < y < height:
-            inside[k] = _square(covered, x, y, side) / (255.0 * side * side)
+            cells[0, k] = _square(covered, x, y, side) / (255.0 * side * side)
 
 
 @helper
@@ -321,54 +304,52 @@ def _box(covered: Sums, top: int, left: int, bottom: int, right: int) -> int:
 
 
 @kernel(
-    "void(float64[::1], float64[:, ::1], float64[:, :, ::1], int64[::1], float64, float64[:, ::1],"
-    " float64[::1], float64[:, ::1], float64[:, ::1])",
+    "void(float64[:, ::1], float64[:, :, ::1], int64[::1], float64, float64[:, ::1], float64[::1],"
+    " float64[:, ::1])",
     reorder=True,
 )
 def sum_region(
-    inside: FloatArray,
-    moved: FloatArray,
+    cells: FloatArray,
     to_markers: FloatArray,
     window: IntArray,
     spacing: float,
     table: FloatArray,
     sums: FloatArray,
-    weights: FloatArray,
     to_region: FloatArray,
 ) -> None:
     """Sums over the cells of a region, for its mean motion and its slopes.
 
-    inside, moved, to_markers, window : of `sample_region`. spacing : of the window's cells, px.
+    cells, to_markers, window : of `sample_region`; the last three rows of cells are filled with the share of
+    each cell, in sum 1, and that times a_x and a_y. spacing : of the window's cells, px.
     table : (R, 2 C - 1), kernel between cells so many rows and columns apart, the latter from 1 - C on.
     sums : (26,) of 0, filled up to the 17th. Cells count by their share in the region, in sum 1; a is the way
     from the middle to a cell, m its motion, r what that is beyond the mean. The shares; mean m (x, y); a a'
     (xx, xy, yy); a r' (xx, xy, yx, yy); r r'; what cells at the outline have of r^2 (x, y); over pairs of
     cells, the kernel times 1, and times a a' of the two (xx, xy, yy). All are 0 without a cell.
-    weights : (3, n), filled with the share of each cell, and that times a_x and a_y.
     to_region : (3, N) of 0, filled with the kernel between the region and the markers, times 1, a_x and a_y.
     """
     total = x = y = u = v = 0.0
-    columns = window[4]
-    for k in range(inside.size):
-        share = inside[k]
+    columns, count = window[4], window[3] * window[4]
+    for k in range(count):
+        share = cells[0, k]
         total += share
         x += share * (k % columns)
         y += share * (k // columns)
-        u += share * moved[k, 0]
-        v += share * moved[k, 1]
+        u += share * cells[1, k]
+        v += share * cells[2, k]
     if total == 0:
         return
     x, y, u, v = x / total, y / total, u / total, v / total
     sums[0], sums[1], sums[2] = total, u, v
-    for k in range(inside.size):
-        share = inside[k] / total
+    for k in range(count):
+        share = cells[0, k] / total
         across, down = spacing * (k % columns - x), spacing * (k // columns - y)
-        right, below = moved[k, 0] - u, moved[k, 1] - v
+        right, below = cells[1, k] - u, cells[2, k] - v
         at_x, at_y = share * across, share * down
-        weights[0, k], weights[1, k], weights[2, k] = share, at_x, at_y
+        cells[3, k], cells[4, k], cells[5, k] = share, at_x, at_y
         if share == 0:
             continue
-        edge = inside[k] * (1 - inside[k])
+        edge = cells[0, k] * (1 - cells[0, k])
         sums[3] += at_x * across
         sums[4] += at_x * down
         sums[5] += at_y * down
@@ -384,65 +365,59 @@ def sum_region(
             to_region[0, n] += share * near[n]
             to_region[1, n] += at_x * near[n]
             to_region[2, n] += at_y * near[n]
-    _sum_pairs(weights, table, columns, sums[13:17])
+    _sum_pairs(cells, table, columns, count, sums)
 
 
 @helper
-def _sum_pairs(weights: FloatArray, table: FloatArray, columns: int, sums: FloatArray) -> None:
+def _sum_pairs(cells: FloatArray, table: FloatArray, columns: int, count: int, sums: FloatArray) -> None:
     """What the cells of a region have in common: the last four sums of `sum_region`."""
-    ones, across, down = weights[0], weights[1], weights[2]
     middle = table.shape[1] // 2
-    for row in range(ones.size // columns):
-        start = row * columns
+    for start in range(0, count, columns):
         first, end = 0, columns
-        while first < end and ones[start + first] == 0:
+        while first < end and cells[3, start + first] == 0:
             first += 1
-        while first < end and ones[start + end - 1] == 0:
+        while first < end and cells[3, start + end - 1] == 0:
             end -= 1
         for other in range(start + columns if first < end else 0):
-            if ones[other] == 0:
+            one, across, down = cells[3, other], cells[4, other], cells[5, other]
+            if one == 0:
                 continue
-            # In the cell's own row, each pair comes twice.
-            count = 1.0 if other >= start else 2.0
-            near = table[row - other // columns, middle - other % columns :]
-            with_one = with_x = with_y = 0.0
+            near = table[(start - other + other % columns) // columns, middle - other % columns :]
+            with_one = with_x = 0.0
             for k in range(first, end):
-                with_one += ones[start + k] * near[k]
-                with_x += across[start + k] * near[k]
-                with_y += down[start + k] * near[k]
-            sums[0] += count * ones[other] * with_one
-            sums[1] += count * across[other] * with_x
-            sums[2] += count * (across[other] * with_y + down[other] * with_x) / 2
-            sums[3] += count * down[other] * with_y
+                with_one += cells[3, start + k] * near[k]
+                with_x += cells[4, start + k] * near[k]
+            # In the cell's own row, each pair comes twice. All cells of a row are equally far down.
+            times = 1.0 if other >= start else 2.0
+            with_y = with_one * cells[5, start + first] / cells[3, start + first]
+            sums[13] += times * one * with_one
+            sums[14] += times * across * with_x
+            sums[15] += times * (across * with_y + down * with_x) / 2
+            sums[16] += times * down * with_y
 
 
 @kernel(
-    "void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1],"
-    " float64[:, ::1], float64[::1])",
+    "void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1])",
     reorder=True,
 )
 def sum_markers(
     to_region: FloatArray,
     inverse: FloatArray,
     removed: FloatArray,
-    coefficients: FloatArray,
-    precision: FloatArray,
-    variance: FloatArray,
+    planes: FloatArray,
     weights: FloatArray,
     sums: FloatArray,
 ) -> None:
     """Sums over the markers, for the standard errors of a region's mean motion and slopes.
 
     to_region : (3, N), of `sum_region`. inverse : (N, N), of the kernel between markers, symmetric; it is
-    less by removed.T @ removed, (S, N), S >= 0. coefficients : (2, N), of the field.
-    precision : (N,), 1 over twice the variance of each marker given all others, relative to the field's; 0
-    for markers that are not seen. variance : (N,), of their own errors, px^2.
+    less by removed.T @ removed, (S, N), S >= 0. planes : (6, N), of `weigh_markers`.
     weights : (3, N), filled with to_region times the inverse.
     sums : (26,), from the 18th on filled. Variance of the field near the region, px^2; then of 1 and 1, x and
     x, x and y, y and y: what the markers tell of the variance, relative; what their own errors add to it,
     px^2.
     """
-    count = variance.size
+    count = planes.shape[1]
     for i in range(count + len(removed)):
         row = inverse[i] if i < count else removed[i - count]
         one = x = y = 0.0
@@ -458,17 +433,26 @@ def sum_markers(
                 weights[1, n] -= x * removed[i - count, n]
                 weights[2, n] -= y * removed[i - count, n]
     near = squares = 0.0
-    for i in range(variance.size):
-        x, y = coefficients[0, i], coefficients[1, i]
-        squares += to_region[0, i] * precision[i] * (x * x + y * y)
-        near += to_region[0, i] if precision[i] > 0 else 0.0
+    for i in range(count):
+        x, y, variance = planes[2, i], planes[3, i], planes[4, i]
+        squares += to_region[0, i] * planes[5, i] * (x * x + y * y)
+        near += to_region[0, i] if planes[5, i] > 0 else 0.0
         one, x, y = weights[0, i], weights[1, i], weights[2, i]
         sums[18] += one * to_region[0, i]
         sums[19] += x * to_region[1, i]
         sums[20] += x * to_region[2, i]
         sums[21] += y * to_region[2, i]
-        sums[22] += variance[i] * one * one
-        sums[23] += variance[i] * x * x
-        sums[24] += variance[i] * x * y
-        sums[25] += variance[i] * y * y
+        sums[22] += variance * one * one
+        sums[23] += variance * x * x
+        sums[24] += variance * x * y
+        sums[25] += variance * y * y
     sums[17] = squares / max(near, _NOWHERE)
+
+
+@kernel("void(float64[:, ::1], uint8[:, ::1], boolean[::1])")
+def look_up(points: FloatArray, mask: Bytes, inside: NDArray[np.bool_]) -> None:
+    """Which points (N, 2), px, fall on a pixel of a mask that is not 0; none outside of it does."""
+    for i in range(len(points)):
+        x, y = np.rint(points[i, 0]), np.rint(points[i, 1])
+        within = 0 <= x < mask.shape[1] and 0 <= y < mask.shape[0]
+        inside[i] = within and mask[int(y), int(x)] != 0

@@ -120,8 +120,9 @@ class MotionTest:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
         origin = np.array(origin, np.float64)
         self._origin = origin
-        middle = origin.mean(axis=0) if len(origin) else 0.0
-        self._rest = np.ascontiguousarray(np.hstack([origin, origin - middle]).T)
+        arms = origin - (origin.mean(axis=0) if len(origin) else 0.0)
+        levers = arms / np.maximum((arms * arms).sum(axis=1, keepdims=True), 1.0)
+        self._rest = np.ascontiguousarray(np.hstack([origin, arms, levers]).T)
         self._variance = steadiness**2
         self._relaxation = relaxation
         self.pitch = pitch_of(origin) if len(origin) > 1 else 0.0

@@ -121,10 +121,6 @@ def measure_region(mask: NDArray[np.uint8], found: Whole, ends: Ends) -> None:
     each row; W and -1 in a row without any.
     """
     height, width = mask.shape
-    # Squares from a table: the compiler adds many numbers at once, but multiplies one by one.
-    squares = np.empty(width, np.int64)
-    for x in range(width):
-        squares[x] = x * x
     left, right, top, bottom = width, -1, -1, -1
     connected = True
     count = sx = sy = sxx = sxy = syy = np.int64(0)
@@ -138,7 +134,9 @@ def measure_region(mask: NDArray[np.uint8], found: Whole, ends: Ends) -> None:
         last = _end_of_run(row, max(first, ends[bottom, 1] if bottom >= 0 else 0))
         if _all(row[first : last + 1]) and not (_any(row[:first]) or _any(row[last + 1 :])):
             number = last + 1 - first
-            ones, twos = number * (first + last) // 2, _sum_squares(last) - _sum_squares(first - 1)
+            more = number * (number - 1)
+            ones = number * first + more // 2
+            twos = number * first * first + more * first + more * (2 * number - 1) // 6
             touching = bottom == y - 1 and ends[bottom, 0] <= last + 1 and first <= ends[bottom, 1] + 1
             connected = connected and (top < 0 or touching)
         else:
@@ -146,7 +144,7 @@ def measure_region(mask: NDArray[np.uint8], found: Whole, ends: Ends) -> None:
             for x in range(width):
                 number += 1 if row[x] != 0 else 0
                 ones += x if row[x] != 0 else 0
-                twos += squares[x] if row[x] != 0 else 0
+                twos += x * x if row[x] != 0 else 0
             first, last = 0, width - 1
             while row[first] == 0:
                 first += 1
@@ -211,12 +209,6 @@ def _end_of_run(row: NDArray[np.uint8], near: int) -> int:
     while x + 1 < row.size and row[x + 1] != 0:
         x += 1
     return x
-
-
-@helper
-def _sum_squares(last: int) -> int:
-    """Of the whole numbers from 0 to `last`; 0 for -1."""
-    return last * (last + 1) * (2 * last + 1) // 6
 
 
 @kernel("Tuple((int64, float64))(int32[:, ::1], int64, int64, float64[:, ::1])")

@@ -10,12 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halve_block
 
 Bytes = NDArray[np.uint8]
 Float = NDArray[np.float32]
+Sums = NDArray[np.uint16]
 Places = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 
 RADIUS: Final = 7.0
@@ -33,6 +35,14 @@ FRAME_WEIGHT: Final = np.float32(1e-6)
 
 LEAST_WEIGHT: Final = 1e-3
 """Weight, of at most 255, below which a window has no valid pixel: one px in 10 000 gives more (derived)."""
+
+MOST_REACH: Final = 31
+"""Cells of the wide window on either side, at most: so its columns' sums fit in 16 bits. Derived: 63 cells of
+at most 4 * 255 are below 2**16."""
+
+LANES: Final = 32
+"""A line's sections are padded to multiples of so many cells: whole vectors. What is left of one is computed
+value by value, slowly."""
 
 
 def remove_markers(
@@ -52,7 +62,7 @@ def remove_markers(
         inwards from the border of the mask, 10 ms and more; `ns` continues lines of equal brightness, as
         slow; `none` returns a copy of the image.
     radius : neighbourhood, px, > 0. For `normalized` about the radius of a dot: a larger one is smoother, a
-        much smaller one leaves the middle of a dot to its far surroundings.
+        much smaller one leaves the middle of a dot to its far surroundings; beyond 120 px it changes nothing.
 
     Returns
     -------
@@ -117,20 +127,20 @@ class _Buffers:
     """What `_fill_cells` computes in; see the kernels."""
 
     def __init__(self, height: int, width: int, reach: int) -> None:
-        wide = width + 2 * reach
-        self.masked = np.empty(height, np.int64)
-        self.either = np.empty(8 * height * width, np.uint8)
-        self.valid = np.empty(4 * height * width, np.uint8)
-        self.half = np.empty((2 * height, 6 * width), np.uint8)
-        self.cells = np.zeros((height + 2 * reach, 4 * wide), np.float32)
-        self.rows = np.pad(np.arange(height), reach, mode="reflect") + reach
+        section = -(-(width + 2 * reach) // LANES) * LANES
+        long = 4 * section
+        self.rows = np.pad(np.arange(height), reach + 1, mode="reflect")
         self.columns = np.pad(np.arange(width), reach, mode="reflect") + reach
-        self.lines = np.empty((3, 4 * wide), np.float32)
-        self.sums = np.zeros((height, 4 * wide), np.float32)
-        # Whole vectors: what is left of one is computed value by value, slowly.
-        vectors = -(-3 * wide // 64)
-        self.line = np.zeros(64 * vectors + 2, np.float32)
-        self.fill = np.empty(4 * 64 * vectors, np.uint8)
+        self.half = np.empty((2 * height, 6 * width), np.uint8)
+        self.either = np.empty(8 * width, np.uint8)
+        self.valid = np.empty(12 * width, np.uint8)
+        self.sums = np.empty(6 * width, np.uint16)
+        self.cells = np.zeros((height, long), np.uint16)
+        self.masked = np.empty(height, np.bool_)
+        self.tall, self.near = np.zeros((2, long + 2 * reach), np.uint16)
+        self.windows = np.zeros((height, long), np.float32)
+        self.line = np.zeros(3 * section + 2, np.float32)
+        self.fill = np.empty(12 * section, np.uint8)
 
 
 _kept = threading.local()
@@ -142,182 +152,179 @@ def _fill_cells(whole: Bytes, mask: Bytes, radius: float) -> Bytes:
 
     The kernels compute with sums where the definition has means, so their weights are up to 64 * 255.
     """
-    reach = math.ceil(radius / CELL + 1)
+    reach = min(math.ceil(radius / CELL + 1), MOST_REACH)
     height, width = mask.shape[0] // CELL, mask.shape[1] // CELL
     kind = (height, width, reach)
     if getattr(_kept, "kind", None) != kind:
         _kept.kind, _kept.buffers = kind, _Buffers(*kind)
     own: _Buffers = _kept.buffers
-    section = width + 2 * reach
     picture = whole.reshape(len(whole), -1)
     halve_block(picture, 0, 0, own.half, 0, 0, 2 * height, 2 * width, False, False)
-    sum_valid(mask, own.either, own.valid, own.half, own.cells, reach, own.masked)
+    sum_valid(mask, own.half, own.columns, own.either, own.valid, own.sums, own.cells, own.masked)
     far = FAR_WEIGHT * 16 / (2 * reach + 1) ** 2
     least = 64 * LEAST_WEIGHT
-    few = sum_windows(own.cells, reach, own.rows, own.columns, far, least, own.lines, own.sums)
-    if few:
-        inner = own.cells.reshape(-1, 4, section)[reach : reach + height, :, reach : reach + width]
+    if sum_windows(
+        own.cells, own.masked, own.rows, reach, width, far, least, own.tall, own.near, own.windows
+    ):
+        inner = own.cells.reshape(height, 4, -1)[:, :, reach : reach + width]
         everywhere = inner.mean(axis=(0, 2), dtype=np.float64).astype(np.float32)
         if everywhere[3] == 0:
             return whole
-        own.sums.reshape(height, 4, section)[:] += 16 * FRAME_WEIGHT * everywhere[:, None]
-    fill_masked(mask, own.masked, own.sums, section, own.line, own.fill, picture)
+        own.windows.reshape(height, 4, -1)[:] += 16 * FRAME_WEIGHT * everywhere[:, None]
+    fill_masked(mask, own.masked, own.windows, own.line, own.fill, picture)
     return whole
 
 
-# A line of cells has four sections one after another, the sums of the three channels and the weight, each
-# with a margin of `reach` cells on either side. So one loop serves all of them, and what it computes across
-# two sections lies in their margins.
+# A line of cells has four sections one after another, the sums of the three channels and the weight. Each has
+# a margin of `reach` cells before its own and as many or more after them. So one loop serves all of them, and
+# what it computes across two sections lies in their margins. A loop writes to an array of its own, not to
+# another line of one that it reads: only so does the compiler turn it into whole vectors.
 
 _READ: Final = "Array(uint8, 2, 'C', readonly=True)"
 """numba's type of a picture that a caller may have locked."""
 
 
-@kernel(f"void({_READ}, uint8[::1], uint8[::1], uint8[:, ::1], float32[:, ::1], int64, int64[::1])")
+@kernel(
+    f"void({_READ}, uint8[:, ::1], int64[::1], uint8[::1], uint8[::1], uint16[::1], uint16[:, ::1], "
+    "boolean[::1])"
+)
 def sum_valid(
-    mask: Bytes, either: Bytes, valid: Bytes, half: Bytes, cells: Float, reach: int, masked: Places
+    mask: Bytes,
+    half: Bytes,
+    columns: Places,
+    either: Bytes,
+    valid: Bytes,
+    sums: Sums,
+    cells: Sums,
+    masked: Flags,
 ) -> None:
     """Sums over the valid ones of each cell's 2 x 2 values at half resolution, and 255 for each as weight.
 
-    mask : (4 h, 4 w). either : (8 h w,) is written over. valid : (4 h w,) becomes 255 where none of 2 x 2 px
-    is masked, else 0. half : (2 h, 6 w), the picture; becomes 0 where not valid. cells : (h + 2 reach,
-    4 (w + 2 reach)) is filled but for its margins. masked : (h,) becomes how many cells of each line have a
-    masked px.
+    A value is valid where none of its 2 x 2 px is masked. mask : (4 h, 4 w). half : (2 h, 6 w), the picture.
+    columns : (w + 2 reach,), the place in a section of which each place shows the cell. either : (8 w,),
+    valid : (12 w,) and sums : (6 w,) are written over. cells : (h, 4 sections) and masked : (h,), whether a
+    line has a masked px, are filled.
     """
-    wide = mask.shape[1]
-    for y in range(half.shape[0]):
-        upper, lower, line = mask[2 * y], mask[2 * y + 1], either[y * wide :]
+    width, wide, section = mask.shape[1] // 4, half.shape[1], cells.shape[1] // 4
+    reach = (columns.size - width) // 2
+    valid_below = valid[wide:]
+    for y in range(cells.shape[0]):
+        line, upper, lower = cells[y], half[2 * y], half[2 * y + 1]
+        for part in range(2):
+            first, second = mask[4 * y + 2 * part], mask[4 * y + 2 * part + 1]
+            into = either[4 * part * width :]
+            for x in range(4 * width):
+                into[x] = first[x] | second[x]
+        any_bits = np.uint8(0)
+        for x in range(either.size):
+            any_bits = np.uint8(any_bits | either[x])
+        # Most often what is valid is that of the line before: all.
+        if any_bits or y == 0 or masked[y - 1]:
+            for x in range(4 * width):
+                kept = np.uint8(0) if either[2 * x] | either[2 * x + 1] else np.uint8(255)
+                valid[3 * x] = kept
+                valid[3 * x + 1] = kept
+                valid[3 * x + 2] = kept
+        masked[y] = any_bits != 0
         for x in range(wide):
-            line[x] = upper[x] | lower[x]
-    for at in range(valid.size):
-        valid[at] = 0 if either[2 * at] | either[2 * at + 1] else 255
-    values = half.reshape(-1)
-    for at in range(valid.size):
-        values[3 * at] &= valid[at]
-        values[3 * at + 1] &= valid[at]
-        values[3 * at + 2] &= valid[at]
-    height, width = half.shape[0] // 2, wide // 4
-    section, full = width + 2 * reach, np.float32(4 * 255)
-    for y in range(height):
-        upper, lower, line = half[2 * y], half[2 * y + 1], cells[reach + y]
+            sums[x] = (upper[x] & valid[x]) + (lower[x] & valid_below[x])
         first, second, third = line[reach:], line[section + reach :], line[2 * section + reach :]
-        for x in range(width):
-            first[x] = upper[6 * x] + upper[6 * x + 3] + lower[6 * x] + lower[6 * x + 3]
-            second[x] = upper[6 * x + 1] + upper[6 * x + 4] + lower[6 * x + 1] + lower[6 * x + 4]
-            third[x] = upper[6 * x + 2] + upper[6 * x + 5] + lower[6 * x + 2] + lower[6 * x + 5]
-        above, below = valid[4 * y * width :], valid[(4 * y + 2) * width :]
         weight = line[3 * section + reach :]
         for x in range(width):
-            weight[x] = above[2 * x] + above[2 * x + 1] + below[2 * x] + below[2 * x + 1]
-        count = 0
+            first[x] = sums[6 * x] + sums[6 * x + 3]
+            second[x] = sums[6 * x + 1] + sums[6 * x + 4]
+            third[x] = sums[6 * x + 2] + sums[6 * x + 5]
         for x in range(width):
-            count += weight[x] < full
-        masked[y] = count
-
-
-@helper
-def mirror_margins(cells: Float, reach: int, rows: Places, columns: Places) -> None:
-    """Fill the margins of `cells` with the cells of which they are the mirror image."""
-    section = columns.size
-    width, long = section - 2 * reach, 4 * section
-    for y in range(cells.shape[0] - 2 * reach):
-        line = cells[reach + y]
-        for start in range(0, long, section):
-            part = line[start:]
+            weight[x] = valid[6 * x] + valid[6 * x + 3] + valid_below[6 * x] + valid_below[6 * x + 3]
+        for start in range(0, 4 * section, section):
+            part_of_line = line[start:]
             for x in range(reach):
-                part[x] = part[columns[x]]
-                part[reach + width + x] = part[columns[reach + width + x]]
-    for y in range(cells.shape[0]):
-        if rows[y] != y:
-            line, source = cells[y], cells[rows[y]]
-            for x in range(long):
-                line[x] = source[x]
+                part_of_line[x] = part_of_line[columns[x]]
+                part_of_line[reach + width + x] = part_of_line[columns[reach + width + x]]
 
 
 @kernel(
-    "int64(float32[:, ::1], int64, int64[::1], int64[::1], float32, float32, "
-    "float32[:, ::1], float32[:, ::1])"
+    "boolean(uint16[:, ::1], boolean[::1], int64[::1], int64, int64, float32, float32, uint16[::1], "
+    "uint16[::1], float32[:, ::1])"
 )
 def sum_windows(
-    cells: Float,
-    reach: int,
+    cells: Sums,
+    masked: Flags,
     rows: Places,
-    columns: Places,
+    reach: int,
+    width: int,
     far: float,
     least: float,
-    lines: Float,
-    sums: Float,
-) -> int:
+    tall: Sums,
+    near: Sums,
+    windows: Float,
+) -> bool:
     """Binomial windows of 3 x 3 cells plus `far` times windows of 2 reach + 1 cells each way.
 
-    cells : (h + 2 reach, 4 (w + 2 reach)), of `sum_valid`; its margins are filled. rows : (h + 2 reach,) and
-    columns : (w + 2 reach,), the row and column of which each one of `cells` is a copy; itself, if not in a
-    margin. lines : (3, 4 (w + 2 reach)) is written over. sums : (h, 4 (w + 2 reach)) is filled; each section
-    starts with its first cell, and 2 reach values at its end mean nothing. Returns how many weights are below
-    `least`.
+    cells : (h, 4 sections) and masked : (h,), of `sum_valid`. rows : (h + 2 reach + 2,), which line is seen
+    at each, from -reach - 1 on. tall, near : (4 sections + 2 reach,) are written over. windows :
+    (h, 4 sections) is filled in masked lines and those beside them; each section starts with its first cell,
+    and what follows its `width` cells means nothing. Returns whether a weight is below `least`.
     """
-    section = columns.size
-    height, width, long = sums.shape[0], section - 2 * reach, 4 * section
-    mirror_margins(cells, reach, rows, columns)
-    # Sums of whole numbers below 2**24 are exact, in whatever order.
-    tall, wide, near = lines[0], lines[1], lines[2]
+    height, long = windows.shape
+    last = height - 1
     tall[:] = 0
-    for y in range(2 * reach):
-        line = cells[y]
+    for y in range(2 * reach + 1):
+        line = cells[rows[y]]
         for x in range(long):
             tall[x] += line[x]
-    two = np.float32(2)
-    few, count = 0, long - 2 * reach
+    left, middle, right = near[reach - 1 :], near[reach:], near[reach + 1 :]
+    few = np.uint8(0)
     for y in range(height):
-        first, last, out = cells[y], cells[y + 2 * reach], sums[y]
+        before, line = cells[rows[y]], cells[rows[y + 2 * reach + 1]]
         for x in range(long):
-            tall[x] += last[x]
-            wide[x] = tall[x]
+            tall[x] += line[x] - before[x]
+        if not (masked[max(y - 1, 0)] or masked[y] or masked[min(y + 1, last)]):
+            continue
+        out = windows[y]
+        # Sums of whole numbers below 2**24 are exact, in whatever order.
+        for x in range(long):
+            out[x] = np.float32(tall[x])
         for step in range(1, 2 * reach, 2):
-            beside = tall[step:]
-            for x in range(count):
-                wide[x] += beside[x] + beside[x + 1]
-        above, here, below = cells[y + reach - 1], cells[y + reach], cells[y + reach + 1]
+            first, second = tall[step:], tall[step + 1 :]
+            for x in range(long):
+                out[x] += np.float32(first[x] + second[x])
+        above, here, below = cells[rows[y + reach]], cells[y], cells[rows[y + reach + 2]]
         for x in range(long):
-            near[x] = above[x] + two * here[x] + below[x]
-        left, middle, right = near[reach - 1 :], near[reach:], near[reach + 1 :]
-        for x in range(count):
-            out[x] = left[x] + two * middle[x] + right[x] + far * wide[x]
-        weight = out[3 * section :]
+            near[x] = above[x] + 2 * here[x] + below[x]
+        for x in range(long):
+            out[x] = np.float32(np.uint16(left[x] + 2 * middle[x] + right[x])) + far * out[x]
+        weight = out[3 * long // 4 :]
         for x in range(width):
-            few += weight[x] < least
-        for x in range(long):
-            tall[x] -= first[x]
-    return few
+            few = np.uint8(few | (weight[x] < least))
+    return bool(few)
 
 
-@kernel(f"void({_READ}, int64[::1], float32[:, ::1], int64, float32[::1], uint8[::1], uint8[:, ::1])")
-def fill_masked(
-    mask: Bytes, masked: Places, sums: Float, section: int, line: Float, fill: Bytes, picture: Bytes
-) -> None:
+@kernel(f"void({_READ}, boolean[::1], float32[:, ::1], float32[::1], uint8[::1], uint8[:, ::1])")
+def fill_masked(mask: Bytes, masked: Flags, windows: Float, line: Float, fill: Bytes, picture: Bytes) -> None:
     """Masked px become the sums over their weight, interpolated between the centres of cells.
 
-    mask : (4 h, 4 w). masked : (h,), of `sum_valid`. sums : (h, 4 section), of `sum_windows`; becomes the
-    quotients. line : (3 section + 2 or a little more,) and fill : (4 times that,) are written over.
-    picture : (4 h, 12 w).
+    mask : (4 h, 4 w). masked : (h,) and windows : (h, 4 sections), of `sum_windows`; these become the
+    quotients. line : (3 sections + 2,) and fill : (12 sections,) are written over. picture : (4 h, 12 w).
     """
-    height, width = sums.shape[0], mask.shape[1] // 4
+    height, width, section = windows.shape[0], mask.shape[1] // 4, windows.shape[1] // 4
+    last = height - 1
     for y in range(height):
-        weight = sums[y, 3 * section :]
-        for x in range(width):
-            line[x] = np.float32(255) / weight[x]
-        for start in range(0, 3 * section, section):
-            part = sums[y, start:]
-            for x in range(width):
-                part[x] *= line[x]
+        if masked[max(y - 1, 0)] or masked[y] or masked[min(y + 1, last)]:
+            weight = windows[y, 3 * section :]
+            for x in range(section):
+                line[x] = np.float32(255) / weight[x]
+            for start in range(0, 3 * section, section):
+                part = windows[y, start:]
+                for x in range(section):
+                    part[x] *= line[x]
     most, rest = np.float32(0.75), np.float32(0.25)
     inner = line[1:]
     for y in range(2 * height):
         cell = y // 2
-        if masked[cell] == 0:
+        if not masked[cell]:
             continue
-        other = max(cell - 1, 0) if y % 2 == 0 else min(cell + 1, height - 1)
-        here, beyond = sums[cell], sums[other]
+        here, beyond = windows[cell], windows[max(cell - 1, 0) if y % 2 == 0 else min(cell + 1, last)]
         for x in range(3 * section):
             inner[x] = most * here[x] + rest * beyond[x]
         # Beyond its ends a section goes on as it ends; there is room in the margins.
