@@ -17,7 +17,6 @@ def plain_trace_outlines(
     hidden: Mask,
     beside: Mask,
     marks: Mask,  # noqa: ARG001
-    words: NDArray[np.uint64],  # noqa: ARG001
     points: NDArray[np.int32],
     ends: NDArray[np.int32],
 ) -> int:
@@ -38,4 +37,4 @@ def plain_trace_outlines(
     return count
 
 
-GAINS = [Gain(trace_outlines, plain_trace_outlines, scratch=("marks", "words"))]
+GAINS = [Gain(trace_outlines, plain_trace_outlines, scratch=("marks",))]

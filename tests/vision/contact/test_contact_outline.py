@@ -192,9 +192,9 @@ def test_outlines_are_those_of_opencv_without_what_is_hidden(seed: int) -> None:
     hidden = Hidden(spots, np.asarray(cv2.dilate(spots, np.ones((3, 3), np.uint8)), np.uint8))
     found = []
     for trace in (trace_outlines, plain_trace_outlines):
-        marks = np.zeros((size[0] + 2, 64), np.uint8)
+        marks = np.zeros((size[0] + 2, size[1] + 2), np.uint8)
         points, ends = np.zeros((4 * mask.size + 4, 1, 2), np.int32), np.zeros((mask.size + 2, 2), np.int32)
-        count = trace(mask, *hidden, marks, marks.view(np.uint64), points, ends)
+        count = trace(mask, *hidden, marks, points, ends)
         found.append((count, points.tolist(), ends.tolist()))
     assert found[0] == found[1]
 
