@@ -16,6 +16,7 @@ from tactflow.vision.contact.background_kernels import (
     smooth_cells,
     weigh_change,
 )
+from tests.oracles.downsample import plain_halved
 from tests.oracles.gains import Gain
 
 Float = NDArray[np.float32]
@@ -27,9 +28,10 @@ def _change(planes: Float, mean: Float, coefficients: Float, across: Float, down
     return np.asarray(np.maximum(planes - mean - light, planes - np.float32(255)), np.float32)
 
 
-def plain_smooth_cells(cells: NDArray[np.uint8], smooth: Float) -> None:
-    """A box filter."""
-    means = cv2.boxFilter(cells.reshape(len(cells), -1, 3), cv2.CV_32F, (3, 3))
+def plain_smooth_cells(half: NDArray[np.uint8], smooth: Float) -> None:
+    """Half the resolution, and a box filter."""
+    cells = plain_halved(half.reshape(len(half), -1, 3))
+    means = cv2.boxFilter(cells, cv2.CV_32F, (3, 3))
     smooth[:] = means.reshape(*smooth.shape[1:], 3).transpose(2, 0, 1)
 
 
@@ -52,7 +54,8 @@ def plain_weigh_change(
     """Squared length of the weighted change; of its colour, without the part along the brightness."""
     change = _change(smooth, mean, coefficients, across, down)
     squared[:] = ((change * weight) ** 2).sum(axis=0)
-    colour[:] = squared * colour_factor - (change * brightness).sum(axis=0) ** 2
+    along = (change * weight**2 * mean).sum(axis=0)
+    colour[:] = (squared - along**2 * brightness) * colour_factor
     np.maximum(squared, colour, out=evidence)
     summary[:2] = squared.max(), colour.max()
     inside = before > 0

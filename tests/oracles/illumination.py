@@ -42,7 +42,7 @@ def plain_compare_blocks(
 
 
 def plain_fit_robustly(
-    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
+    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, center: Float, coefficients: Float
 ) -> None:
     """Least-squares steps with clipped residuals, twice."""
     for reject in (NEVER, REJECT):
@@ -54,6 +54,7 @@ def plain_fit_robustly(
             coefficients += change
             if np.abs(change).max() < CONVERGED:
                 break
+    coefficients[:, :3] /= center[:, None]
 
 
 GAINS = [

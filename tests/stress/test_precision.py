@@ -174,7 +174,7 @@ def test_single_precision_costs_the_outline_nothing(kind: str) -> None:
 
 def test_single_precision_costs_the_fit_of_the_light_nothing() -> None:
     untouched, touched = (
-        background._smoothed(background._cells(picture)[1])
+        background._smoothed(background._halves(picture)[1])
         for picture in (gel(dots=False).reference, gel(dots=False).touched)
     )
 

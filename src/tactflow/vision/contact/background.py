@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -52,8 +52,7 @@ _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
 """What a comparison gives that found no change: nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(NamedTuple):
     """How a frame differs from the background.
 
     whole, half : (4h, 4w, 3) and (2h, 2w, 3) uint8, the frame, also at half resolution. illumination : (3, 4)
@@ -92,9 +91,8 @@ class _Untouched:
 class _Derived:
     """What follows from the frames learned: (3, h, w) float32 of cells.
 
-    weight : one over the standard deviation. brightness : weight of a change along the background's own
-    colour. colour_factor : (h, w), how much more a change of colour counts than one of brightness.
-    noise : its variance.
+    weight : one over the standard deviation. brightness : (h, w), one over the squared length of the mean, so
+    weighed. colour_factor : (h, w), how much more a change of colour counts than one of brightness.
     """
 
     illumination: IlluminationModel
@@ -136,11 +134,11 @@ class BackgroundModel:
         shift: float,
         valid: NDArray[np.uint8] | None = None,
     ) -> None:
-        whole, half, cells = _cells(image)
+        whole, half = _halves(image)
         self._pictures = {1: _planes(whole), 2: _planes(half)}
-        self._mean: Float = _smoothed(cells)
+        self._mean: Float = _smoothed(half)
         self._squares = np.zeros_like(self._mean)
-        self._noise = _spatial_noise(cells)
+        self._noise = _spatial_noise(halved(half))
         self._counts = _counting(half, valid)
         self._count = 1
         self._repeatability, self._tint, self._shift = repeatability, tint, shift
@@ -150,8 +148,8 @@ class BackgroundModel:
     def add(self, image: NDArray[np.uint8]) -> None:
         """Learn from one more frame of the same size; the more, the better the noise is known."""
         known = self._derived()
-        whole, half, cells = _cells(image)
-        smooth = _smoothed(cells)
+        whole, half = _halves(image)
+        smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
         change: Float = smooth - under_illumination(known.mean, coefficients)
         count = self._count
@@ -177,8 +175,8 @@ class BackgroundModel:
             # At the reference: the first frame with contact shall not wait for it.
             self._untouched = self._compared_with()
         high, wide = known.colour_factor.shape
-        whole, half, cells = _cells(image)
-        smooth = _smoothed(cells)
+        whole, half = _halves(image)
+        smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
         squared, colour, evidence = np.empty((3, high, wide), np.float32)
         summary = np.empty(4)
@@ -254,15 +252,14 @@ class BackgroundModel:
         weight = 1 / np.sqrt(variance)
         # One factor for all channels, so that a change in proportion to the brightness is none of colour.
         factor = (variance / (steady + (self._tint * mean) ** 2)).min(axis=0)
-        direction = mean * weight
-        direction /= np.linalg.norm(direction, axis=0) + np.float32(1e-6)
+        length = np.linalg.norm(mean * weight, axis=0) + np.float32(1e-6)
         if self._counts is not None:
             weight = weight * self._counts
         self._known = _Derived(
             illumination=illumination,
             mean=np.ascontiguousarray(mean, np.float32),
             weight=np.asarray(weight, np.float32),
-            brightness=np.asarray(direction * weight * np.sqrt(factor), np.float32),
+            brightness=np.asarray(1 / length**2, np.float32),
             colour_factor=np.asarray(factor, np.float32),
         )
         return self._known
@@ -316,21 +313,21 @@ def _planes(picture: NDArray[np.uint8]) -> Float:
     return np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32)
 
 
-def _smoothed(cells: NDArray[np.uint8]) -> Float:
-    """(3, h, w) float32: means over 3 x 3 cells of (h, w, 3)."""
-    planes = np.empty((3, *cells.shape[:2]), np.float32)
-    smooth_cells(cells.reshape(len(cells), -1), planes)
+def _smoothed(half: NDArray[np.uint8]) -> Float:
+    """(3, h, w) float32: means over 3 x 3 cells of a picture at half resolution, (2 h, 2 w, 3)."""
+    high, wide = half.shape[:2]
+    planes = np.empty((3, high // 2, wide // 2), np.float32)
+    smooth_cells(half.reshape(high, -1), planes)
     return planes
 
 
-def _cells(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Pixels, means over 2 x 2 px and over 4 x 4 px; the border is repeated to make whole cells."""
+def _halves(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Pixels, and means over 2 x 2 px; the border is repeated to make whole cells."""
     bottom, right = -image.shape[0] % CELL, -image.shape[1] % CELL
     whole = np.ascontiguousarray(image)
     if bottom or right:
         whole = np.asarray(cv2.copyMakeBorder(whole, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
-    half = halved(whole)
-    return whole, half, halved(half)
+    return whole, halved(whole)
 
 
 def _counting(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
@@ -339,7 +336,8 @@ def _counting(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArr
         return None
     counts = lit_area(half)[::2, ::2]
     if not valid.all():
-        counts = counts & (_cells(np.repeat(valid[:, :, None], 3, axis=2))[2][:, :, 0] >= CELL_VALID)
+        cells = halved(_halves(np.repeat(valid[:, :, None], 3, axis=2))[1])
+        counts = counts & (cells[:, :, 0] >= CELL_VALID)
     return None if counts.all() else np.asarray(counts)
 
 

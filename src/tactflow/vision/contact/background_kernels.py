@@ -31,13 +31,28 @@ NINTH: Final = np.float32(1 / 9)
 
 
 @kernel("void(uint8[:, ::1], float32[:, :, ::1])")
-def smooth_cells(cells: Byte, smooth: Float) -> None:
-    """Means over 3 x 3 cells, (h, 3 w), into the planes `smooth`, (3, h, w)."""
+def smooth_cells(half: Byte, smooth: Float) -> None:
+    """Means over 3 x 3 cells into the planes `smooth`, (3, h, w).
+
+    half : (2 h, 6 w), a picture of which 2 x 2 pixels are a cell; their mean is rounded, as `halved` does.
+    """
     high, wide = smooth.shape[1:]
+    # Of each pixel and the next one, of two lines; lines of cells, of which three are in use.
+    means, cells = np.empty(6 * wide, np.uint8), np.empty((3, 3 * wide), np.uint8)
     sums, squares = np.empty(3 * wide + 6, np.int16), np.empty(3 * wide, np.int16)
-    for y in range(high):
-        above = cells[min(1, high - 1) if y == 0 else y - 1]
-        here, below = cells[y], cells[max(high - 2, 0) if y == high - 1 else y + 1]
+    for row in range(high + 1):
+        if row < high:
+            upper, lower, line = half[2 * row], half[2 * row + 1], cells[row % 3]
+            for i in range(6 * wide - 3):
+                means[i] = (upper[i] + upper[i + 3] + lower[i] + lower[i + 3] + 2) >> 2
+            for x in range(wide):
+                for c in range(3):
+                    line[3 * x + c] = means[6 * x + c]
+        if row == 0:
+            continue
+        y = row - 1
+        above = cells[(min(1, high - 1) if y == 0 else y - 1) % 3]
+        here, below = cells[y % 3], cells[(max(high - 2, 0) if y == high - 1 else y + 1) % 3]
         for x in range(3 * wide):
             sums[x + 3] = np.int16(above[x]) + np.int16(here[x]) + np.int16(below[x])
         for c in range(3):
@@ -52,7 +67,7 @@ def smooth_cells(cells: Byte, smooth: Float) -> None:
 
 @kernel(
     "void(float32[:, :, ::1], float32[:, ::1], float32[::1], float32[::1], float32[:, :, ::1],"
-    " float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1], uint8[:, ::1],"
+    " float32[:, :, ::1], float32[:, ::1], float32[:, ::1], uint8[:, ::1],"
     " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float64[::1])",
     reorder=True,
 )
@@ -74,10 +89,11 @@ def weigh_change(
 ) -> None:
     """Squared deviations of each cell from the background under this frame's illumination.
 
-    smooth, mean, weight, brightness : (3, h, w). coefficients : (3, 4). across, down : positions,
-    (w,) and (h,). before : (h, w), cells in contact in the previous frame, and evidence_before : the evidence
-    there; both (0, 0) if none. squared, colour, evidence : (h, w), filled. summary : filled with the largest
-    of squared and of colour, and the sums of the evidence over `before`, now and then.
+    smooth, mean, weight : (3, h, w). brightness, colour_factor : (h, w). coefficients : (3, 4). across,
+    down : positions, (w,) and (h,). before : (h, w), cells in contact in the previous frame, and
+    evidence_before : the evidence there; both (0, 0) if none. squared, colour, evidence : (h, w), filled.
+    summary : filled with the largest of squared and of colour, and the sums of the evidence over `before`,
+    now and then.
     """
     high, wide = squared.shape
     largest = np.full(wide, -np.inf, np.float32)
@@ -86,28 +102,30 @@ def weigh_change(
     now = was = 0.0
     for y in range(high):
         total, rest, both = squared[y], colour[y], evidence[y]
+        for x in range(wide):
+            total[x] = along[x] = 0
         for c in range(3):
             gain = coefficients[c, 0] + coefficients[c, 2] * down[y]
             slope, offset = coefficients[c, 1], coefficients[c, 3]
             line, usual = smooth[c, y], mean[c, y]
-            scale, tone = weight[c, y], brightness[c, y]
+            scale = weight[c, y]
             for x in range(wide):
                 light = usual[x] * (gain + slope * across[x]) + offset
                 change, least = line[x] - usual[x] - light, line[x] - WHITE
                 change = change if change > least else least
                 deviation = change * scale[x]
-                total[x] = deviation * deviation + (total[x] if c else np.float32(0))
-                along[x] = change * tone[x] + (along[x] if c else np.float32(0))
+                total[x] = deviation * deviation + total[x]
+                along[x] += deviation * scale[x] * usual[x]
         for x in range(wide):
-            rest[x] = total[x] * colour_factor[y, x] - along[x] * along[x]
+            rest[x] = (total[x] - along[x] * along[x] * brightness[y, x]) * colour_factor[y, x]
             both[x] = total[x] if total[x] > rest[x] else rest[x]
             largest[x] = largest[x] if largest[x] > total[x] else total[x]
             largest_colour[x] = largest_colour[x] if largest_colour[x] > rest[x] else rest[x]
         if before.size:
             for x in range(wide):
-                inside = np.float32(before[y, x])
-                now += inside * both[x]
-                was += inside * evidence_before[y, x]
+                if before[y, x]:
+                    now += both[x]
+                    was += evidence_before[y, x]
     summary[0] = summary[1] = -np.inf
     for x in range(wide):
         summary[0] = max(summary[0], largest[x])

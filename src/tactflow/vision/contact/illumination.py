@@ -74,8 +74,8 @@ class IlluminationModel:
         height, width = reference.shape[1:]
         self._row_weights = _block_weights(max(1, height // BLOCK), height)
         self._column_weights = _block_weights(max(1, width // BLOCK), width)
-        self._center: Float = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))[:, None]
-        relative = reference / self._center[:, None]
+        self._center: Float = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))
+        relative = reference / self._center[:, None, None]
         slopes = np.stack([relative * positions(width), relative * positions(height)[:, None]], axis=1)
         terms = np.concatenate([relative[:, None], slopes, np.ones_like(relative)[:, None]], axis=1)
         basis = np.stack([self._block_means(channel) for channel in terms])
@@ -94,6 +94,8 @@ class IlluminationModel:
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
         self._limit: Float = np.float32(CLIP) * np.sqrt(self._block_means(variance))
+        # Of the frame that is fitted; kept, as memory that was in use lately is at hand.
+        self._excess, self._clip = np.empty((2, *self._reference.shape), np.float32)
 
     def fit(self, cells: Float) -> Float:
         """Coefficients of the change of illumination between the reference and a frame.
@@ -103,7 +105,6 @@ class IlluminationModel:
         frame), and the offset, grey levels.
         """
         coefficients = np.zeros((3, 4), np.float32)
-        excess, limit = np.empty((2, *self._reference.shape), np.float32)
         compare_blocks(
             cells,
             self._row_weights,
@@ -111,12 +112,13 @@ class IlluminationModel:
             self._reference,
             self._per_brightness,
             self._limit,
-            excess,
-            limit,
+            self._excess,
+            self._clip,
             coefficients,
         )
-        fit_robustly(excess, self._basis, self._step, self._shrink, limit, coefficients)
-        coefficients[:, :3] /= self._center
+        fit_robustly(
+            self._excess, self._basis, self._step, self._shrink, self._clip, self._center, coefficients
+        )
         return coefficients
 
     def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -214,17 +216,18 @@ def compare_blocks(
 
 @kernel(
     "void(float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1],"
-    " float32[:, ::1])",
+    " float32[::1], float32[:, ::1])",
     reorder=True,
 )
 def fit_robustly(
-    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, coefficients: Float
+    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, center: Float, coefficients: Float
 ) -> None:
     """Least-squares steps with clipped residuals; `coefficients`, (3, 4), start and result.
 
     excess, limit : (3, n), the data and where their residuals are clipped; in the second fit, those of more
     than `REJECT` times as much do not count. basis, step : (3, 4, n), the model and its
-    pseudo-inverse. shrink : (3, 4, 4), what the ridge takes from the coefficients in a step.
+    pseudo-inverse. shrink : (3, 4, 4), what the ridge takes from the coefficients in a step. center :
+    (3,), by which the first three coefficients are divided in the end.
     """
     change = np.empty(4, np.float32)
     for reject in (np.float32(NEVER), np.float32(REJECT)):
@@ -253,3 +256,6 @@ def fit_robustly(
                     longest = max(longest, abs(change[k]))
             if longest < np.float32(CONVERGED):
                 break
+    for c in range(3):
+        for k in range(3):
+            coefficients[c, k] /= center[c]

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from tactflow.vision.compiled import helper, kernel
 
 Float = NDArray[np.float32]
-Double = NDArray[np.float64]
 
 LARGEST_GAIN: Final = 2.0
 """By how much a weak answer is raised at most, since noise is raised with it. Chosen by hand; 3 gives the
@@ -76,86 +75,74 @@ def light_response(change: Float, inside: NDArray[np.bool_]) -> Response:
 @kernel("void(float32[:, ::1], uint8[:, ::1], float32[::1])", reorder=True)
 def weigh_colours(change: Float, inside: NDArray[np.uint8], response: Float) -> None:
     """What `light_response` does; response : (4,), filled with the gain and the strongest colour."""
-    sums = _sum_change(change, inside)
-    response[0], response[1:] = 1, 0
-    mass = max(sums[0], 1e-9)
-    along, across = sums[3] - sums[1] * sums[1] / mass, sums[5] - sums[2] * sums[2] / mass
-    total = along + across
-    spread = math.hypot(along - across, 2 * (sums[4] - sums[1] * sums[2] / mass))
-    if not LEAST * mass < total + spread < LONG * (total - spread):
-        return
-    elongation = (total + spread) / (total - spread)
-    first, second, direction = _principal(sums[6:])
-    if second * elongation >= first:
-        return
-    raised = min(first / max(second * elongation, 1e-6 * first), LARGEST_GAIN**2)
-    gain = raised ** min((LONG - elongation) / (LONG - ROUND), 1.0)
-    whole = sums[6] + sums[9] + sums[11]
-    scale = whole / (gain * whole - (gain - 1) * first)
-    length = math.copysign(math.sqrt((gain - 1) * scale), direction[2])
-    response[0] = gain * scale
-    for c in range(3):
-        response[1 + c] = length * direction[c]
-
-
-@helper
-def _sum_change(change: Float, inside: NDArray[np.uint8]) -> Double:
-    """(12,) float64: sums over every second pixel of a change where `inside` is not 0.
-
-    The moments of its size: 1, x, y, x^2, x y, y^2, in two pixels; and the products of its channels: blue
-    blue, blue green, blue red, green green, green red, red red.
-    """
-    sums, zero = np.zeros(12), np.float32(0)
-    each = len(change) // (2 * len(inside))
+    each, zero = len(change) // (2 * len(inside)), np.float32(0)
+    # Over every second pixel: moments of the change's length, in two pixels, and products of the channels.
+    mass = sum_x = sum_y = sum_xx = sum_xy = sum_yy = np.float64(1e-9)
+    bb = bg = br = gg = gr = rr = np.float64(0)
     for y in range(each * len(inside)):
         cells, line = inside[y // each], change[2 * y]
-        bb = bg = br = gg = gr = rr = size = size_x = size_xx = zero
+        size = size_x = size_xx = zero
         for cell in range(cells.size):
             if cells[cell]:
                 for x in range(each * cell, each * cell + each):
-                    b, g, r = line[6 * x], line[6 * x + 1], line[6 * x + 2]
+                    b, g, r, along = line[6 * x], line[6 * x + 1], line[6 * x + 2], np.float32(x)
                     bb, gg, rr = bb + b * b, gg + g * g, rr + r * r
                     bg, br, gr = bg + b * g, br + b * r, gr + g * r
-                    length, along = np.sqrt(b * b + g * g + r * r), np.float32(x)
+                    length = np.sqrt(b * b + g * g + r * r)
                     size, size_x, size_xx = (
                         size + length,
                         size_x + length * along,
                         size_xx + length * along * along,
                     )
-        sums[0], sums[1], sums[2] = sums[0] + size, sums[1] + size_x, sums[2] + size * y
-        sums[3], sums[4], sums[5] = sums[3] + size_xx, sums[4] + size_x * y, sums[5] + size * y * y
-        sums[6], sums[7], sums[8] = sums[6] + bb, sums[7] + bg, sums[8] + br
-        sums[9], sums[10], sums[11] = sums[9] + gg, sums[10] + gr, sums[11] + rr
-    return sums
+        mass, sum_x, sum_y = mass + size, sum_x + size_x, sum_y + size * y
+        sum_xx, sum_xy, sum_yy = sum_xx + size_xx, sum_xy + size_x * y, sum_yy + size * y * y
+    response[0] = 1
+    response[1] = response[2] = response[3] = 0
+    along_x, along_y = sum_xx - sum_x * sum_x / mass, sum_yy - sum_y * sum_y / mass
+    total, mixed = along_x + along_y, sum_xy - sum_x * sum_y / mass
+    spread = math.sqrt((along_x - along_y) * (along_x - along_y) + 4 * mixed * mixed)
+    if not LEAST * mass < total + spread < LONG * (total - spread):
+        return
+    elongation, whole = (total + spread) / (total - spread), bb + gg + rr
+    first, second, blue, green, red = _principal(bb, bg, br, gg, gr, rr)
+    if second * elongation >= first:
+        return
+    raised = first / max(second * elongation, 1e-6 * first)
+    gain = min(raised, LARGEST_GAIN**2) ** min((LONG - elongation) / (LONG - ROUND), 1.0)
+    scale = whole / (gain * whole - (gain - 1) * first)
+    length = math.sqrt((gain - 1) * scale)
+    response[0] = gain * scale
+    response[1], response[2], response[3] = length * blue, length * green, length * red
 
 
 @helper
-def _principal(matrix: Double) -> tuple[float, float, Double]:
-    """The two largest eigenvalues of a symmetric matrix, and the first's eigenvector, of length 1.
+def _principal(
+    bb: float, bg: float, br: float, gg: float, gr: float, rr: float
+) -> tuple[float, float, float, float, float]:
+    """The two largest eigenvalues of a symmetric matrix; and the first's eigenvector, of length 1, red >= 0.
 
-    matrix : (6,), what is on and above its diagonal, row by row; positive semidefinite.
+    The matrix is given by what is on its diagonal and above; it is positive semidefinite and not 0.
 
     References
     ----------
     O. K. Smith, "Eigenvalues of a symmetric 3 x 3 matrix", Communications of the ACM 4 (1961).
     """
-    bg, br, gr = matrix[1], matrix[2], matrix[4]
-    middle = (matrix[0] + matrix[3] + matrix[5]) / 3
-    b, g, r = matrix[0] - middle, matrix[3] - middle, matrix[5] - middle
-    radius = math.sqrt((b * b + g * g + r * r + 2 * (bg * bg + br * br + gr * gr)) / 6)
+    middle = (bb + gg + rr) / 3
+    b, g, r = bb - middle, gg - middle, rr - middle
+    radius = math.sqrt((b * b + g * g + r * r + 2 * (bg * bg + br * br + gr * gr)) / 6) + 1e-12 * middle
     half = (b * (g * r - gr * gr) - bg * (bg * r - gr * br) + br * (bg * gr - g * br)) / 2
-    turn = math.acos(min(max(half / max(radius**3, 1e-30), -1.0), 1.0)) / 3
+    cosine = half / (radius * radius * radius)
+    turn = math.acos(min(max(cosine, -1.0), 1.0)) / 3
     first, second = 2 * radius * math.cos(turn), 2 * radius * math.cos(turn - 2 * math.pi / 3)
     # Across two rows of the matrix less the eigenvalue; those that span most tell it best.
     b, g, r = b - first, g - first, r - first
-    direction, longest = np.zeros(3), 0.0
-    for x, y, z in (
-        (bg * gr - br * g, br * bg - b * gr, b * g - bg * bg),
-        (g * r - gr * gr, gr * br - bg * r, bg * gr - g * br),
-        (bg * r - gr * br, br * br - b * r, b * gr - br * bg),
-    ):
-        length = math.sqrt(x * x + y * y + z * z)
-        if length > longest:
-            longest = length
-            direction[0], direction[1], direction[2] = x / length, y / length, z / length
-    return middle + first, middle + second, direction
+    x, y, z = bg * gr - br * g, br * bg - b * gr, b * g - bg * bg
+    square = x * x + y * y + z * z
+    for turned in range(2):
+        u, v, w = g * r - gr * gr, gr * br - bg * r, bg * gr - g * br
+        if turned:
+            u, v, w = bg * r - gr * br, br * br - b * r, b * gr - br * bg
+        if u * u + v * v + w * w > square:
+            x, y, z, square = u, v, w, u * u + v * v + w * w
+    length = math.copysign(math.sqrt(square) + 1e-300, z)
+    return middle + first, middle + second, x / length, y / length, z / length
