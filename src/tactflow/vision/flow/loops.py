@@ -337,10 +337,8 @@ def sum_region(
             k = row * columns + column
             share = cells[0, k]
             total += share
-            x += share * column
-            y += share * row
-            u += share * cells[1, k]
-            v += share * cells[2, k]
+            x, y = x + share * column, y + share * row
+            u, v = u + share * cells[1, k], v + share * cells[2, k]
     if total == 0:
         return
     x, y, u, v = x / total, y / total, u / total, v / total
