@@ -296,6 +296,15 @@ def nearest_phase(x: float, y: float, width: int, height: int, phases: int) -> A
 
 
 @helper
+def ask_for_template(weights: Levels, terms: Float32Array, which: int) -> None:
+    """Have what `fit_template` reads brought into the caches."""
+    all_weights, all_terms, size = weights.reshape(-1), terms.reshape(-1), weights.shape[1] * weights.shape[2]
+    prefetch(all_terms, which * terms.shape[1])
+    for place in range(which * size, (which + 1) * size, CACHE_LINE):
+        prefetch(all_weights, place)
+
+
+@helper
 def touch_patches(flat: NDArray[np.uint8], shape: Any, start: FloatArray, reach: int) -> int:
     """Read the ends of all rows of all patches, which brings them into the cache; a number without meaning.
 
@@ -371,7 +380,7 @@ def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Levels) -> N
 
 @helper
 def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int) -> Any:
-    """Gain, shift x and y times gain, and the explained and the unexplained sum of squares of a patch."""
+    """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained."""
     first = second = third = fourth = fifth = total = squares = np.int32(0)
     # Whole numbers below 2**31, exact in whatever order.
     for p in range(len(patch)):
@@ -391,13 +400,13 @@ def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int)
     contrast = squares - float(total) * total / pixels - slope_x * slope_x - slope_y * slope_y
     gain, shift_x, shift_y = np.float32(gain), np.float32(shift_x), np.float32(shift_y)
     explained, contrast = np.float32(explained), np.float32(contrast)
-    return gain, shift_x, shift_y, explained, max(contrast - explained, LEAST_RESIDUAL)
+    rest = max(contrast - explained, LEAST_RESIDUAL)
+    return gain, shift_x, shift_y, explained / (explained + rest), rest
 
 
 @kernel(
     "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int16[:, :, ::1],"
-    "float32[:, ::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1],"
-    "float32[:, ::1], int64[::1])",
+    "float32[:, ::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1], float32[:, ::1], int64[::1])",
     reorder=True,
 )
 def align_marks(
@@ -416,9 +425,8 @@ def align_marks(
     """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
 
     image : (H, W, 3) BGR or (H, W, 1) grey. start : (n, 2). marks : (n,), of those in `weights`.
-    weights : (phases^2 N, 5, P), of `whole_numbers`. terms : (phases^2 N, 16), for each the Gram matrix, the
-    variance per pixel, the units of the weights, and one that is not used.
-    disc : (2, p) dx and dy of the pixels of a patch, p <= P; the other weights are zero.
+    weights : (phases^2 N, 5, P), of `whole_numbers`. terms : (phases^2 N, 16), 9 of the Gram matrix, variance
+    per pixel, 5 units of weights. disc : (2, p) dx and dy of the pixels, p <= P; other weights are zero.
     whole : reach of a patch, phases per axis, rounds after the first step. real : radius, px, length of a
     step that calls for another, px, and the sampling error, px.
     touched : (1,), takes a number without meaning: what goes nowhere would not be read.
@@ -430,7 +438,6 @@ def align_marks(
     offsets = np.empty(disc.shape[1], np.int64)
     for p in range(len(offsets)):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
-    all_weights, all_terms, size = weights.reshape(-1), terms.reshape(-1), weights.shape[1] * weights.shape[2]
     words, patch = np.empty(len(offsets), np.int32), np.zeros(weights.shape[2], np.int16)
     touched[0] = touch_patches(flat, image.shape, start, reach)
     for n in range(len(marks)):
@@ -438,9 +445,7 @@ def align_marks(
         if n + 1 < len(marks):
             phase_x, phase_y = nearest_phase(start[n + 1, 0], start[n + 1, 1], width, height, phases)
             which = (phase_x % phases + phase_y % phases * phases) * count + marks[n + 1]
-            prefetch(all_terms, which * terms.shape[1])
-            for place in range(which * size, (which + 1) * size, CACHE_LINE):
-                prefetch(all_weights, place)
+            ask_for_template(weights, terms, which)
         x, y = start[n, 0], start[n, 1]
         seen_left = seen_top = -1
         for number in range(rounds + 1):
@@ -452,11 +457,9 @@ def align_marks(
                 seen_left, seen_top = left, top
                 read_patch(flat, image.shape, left, top, reach, disc, offsets, words)
                 to_centred_gray(words, channels, patch)
-            gain, shift_x, shift_y, explained, rest = fit_template(
-                weights[which], terms[which], patch, len(offsets)
-            )
+            fitted = fit_template(weights[which], terms[which], patch, len(offsets))
+            gain, shift_x, shift_y, r_squared, rest = fitted
             safe = max(gain, LEAST_DIVISOR)
-            r_squared = explained / (explained + rest)
             now_x = (phase_x + 0.5) / phases - 0.5 + min(max(shift_x / safe, -radius), radius)
             now_y = (phase_y + 0.5) / phases - 0.5 + min(max(shift_y / safe, -radius), radius)
             far = (now_x - x) ** 2 + (now_y - y) ** 2 > converged
