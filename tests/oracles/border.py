@@ -44,20 +44,18 @@ def change_of(picture: Float, inside: Mask) -> WindowChange:
 def plain_border_level(
     parts: Float,
     nearest: NDArray[np.int32],
-    points: NDArray[np.int32],
-    ends: NDArray[np.int32],
-    steps: NDArray[np.int32],
+    corners: NDArray[np.int32],
+    outlines: NDArray[np.int32],
     strength: Float,
     hidden: Mask,
     middle: float,
-    bins: NDArray[np.float64],
     level: Float,
 ) -> None:
     """Histograms of the depth over all pixels at once, smoothed along each outline by a convolution."""
     marks = np.zeros(parts.shape, np.float32)
-    for (begin, end), (first, last) in zip(pairwise(ends.tolist()), pairwise(steps.tolist()), strict=True):
-        x, y = points[begin:end].T
-        marks[y, x] = 1 + first + np.arange(end - begin) * ((last - first) / (end - begin))
+    for (begin, first, _), (end, last, length) in pairwise(outlines.tolist()):
+        x, y = _passed(corners[begin:end]).T
+        marks[y, x] = 1 + first + np.arange(length) * ((last - first) / length)
     marks = np.asarray(cv2.dilate(marks, np.ones((3, 3), np.uint8)), np.float32)
     place = np.zeros(parts.size + 1, np.float32)
     beside = (parts <= 0) & (marks > 0)
@@ -67,13 +65,14 @@ def plain_border_level(
     if hidden.size:
         seen &= hidden == 0
     at = (parts * np.float32(1 / BIN)).astype(np.intp)
+    bins = np.zeros((outlines[-1, 1] + 1, 2, int(middle / BIN) + 2))
     for row, counted in ((step, seen & (step >= 0)), (np.full_like(step, len(bins) - 1), seen)):
         np.add.at(bins[:, 0], (row[counted], at[counted]), 1)
         np.add.at(bins[:, 1], (row[counted], at[counted]), strength[counted])
     whole = _border_depth(bins[-1], MIN_BIN_PIXELS, middle, 0.5)
     offsets = np.arange(1 - STEPS, STEPS)
     borders, weights = [], []
-    for first, last in pairwise(steps.tolist()):
+    for first, last in pairwise(outlines[:, 1].tolist()):
         varies = VARIES * min((last - first) / (STEPS * FEWEST_ARCS), LEANS)
         own = bins[first:last]
         for k in range(last - first):
@@ -88,6 +87,17 @@ def plain_border_level(
     depth = np.full(parts.shape, whole)
     depth[inside] = np.maximum(border[step[inside]], BIN)
     level[:] = parts - depth.astype(np.float32)
+
+
+def _passed(corners: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Pixels that a closed outline passes, (n, 2), of those where it turns."""
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    return np.concatenate(
+        [
+            np.linspace(start, end, max(int(np.abs(end - start).max()), 1), endpoint=False).astype(np.int32)
+            for start, end in sides
+        ]
+    )
 
 
 def _border_depth(bins: NDArray[np.float64], least: int, middle: float, otherwise: float) -> float:
@@ -125,4 +135,4 @@ def _crossing(profile: list[float], at: list[float], wanted: float) -> float:
     return at[first - 1] + fraction * (at[first] - at[first - 1])
 
 
-GAINS = [Gain(border_level, plain_border_level, tolerance=1e-4, scratch=("bins",))]
+GAINS = [Gain(border_level, plain_border_level, tolerance=1e-4)]

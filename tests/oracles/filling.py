@@ -22,19 +22,19 @@ def plain_trace_outlines(
 ) -> int:
     """OpenCV's outlines, of whose pixels those are kept that are seen and between others not on a line."""
     found, _ = cv2.findContours(mask | hidden, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    spans = [0]
+    count = 0
+    ends[0] = 0
     for outline in found[::-1]:
         x, y = outline[:, 0].T
         seen = beside[y, x] == 0
         before, after = np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0)
         straight = np.all(outline - before == after - outline, axis=(1, 2)) & (len(outline) > 1)
-        between = straight & np.roll(seen, 1) & np.roll(seen, -1)
-        kept = outline[seen & ~between]
+        kept = outline[seen & ~(straight & np.roll(seen, 1) & np.roll(seen, -1))]
         if len(kept):
-            points[spans[-1] : spans[-1] + len(kept)] = kept
-            spans.append(spans[-1] + len(kept))
-    ends[: len(spans)] = spans
-    return len(spans)
+            start, count = ends[count, 0], count + 1
+            ends[count] = start + len(kept), len(outline)
+            points[start : ends[count, 0]] = kept
+    return count
 
 
 GAINS = [Gain(trace_outlines, plain_trace_outlines, scratch=("marks",))]

@@ -69,11 +69,11 @@ def plain_fill_masked(
     """Quotients, interpolated linearly to twice their number, every pixel four times, under the mask."""
     del line, fill
     height, width = len(windows), mask.shape[1] // 4
-    sections, looked_at = windows.reshape(height, 4, -1), _or_beside(masked)
-    # What lies between two sections means nothing, and what is not looked at is of another frame.
+    sections, looked_at = windows.reshape(height, 4, -1)[:, :, :width], _or_beside(masked)
+    # What is not looked at is of another frame.
     with np.errstate(divide="ignore", invalid="ignore"):
         sections[looked_at, :3] *= np.float32(255) / sections[looked_at, 3:]
-        filled = sections[:, :3, :width].transpose(0, 2, 1)
+        filled = sections[:, :3].transpose(0, 2, 1)
         for axis in (0, 1):
             filled = np.moveaxis(filled, axis, 0)
             before = np.concatenate([filled[:1], filled[:-1]])

@@ -238,10 +238,10 @@ def helper(function: Callable[P, R]) -> Helper[P, R]:
 
 
 @helper
-def prefetch(values: NDArray[np.uint8], index: int) -> None:
+def prefetch(values: NDArray[Any], index: int) -> None:
     """Have a value brought into the caches before it is needed; only a compiled loop can ask for that.
 
-    values : (n,) uint8, C-contiguous. index : may lie outside, where nothing is brought.
+    values : (n,), C-contiguous. index : may lie outside, where nothing is brought.
     """
 
 

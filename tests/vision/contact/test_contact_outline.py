@@ -193,8 +193,9 @@ def test_outlines_are_those_of_opencv_without_what_is_hidden(seed: int) -> None:
     found = []
     for trace in (trace_outlines, plain_trace_outlines):
         marks = np.zeros((size[0] + 2, size[1] + 2), np.uint8)
-        points, ends = np.zeros((4 * mask.size + 4, 1, 2), np.int32), np.zeros(mask.size + 2, np.int32)
-        found.append((trace(mask, *hidden, marks, points, ends), points.tolist(), ends.tolist()))
+        points, ends = np.zeros((4 * mask.size + 4, 1, 2), np.int32), np.zeros((mask.size + 2, 2), np.int32)
+        count = trace(mask, *hidden, marks, points, ends)
+        found.append((count, points.tolist(), ends.tolist()))
     assert found[0] == found[1]
 
 

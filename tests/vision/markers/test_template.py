@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tactflow.vision.markers import template as template_module
 from tactflow.vision.markers.detection import Detection, detect_markers, to_gray
-from tactflow.vision.markers.template import MarkerTemplates
+from tactflow.vision.markers.template import MarkerTemplates, whole_numbers
 from tests.oracles import template
 from tests.oracles.plain import plain
 from tests.vision.dots import FloatArray, grid, render
@@ -121,3 +122,29 @@ def test_grey_is_that_of_opencv_to_the_last_level() -> None:
         grey = under_test.align(to_gray(image), start)
         for one, other in zip(coloured, grey, strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("dark", [True, False])
+def test_templates_of_whole_numbers_find_marks_as_templates_of_float64_do(
+    dark: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights: list[FloatArray] = []
+
+    def recorded(exact: FloatArray) -> tuple[NDArray[np.int16], FloatArray]:
+        weights.append(exact)
+        return whole_numbers(exact)
+
+    monkeypatch.setattr(template_module, "whole_numbers", recorded)
+    under_test = templates(dark)
+    image = picture(TRUTH + 0.2, seed=3)
+    start = TRUTH + np.random.default_rng(4).uniform(-1, 1, TRUTH.shape)
+    found = under_test.align(image, start)
+    exact = np.zeros(under_test._weights.shape)
+    exact[:, :, : weights[0].shape[2]] = np.concatenate(weights)
+    monkeypatch.setattr(under_test, "_weights", exact)
+    under_test._terms[:, 10:15] = 1
+    with plain(template):
+        expected = under_test.align(image, start)
+    # Measured: 6e-6 px, 2e-6 for gain, 4e-6 for r_squared, 1.2e-5 px for standard errors.
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=2e-5)

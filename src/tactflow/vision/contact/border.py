@@ -76,24 +76,27 @@ MIN_BIN_PIXELS: Final = 8
 MIN_ARC_PIXELS: Final = 2
 """Pixels from which on a bin of the profile counts, of the whole outline and of an arc. Chosen by hand."""
 
+LEVELS: Final = (SKIRT, TOP, BORDER)
+"""Fractions of its peak at which a profile is measured."""
+
 _NOTHING: Final = np.zeros((0, 0), np.uint8)
 """An empty mask."""
 
 
 class Depth(NamedTuple):
-    """How deep inside a region each pixel is, and what its outlines pass.
+    """How deep inside a region each pixel is, and its outlines.
 
     depth : (h, w) float32, distance to what is outside, px; 0 there. nearest : (h, w) int32, label of the
-    nearest pixel outside. points : (n, 2) int32, x and y of the outlines' pixels, one outline after another.
-    ends, steps : (outlines + 1,) int32, 0, and how many points and steps there are up to the end of each
-    outline.
+    nearest pixel outside. middle : the largest depth. corners : (n, 2) int32, x and y of the pixels where
+    outlines turn, one outline after another. outlines : (outlines + 1, 3) int32, 0, and at the end of each
+    outline, how many corners and steps there are so far, and how many pixels it passes.
     """
 
     depth: Float
     nearest: Whole
-    points: Whole
-    ends: Whole
-    steps: Whole
+    middle: float
+    corners: Whole
+    outlines: Whole
 
 
 def depth_of(region: Region) -> Depth:
@@ -101,19 +104,17 @@ def depth_of(region: Region) -> Depth:
     depth, nearest = cv2.distanceTransformWithLabels(
         region.filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    middle = max(float(cv2.minMaxLoc(depth)[1]), 1.0)
-    outlines, _ = cv2.findContours(region.filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    ends, steps = [0], [0]
-    for outline in outlines:
-        arcs = min(max(round(len(outline) / middle), FEWEST_ARCS), MOST_ARCS)
-        ends.append(ends[-1] + len(outline))
-        steps.append(steps[-1] + STEPS * arcs)
+    middle, outlines, ends = cv2.minMaxLoc(depth)[1], region.outlines, [(0, 0, 0)]
+    corners = np.concatenate(outlines) if len(outlines) > 1 else outlines[0]
+    for outline, length in zip(outlines, region.lengths, strict=True):
+        arcs = min(max(round(length / max(middle, 1.0)), FEWEST_ARCS), MOST_ARCS)
+        ends.append((ends[-1][0] + len(outline), ends[-1][1] + STEPS * arcs, length))
     return Depth(
         np.asarray(depth, np.float32),
         np.asarray(nearest, np.int32),
-        np.asarray(np.concatenate(outlines)[:, 0], np.int32),
+        middle,
+        corners.reshape(-1, 2),
         np.array(ends, np.int32),
-        np.array(steps, np.int32),
     )
 
 
@@ -123,18 +124,16 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
     region : of the change. parts : (h, w), its depth, but below 0 where it does not belong to the contact.
     strength : (h, w), relative to the largest nearby. hidden : (h, w), 1 where a marker was removed; or None.
     """
-    middle = float(cv2.minMaxLoc(parts)[1])
+    middle = region.middle if parts is region.depth else cv2.minMaxLoc(parts)[1]
     level = np.empty_like(parts)
     border_level(
         parts,
         region.nearest,
-        region.points,
-        region.ends,
-        region.steps,
+        region.corners,
+        region.outlines,
         strength,
         _NOTHING if hidden is None else hidden,
         middle,
-        np.zeros((int(region.steps[-1]) + 1, 2, int(middle / BIN) + 2)),
         level,
     )
     return level
@@ -156,124 +155,142 @@ def _crossing(profile: Double, at: Double, wanted: float) -> float:
 def _border_depth(bins: Double, least: int, middle: float, otherwise: float) -> float:
     """How deep the border lies by one profile, or `otherwise` if too little of it is known.
 
-    bins : (2, n), number of pixels and sum of their strengths in bins of depth, changed. least : pixels from
+    bins : (2 n,), number of pixels and sum of their strengths in bins of depth, in turns. least : pixels from
     which on a bin counts. middle : the largest depth.
     """
-    counts, sums = bins[0], bins[1]
-    # Bins with enough pixels, and where they are; they take the place of the others.
-    known = 0
-    for k in range(counts.size):
-        if counts[k] >= least:
-            sums[known] = sums[k] / counts[k]
-            counts[known] = (k + 0.5) * BIN
+    # Bins with enough pixels: where they are, and what they hold.
+    at, means, known = np.empty(bins.size), np.empty(bins.size), 0
+    for k in range(bins.size // 2):
+        if bins[2 * k] >= least:
+            at[known], means[known] = (k + 0.5) * BIN, bins[2 * k + 1] / bins[2 * k]
             known += 1
     if known < 2:
         return otherwise
-    at, profile = counts[:known], np.empty(known)
-    for k in range(known):
-        before, after = sums[max(k - 1, 0)], sums[min(k + 1, known - 1)]
-        profile[k] = before / 4 + sums[k] / 2 + after / 4
     # The largest value before the profile falls clearly for the first time.
-    peak = profile[0]
+    profile, peak, fallen = np.empty(known), 0.0, False
     for k in range(known):
-        if profile[k] > peak:
+        before, after = means[max(k - 1, 0)], means[min(k + 1, known - 1)]
+        profile[k] = before / 4 + means[k] / 2 + after / 4
+        fallen |= profile[k] < FALLEN * peak
+        if profile[k] > peak and not fallen:
             peak = profile[k]
-        elif profile[k] < FALLEN * peak:
-            break
-    border, top = _crossing(profile, at, BORDER * peak), _crossing(profile, at, TOP * peak)
-    soft = top - _crossing(profile, at, SKIRT * peak) - SHARP_SKIRT * (middle - top) - SKIRT_BLUR
+    skirt = top = border = 0.0
+    for level in LEVELS:
+        skirt, top, border = top, border, _crossing(profile, at, level * peak)
+    soft = top - skirt - SHARP_SKIRT * (middle - top) - SKIRT_BLUR
     return min(border + SOFTNESS * max(soft, 0.0), DEEPEST * middle)
 
 
 @helper
-def _place_beside(points: Whole, ends: Whole, steps: Whole, nearest: Whole, parts: Float) -> Float:
-    """Label of a pixel outside -> 1 and the place on the outline that it is beside, steps; 0 if none."""
+def _place_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float, place: Whole) -> None:
+    """Label of a pixel outside -> 1 and the step of the outline that it is beside; `place`, 0, is filled."""
     high, wide = parts.shape
-    place = np.zeros(parts.size + 1, np.float32)
-    for outline in range(steps.size - 1):
-        first, last = ends[outline], ends[outline + 1]
-        step = (steps[outline + 1] - steps[outline]) / (last - first)
-        for k in range(first, last):
-            mark = np.float32(1 + steps[outline] + (k - first) * step)
-            for y in range(max(points[k, 1] - 1, 0), min(points[k, 1] + 2, high)):
-                for x in range(max(points[k, 0] - 1, 0), min(points[k, 0] + 2, wide)):
-                    if parts[y, x] <= 0:
-                        place[nearest[y, x]] = max(mark, place[nearest[y, x]])
-    return place
+    for outline in range(1, outlines.shape[0]):
+        first, last, length = outlines[outline - 1, 0], outlines[outline, 0], outlines[outline, 2]
+        steps, ahead = outlines[outline - 1, 1], first
+        x, y = corners[first, 0], corners[first, 1]
+        step = (outlines[outline, 1] - steps) / length
+        for k in range(length):
+            mark = int(np.float32(1 + steps + k * step))
+            for row in range(max(y - 1, 0), min(y + 2, high)):
+                for column in range(max(x - 1, 0), min(x + 2, wide)):
+                    if parts[row, column] <= 0:
+                        label = nearest[row, column]
+                        place[label] = max(mark, place[label])
+            if x == corners[ahead, 0] and y == corners[ahead, 1]:
+                ahead = ahead + 1 if ahead + 1 < last else first
+            across, down = corners[ahead, 0] - x, corners[ahead, 1] - y
+            x += min(max(across, -1), 1)
+            y += min(max(down, -1), 1)
 
 
 @helper
-def _step_depths(bins: Double, steps: Whole, middle: float, whole: float, border: Double) -> None:
-    """How deep the border lies at each step along the outlines, `whole` in the mean.
+def _profile_around(bins: Double, step: int, first: int, last: int, around: Double) -> None:
+    """Sum of the bins along an outline from `first` to `last`, those near a step; what is nearer counts more.
 
-    bins : as `border_level` fills them. steps : of a `Depth`. border : (steps,), filled.
+    bins : (steps * n,). around : (n,), filled.
     """
-    size = bins.shape[2]
-    around = np.empty((2, size))
-    sums = weights = 0.0
-    for outline in range(steps.size - 1):
-        first, last = steps[outline], steps[outline + 1]
-        varies = VARIES * min((last - first) / (STEPS * FEWEST_ARCS), LEANS)
-        for step in range(first, last):
-            for row in range(2):
-                for at in range(size):
-                    around[row, at] = 0
-            for beside in range(1 - STEPS, STEPS):
-                share, other = 1 - abs(beside) / STEPS, first + (step + beside - first) % (last - first)
-                for row in range(2):
-                    for at in range(size):
-                        around[row, at] += share * bins[other, row, at]
-            weight = 0.0
-            for at in range(size):
-                weight += around[0, at]
-            found = _border_depth(around, MIN_ARC_PIXELS, middle, whole)
+    around[:] = 0
+    other = step - STEPS
+    for beside in range(1 - STEPS, STEPS):
+        other += 1
+        start = other + (last - first if other < first else 0) - (last - first if other >= last else 0)
+        share, profile = 1 - abs(beside) / STEPS, bins[start * around.size :]
+        for k in range(around.size):
+            around[k] += share * profile[k]
+
+
+@helper
+def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, border: Double) -> float:
+    """How deep the border lies at each step along the outlines, and in the mean, which is returned.
+
+    bins : as `border_level` fills them. around : (n,), the profile of all pixels, changed. border : (steps,),
+    filled.
+    """
+    whole, sums, weights, outline = 0.5, 0.0, 0.0, 1
+    # First of all pixels together.
+    for step in range(-1, border.size):
+        if step == outlines[outline, 1]:
+            outline += 1
+        first, last, weight = outlines[outline - 1, 1], outlines[outline, 1], 0.0
+        if step >= 0:
+            _profile_around(bins, step, first, last, around)
+        for k in range(0, around.size, 2):
+            weight += around[k]
+        found = _border_depth(around, MIN_ARC_PIXELS if step >= 0 else MIN_BIN_PIXELS, middle, whole)
+        if step < 0:
+            whole = found
+        else:
+            varies = VARIES * min((last - first) / (STEPS * FEWEST_ARCS), LEANS)
             border[step] = min(max(found, (1 - varies) * whole), (1 + varies) * whole)
             sums, weights = sums + weight * border[step], weights + weight
     for step in range(border.size):
-        border[step] += whole - sums / max(weights, 1e-9)
+        border[step] = max(border[step] + whole - sums / max(weights, 1e-9), BIN)
+    return whole
 
 
 @kernel(
-    "void(float32[:, ::1], int32[:, ::1], int32[:, ::1], int32[::1], int32[::1], float32[:, ::1],"
-    " uint8[:, ::1], float64, float64[:, :, ::1], float32[:, ::1])"
+    "void(float32[:, ::1], int32[:, ::1], int32[:, ::1], int32[:, ::1], float32[:, ::1], uint8[:, ::1],"
+    " float64, float32[:, ::1])"
 )
 def border_level(
     parts: Float,
     nearest: Whole,
-    points: Whole,
-    ends: Whole,
-    steps: Whole,
+    corners: Whole,
+    outlines: Whole,
     strength: Float,
     hidden: Mask,
     middle: float,
-    bins: Double,
     level: Float,
 ) -> None:
     """What `inside_border` finds; `level` is filled.
 
-    nearest, points, ends, steps : of a `Depth`. hidden : not 0 where a pixel does not count; (0, 0) if all
-    do. middle : the largest depth. bins : (steps + 1, 2, n), 0, changed: for each step, then for all pixels,
-    the number of pixels and the sum of their strengths in bins of depth.
+    nearest, corners, outlines : of a `Depth`. hidden : not 0 where a pixel does not count; (0, 0) if all do.
+    middle : the largest depth of the parts.
     """
     high, wide = parts.shape
-    all_pixels = bins.shape[0] - 1
-    place = _place_beside(points, ends, steps, nearest, parts)
+    place = np.zeros(parts.size + 1, np.int32)
+    _place_beside(corners, outlines, nearest, parts, place)
+    # Of all pixels, and of those of each step: their number and the sum of their strengths in bins of depth.
+    steps, around = outlines[-1, 1], np.zeros(2 * int(middle / BIN) + 4)
+    bins, border = np.zeros(steps * around.size), np.empty(steps)
     bins_per_pixel = np.float32(1 / BIN)
     for y in range(high):
         for x in range(wide):
-            if parts[y, x] > 0 and (hidden.size == 0 or hidden[y, x] == 0):
-                at, step = int(parts[y, x] * bins_per_pixel), int(place[nearest[y, x]]) - 1
-                bins[all_pixels, 0, at] += 1
-                bins[all_pixels, 1, at] += strength[y, x]
-                if step >= 0:
-                    bins[step, 0, at] += 1
-                    bins[step, 1, at] += strength[y, x]
-    whole = _border_depth(bins[all_pixels], MIN_BIN_PIXELS, middle, 0.5)
-    border = np.empty(all_pixels)
-    _step_depths(bins, steps, middle, whole, border)
+            if parts[y, x] > 0:
+                step = place[nearest[y, x]] - 1
+                level[y, x] = step
+                if hidden.size == 0 or hidden[y, x] == 0:
+                    at = 2 * int(parts[y, x] * bins_per_pixel)
+                    around[at] += 1
+                    around[at + 1] += strength[y, x]
+                    if step >= 0:
+                        bins[step * around.size + at] += 1
+                        bins[step * around.size + at + 1] += strength[y, x]
+    whole = _step_depths(bins, outlines, middle, around, border)
     for y in range(high):
         for x in range(wide):
             depth = whole
-            if parts[y, x] > 0 and place[nearest[y, x]] > 0:
-                depth = max(border[int(place[nearest[y, x]]) - 1], BIN)
+            if parts[y, x] > 0 and level[y, x] >= 0:
+                depth = border[int(level[y, x])]
             level[y, x] = parts[y, x] - np.float32(depth)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import cv2
@@ -55,16 +56,17 @@ class Region(NamedTuple):
     """A region without holes, and its border.
 
     filled : (h, w) uint8, 0 or 1. outlines : of each part of it, (n, 1, 2) int32, x and y of the pixels where
-    it turns, px.
+    it turns, px. lengths : how many pixels each of them passes.
     """
 
     filled: Mask
     outlines: Sequence[NDArray[np.int32]]
+    lengths: Sequence[int]
 
 
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
-    return Region(filled, _outlines(filled, Hidden(filled, np.zeros_like(filled))))
+    return Region(filled, *_outlines(filled, Hidden(filled, np.zeros_like(filled))))
 
 
 def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:
@@ -90,42 +92,44 @@ def outlined(mask: Mask, hidden: Hidden | None) -> Mask:
     if hidden is None:
         return _without_holes(mask.copy())
     filled = np.zeros_like(mask)
-    parts = _outlines(mask, hidden)
+    parts, _ = _outlines(mask, hidden)
     if parts:
         cv2.fillPoly(filled, parts, (1.0,))
     return filled
 
 
-def _outlines(mask: Mask, hidden: Hidden) -> list[NDArray[np.int32]]:
-    """What `trace_outlines` finds, the last outline first, as OpenCV has it."""
+def _outlines(mask: Mask, hidden: Hidden) -> tuple[list[NDArray[np.int32]], list[int]]:
+    """Outlines as `trace_outlines` finds them, the last one first, as OpenCV has it; and their lengths."""
     high, wide = mask.shape
     marks = np.zeros((high + 2, wide + 2), np.uint8)
     # A pixel is passed at most once for each of its four neighbours that is outside.
     points = np.empty((2 * (high + 1) * (wide + 1), 1, 2), np.int32)
-    ends = np.empty((high + 1) * (wide + 1) // 2, np.int32)
-    spans = ends[: trace_outlines(mask, *hidden, marks, points, ends)].tolist()
-    return [points[start:end] for start, end in zip(spans[-2::-1], spans[:0:-1], strict=True)]
+    ends = np.empty(((high + 1) * (wide + 1) // 2, 2), np.int32)
+    found = trace_outlines(mask, *hidden, marks, points, ends)
+    spans, lengths = ends[found::-1].T.tolist()
+    return [points[start:end] for end, start in pairwise(spans)], lengths[:-1]
 
 
-@kernel("int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], int32[:, :, ::1], int32[::1])")
+@kernel("int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], int32[:, :, ::1], int32[:, ::1])")
 def trace_outlines(
     mask: Mask, hidden: Mask, beside: Mask, marks: Mask, points: NDArray[np.int32], ends: NDArray[np.int32]
 ) -> int:
-    """Outer borders of a region's parts, counterclockwise, as far as they are seen; returns how many ends.
+    """Outer borders of a region's parts, counterclockwise, as far as they are seen; returns how many.
 
     Border following after S. Suzuki and K. Abe, "Topological structural analysis of digitized binary images
     by border following", CVGIP 30 (1985); parts within holes are left out.
 
     mask : (h, w), 0 or 1. hidden, beside : of a `Hidden`; what is hidden is traced as if it belonged to the
-    region, and what is beside it left out. marks : (h + 2, w + 2), 0, changed. points : (n, 1, 2), filled: x
-    and y of the pixels where outlines turn or come out of what is hidden, one outline after another. ends :
-    (outlines + 1,), filled: 0, and where the points of each outline end.
+    region, and what is beside it left out. marks : (h + 2, w + 2), 0, changed.
+    points : (n, 1, 2), filled: x and y of the pixels where outlines turn or come out of what is hidden, one
+    outline after another. ends : (outlines + 1, 2), filled: where the points of each outline end, and how
+    many pixels it passes, after a 0.
     """
     high, wide = mask.shape
     for y in range(high):
         for x in range(wide):
             marks[y + 1, x + 1] = mask[y, x] | hidden[y, x] | beside[y, x] * BESIDE
-    found = ends[0] = 0
+    found = ends[0, 0] = ends[0, 1] = 0
     for y in range(1, high + 1):
         x, outside = 1, True
         while x <= wide:
@@ -133,24 +137,24 @@ def trace_outlines(
                 x += 1
                 continue
             if outside and marks[y, x] & PASSED == 0:
-                end = _follow(marks, x, y, points, ends[found])
-                if end > ends[found]:
+                end, length = _follow(marks, x, y, points, ends[found, 0])
+                if end > ends[found, 0]:
                     found += 1
-                    ends[found] = end
+                    ends[found, 0], ends[found, 1] = end, length
             while marks[y, x] & PIXEL:
                 x += 1
             # To the right of a part lies a hole of it, or what is outside.
             outside = marks[y, x - 1] & RIGHT != 0
-    return found + 1
+    return found
 
 
 @helper
-def _follow(marks: Mask, x: int, y: int, points: NDArray[np.int32], end: int) -> int:
-    """Follow one outline of `trace_outlines` from its first pixel; returns where its points end.
+def _follow(marks: Mask, x: int, y: int, points: NDArray[np.int32], end: int) -> tuple[int, int]:
+    """Follow one outline of `trace_outlines` from its first pixel; returns its end, and its length.
 
     marks : (h + 2, w + 2) uint8, changed. end : where the points before end.
     """
-    back = 3
+    back, length = 3, 0
     while back != 4 and marks[y + DOWN[back], x + ACROSS[back]] & PIXEL == 0:
         back = (back - 1) & 7
     alone, first_x, first_y, first_back = back == 4, x, y, back
@@ -165,9 +169,9 @@ def _follow(marks: Mask, x: int, y: int, points: NDArray[np.int32], end: int) ->
             end += 1
         # What lies to the right has been looked at, and is outside.
         marks[y, x] |= PASSED | RIGHT if alone or 0 < turn <= back else PASSED
-        x, y, back = x + ACROSS[turn], y + DOWN[turn], turn ^ 4
+        x, y, back, length = x + ACROSS[turn], y + DOWN[turn], turn ^ 4, length + 1
         if alone or (x == first_x and y == first_y and back == first_back):
-            return end
+            return end, length
 
 
 def _without_holes(mask: Mask) -> Mask:
@@ -214,7 +218,7 @@ def fill_bay(region: Region, faint: Mask) -> Region:
     >>> int(fill_bay(traced(ring), faint).filled.sum())
     81
     """
-    filled, outlines = region
+    filled, outlines, _ = region
     if len(outlines) != 1:
         return region
     bays = np.asarray(cv2.bitwise_xor(_hull(region), filled), np.uint8)

@@ -249,21 +249,23 @@ def sample_region(
     rows, columns = (end_row - first_row + step - 1) // step, (end_column - first_column + step - 1) // step
     window[0], window[1], window[3], window[4] = first_row, first_column, rows, columns
     for k in range(rows * columns):
-        i, j = first_row + step * (k // columns), first_column + step * (k % columns)
-        x, y = place[0] + place[2] * j - left, place[1] + place[2] * i - top
         cells[0, k] = cells[1, k] = cells[2, k] = 0.0
-        up, down = _within(y + least_y, height), _within(y + most_y + 1, height)
-        if not _box(covered, up, _within(x + least_x, width), down, _within(x + most_x + 1, width)):
-            continue
-        u = v = 0.0
-        for n in range(planes.shape[1]):
-            u += to_markers[i, j, n] * planes[2, n]
-            v += to_markers[i, j, n] * planes[3, n]
-        cells[1, k], cells[2, k] = u, v
-        # The left and upper end of the square, from the outer corner of the part.
-        x, y = x + u + 0.5 - 0.5 * side, y + v + 0.5 - 0.5 * side
-        if -side < x < width and -side < y < height:
-            cells[0, k] = _square(covered, x, y, side) / (255.0 * side * side)
+    for row in range(rows):
+        for column in range(columns):
+            i, j, k = first_row + step * row, first_column + step * column, row * columns + column
+            x, y = place[0] + place[2] * j - left, place[1] + place[2] * i - top
+            up, down = _within(y + least_y, height), _within(y + most_y + 1, height)
+            if not _box(covered, up, _within(x + least_x, width), down, _within(x + most_x + 1, width)):
+                continue
+            u = v = 0.0
+            for n in range(planes.shape[1]):
+                u += to_markers[i, j, n] * planes[2, n]
+                v += to_markers[i, j, n] * planes[3, n]
+            cells[1, k], cells[2, k] = u, v
+            # The left and upper end of the square, from the outer corner of the part.
+            x, y = x + u + 0.5 - 0.5 * side, y + v + 0.5 - 0.5 * side
+            if -side < x < width and -side < y < height:
+                cells[0, k] = _square(covered, x, y, side) / (255.0 * side * side)
 
 
 @helper
@@ -329,71 +331,77 @@ def sum_region(
     to_region : (3, N) of 0, filled with the kernel between the region and the markers, times 1, a_x and a_y.
     """
     total = x = y = u = v = 0.0
-    columns, count = window[4], window[3] * window[4]
-    for k in range(count):
-        share = cells[0, k]
-        total += share
-        x += share * (k % columns)
-        y += share * (k // columns)
-        u += share * cells[1, k]
-        v += share * cells[2, k]
+    rows, columns = window[3], window[4]
+    for row in range(rows):
+        for column in range(columns):
+            k = row * columns + column
+            share = cells[0, k]
+            total += share
+            x, y = x + share * column, y + share * row
+            u, v = u + share * cells[1, k], v + share * cells[2, k]
     if total == 0:
         return
     x, y, u, v = x / total, y / total, u / total, v / total
     sums[0], sums[1], sums[2] = total, u, v
-    for k in range(count):
-        share = cells[0, k] / total
-        across, down = spacing * (k % columns - x), spacing * (k // columns - y)
-        right, below = cells[1, k] - u, cells[2, k] - v
-        at_x, at_y = share * across, share * down
-        cells[3, k], cells[4, k], cells[5, k] = share, at_x, at_y
-        if share == 0:
-            continue
-        edge = cells[0, k] * (1 - cells[0, k])
-        sums[3] += at_x * across
-        sums[4] += at_x * down
-        sums[5] += at_y * down
-        sums[6] += at_x * right
-        sums[7] += at_x * below
-        sums[8] += at_y * right
-        sums[9] += at_y * below
-        sums[10] += share * (right * right + below * below)
-        sums[11] += edge * right * right
-        sums[12] += edge * below * below
-        near = to_markers[window[0] + window[2] * (k // columns), window[1] + window[2] * (k % columns)]
-        for n in range(near.size):
-            to_region[0, n] += share * near[n]
-            to_region[1, n] += at_x * near[n]
-            to_region[2, n] += at_y * near[n]
-    _sum_pairs(cells, table, columns, count, sums)
+    for row in range(rows):
+        for column in range(columns):
+            k = row * columns + column
+            share = cells[0, k] / total
+            across, down = spacing * (column - x), spacing * (row - y)
+            right, below = cells[1, k] - u, cells[2, k] - v
+            at_x, at_y = share * across, share * down
+            cells[3, k], cells[4, k], cells[5, k] = share, at_x, at_y
+            if share == 0:
+                continue
+            edge = cells[0, k] * (1 - cells[0, k])
+            sums[3] += at_x * across
+            sums[4] += at_x * down
+            sums[5] += at_y * down
+            sums[6] += at_x * right
+            sums[7] += at_x * below
+            sums[8] += at_y * right
+            sums[9] += at_y * below
+            sums[10] += share * (right * right + below * below)
+            sums[11] += edge * right * right
+            sums[12] += edge * below * below
+            near = to_markers[window[0] + window[2] * row, window[1] + window[2] * column]
+            for n in range(near.size):
+                to_region[0, n] += share * near[n]
+                to_region[1, n] += at_x * near[n]
+                to_region[2, n] += at_y * near[n]
+    _sum_pairs(cells, table, rows, columns, sums)
 
 
 @helper
-def _sum_pairs(cells: FloatArray, table: FloatArray, columns: int, count: int, sums: FloatArray) -> None:
+def _sum_pairs(cells: FloatArray, table: FloatArray, rows: int, columns: int, sums: FloatArray) -> None:
     """What the cells of a region have in common: the last four sums of `sum_region`."""
     middle = table.shape[1] // 2
-    for start in range(0, count, columns):
-        first, end = 0, columns
-        while first < end and cells[3, start + first] == 0:
+    # Of each row, the first cell that counts, and the one behind the last.
+    ends = np.empty((rows, 2), np.int64)
+    for row in range(rows):
+        first, end = row * columns, row * columns + columns
+        while first < end and cells[3, first] == 0:
             first += 1
-        while first < end and cells[3, start + end - 1] == 0:
+        while first < end and cells[3, end - 1] == 0:
             end -= 1
-        for other in range(start + columns if first < end else 0):
-            one, across, down = cells[3, other], cells[4, other], cells[5, other]
-            if one == 0:
-                continue
-            near = table[(start - other + other % columns) // columns, middle - other % columns :]
-            with_one = with_x = 0.0
-            for k in range(first, end):
-                with_one += cells[3, start + k] * near[k]
-                with_x += cells[4, start + k] * near[k]
-            # In the cell's own row, each pair comes twice. All cells of a row are equally far down.
-            times = 1.0 if other >= start else 2.0
-            with_y = with_one * cells[5, start + first] / cells[3, start + first]
-            sums[13] += times * one * with_one
-            sums[14] += times * across * with_x
-            sums[15] += times * (across * with_y + down * with_x) / 2
-            sums[16] += times * down * with_y
+        ends[row, 0], ends[row, 1] = first - row * columns, end - row * columns
+        for before in range(row + 1 if first < end else 0):
+            # In the cell's own row, each pair comes twice.
+            times = 1.0 if before == row else 2.0
+            for column in range(ends[before, 0], ends[before, 1]):
+                other = before * columns + column
+                one, across, down = cells[3, other], cells[4, other], cells[5, other]
+                with_one = with_x = 0.0
+                for k in range(first, end):
+                    near = table[row - before, middle - column + k - row * columns]
+                    with_one += cells[3, k] * near
+                    with_x += cells[4, k] * near
+                # All cells of a row are equally far down.
+                with_y = with_one * cells[5, first] / cells[3, first]
+                sums[13] += times * one * with_one
+                sums[14] += times * across * with_x
+                sums[15] += times * (across * with_y + down * with_x) / 2
+                sums[16] += times * down * with_y
 
 
 @kernel(

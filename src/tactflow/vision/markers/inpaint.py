@@ -312,11 +312,11 @@ def fill_masked(mask: Bytes, masked: Flags, windows: Float, line: Float, fill: B
     for y in range(height):
         if masked[max(y - 1, 0)] or masked[y] or masked[min(y + 1, last)]:
             weight = windows[y, 3 * section :]
-            for x in range(section):
+            for x in range(width):
                 line[x] = np.float32(255) / weight[x]
             for start in range(0, 3 * section, section):
                 part = windows[y, start:]
-                for x in range(section):
+                for x in range(width):
                     part[x] *= line[x]
     most, rest = np.float32(0.75), np.float32(0.25)
     inner = line[1:]

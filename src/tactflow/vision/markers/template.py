@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import helper, kernel, prefetch
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
+Levels = NDArray[np.int16]
 
 PHASES: Final = 4
 """Sub-pixel phases per axis at which templates are kept. An estimate then lies at most an eighth of a pixel
@@ -46,6 +47,15 @@ ONE_TEMPLATE: Final = 1.5
 
 LANES: Final = 32
 """Rows of weights are padded to multiples of so many values: whole vector registers."""
+
+LARGEST_LEVEL: Final = 2**15 - 2
+"""Largest weight as a whole number: so it takes 16 bits, half of what has to be read for each mark."""
+
+LARGEST_SUM: Final = 2**23
+"""Largest sum of the sizes of such weights: times grey levels less 128 it fits in 32 bits. Derived: 2**30."""
+
+CACHE_LINE: Final = 32
+"""Whole numbers of 16 bits that memory gives at a time, on most processors."""
 
 LEAST_RESIDUAL: Final = np.float32(1e-3)
 """Sum of squares, grey levels^2, that always counts as unexplained: keeps r_squared below 1 and errors
@@ -119,20 +129,19 @@ class MarkerTemplates:
         steps = ((np.arange(PHASES) + 0.5) / PHASES - 0.5).tolist()
         # The pixels after the patch's own weigh nothing.
         length = -(-pixels // LANES) * LANES
-        weights = np.zeros((PHASES, PHASES, count, 6, length), np.float32)
-        gram = np.empty((PHASES, PHASES, count, 3, 3), np.float32)
-        variance = np.empty((PHASES, PHASES, count), np.float32)
+        weights = np.zeros((PHASES, PHASES, count, 5, length), np.int16)
+        terms = np.zeros((PHASES, PHASES, count, 16), np.float32)
         sampler = _Sampler(reference, origin, reach, disc)
         scaled = self._disc / radius
         for row, phase_y in enumerate(steps):
             for column, phase_x in enumerate(steps):
                 model = _normal_equations(*sampler.with_slopes(phase_x, phase_y), scaled, dark)
-                weights[row, column, :, :, :pixels] = model[0]
-                gram[row, column], variance[row, column] = model[1:]
+                weights[row, column, :, :, :pixels], terms[row, column, :, 10:15] = whole_numbers(model[0])
+                terms[row, column, :, :9] = model[1].reshape(count, 9)
+                terms[row, column, :, 9] = model[2] / max(pixels - 6, 1)
         self._all = np.arange(count)
-        self._weights = weights.reshape(PHASES * PHASES * count, 6, length)
-        self._gram = gram.reshape(PHASES * PHASES * count, 3, 3)
-        self._variance = variance.reshape(PHASES * PHASES * count) / np.float32(max(pixels - 6, 1))
+        self._weights = weights.reshape(PHASES * PHASES * count, 5, length)
+        self._terms = terms.reshape(PHASES * PHASES * count, 16)
         self._whole = np.array([reach, PHASES, ROUNDS])
         self._real = np.array([radius, CONVERGED, SAMPLING_ERROR])
 
@@ -150,8 +159,7 @@ class MarkerTemplates:
             np.ascontiguousarray(start),
             marks,
             self._weights,
-            self._gram,
-            self._variance,
+            self._terms,
             self._disc,
             self._whole,
             self._real,
@@ -225,9 +233,9 @@ def _normal_equations(
     """What least squares need of templates (N, p) at one phase.
 
     disc : (2, p), x and y of the pixels, in radii.
-    Returns weights (N, 6, p): products with a patch give gain and shift x, y times gain, and the three
-    coefficients of the illumination in an orthonormal basis; Gram matrices (N, 3, 3) of gain and shifts;
-    variances (N,) of a coordinate at unit noise and gain.
+    Returns weights (N, 5, p): products with a patch give gain and shift x, y times gain, and the two
+    coefficients of the illumination's slope in an orthonormal basis, whose first vector is constant; Gram
+    matrices (N, 3, 3) of gain and shifts; variances (N,) of a coordinate at unit noise and gain.
     """
     lit = template if dark else np.ones_like(template)
     plane, _ = np.linalg.qr(np.stack([np.ones_like(lit), lit * disc[0], lit * disc[1]], axis=2))
@@ -236,8 +244,20 @@ def _normal_equations(
     gram = basis @ basis.transpose(0, 2, 1)
     ridge = RIDGE * np.trace(gram, axis1=1, axis2=2) + RIDGE
     inverse = np.linalg.inv(gram + ridge[:, None, None] * np.eye(3))
-    weights = np.concatenate([inverse @ basis, plane.transpose(0, 2, 1)], axis=1)
+    weights = np.concatenate([inverse @ basis, plane[:, :, 1:].transpose(0, 2, 1)], axis=1)
     return weights, gram, 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
+
+
+def whole_numbers(weights: FloatArray) -> tuple[Levels, FloatArray]:
+    """Rows of weights (N, 5, p) as whole numbers, and the unit of each row (N, 5).
+
+    What one is rounded by, the next takes on: so sums over neighbours, which are alike in a patch, are right.
+    """
+    size = np.abs(weights)
+    unit = np.maximum(size.max(axis=2) / LARGEST_LEVEL, size.sum(axis=2) / LARGEST_SUM)
+    unit = np.maximum(unit, np.finfo(np.float32).tiny)
+    total = np.rint(np.cumsum(weights / unit[:, :, None], axis=2))
+    return np.diff(total, axis=2, prepend=0.0).astype(np.int16), unit
 
 
 def _interpolate(image: Float32Array, points: FloatArray, reach: int) -> FloatArray:
@@ -264,6 +284,15 @@ def _lanczos(fraction: FloatArray) -> FloatArray:
     distance = fraction[:, None] - np.arange(-2, 4)
     weights = np.sinc(distance) * np.sinc(distance / 3)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float64)
+
+
+@helper
+def nearest_phase(x: float, y: float, width: int, height: int, phases: int) -> Any:
+    """The phases nearest to a point: whole pixels in the higher digits, the phase in the lowest."""
+    # Written so that NaN, too, becomes a place inside the image.
+    inside_x = min(x, width - 1.0) if x > 0.0 else 0.0
+    inside_y = min(y, height - 1.0) if y > 0.0 else 0.0
+    return int(inside_x * phases + phases / 2), int(inside_y * phases + phases / 2)
 
 
 @helper
@@ -325,8 +354,8 @@ def read_patch(
 
 
 @helper
-def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Float32Array) -> None:
-    """Grey levels as OpenCV makes them of BGR, less 128: far from zero, sums of squares would lose digits."""
+def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Levels) -> None:
+    """Grey levels as OpenCV makes them of BGR, less 128."""
     blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
     bits, middle, low = np.int32(15), np.int32(128), np.int32(255)
     byte, two_bytes = np.int32(8), np.int32(16)
@@ -334,35 +363,40 @@ def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Float32Array
         for p in range(len(words)):
             level = blue * (words[p] & low) + green * ((words[p] >> byte) & low)
             level += red * ((words[p] >> two_bytes) & low) + half
-            patch[p] = np.float32((level >> bits) - middle)
+            patch[p] = np.int16((level >> bits) - middle)
     else:
         for p in range(len(words)):
-            patch[p] = np.float32(words[p] - middle)
+            patch[p] = np.int16(words[p] - middle)
 
 
 @helper
-def fit_template(weight: Float32Array, product: Float32Array, patch: Float32Array) -> Any:
+def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int) -> Any:
     """Gain, shift x and y times gain, and the explained and the unexplained sum of squares of a patch."""
-    gain = shift_x = shift_y = light = slope_x = slope_y = contrast = np.float32(0.0)
+    first = second = third = fourth = fifth = total = squares = np.int32(0)
+    # Whole numbers below 2**31, exact in whatever order.
     for p in range(len(patch)):
-        value = patch[p]
-        gain += weight[0, p] * value
-        shift_x += weight[1, p] * value
-        shift_y += weight[2, p] * value
-        light += weight[3, p] * value
-        slope_x += weight[4, p] * value
-        slope_y += weight[5, p] * value
-        contrast += value * value
-    explained = gain * (product[0, 0] * gain + product[0, 1] * shift_x + product[0, 2] * shift_y)
-    explained += shift_x * (product[1, 0] * gain + product[1, 1] * shift_x + product[1, 2] * shift_y)
-    explained += shift_y * (product[2, 0] * gain + product[2, 1] * shift_x + product[2, 2] * shift_y)
-    contrast -= light * light + slope_x * slope_x + slope_y * slope_y
+        value = np.int32(patch[p])
+        first = np.int32(first + weight[0, p] * value)
+        second = np.int32(second + weight[1, p] * value)
+        third = np.int32(third + weight[2, p] * value)
+        fourth = np.int32(fourth + weight[3, p] * value)
+        fifth = np.int32(fifth + weight[4, p] * value)
+        total = np.int32(total + value)
+        squares = np.int32(squares + value * value)
+    gain, shift_x, shift_y = term[10] * first, term[11] * second, term[12] * third
+    explained = gain * (term[0] * gain + term[1] * shift_x + term[2] * shift_y)
+    explained += shift_x * (term[3] * gain + term[4] * shift_x + term[5] * shift_y)
+    explained += shift_y * (term[6] * gain + term[7] * shift_x + term[8] * shift_y)
+    slope_x, slope_y = term[13] * fourth, term[14] * fifth
+    contrast = squares - float(total) * total / pixels - slope_x * slope_x - slope_y * slope_y
+    gain, shift_x, shift_y = np.float32(gain), np.float32(shift_x), np.float32(shift_y)
+    explained, contrast = np.float32(explained), np.float32(contrast)
     return gain, shift_x, shift_y, explained, max(contrast - explained, LEAST_RESIDUAL)
 
 
 @kernel(
-    "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], float32[:, :, ::1],"
-    "float32[:, :, ::1], float32[::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1],"
+    "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int16[:, :, ::1],"
+    "float32[:, ::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1],"
     "float32[:, ::1], int64[::1])",
     reorder=True,
 )
@@ -370,9 +404,8 @@ def align_marks(
     image: NDArray[np.uint8],
     start: FloatArray,
     marks: IntArray,
-    weights: Float32Array,
-    gram: Float32Array,
-    variance: Float32Array,
+    weights: Levels,
+    terms: Float32Array,
     disc: IntArray,
     whole: IntArray,
     real: FloatArray,
@@ -383,7 +416,8 @@ def align_marks(
     """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
 
     image : (H, W, 3) BGR or (H, W, 1) grey. start : (n, 2). marks : (n,), of those in `weights`.
-    weights : (phases^2 N, 6, P), `gram` and `variance` alike, as `MarkerTemplates` holds them.
+    weights : (phases^2 N, 5, P), of `whole_numbers`. terms : (phases^2 N, 16), for each the Gram matrix, the
+    variance per pixel, the units of the weights, and one that is not used.
     disc : (2, p) dx and dy of the pixels of a patch, p <= P; the other weights are zero.
     whole : reach of a patch, phases per axis, rounds after the first step. real : radius, px, length of a
     step that calls for another, px, and the sampling error, px.
@@ -396,17 +430,21 @@ def align_marks(
     offsets = np.empty(disc.shape[1], np.int64)
     for p in range(len(offsets)):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
-    words, patch = np.empty(len(offsets), np.int32), np.zeros(weights.shape[2], np.float32)
+    all_weights, all_terms, size = weights.reshape(-1), terms.reshape(-1), weights.shape[1] * weights.shape[2]
+    words, patch = np.empty(len(offsets), np.int32), np.zeros(weights.shape[2], np.int16)
     touched[0] = touch_patches(flat, image.shape, start, reach)
     for n in range(len(marks)):
+        # The next mark's template is asked for while this one is aligned.
+        if n + 1 < len(marks):
+            phase_x, phase_y = nearest_phase(start[n + 1, 0], start[n + 1, 1], width, height, phases)
+            which = (phase_x % phases + phase_y % phases * phases) * count + marks[n + 1]
+            prefetch(all_terms, which * terms.shape[1])
+            for place in range(which * size, (which + 1) * size, CACHE_LINE):
+                prefetch(all_weights, place)
         x, y = start[n, 0], start[n, 1]
         seen_left = seen_top = -1
         for number in range(rounds + 1):
-            # Written so that NaN, too, becomes a place inside the image.
-            inside_x = min(x, width - 1.0) if x > 0.0 else 0.0
-            inside_y = min(y, height - 1.0) if y > 0.0 else 0.0
-            # In units of a phase: whole pixels above, the phase below.
-            phase_x, phase_y = int(inside_x * phases + phases / 2), int(inside_y * phases + phases / 2)
+            phase_x, phase_y = nearest_phase(x, y, width, height, phases)
             left, top = phase_x // phases, phase_y // phases
             which = (phase_x % phases + phase_y % phases * phases) * count + marks[n]
             # A step of less than a pixel often sees the same patch from another phase.
@@ -414,7 +452,9 @@ def align_marks(
                 seen_left, seen_top = left, top
                 read_patch(flat, image.shape, left, top, reach, disc, offsets, words)
                 to_centred_gray(words, channels, patch)
-            gain, shift_x, shift_y, explained, rest = fit_template(weights[which], gram[which], patch)
+            gain, shift_x, shift_y, explained, rest = fit_template(
+                weights[which], terms[which], patch, len(offsets)
+            )
             safe = max(gain, LEAST_DIVISOR)
             r_squared = explained / (explained + rest)
             now_x = (phase_x + 0.5) / phases - 0.5 + min(max(shift_x / safe, -radius), radius)
@@ -425,4 +465,4 @@ def align_marks(
                 break
         position[n, 0], position[n, 1] = x, y
         found[0, n], found[1, n] = gain, r_squared
-        found[2, n] = np.sqrt(rest * variance[which] / (safe * safe) + sampling)
+        found[2, n] = np.sqrt(rest * terms[which, 9] / (safe * safe) + sampling)

@@ -120,7 +120,8 @@ class MarkerTracker:
     as a starting point. Identities rest on the smoothness of the whole field, so a wrong one does not
     survive.
 
-    Measured in float32; positions and standard errors are those of float64 to 1e-4 px.
+    Measured in float32, with templates of 16 bits; positions and standard errors are those of float64 to
+    1e-4 px.
 
     Parameters
     ----------
