@@ -174,9 +174,8 @@ def scaled_change(
     light = _light_along(coefficients, across[left : left + wide])
     # With a pixel more on both sides.
     line, most = np.empty(3 * wide + 6, np.float32), np.zeros(3 * wide, np.float32)
-    begin = end = 0
     known = mean.reshape(-1), scale.reshape(-1), pattern.reshape(-1)
-    peaks[:2] = 0
+    begin, end, peaks[:2] = 0, 0, 0
     for y in range(high):
         if y % side == 0:
             begin, end = _neighbours(spans, y // side, wide)
