@@ -158,7 +158,6 @@ class Sample:
 @kernel(
     "void(uint8[:, ::1], int64, int32[:, ::1], uint8[:, ::1], float32[:, :, ::1], uint16[::1], "
     "float32[:, :, ::1])",
-    reorder=True,
 )
 def sum_tiles(
     lines: NDArray[np.uint8],
@@ -179,9 +178,9 @@ def sum_tiles(
     thick, width = lines.shape[0] // rows, lines.shape[1] // columns
     for row in range(rows):
         heap[:] = 0
-        for line in lines[row * thick : (row + 1) * thick]:
-            for x in range(line.size):
-                heap[x] += line[x]
+        for line in range(row * thick, (row + 1) * thick):
+            for x in range(heap.size):
+                heap[x] += lines[line, x]
         for column in range(columns):
             _sum_light(heap[column * width : (column + 1) * width], channels, sums[row, : kinds - 3, column])
             tile = row * columns + column

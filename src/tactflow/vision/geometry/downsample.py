@@ -52,7 +52,9 @@ def halve_block(
         start = (top + 2 * y) * stride + 3 * left
         line = half[half_top + (height - 1 - y if upside_down else y), 3 * half_left :]
         if width < _STEP:
-            _halve_line(values[start:], values[start + stride :], line, width)
+            for x in range(width):
+                upper = values[start + 6 * x :]
+                _halve_line(upper, upper[stride:], line[3 * x :], 1)
             continue
         ahead = start + _AHEAD * stride
         for step in range(0, width, _STEP):
