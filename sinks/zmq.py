@@ -253,8 +253,8 @@ class Zmq(Sink):
         return {"serialised": self._serialised, "subscriptions": len(self._subscriptions)}
 
     def write(self, tick: Tick, results: Results) -> None:
-        """Send one message to whoever had subscribed when `wants` was asked for this frame; never waits."""
-        if not self._wanted:
+        """Send one message to whoever has subscribed; never waits."""
+        if not self.wants():
             return
         body = encode_message(tick, results, detail=self.params.detail, field=self.params.field)
         self._serialised += 1
