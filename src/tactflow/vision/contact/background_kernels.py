@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel, prefetch
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.contact.illumination import WHITE
 
 Float = NDArray[np.float32]
@@ -26,10 +26,6 @@ _AT_ONE: Final = math.exp(-1 / (2 * BLUR_SIGMA**2))
 MIDDLE: Final = np.float32(1 / (1 + 2 * _AT_ONE))
 BESIDE: Final = np.float32(_AT_ONE / (1 + 2 * _AT_ONE))
 """Weights of a pixel and of each of its two neighbours, those of a Gaussian with that standard deviation."""
-AHEAD: Final = 2
-"""Lines of a window by which what it is compared with is asked for ahead. Chosen by hand."""
-CACHE_LINE: Final = 64
-"""Bytes that come into a cache together, on all processors in use."""
 NINTH: Final = np.float32(1 / 9)
 """Weight of one of 3 x 3 cells."""
 
@@ -174,18 +170,18 @@ def scaled_change(
     light = _light_along(coefficients, across[left : left + wide])
     # With a pixel more on both sides.
     line, most = np.empty(3 * wide + 6, np.float32), np.zeros(3 * wide, np.float32)
-    known = mean.reshape(-1), scale.reshape(-1), pattern.reshape(-1)
-    begin, end, peaks[:2] = 0, 0, 0
+    begin, end = 0, 0
+    peaks[:] = 0
     for y in range(high):
         if y % side == 0:
             begin, end = _neighbours(spans, y // side, wide)
         if begin >= end:
             continue
         first, last, count = max(begin - 1, 0), min(end + 1, wide), 3 * (end - begin)
-        row, part, shift = top + y, slice(3 * (left + first), 3 * (left + last)), 3 * (first - begin + 1)
-        usual, unit, toward = mean[row, part], scale[row, part], pattern[row, part]
-        _fetch(known, (row + AHEAD) * mean.shape[1] + part.start, 3 * (last - first))
-        _scale_line(picture[row, part], usual, unit, toward, light, first, down[row], line[shift:])
+        row, start, shift = top + y, 3 * (left + first), 3 * (first - begin + 1)
+        values, usual = picture[row, start : 3 * (left + last)], mean[row, start:]
+        unit, toward = scale[row, start:], pattern[row, start:]
+        _scale_line(values, usual, unit, toward, light, first, down[row], line[shift:])
         for c in range(3):
             if begin == 0:
                 line[c] = line[3 * min(2, wide) + c]
@@ -197,18 +193,20 @@ def scaled_change(
             size = abs(smooth[i])
             largest[i] = largest[i] if largest[i] > size else size
         if y == 0:
-            peaks[0] = _largest(most)
-    peaks[2], peaks[3], peaks[4] = _largest(most[:3]), _largest(most[-3:]), _largest(most)
+            for i in range(count):
+                peaks[0] = max(peaks[0], largest[i])
     for i in range(3 * begin, 3 * end):
         peaks[1] = max(peaks[1], abs(blurred[high - 1, i]))
+    _note_peaks(most, peaks)
 
 
 @helper
-def _fetch(known: tuple[Float, Float, Float], first: int, count: int) -> None:
-    """Have numbers brought into the caches: the processor does not foresee a window's short lines."""
-    for values in known:
-        for place in range(4 * first, 4 * (first + count), CACHE_LINE):
-            prefetch(values.view(np.uint8), place)
+def _note_peaks(most: Float, peaks: Float) -> None:
+    """The first and the last column's peaks and that of all, of the largest change in each column, (3 w,)."""
+    for c in range(3):
+        peaks[2], peaks[3] = max(peaks[2], most[c]), max(peaks[3], most[most.size - 3 + c])
+    for i in range(most.size):
+        peaks[4] = max(peaks[4], most[i])
 
 
 @helper
@@ -268,15 +266,6 @@ def _neighbours(spans: Index, row: int, wide: int) -> tuple[int, int]:
         if spans[near, 1]:
             begin, end = min(begin, spans[near, 0]), max(end, spans[near, 1])
     return begin, end
-
-
-@helper
-def _largest(values: Float) -> np.float32:
-    """The largest of some numbers that are not negative."""
-    largest = np.float32(0)
-    for value in values:
-        largest = max(largest, value)
-    return largest
 
 
 @kernel(
