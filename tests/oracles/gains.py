@@ -63,7 +63,9 @@ class Gain:
     def _difference(self, name: str, ours: Any, theirs: Any) -> str | None:
         if ours is None and theirs is None:
             return None
-        one, other = np.asarray(ours, np.float64), np.asarray(theirs, np.float64)
+        # Memory that a kernel leaves as it was may hold any bits, also those that are no number.
+        with np.errstate(invalid="ignore", over="ignore"):
+            one, other = np.asarray(ours, np.float64), np.asarray(theirs, np.float64)
         near = np.isclose(one, other, rtol=0, atol=self.tolerance, equal_nan=True)
         if near.all() or (near.size > 1 and np.mean(~near) <= self.outliers):
             return None
