@@ -94,8 +94,6 @@ class IlluminationModel:
         self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
         self._limit: Float = np.float32(CLIP) * np.sqrt(self._block_means(variance))
-        # Of the frame that is fitted; kept, as memory that was in use lately is at hand.
-        self._excess, self._clip = np.empty((2, *self._reference.shape), np.float32)
 
     def fit(self, cells: Float) -> Float:
         """Coefficients of the change of illumination between the reference and a frame.
@@ -105,6 +103,7 @@ class IlluminationModel:
         frame), and the offset, grey levels.
         """
         coefficients = np.zeros((3, 4), np.float32)
+        excess, limit = np.empty((2, *self._reference.shape), np.float32)
         compare_blocks(
             cells,
             self._row_weights,
@@ -112,13 +111,11 @@ class IlluminationModel:
             self._reference,
             self._per_brightness,
             self._limit,
-            self._excess,
-            self._clip,
+            excess,
+            limit,
             coefficients,
         )
-        fit_robustly(
-            self._excess, self._basis, self._step, self._shrink, self._clip, self._center, coefficients
-        )
+        fit_robustly(excess, self._basis, self._step, self._shrink, limit, self._center, coefficients)
         return coefficients
 
     def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:

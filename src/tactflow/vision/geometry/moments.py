@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -251,13 +252,5 @@ def wrap_rows(ends: Ends, left: int, above: int, corners: NDArray[np.float64]) -
     for k in range(1, count):
         x, y = corners[k - 1, 0], corners[k - 1, 1]
         twice += x * corners[k, 1] - corners[k, 0] * y
-        on_border += _common_divisor(abs(int(corners[k, 0] - x)), abs(int(corners[k, 1] - y)))
+        on_border += math.gcd(int(corners[k, 0] - x), int(corners[k, 1] - y))
     return count, (abs(twice) + on_border) / 2 + 1
-
-
-@helper
-def _common_divisor(one: int, other: int) -> int:
-    """The greatest one (Euclid)."""
-    while other:
-        one, other = other, one % other
-    return one
