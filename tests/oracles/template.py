@@ -31,10 +31,8 @@ def plain_align_marks(
     real: FloatArray,
     position: FloatArray,
     found: Float32Array,
-    touched: IntArray,
 ) -> None:
     """Steps of all marks together, as products of matrices; those that are done take part no longer."""
-    del touched
     gray = image[:, :, 0] if image.shape[2] == 1 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     models, rounds = (weights, terms, disc, whole, real), int(whole[2])
     position[:], found[:] = _step(gray, start, marks, *models)
@@ -80,4 +78,4 @@ def _step(
 
 
 # Some ten operations in float32 after sums that are exact: relative errors of 1e-6.
-GAINS = [Gain(align_marks, plain_align_marks, tolerance=2e-5, scratch=("touched",))]
+GAINS = [Gain(align_marks, plain_align_marks, tolerance=2e-5)]

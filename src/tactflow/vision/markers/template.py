@@ -165,7 +165,6 @@ class MarkerTemplates:
             self._real,
             position,
             found,
-            np.empty(1, np.int64),
         )
         return Alignment(position, found[0], found[1], found[2])
 
@@ -305,22 +304,12 @@ def ask_for_template(weights: Levels, terms: Float32Array, which: int) -> None:
 
 
 @helper
-def touch_patches(flat: NDArray[np.uint8], shape: Any, start: FloatArray, reach: int) -> int:
-    """Read the ends of all rows of all patches, which brings them into the cache; a number without meaning.
-
-    Patches lie far apart in memory, and waiting for one after the other takes longer than all arithmetic;
-    reads that do not depend on each other are done many at a time.
-    """
+def ask_for_patch(flat: NDArray[np.uint8], shape: Any, left: int, top: int, reach: int) -> None:
+    """Have the ends of all rows of a patch brought into the caches: rows lie far apart in memory."""
     height, width, channels = shape
-    touched = 0
-    for n in range(len(start)):
-        left = min(max(int(start[n, 0]) - reach, 0), width - 1) * channels
-        right = min(max(int(start[n, 0]) + reach, 0), width - 1) * channels
-        top = min(max(int(start[n, 1]), 0), height - 1)
-        for row in range(max(top - reach, 0), min(top + reach + 1, height)):
-            touched += flat[np.uintp(row * width * channels + left)]
-            touched += flat[np.uintp(row * width * channels + right)]
-    return touched
+    for row in range(max(top - reach, 0), min(top + reach + 1, height)):
+        prefetch(flat, (row * width + left - reach) * channels)
+        prefetch(flat, (row * width + left + reach) * channels)
 
 
 @helper
@@ -406,7 +395,7 @@ def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int)
 
 @kernel(
     "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int16[:, :, ::1],"
-    "float32[:, ::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1], float32[:, ::1], int64[::1])",
+    "float32[:, ::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1], float32[:, ::1])",
     reorder=True,
 )
 def align_marks(
@@ -420,7 +409,6 @@ def align_marks(
     real: FloatArray,
     position: FloatArray,
     found: Float32Array,
-    touched: IntArray,
 ) -> None:
     """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
 
@@ -429,7 +417,6 @@ def align_marks(
     per pixel, 5 units of weights. disc : (2, p) dx and dy of the pixels, p <= P; other weights are zero.
     whole : reach of a patch, phases per axis, rounds after the first step. real : radius, px, length of a
     step that calls for another, px, and the sampling error, px.
-    touched : (1,), takes a number without meaning: what goes nowhere would not be read.
     """
     height, width, channels = image.shape
     reach, phases, rounds = whole[0], whole[1], whole[2]
@@ -439,13 +426,13 @@ def align_marks(
     for p in range(len(offsets)):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
     words, patch = np.empty(len(offsets), np.int32), np.zeros(weights.shape[2], np.int16)
-    touched[0] = touch_patches(flat, image.shape, start, reach)
     for n in range(len(marks)):
-        # The next mark's template is asked for while this one is aligned.
+        # The next mark's template and patch are asked for while this one is aligned.
         if n + 1 < len(marks):
             phase_x, phase_y = nearest_phase(start[n + 1, 0], start[n + 1, 1], width, height, phases)
             which = (phase_x % phases + phase_y % phases * phases) * count + marks[n + 1]
             ask_for_template(weights, terms, which)
+            ask_for_patch(flat, image.shape, phase_x // phases, phase_y // phases, reach)
         x, y = start[n, 0], start[n, 1]
         seen_left = seen_top = -1
         for number in range(rounds + 1):
