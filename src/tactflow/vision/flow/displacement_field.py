@@ -205,9 +205,13 @@ class FieldModel:
         if markers.position.shape != self.origin.shape:
             raise ValueError(f"required {len(self.origin)} markers, got {len(markers.position)}")
         seen = markers.status == _TRACKED
-        if np.count_nonzero(seen) < FEWEST:
+        errors = np.asarray(markers.stderr, np.float64)[seen]
+        if len(errors) < FEWEST:
             return None
-        return DisplacementField(self, markers, seen)
+        errors.sort()
+        # What is unknown, infinite or NaN, comes last.
+        known = len(errors) if math.isfinite(errors[-1]) else int(errors.searchsorted(np.inf))
+        return DisplacementField(self, markers, seen, float(errors[known // 2]) if known else 0.0)
 
 
 class DisplacementField:
@@ -217,22 +221,20 @@ class DisplacementField:
     that was at `grid.points[row, column]` in the reference frame.
 
     model : of the reference. markers : of the frame. seen : (N,) bool, those that were seen, three or more.
+    noise : median standard error of a marker, px; 0 where none is known.
 
-    grid : where the field is told. noise : median standard error of a marker, px; 0 where none is known.
+    grid : where the field is told.
     """
 
-    def __init__(self, model: FieldModel, markers: Markers, seen: NDArray[np.bool_]) -> None:
-        self.grid = model.grid
+    def __init__(self, model: FieldModel, markers: Markers, seen: NDArray[np.bool_], noise: float) -> None:
+        self.grid, self.noise = model.grid, noise
         self._model, self._seen = model, seen
-        stderr = np.ascontiguousarray(markers.stderr, np.float64)
-        ordered = np.sort(stderr[seen & np.isfinite(stderr)])
-        self.noise = float(ordered[len(ordered) // 2]) if len(ordered) else 0.0
         position = np.ascontiguousarray(markers.position, np.float64)
+        stderr = np.ascontiguousarray(markers.stderr, np.float64)
         self._planes = np.empty((6, len(seen)))
         removed = np.empty_like(model.inverse)
-        usual, inverse = self.noise, model.inverse
         count = weigh_markers(
-            position, model.rest, seen, stderr, usual, POOR * usual, inverse, self._planes, removed
+            position, model.rest, seen, stderr, noise, POOR * noise, model.inverse, self._planes, removed
         )
         self._removed = removed[:count].copy()
 
@@ -262,7 +264,7 @@ class DisplacementField:
         model, step = self._model, int(window[2])
         spacing = step * self.grid.spacing
         # Between region and markers, and how much each marker counts.
-        kernel, counts = np.zeros((2, 3, len(model.origin)))
+        kernel, counts = np.zeros((3, len(model.origin))), np.empty((3, len(model.origin)))
         sums = np.zeros(26)
         sum_region(cells, model.to_markers, window, spacing, model.between[step], sums, kernel)
         sum_markers(kernel, model.inverse, self._removed, self._planes, counts, sums)
@@ -356,7 +358,7 @@ def _motion(sums: list[float], spacing: float) -> GelMotion:
     if determinant <= (xx + yy) * spacing * spacing / 12:
         return GelMotion((u, v), stderr, outline, spread, None, None, left / prior[0])
     x, y, z = yy / determinant, -xy / determinant, xx / determinant
-    unknown = [form - known for form, known in zip(prior, told, strict=True)]
+    unknown = [left, prior[1] - told[1], prior[2] - told[2], prior[3] - told[3]]
     dx_stderr = math.sqrt(scale * max(_square(unknown, x, y), 0.0) + _square(noise, x, y))
     dy_stderr = math.sqrt(scale * max(_square(unknown, y, z), 0.0) + _square(noise, y, z))
     dx, dy = (x * xu + y * yu, x * xv + y * yv), (y * xu + z * yu, y * xv + z * yv)

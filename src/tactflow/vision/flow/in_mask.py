@@ -114,16 +114,16 @@ def _inside(markers: Markers, mask: NDArray[np.uint8], dilate: float) -> NDArray
 
 def _field_summary(motion: GelMotion, count: int, coarse: bool) -> Flow:
     outline = (motion.spread, motion.spread) if coarse else motion.outline_stderr
-    x, y = (math.hypot(motion.stderr, error) for error in outline)
+    stderr = math.hypot(motion.stderr, outline[0]), math.hypot(motion.stderr, outline[1])
     gradient = motion.gradient
     if gradient is None:
-        return Flow(motion.mean, count, (x, y))
+        return Flow(motion.mean, count, stderr)
     spread, turn = gradient.growth
     error = gradient.stderr
     return Flow(
         motion.mean,
         count,
-        (x, y),
+        stderr,
         _rotation(spread, turn),
         _divergence(spread, turn),
         motion.residual,
