@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from tactflow.vision.markers.template import (
     LEAST_DIVISOR,
     LEAST_RESIDUAL,
+    PHASES,
+    ROUNDS,
     STEP_GAIN,
     STEP_R_SQUARED,
     align_marks,
@@ -27,18 +29,19 @@ def plain_align_marks(
     weights: NDArray[np.int16],
     terms: Float32Array,
     disc: IntArray,
-    whole: IntArray,
+    reach: int,
     real: FloatArray,
     position: FloatArray,
     found: Float32Array,
 ) -> None:
     """Steps of all marks together, as products of matrices; those that are done take part no longer."""
     gray = image[:, :, 0] if image.shape[2] == 1 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-    models, rounds = (weights, terms, disc, whole, real), int(whole[2])
+    del reach
+    models = (weights, terms, disc, real)
     position[:], found[:] = _step(gray, start, marks, *models)
     active = np.arange(len(marks))
     start = start.copy()
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         far = ((position[active] - start[active]) ** 2).sum(axis=1) > real[1] ** 2
         active = active[far & (found[1, active] > STEP_R_SQUARED) & (found[0, active] > STEP_GAIN)]
         start[active] = position[active]
@@ -52,11 +55,10 @@ def _step(
     weights: NDArray[np.int16],
     terms: Float32Array,
     disc: IntArray,
-    whole: IntArray,
     real: FloatArray,
 ) -> tuple[FloatArray, Float32Array]:
     """One least-squares step from the phase nearest to the starting points."""
-    phases, radius = int(whole[1]), np.float32(real[0])
+    phases, radius = PHASES, np.float32(real[0])
     count, pixels = len(weights) // phases**2, disc.shape[1]
     limits = np.array([gray.shape[1] - 1, gray.shape[0] - 1])
     phase = (np.clip(start, 0, limits) * phases + phases / 2).astype(np.int64)

@@ -86,6 +86,7 @@ class RunningNode:
         self.ports = ports.inputs
         refs = [node.inputs.get(port.name) for port in self.ports]
         self.input_slots = [slots[ref.node, ref.port] if ref else UNCONNECTED for ref in refs]
+        self._connected_slots = [slot for slot in self.input_slots if slot != UNCONNECTED]
         self._named_slots = [(p.name, slot) for p, slot in zip(self.ports, self.input_slots, strict=True)]
         self.slots = [slots[node.id, port.name] for port in ports.outputs]
         self.gates = [RunningGate(gate, slots) for gate in node.gates] if skipping else []
@@ -183,21 +184,26 @@ class RunningNode:
         This goes by the data alone, not by whether the node had run before, so that an observer changes no
         reason either.
         """
-        if not tick.reasons or not self._is_pure:
+        reasons, first = tick.reasons, None
+        if not self._is_pure:
             return None
-        reasons = [tick.reasons.get(slot) for slot in self.input_slots if slot != UNCONNECTED]
-        return reasons[0] if reasons and None not in reasons else None
+        for slot in self._connected_slots:
+            if slot not in reasons:
+                return None
+            first = first or reasons[slot]
+        return first
 
     def publish(self, tick: TickState, outputs: Sequence[Any]) -> None:
         """Enter its outputs into the tick's table."""
-        inherited = self.inherited_reason(tick)
+        inherited = self.inherited_reason(tick) if tick.reasons else None
         for number, slot in enumerate(self.slots):
             tick.values[slot] = value = outputs[number]
             if isinstance(value, Absent):
                 tick.reasons[slot] = value.reason
             elif inherited is not None:
                 tick.reasons[slot] = inherited
-        self._read_signals(tick)
+        if self.signals:
+            self._read_signals(tick)
 
     def skip(self, tick: TickState, absent: Absent, *, repeat: bool = False) -> None:
         """Enter what its outputs are where it does not run: absent, or with `repeat` its last ones again."""
@@ -206,7 +212,8 @@ class RunningNode:
         for number, slot in enumerate(self.slots):
             tick.values[slot] = absent if last is None else last[number]
             tick.reasons[slot] = absent.reason
-        self._read_signals(tick)
+        if self.signals:
+            self._read_signals(tick)
 
     def _read_signals(self, tick: TickState) -> None:
         for slot, signal in self.signals.values():

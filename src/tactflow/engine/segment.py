@@ -167,7 +167,7 @@ class Segment:
 
     def _evaluate(self, node: RunningNode, tick: TickState) -> None:
         """Run a node, unless a gate, an absent input or unchanged inputs make that unnecessary."""
-        gate = node.closed_gate(tick.values)
+        gate = node.closed_gate(tick.values) if node.gates else None
         if gate is not None:
             if not gate.repeats:
                 # There is nothing: what was before that is not repeated after it either.

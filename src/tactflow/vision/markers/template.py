@@ -142,7 +142,7 @@ class MarkerTemplates:
         self._all = np.arange(count)
         self._weights = weights.reshape(PHASES * PHASES * count, 5, length)
         self._terms = terms.reshape(PHASES * PHASES * count, 16)
-        self._whole = np.array([reach, PHASES, ROUNDS])
+        self._reach = reach
         self._real = np.array([radius, CONVERGED, SAMPLING_ERROR])
 
     def align(self, image: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None) -> Alignment:
@@ -161,7 +161,7 @@ class MarkerTemplates:
             self._weights,
             self._terms,
             self._disc,
-            self._whole,
+            self._reach,
             self._real,
             position,
             found,
@@ -286,12 +286,12 @@ def _lanczos(fraction: FloatArray) -> FloatArray:
 
 
 @helper
-def nearest_phase(x: float, y: float, width: int, height: int, phases: int) -> Any:
+def nearest_phase(x: float, y: float, width: int, height: int) -> Any:
     """The phases nearest to a point: whole pixels in the higher digits, the phase in the lowest."""
     # Written so that NaN, too, becomes a place inside the image.
     inside_x = min(x, width - 1.0) if x > 0.0 else 0.0
     inside_y = min(y, height - 1.0) if y > 0.0 else 0.0
-    return int(inside_x * phases + phases / 2), int(inside_y * phases + phases / 2)
+    return int(inside_x * PHASES + PHASES / 2), int(inside_y * PHASES + PHASES / 2)
 
 
 @helper
@@ -395,7 +395,7 @@ def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int)
 
 @kernel(
     "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int16[:, :, ::1],"
-    "float32[:, ::1], int64[:, ::1], int64[::1], float64[::1], float64[:, ::1], float32[:, ::1])",
+    "float32[:, ::1], int64[:, ::1], int64, float64[::1], float64[:, ::1], float32[:, ::1])",
     reorder=True,
 )
 def align_marks(
@@ -405,7 +405,7 @@ def align_marks(
     weights: Levels,
     terms: Float32Array,
     disc: IntArray,
-    whole: IntArray,
+    reach: int,
     real: FloatArray,
     position: FloatArray,
     found: Float32Array,
@@ -413,15 +413,14 @@ def align_marks(
     """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
 
     image : (H, W, 3) BGR or (H, W, 1) grey. start : (n, 2). marks : (n,), of those in `weights`.
-    weights : (phases^2 N, 5, P), of `whole_numbers`. terms : (phases^2 N, 16), 9 of the Gram matrix, variance
+    weights : (PHASES^2 N, 5, P), of `whole_numbers`. terms : (PHASES^2 N, 16), 9 of the Gram matrix, variance
     per pixel, 5 units of weights. disc : (2, p) dx and dy of the pixels, p <= P; other weights are zero.
-    whole : reach of a patch, phases per axis, rounds after the first step. real : radius, px, length of a
-    step that calls for another, px, and the sampling error, px.
+    reach : of a patch, px. real : radius, px, length of a step that calls for another, px, and the sampling
+    error, px.
     """
     height, width, channels = image.shape
-    reach, phases, rounds = whole[0], whole[1], whole[2]
     radius, converged, sampling = np.float32(real[0]), real[1] * real[1], np.float32(real[2] * real[2])
-    count, flat = weights.shape[0] // (phases * phases), image.reshape(-1)
+    count, flat = weights.shape[0] // (PHASES * PHASES), image.reshape(-1)
     offsets = np.empty(disc.shape[1], np.int64)
     for p in range(len(offsets)):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
@@ -429,16 +428,16 @@ def align_marks(
     for n in range(len(marks)):
         # The next mark's template and patch are asked for while this one is aligned.
         if n + 1 < len(marks):
-            phase_x, phase_y = nearest_phase(start[n + 1, 0], start[n + 1, 1], width, height, phases)
-            which = (phase_x % phases + phase_y % phases * phases) * count + marks[n + 1]
+            phase_x, phase_y = nearest_phase(start[n + 1, 0], start[n + 1, 1], width, height)
+            which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + marks[n + 1]
             ask_for_template(weights, terms, which)
-            ask_for_patch(flat, image.shape, phase_x // phases, phase_y // phases, reach)
+            ask_for_patch(flat, image.shape, phase_x // PHASES, phase_y // PHASES, reach)
         x, y = start[n, 0], start[n, 1]
         seen_left = seen_top = -1
-        for number in range(rounds + 1):
-            phase_x, phase_y = nearest_phase(x, y, width, height, phases)
-            left, top = phase_x // phases, phase_y // phases
-            which = (phase_x % phases + phase_y % phases * phases) * count + marks[n]
+        for number in range(ROUNDS + 1):
+            phase_x, phase_y = nearest_phase(x, y, width, height)
+            left, top = phase_x // PHASES, phase_y // PHASES
+            which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + marks[n]
             # A step of less than a pixel often sees the same patch from another phase.
             if left != seen_left or top != seen_top:
                 seen_left, seen_top = left, top
@@ -447,11 +446,11 @@ def align_marks(
             fitted = fit_template(weights[which], terms[which], patch, len(offsets))
             gain, shift_x, shift_y, r_squared, rest = fitted
             safe = max(gain, LEAST_DIVISOR)
-            now_x = (phase_x + 0.5) / phases - 0.5 + min(max(shift_x / safe, -radius), radius)
-            now_y = (phase_y + 0.5) / phases - 0.5 + min(max(shift_y / safe, -radius), radius)
+            now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -radius), radius)
+            now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -radius), radius)
             far = (now_x - x) ** 2 + (now_y - y) ** 2 > converged
             x, y = now_x, now_y
-            if number == rounds or not (far and r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
+            if number == ROUNDS or not (far and r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
                 break
         position[n, 0], position[n, 1] = x, y
         found[0, n], found[1, n] = gain, r_squared
