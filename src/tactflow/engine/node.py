@@ -226,12 +226,16 @@ class RunningNode:
 
 def _outputs(result: Any, count: int) -> Sequence[Any]:
     """What a node returned, as one value per output port; None stands for absent."""
-    if isinstance(result, Absent) or (result is None and count):
-        return [result or _NONE] * count
-    values: Sequence[Any] = result if isinstance(result, tuple) else [result] if count else ()
+    values: list[Any]
+    if isinstance(result, tuple):
+        values = [_NONE if value is None else value for value in result]
+    elif result is None or isinstance(result, Absent):
+        values = [result or _NONE] * count
+    else:
+        values = [result] if count else []
     if len(values) != count:
         raise TypeError(f"required {count} outputs, got {len(values)}")
-    return [_NONE if value is None else value for value in values]
+    return values
 
 
 def _by_position(function: Callable[..., Any], names: Sequence[str]) -> Callable[..., Any]:
