@@ -107,17 +107,15 @@ def encode_message(tick: Tick, results: Results, *, detail: bool = False, field:
     frame = tick.frame
     image, contact, flow, markers, scale, depth, _, slip, force = results
     pixels = frame.image if image is None else image
-    described = None if contact is None else _contact(contact, scale, detail)
-    separate = () if contact is None else contact.separate
+    whole, contacts = _contacts(contact, scale, depth, detail)
     message: dict[str, Any] = {
         "schema": SCHEMA,
         "sensor": frame.sensor,
         "seq": frame.seq,
         "t": _number(frame.t, "t"),
         "size": [pixels.shape[1], pixels.shape[0]],
-        "contact": _with_depth(described, depth, detail),
-        "contacts": [_contact(part, scale, detail) for part in separate]
-        or [one for one in (described,) if one is not None],
+        "contact": whole,
+        "contacts": contacts,
         "flow": None if flow is None else _flow(flow, scale, detail),
         "markers": None if markers is None else _markers(markers, detail),
         "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
@@ -139,6 +137,21 @@ def _scale(scale: Scale) -> dict[str, Any]:
         "mm_per_px": _pair((scale.x, scale.y), "scale.mm_per_px"),
         "origin": _pair(scale.origin, "scale.origin"),
     }
+
+
+def _contacts(
+    contact: Contact | None, scale: Scale | None, depth: Depth | None, detail: bool
+) -> tuple[Any, list[Any]]:
+    """What touches as a whole, and each separate contact, for the encoder."""
+    if contact is None:
+        return None, []
+    whole = _contact(contact, scale, detail)
+    if contact.separate:
+        parts = [_contact(part, scale, detail) for part in contact.separate]
+        return _with_depth(whole, depth, detail), parts
+    # Told twice, encoded once.
+    text = orjson.Fragment(orjson.dumps(whole, option=_OPTIONS))
+    return (text if depth is None else _with_depth(whole, depth, detail)), [text]
 
 
 def _contact(contact: Contact, scale: Scale | None, detail: bool) -> dict[str, Any]:
@@ -169,8 +182,8 @@ def _contact(contact: Contact, scale: Scale | None, detail: bool) -> dict[str, A
     return result
 
 
-def _with_depth(contact: dict[str, Any] | None, depth: Depth | None, detail: bool) -> dict[str, Any] | None:
-    if contact is None or depth is None:
+def _with_depth(contact: dict[str, Any], depth: Depth | None, detail: bool) -> dict[str, Any]:
+    if depth is None:
         return contact
     result = contact | {
         "depth_mm": _number(depth.greatest, "contact.depth_mm"),
