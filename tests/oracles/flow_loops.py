@@ -30,10 +30,11 @@ def plain_rate_motion(
     stderr: FloatArray,
     rest: FloatArray,
     links: IntArray,
-    limits: FloatArray,
+    deviations: float,
+    variance: float,
+    resting: float,
     rated: FloatArray,
-    found: FloatArray,
-) -> None:
+) -> tuple[float, float]:
     """Medians as complex numbers. A neighbour that has two of its own rank is the middle of three."""
     tracked = np.flatnonzero(status == 0)
     left = np.zeros(len(status))
@@ -43,7 +44,6 @@ def plain_rate_motion(
         moved -= np.median(moved.real) + 1j * np.median(moved.imag)
         turn = np.median((moved * arms.conj()).imag / np.maximum(abs(arms) ** 2, 1.0))
         left[tracked] = abs(moved - 1j * turn * arms)
-    deviations, variance, resting = limits.tolist()
     bound = deviations * np.sqrt(stderr**2 + variance)
     ratio = np.nan_to_num(np.where(left > resting, left / bound, 0.0))
     rated[:3], rated[3:] = (left, bound, ratio), 0.0
@@ -51,8 +51,8 @@ def plain_rate_motion(
         beside = np.concatenate([links[links[:, 0] == marker, 1], links[links[:, 1] == marker, 0]])
         largest = np.sort(ratio[beside])[::-1][:2]
         rated[3 : 3 + len(largest), marker] = largest
-    found[0] = np.sort(left)[-3] if len(left) >= 3 else 0.0
-    found[1] = np.minimum(ratio, rated[4]).max(initial=0.0)
+    third = np.sort(left)[-3] if len(left) >= 3 else 0.0
+    return float(third), float(np.minimum(ratio, rated[4]).max(initial=0.0))
 
 
 def plain_weigh_markers(

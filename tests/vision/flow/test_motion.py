@@ -157,10 +157,8 @@ def test_medians_are_right_for_even_and_odd_numbers_and_for_equal_motions(count:
         position = rest[:2].T + np.round(rng.normal(0, 2, (count, 2)), digits)
         status = (rng.random(count) < 0.2).astype(np.uint8)
         links = rng.integers(0, max(count, 1), (count, 2))
-        given = position, status, np.full(count, 0.02), rest, links, np.array([3.0, 0.02, 0.1])
+        given = position, status, np.full(count, 0.02), rest, links, 3.0, 0.02, 0.1
         rated, expected = np.empty((2, 5, count))
-        found, expected_found = np.empty((2, 2))
-        rate_motion(*given, rated, found)
-        plain_rate_motion(*given, expected, expected_found)
+        found, expected_found = rate_motion(*given, rated), plain_rate_motion(*given, expected)
         np.testing.assert_allclose(rated, expected, atol=1e-9)
         np.testing.assert_allclose(found, expected_found, atol=1e-9)

@@ -26,8 +26,8 @@ _NOWHERE: Final = 1e-12
 
 
 @kernel(
-    "void(float64[:, ::1], uint8[::1], float64[::1], float64[:, ::1], int64[:, ::1], float64[::1],"
-    " float64[:, ::1], float64[::1])"
+    "Tuple((float64, float64))(float64[:, ::1], uint8[::1], float64[::1], float64[:, ::1], int64[:, ::1],"
+    " float64, float64, float64, float64[:, ::1])"
 )
 def rate_motion(
     position: FloatArray,
@@ -35,23 +35,24 @@ def rate_motion(
     stderr: FloatArray,
     rest: FloatArray,
     links: IntArray,
-    limits: FloatArray,
+    deviations: float,
+    variance: float,
+    resting: float,
     rated: FloatArray,
-    found: FloatArray,
-) -> None:
+) -> tuple[float, float]:
     """How far beyond chance the markers of a chain of three neighbours have moved against the whole gel.
+
+    Returns the third largest motion, px, and the largest number that each marker of a chain reaches.
 
     position : (N, 2), px. status : (N,), of `MarkerStatus`. stderr : (N,), px, NaN where unknown.
     rest : (6, N), of each marker in the reference: x and y, and its arm, x and y from the middle of all, px;
     the arm over its square, 1/px.
-    links : (L, 2), neighbours. limits : (3,): standard deviations that are a motion; variance of markers of
-    an untouched gel, px^2; the motion up to which a marker of a released gel is at rest, px.
+    links : (L, 2), neighbours. deviations : standard deviations that are a motion. variance : of markers of
+    an untouched gel, px^2. resting : the motion up to which a marker of a released gel is at rest, px.
     rated : (5, N), filled: what a shift and a turn of the whole gel leave of each tracked marker's motion,
     px, 0 of others, and of all where fewer than three are; what it takes to be a motion, px; each motion in
     this unit, 0 where it is at rest or its error unknown; the largest and the second largest of these
     numbers among a marker's neighbours.
-    found : (2,), filled: the third largest motion, px; the largest number that each marker of a chain
-    reaches.
     """
     left, bounds, ratio, largest, second_largest = rated[0], rated[1], rated[2], rated[3], rated[4]
     shift_x = shift_y = middle = 0.0
@@ -74,9 +75,9 @@ def rate_motion(
         third = max(third, min(left[i], second))
         second = max(second, min(left[i], most))
         most = max(most, left[i])
-        bound = limits[0] * math.sqrt(stderr[i] * stderr[i] + limits[1])
+        bound = deviations * math.sqrt(stderr[i] * stderr[i] + variance)
         # Nothing is larger than NaN.
-        bounds[i], ratio[i] = bound, left[i] / bound if left[i] > limits[2] and bound > 0 else 0.0
+        bounds[i], ratio[i] = bound, left[i] / bound if left[i] > resting and bound > 0 else 0.0
         largest[i] = second_largest[i] = 0.0
     for k in range(len(links)):
         for end in range(2):
@@ -85,7 +86,7 @@ def rate_motion(
             largest[i] = max(largest[i], other)
     for i in range(left.size):
         chain = max(chain, min(ratio[i], second_largest[i]))
-    found[0], found[1] = third, chain
+    return third, chain
 
 
 @helper

@@ -145,12 +145,20 @@ class MotionTest:
         count = len(self._origin)
         if len(markers.position) != count:
             raise ValueError(f"required {count} markers, got {len(markers.position)}")
-        limits = np.array([self._limit, self._variance, self._relaxation * self._strongest])
-        rated, found = np.empty((5, count)), np.empty(2)
+        resting, rated = self._relaxation * self._strongest, np.empty((5, count))
         position = np.ascontiguousarray(markers.position, np.float64)
         stderr = np.ascontiguousarray(markers.stderr, np.float64)
-        rate_motion(position, markers.status, stderr, self._rest, self._links, limits, rated, found)
-        largest, chain = found.tolist()
+        largest, chain = rate_motion(
+            position,
+            markers.status,
+            stderr,
+            self._rest,
+            self._links,
+            self._limit,
+            self._variance,
+            resting,
+            rated,
+        )
         self._lasted = min(self._lasted + 1, LASTING) if self._moving else 1
         alone = ALONE if largest < FADES * self._largest else ALONE / math.sqrt(self._lasted)
         self._largest = largest
