@@ -216,7 +216,7 @@ class MarkerTracker:
             left = self._graph.strain(position) + STRAIN_MARGIN
             self._steepest = np.minimum(np.maximum(STEEP_STRAIN, left), MOST_STRAIN)
             self._age = 0
-        # Tracked, which is 0. To fill an array with another number takes ten times as long.
+        # All tracked, which is 0; `np.full` takes three times as long.
         status = np.zeros(self._count, np.uint8)
         errors = stderr.astype(np.float64)
         if doubt and not seen.all():
