@@ -33,6 +33,9 @@ BESIDE: Final = 8
 """Marks of a pixel where outlines are traced: it belongs to the region; an outline passes it; one that has
 what is outside to its right does; it is hidden, or next to what is."""
 
+EIGHT_PIXELS: Final = np.uint64(0x0101010101010101)
+"""`PIXEL`, of eight pixels side by side."""
+
 ACROSS: Final = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 DOWN: Final = np.array([0, -1, -1, -1, 0, 1, 1, 1])
 """Steps to the eight neighbours of a pixel, counterclockwise from the right, y down."""
@@ -101,18 +104,27 @@ def outlined(mask: Mask, hidden: Hidden | None) -> Mask:
 def _outlines(mask: Mask, hidden: Hidden) -> tuple[list[NDArray[np.int32]], list[int]]:
     """Outlines as `trace_outlines` finds them, the last one first, as OpenCV has it; and their lengths."""
     high, wide = mask.shape
-    marks = np.zeros((high + 2, wide + 2), np.uint8)
+    marks = np.zeros((high + 2, (wide + 9) & ~7), np.uint8)
     # A pixel is passed at most once for each of its four neighbours that is outside.
     points = np.empty((2 * (high + 1) * (wide + 1), 1, 2), np.int32)
     ends = np.empty(((high + 1) * (wide + 1) // 2, 2), np.int32)
-    found = trace_outlines(mask, *hidden, marks, points, ends)
+    found = trace_outlines(mask, *hidden, marks, marks.view(np.uint64), points, ends)
     spans, lengths = ends[found::-1].T.tolist()
     return [points[start:end] for end, start in pairwise(spans)], lengths[:-1]
 
 
-@kernel("int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], int32[:, :, ::1], int32[:, ::1])")
+@kernel(
+    "int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint64[:, ::1], int32[:, :, ::1],"
+    " int32[:, ::1])"
+)
 def trace_outlines(
-    mask: Mask, hidden: Mask, beside: Mask, marks: Mask, points: NDArray[np.int32], ends: NDArray[np.int32]
+    mask: Mask,
+    hidden: Mask,
+    beside: Mask,
+    marks: Mask,
+    eights: NDArray[np.uint64],
+    points: NDArray[np.int32],
+    ends: NDArray[np.int32],
 ) -> int:
     """Outer borders of a region's parts, counterclockwise, as far as they are seen; returns how many.
 
@@ -120,7 +132,8 @@ def trace_outlines(
     by border following", CVGIP 30 (1985); parts within holes are left out.
 
     mask : (h, w), 0 or 1. hidden, beside : of a `Hidden`; what is hidden is traced as if it belonged to the
-    region, and what is beside it left out. marks : (h + 2, w + 2), 0, changed.
+    region, and what is beside it left out. marks : (h + 2, n), 0, changed; n a multiple of eight >= w + 2.
+    eights : (h + 2, n / 8), the same, of eight pixels each.
     points : (n, 1, 2), filled: x and y of the pixels where outlines turn or come out of what is hidden, one
     outline after another. ends : (outlines + 1, 2), filled: where the points of each outline end, and how
     many pixels it passes, after a 0.
@@ -134,7 +147,7 @@ def trace_outlines(
         x, outside = 1, True
         while x <= wide:
             if marks[y, x] & PIXEL == 0:
-                x += 1
+                x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == 0 else 1
                 continue
             if outside and marks[y, x] & PASSED == 0:
                 end, length = _follow(marks, x, y, points, ends[found, 0])
@@ -142,7 +155,7 @@ def trace_outlines(
                     found += 1
                     ends[found, 0], ends[found, 1] = end, length
             while marks[y, x] & PIXEL:
-                x += 1
+                x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == EIGHT_PIXELS else 1
             # To the right of a part lies a hole of it, or what is outside.
             outside = marks[y, x - 1] & RIGHT != 0
     return found
