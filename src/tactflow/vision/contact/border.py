@@ -238,27 +238,30 @@ def _crossing(profile: Double, at: Double, wanted: float) -> float:
 
 
 @helper
-def _border_depth(bins: Double, least: int, middle: float, otherwise: float) -> float:
+def _border_depth(
+    bins: Double, least: int, middle: float, otherwise: float, at: Double, profile: Double
+) -> float:
     """How deep the border lies by one profile, or `otherwise` if too little of it is known.
 
     bins : (2 n,), number of pixels and sum of their strengths in bins of depth, in turns. least : pixels from
-    which on a bin counts. middle : the largest depth.
+    which on a bin counts. middle : the largest depth. at, profile : (n,) or more, changed.
     """
     # Bins with enough pixels: where they are, and what they hold.
-    at, means, known = np.empty(bins.size), np.empty(bins.size), 0
+    known, peak = 0, 0.0
     for k in range(bins.size // 2):
         if bins[2 * k] >= least:
-            at[known], means[known] = (k + 0.5) * BIN, bins[2 * k + 1] / bins[2 * k]
+            at[known], profile[known] = (k + 0.5) * BIN, bins[2 * k + 1] / bins[2 * k]
             known += 1
     if known < 2:
         return otherwise
-    # The largest value before the profile falls clearly for the first time.
-    profile, peak, fallen = np.empty(known), 0.0, False
+    # Smoothed, up to where the profile falls clearly for the first time; the largest value before.
+    before = profile[0]
     for k in range(known):
-        before, after = means[max(k - 1, 0)], means[min(k + 1, known - 1)]
-        profile[k] = before / 4 + means[k] / 2 + after / 4
-        fallen |= profile[k] < FALLEN * peak
-        if profile[k] > peak and not fallen:
+        here, after = profile[k], profile[min(k + 1, known - 1)]
+        profile[k], before = before / 4 + here / 2 + after / 4, here
+        if profile[k] < FALLEN * peak:
+            break
+        if profile[k] > peak:
             peak = profile[k]
     skirt = top = border = 0.0
     for level in LEVELS:
@@ -314,6 +317,7 @@ def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, b
     filled.
     """
     whole, sums, weights, outline = 0.5, 0.0, 0.0, 1
+    at, profile = np.empty(around.size), np.empty(around.size)
     # First of all pixels together.
     for step in range(-1, border.size):
         if step == outlines[outline, 1]:
@@ -323,7 +327,8 @@ def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, b
             _profile_around(bins, step, first, last, around)
         for k in range(0, around.size, 2):
             weight += around[k]
-        found = _border_depth(around, MIN_ARC_PIXELS if step >= 0 else MIN_BIN_PIXELS, middle, whole)
+        least = MIN_ARC_PIXELS if step >= 0 else MIN_BIN_PIXELS
+        found = _border_depth(around, least, middle, whole, at, profile)
         if step < 0:
             whole = found
         else:
