@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.border import depth_of, inside_border
 from tactflow.vision.contact.components import STRAY
 from tactflow.vision.contact.filling import (
@@ -112,7 +113,7 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     >>> bool(abs((contact_level(change) > 0).sum() / np.pi - 8**2) < 3)
     True
     """
-    below = None if hidden is None or not cv2.countNonZero(hidden) else _hidden(hidden)
+    below = hidden if hidden is not None and cv2.countNonZero(hidden) else None
     level, near = _level(change, bridge, below)
     if near is not None:
         # Faint changes that only touch the contact's, such as bands of light, have pulled what is typical.
@@ -120,19 +121,16 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     return level
 
 
-def _hidden(pixels: Mask) -> Hidden:
-    """What is hidden of a mask, (h, w) uint8, 0 or 1, and what is beside it."""
-    return Hidden(pixels, np.asarray(cv2.dilate(pixels, SQUARE), np.uint8))
-
-
-def _level(change: WindowChange, bridge: float, hidden: Hidden | None) -> tuple[Float, Float | None]:
+def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Float, Float | None]:
     """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0."""
-    seen = None if hidden is None else 1 - hidden.beside
-    cap = GLOSS * _typical(change.strength, seen)
-    strength = np.asarray(cv2.threshold(change.strength, cap, 0.0, cv2.THRESH_TRUNC)[1], np.float32)
-    even = cv2.norm(strength, cv2.NORM_L2SQR) / EVEN
+    shape = change.strength.shape
+    strength, beside, sums = np.empty(shape, np.float32), np.empty(shape, np.uint8), np.empty(3)
+    none = np.zeros(shape, np.uint8) if pixels is None else pixels
+    cut_gloss(change.strength, change.brightness, none, beside, strength, sums)
+    cap, squares, common = sums.tolist()
+    hidden, even = None if pixels is None else Hidden(pixels, beside), squares / EVEN
     # What is cut is no larger than before: where it is too little then, there is no need to cut it.
-    if cv2.norm(change.brightness, cv2.NORM_L2SQR) > even:
+    if common > even:
         tone = np.float32(cap / 3**0.5)
         brightness = np.clip(change.brightness, -tone, tone)
         if cv2.norm(brightness, cv2.NORM_L2SQR) > even:
@@ -140,10 +138,39 @@ def _level(change: WindowChange, bridge: float, hidden: Hidden | None) -> tuple[
     return _tilted(strength, bridge, hidden)
 
 
-def _typical(values: Float, seen: Mask | None) -> float:
-    """Mean of values >= 0, weighted by the values themselves; seen : 0 where one does not count."""
-    squares, total = cv2.norm(values, cv2.NORM_L2SQR, seen), cv2.norm(values, cv2.NORM_L1, seen)
-    return max(squares / max(total, 1e-9), 1e-9)
+@kernel(
+    "void(float32[:, ::1], float32[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, ::1], float64[::1])",
+    reorder=True,
+)
+def cut_gloss(
+    strength: Float, brightness: Float, hidden: Mask, beside: Mask, cut: Float, sums: NDArray[np.float64]
+) -> None:
+    """Cut what is a mirror image of a lamp.
+
+    strength, brightness : of a `WindowChange`. hidden : (h, w), 1 where a marker was removed. beside : as of
+    `Hidden`, filled; what is typical is told by the others. cut : (h, w), filled with the strength, but no
+    more than a cap. sums : (3,), filled with that, and the sums of the squares of `cut` and of `brightness`.
+    """
+    high, wide = strength.shape
+    near = np.zeros(wide + 2, np.uint8)
+    total = squares = common = 0.0
+    for y in range(high):
+        above, here, below, row = hidden[max(y - 1, 0)], hidden[y], hidden[min(y + 1, high - 1)], beside[y]
+        for x in range(wide):
+            near[x + 1] = above[x] | here[x] | below[x]
+        for x in range(wide):
+            row[x] = near[x] | near[x + 1] | near[x + 2]
+        for x in range(wide):
+            value = np.float64(strength[y, x] if row[x] == 0 else np.float32(0))
+            tone = np.float64(brightness[y, x])
+            total, squares, common = total + value, squares + value * value, common + tone * tone
+    sums[0], sums[2] = GLOSS * max(squares / max(total, 1e-9), 1e-9), common
+    cap, squares = np.float32(sums[0]), 0.0
+    for y in range(high):
+        for x in range(wide):
+            cut[y, x] = strength[y, x] if strength[y, x] < cap else cap
+            squares += np.float64(cut[y, x]) * np.float64(cut[y, x])
+    sums[1] = squares
 
 
 def _largest_nearby(values: Float, part: float = 1.0) -> Float:
@@ -172,13 +199,14 @@ def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
     darker = brighter - brightness
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         brightness, darker = -brightness, brighter
-    around = _typical(darker, None)
+    around = cv2.norm(darker, cv2.NORM_L2SQR) / max(cv2.norm(darker, cv2.NORM_L1), 1e-9)
     nearby = _largest_nearby(brightness, BESIDE)
     half_way = np.maximum((nearby - np.float32(around)) / 2, np.float32(LEAST) * nearby)
     level = (brightness - half_way) / nearby
     if hidden is not None:
         # The change is smooth here: what is painted next to what is seen is nearly right.
-        hidden = _hidden(np.asarray(cv2.erode(hidden.pixels, SQUARE), np.uint8))
+        pixels = np.asarray(cv2.erode(hidden.pixels, SQUARE), np.uint8)
+        hidden = Hidden(pixels, np.asarray(cv2.dilate(pixels, SQUARE), np.uint8))
     inside = enclosed((level > 0).view(np.uint8), hidden).filled.view(np.bool_)
     # What is filled in is as deep inside as the middle of a plateau, what is left out as far outside.
     np.clip(level, -0.5, 0.5, out=level)
