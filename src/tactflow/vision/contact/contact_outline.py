@@ -69,10 +69,6 @@ LEAST: Final = 0.1
 """A contact that has changed as a whole ends half way, but no further out than where this fraction of the
 largest change nearby is left. Chosen by hand."""
 
-COARSE: Final = 2
-"""Pixels of which one is taken where the largest change nearby is sought, which varies little from one to the
-next."""
-
 
 @dataclass(frozen=True, slots=True)
 class WindowChange:
@@ -180,17 +176,105 @@ def _largest_nearby(values: Float, part: float = 1.0) -> Float:
     it: it holds a side of the contact, but not its other end.
     """
     high, wide = values.shape
-    coarse = (-(-wide // COARSE), -(-high // COARSE))
-    smooth = cv2.blur(values, (3, 3))
-    peak = max(float(cv2.minMaxLoc(smooth)[1]), 1e-9)
+    coarse = np.empty((-(-high // 2), -(-wide // 2)), np.float32)
+    peak = max(halve_smoothed(values, coarse), 1e-9)
     radius = math.sqrt(np.count_nonzero(values > np.float32(OUTER * peak)) / math.pi)
-    reach = round(part * radius / COARSE)
-    side = 2 * reach + 1
-    largest = cv2.resize(smooth, coarse, interpolation=cv2.INTER_AREA)
-    largest = cv2.copyMakeBorder(largest, *(reach,) * 4, cv2.BORDER_CONSTANT, value=(0.0,))
-    largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
-    largest = np.maximum(largest[reach:, reach:][: coarse[1], : coarse[0]], np.float32(FAINT * peak))
-    return np.asarray(cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR), np.float32)
+    reach = round(part * radius / 2)
+    around = np.zeros((coarse.shape[0] + 4 * reach + 1, coarse.shape[1] + 2 * reach), np.float32)
+    nearby = np.empty((2 * coarse.shape[0], 2 * coarse.shape[1]), np.float32)
+    spread_largest(coarse, reach, FAINT * peak, around, nearby)
+    return nearby[:high, :wide]
+
+
+@kernel("float64(float32[:, ::1], float32[:, ::1])")
+def halve_smoothed(values: Float, halved: Float) -> float:
+    """Means over 3 x 3 pixels, of which the largest is returned, and over 2 x 2 of them, which fill `halved`.
+
+    values : (h, w). halved : (h / 2, w / 2), rounded up; the last pixel counts twice then.
+    """
+    high, wide = values.shape
+    sums, line = np.empty(wide + 2), np.empty(wide + 1, np.float32)
+    upper, largest = np.empty(wide + 1, np.float32), np.zeros(wide, np.float32)
+    for y in range(2 * len(halved)):
+        row = min(y, high - 1)
+        above, here, below = values[abs(row - 1)], values[row], values[high - 1 - abs(high - 2 - row)]
+        for x in range(wide):
+            sums[x + 1] = np.float64(above[x]) + here[x] + below[x]
+        # Beyond the border are those mirrored about the last pixel.
+        sums[0], sums[wide + 1] = sums[2], sums[wide - 1]
+        for x in range(wide):
+            line[x] = (sums[x] + sums[x + 1] + sums[x + 2]) * (1 / 9)
+            largest[x] = line[x] if line[x] > largest[x] else largest[x]
+        line[wide] = line[wide - 1]
+        if y & 1:
+            for x in range(halved.shape[1]):
+                both = upper[2 * x] + upper[2 * x + 1] + (line[2 * x] + line[2 * x + 1])
+                halved[y >> 1, x] = both * np.float32(0.25)
+        upper, line = line, upper
+    peak = np.float32(0)
+    for x in range(wide):
+        peak = max(peak, largest[x])
+    return float(peak)
+
+
+@kernel("void(float32[:, ::1], int64, float64, float32[:, ::1], float32[:, ::1])")
+def spread_largest(values: Float, reach: int, least: float, around: Float, nearby: Float) -> None:
+    """The mean, over a square, of the largest values in as large squares, interpolated to twice the resolution.
+
+    values : (h, w). reach : half the side of a square. least : of what is interpolated, at least. around :
+    (h + 4 reach + 1, w + 2 reach), 0, changed. nearby : (2 h, 2 w), filled.
+    """
+    high, wide = values.shape
+    side, broad = 2 * reach + 1, wide + 2 * reach
+    # The largest of so many next to one another, of twice as many, and so on; along x, then along y.
+    line, wider = np.zeros(broad + 2 * reach, np.float32), np.zeros(broad + 2 * reach, np.float32)
+    for y in range(high):
+        for x in range(2 * reach):
+            line[x] = line[broad + x] = 0
+        for x in range(wide):
+            line[x + 2 * reach] = values[y, x]
+        span = 1
+        while 2 * span <= side:
+            ahead = line[span:]
+            for x in range(ahead.size):
+                wider[x] = line[x] if line[x] > ahead[x] else ahead[x]
+            line, wider, span = wider, line, 2 * span
+        ahead, row = line[side - span :], around[y + 2 * reach]
+        for x in range(broad):
+            row[x] = line[x] if line[x] > ahead[x] else ahead[x]
+    span = 1
+    while span < side:
+        step = min(span, side - span)
+        for y in range(high + 4 * reach - step):
+            row, below = around[y], around[y + step]
+            for x in range(broad):
+                row[x] = row[x] if row[x] > below[x] else below[x]
+        span += step
+    # Sums along y, and those of all to the left.
+    sums, left = np.zeros(broad), np.zeros(broad + 1)
+    means, share = np.empty((high, wide), np.float32), 1 / (side * side)
+    for y in range(high + 2 * reach):
+        row, old = around[y], around[y - side if y >= side else high + 4 * reach]
+        for x in range(broad):
+            sums[x] += np.float64(row[x]) - old[x]
+        if y >= 2 * reach:
+            for x in range(broad):
+                left[x + 1] = left[x] + sums[x]
+            right = left[side:]
+            for x in range(wide):
+                mean = (right[x] - left[x]) * share
+                means[y - 2 * reach, x] = mean if mean > least else least
+    near, far = np.float32(0.75), np.float32(0.25)
+    # With a pixel more on both sides, as its neighbour.
+    mixed = np.empty(wide + 2, np.float32)
+    for y in range(2 * high):
+        here, other = means[y // 2], means[min(max(y // 2 + 2 * (y & 1) - 1, 0), high - 1)]
+        for x in range(wide):
+            mixed[x + 1] = here[x] * near + other[x] * far
+        mixed[0], mixed[wide + 1] = mixed[1], mixed[wide]
+        for x in range(wide):
+            nearby[y, 2 * x] = mixed[x] * far + mixed[x + 1] * near
+            nearby[y, 2 * x + 1] = mixed[x + 1] * near + mixed[x + 2] * far
 
 
 def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
