@@ -97,9 +97,6 @@ INDEX: Final = (1 << ORDER) - 1
 REACHED: Final = ~(15 << ORDER)
 """What takes only the index of such a number, and all but the place in the order."""
 
-_NOTHING: Final = np.zeros((0, 0), np.uint8)
-"""An empty mask."""
-
 
 class Depth(NamedTuple):
     """How deep inside a region each pixel is, and its outlines.
@@ -218,7 +215,7 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
         region.corners,
         region.outlines,
         strength,
-        _NOTHING if hidden is None else hidden,
+        np.zeros(parts.shape, np.uint8) if hidden is None else hidden,
         middle,
         level,
     )
@@ -297,14 +294,17 @@ def _place_beside(corners: Whole, outlines: Whole, nearest: Index, parts: Float,
 def _profile_around(bins: Double, step: int, first: int, last: int, around: Double) -> None:
     """Sum of the bins along an outline from `first` to `last`, those near a step; what is nearer counts more.
 
-    bins : (steps * n,). around : (n,), filled.
+    bins : (steps, n). around : (n,), filled.
     """
-    around[:] = 0
-    other = step - STEPS
+    for k in range(around.size):
+        around[k] = 0
     for beside in range(1 - STEPS, STEPS):
-        other += 1
-        start = other + (last - first if other < first else 0) - (last - first if other >= last else 0)
-        share, profile = 1 - abs(beside) / STEPS, bins[start * around.size :]
+        other, share = step + beside, 1 - abs(beside) / STEPS
+        if other < first:
+            other += last - first
+        if other >= last:
+            other -= last - first
+        profile = bins[other]
         for k in range(around.size):
             around[k] += share * profile[k]
 
@@ -341,8 +341,8 @@ def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, b
 
 
 @kernel(
-    "void(float32[:, ::1], int64[:, ::1], int32[:, ::1], int32[:, ::1], int32[:, ::1], float32[:, ::1], uint8[:, ::1],"
-    " float64, float32[:, ::1])"
+    "void(float32[:, ::1], int64[:, ::1], int32[:, ::1], int32[:, ::1], int32[:, ::1], float32[:, ::1],"
+    " uint8[:, ::1], float64, float32[:, ::1])"
 )
 def border_level(
     parts: Float,
@@ -357,7 +357,7 @@ def border_level(
 ) -> None:
     """What `inside_border` finds; `level` is filled.
 
-    nearest, corners, outlines : of a `Depth`. hidden : not 0 where a pixel does not count; (0, 0) if all do.
+    nearest, corners, outlines : of a `Depth`. hidden : not 0 where a pixel does not count.
     middle : the largest depth of the parts.
     """
     high, wide = parts.shape
@@ -365,18 +365,18 @@ def border_level(
     _place_beside(corners, outlines, nearest, parts, place)
     # Of all pixels, and of those of each step: their number and the sum of their strengths in bins of depth.
     steps, around = outlines[-1, 1], np.zeros(2 * int(middle / BIN) + 4)
-    bins, border = np.zeros(steps * around.size), np.empty(steps)
+    bins, border = np.zeros((steps, around.size)), np.empty(steps)
     bins_per_pixel = np.float32(1 / BIN)
     for y in range(high):
         for x in range(spans[y, 0], spans[y, 1]):
-            if parts[y, x] > 0 and (hidden.size == 0 or hidden[y, x] == 0):
+            if parts[y, x] > 0 and hidden[y, x] == 0:
                 step = place[nearest[y + 2, x + 2] & INDEX] - 1
                 at = 2 * int(parts[y, x] * bins_per_pixel)
                 around[at] += 1
                 around[at + 1] += strength[y, x]
                 if step >= 0:
-                    bins[step * around.size + at] += 1
-                    bins[step * around.size + at + 1] += strength[y, x]
+                    bins[step, at] += 1
+                    bins[step, at + 1] += strength[y, x]
     whole = _step_depths(bins, outlines, middle, around, border)
     for y in range(high):
         for x in range(wide):
