@@ -223,18 +223,6 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
 
 
 @helper
-def _crossing(profile: Double, at: Double, wanted: float) -> float:
-    """Where, coming from outside, a profile first reaches a value."""
-    first = 0
-    while profile[first] < wanted:
-        first += 1
-    if first == 0:
-        return float(at[0])
-    fraction = (wanted - profile[first - 1]) / (profile[first] - profile[first - 1])
-    return float(at[first - 1] + fraction * (at[first] - at[first - 1]))
-
-
-@helper
 def _border_depth(
     bins: Double, least: int, middle: float, otherwise: float, at: Double, profile: Double
 ) -> float:
@@ -260,9 +248,16 @@ def _border_depth(
             break
         if profile[k] > peak:
             peak = profile[k]
+    # Where, coming from outside, it first reaches each of the levels.
     skirt = top = border = 0.0
     for level in LEVELS:
-        skirt, top, border = top, border, _crossing(profile, at, level * peak)
+        wanted, first = level * peak, 0
+        while profile[first] < wanted:
+            first += 1
+        skirt, top, border = top, border, at[first]
+        if first > 0:
+            step = profile[first] - profile[first - 1]
+            border = at[first - 1] + (wanted - profile[first - 1]) / step * (at[first] - at[first - 1])
     soft = top - skirt - SHARP_SKIRT * (middle - top) - SKIRT_BLUR
     return min(border + SOFTNESS * max(soft, 0.0), DEEPEST * middle)
 
@@ -291,44 +286,35 @@ def _place_beside(corners: Whole, outlines: Whole, nearest: Index, parts: Float,
 
 
 @helper
-def _profile_around(bins: Double, step: int, first: int, last: int, around: Double) -> None:
-    """Sum of the bins along an outline from `first` to `last`, those near a step; what is nearer counts more.
-
-    bins : (steps, n). around : (n,), filled.
-    """
-    for k in range(around.size):
-        around[k] = 0
-    for beside in range(1 - STEPS, STEPS):
-        other, share = step + beside, 1 - abs(beside) / STEPS
-        if other < first:
-            other += last - first
-        if other >= last:
-            other -= last - first
-        profile = bins[other]
-        for k in range(around.size):
-            around[k] += share * profile[k]
-
-
-@helper
 def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, border: Double) -> float:
     """How deep the border lies at each step along the outlines, and in the mean, which is returned.
 
-    bins : as `border_level` fills them. around : (n,), the profile of all pixels, changed. border : (steps,),
+    bins : (steps, n), as `border_level` fills them. around : (n,), the profile of all pixels, changed. border : (steps,),
     filled.
     """
     whole, sums, weights, outline = 0.5, 0.0, 0.0, 1
-    at, profile = np.empty(around.size), np.empty(around.size)
+    at, means = np.empty(around.size), np.empty(around.size)
     # First of all pixels together.
     for step in range(-1, border.size):
         if step == outlines[outline, 1]:
             outline += 1
         first, last, weight = outlines[outline - 1, 1], outlines[outline, 1], 0.0
         if step >= 0:
-            _profile_around(bins, step, first, last, around)
+            # The sum of the profiles near a step; what is nearer counts more.
+            around[:] = 0
+            for beside in range(1 - STEPS, STEPS):
+                other, share = step + beside, 1 - abs(beside) / STEPS
+                if other < first:
+                    other += last - first
+                if other >= last:
+                    other -= last - first
+                profile = bins[other]
+                for k in range(around.size):
+                    around[k] += share * profile[k]
         for k in range(0, around.size, 2):
             weight += around[k]
         least = MIN_ARC_PIXELS if step >= 0 else MIN_BIN_PIXELS
-        found = _border_depth(around, least, middle, whole, at, profile)
+        found = _border_depth(around, least, middle, whole, at, means)
         if step < 0:
             whole = found
         else:
