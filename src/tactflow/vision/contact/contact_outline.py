@@ -176,21 +176,21 @@ def _largest_nearby(values: Float, part: float = 1.0) -> Float:
     it: it holds a side of the contact, but not its other end.
     """
     high, wide = values.shape
-    coarse = np.empty((-(-high // 2), -(-wide // 2)), np.float32)
-    peak = max(halve_smoothed(values, coarse), 1e-9)
-    radius = math.sqrt(np.count_nonzero(values > np.float32(OUTER * peak)) / math.pi)
-    reach = round(part * radius / 2)
-    around = np.zeros((coarse.shape[0] + 4 * reach + 1, coarse.shape[1] + 2 * reach), np.float32)
-    nearby = np.empty((2 * coarse.shape[0], 2 * coarse.shape[1]), np.float32)
-    spread_largest(coarse, reach, FAINT * peak, around, nearby)
+    rows, columns = -(-high // 2), -(-wide // 2)
+    coarse, least = np.empty((rows, columns), np.float32), np.empty(1)
+    reach = halve_smoothed(values, part, coarse, least)
+    around = np.zeros((rows + 4 * reach + 1, columns + 2 * reach), np.float32)
+    nearby = np.empty((2 * rows, 2 * columns), np.float32)
+    spread_largest(coarse, reach, least[0], around, nearby)
     return nearby[:high, :wide]
 
 
-@kernel("float64(float32[:, ::1], float32[:, ::1])")
-def halve_smoothed(values: Float, halved: Float) -> float:
-    """Means over 3 x 3 pixels, of which the largest is returned, and over 2 x 2 of them, which fill `halved`.
+@kernel("int64(float32[:, ::1], float64, float32[:, ::1], float64[::1])")
+def halve_smoothed(values: Float, part: float, halved: Float, least: NDArray[np.float64]) -> int:
+    """Means over 3 x 3 pixels, and over 2 x 2 of them; returns how far "around" reaches, two pixels.
 
-    values : (h, w). halved : (h / 2, w / 2), rounded up; the last pixel counts twice then.
+    values : (h, w). part : of the radius. halved : (h / 2, w / 2), rounded up, filled; the last line counts
+    twice then. least : (1,), filled with the least that counts.
     """
     high, wide = values.shape
     sums, line = np.empty(wide + 2), np.empty(wide + 1, np.float32)
@@ -211,10 +211,14 @@ def halve_smoothed(values: Float, halved: Float) -> float:
                 both = upper[2 * x] + upper[2 * x + 1] + (line[2 * x] + line[2 * x + 1])
                 halved[y >> 1, x] = both * np.float32(0.25)
         upper, line = line, upper
-    peak = np.float32(0)
+    peak, count = 1e-9, 0
     for x in range(wide):
         peak = max(peak, largest[x])
-    return float(peak)
+    limit, least[0] = np.float32(OUTER * peak), FAINT * peak
+    for y in range(high):
+        for x in range(wide):
+            count += values[y, x] > limit
+    return round(part * math.sqrt(count / math.pi) / 2)
 
 
 @kernel("void(float32[:, ::1], int64, float64, float32[:, ::1], float32[:, ::1])")
