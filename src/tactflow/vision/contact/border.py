@@ -133,10 +133,10 @@ def depth_of(region: Region) -> Depth:
 
 @kernel("float64(uint8[:, ::1], int64[:, ::1], int32[:, ::1], float32[:, ::1])")
 def inner_depth(filled: Mask, nearest: Index, spans: Whole, depth: Float) -> float:
-    """Distance to what is outside a region, as `cv2.distanceTransformWithLabels` finds it; returns the largest.
+    """Distance to what is outside a region; returns the largest.
 
-    It looks only where the region is. filled : (h, w), 0 or 1. nearest, spans : of a `Depth`, filled. depth :
-    of a `Depth`, 0, filled.
+    As `cv2.distanceTransformWithLabels` finds it, but only where the region is. filled : (h, w), 0 or 1.
+    nearest, spans : of a `Depth`, filled. depth : of a `Depth`, 0, filled.
     """
     high, wide = filled.shape
     for y in range(high):
@@ -289,8 +289,8 @@ def _place_beside(corners: Whole, outlines: Whole, nearest: Index, parts: Float,
 def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, border: Double) -> float:
     """How deep the border lies at each step along the outlines, and in the mean, which is returned.
 
-    bins : (steps, n), as `border_level` fills them. around : (n,), the profile of all pixels, changed. border : (steps,),
-    filled.
+    bins : (steps, n), as `border_level` fills them. around : (n,), the profile of all pixels, changed.
+    border : (steps,), filled.
     """
     whole, sums, weights, outline = 0.5, 0.0, 0.0, 1
     at, means = np.empty(around.size), np.empty(around.size)

@@ -197,11 +197,12 @@ def halve_smoothed(values: Float, part: float, halved: Float, least: NDArray[np.
     upper, largest = np.empty(wide + 1, np.float32), np.zeros(wide, np.float32)
     for y in range(2 * len(halved)):
         row = min(y, high - 1)
-        above, here, below = values[abs(row - 1)], values[row], values[high - 1 - abs(high - 2 - row)]
+        above = values[min(1, high - 1) if row == 0 else row - 1]
+        here, below = values[row], values[max(high - 2, 0) if row == high - 1 else row + 1]
         for x in range(wide):
             sums[x + 1] = np.float64(above[x]) + here[x] + below[x]
         # Beyond the border are those mirrored about the last pixel.
-        sums[0], sums[wide + 1] = sums[2], sums[wide - 1]
+        sums[0], sums[wide + 1] = sums[min(2, wide)], sums[max(wide - 1, 1)]
         for x in range(wide):
             line[x] = (sums[x] + sums[x + 1] + sums[x + 2]) * (1 / 9)
             largest[x] = line[x] if line[x] > largest[x] else largest[x]
@@ -223,7 +224,7 @@ def halve_smoothed(values: Float, part: float, halved: Float, least: NDArray[np.
 
 @kernel("void(float32[:, ::1], int64, float64, float32[:, ::1], float32[:, ::1])")
 def spread_largest(values: Float, reach: int, least: float, around: Float, nearby: Float) -> None:
-    """The mean, over a square, of the largest values in as large squares, interpolated to twice the resolution.
+    """The mean, over a square, of the largest values in as large ones, interpolated to twice the resolution.
 
     values : (h, w). reach : half the side of a square. least : of what is interpolated, at least. around :
     (h + 4 reach + 1, w + 2 reach), 0, changed. nearby : (2 h, 2 w), filled.

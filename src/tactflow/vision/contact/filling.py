@@ -108,21 +108,17 @@ def _outlines(mask: Mask, hidden: Hidden) -> tuple[list[NDArray[np.int32]], list
     # A pixel is passed at most once for each of its four neighbours that is outside.
     points = np.empty((2 * (high + 1) * (wide + 1), 1, 2), np.int32)
     ends = np.empty(((high + 1) * (wide + 1) // 2, 2), np.int32)
-    found = trace_outlines(mask, *hidden, marks, marks.view(np.uint64), points, ends)
+    found = trace_outlines(mask, *hidden, marks, points, ends)
     spans, lengths = ends[found::-1].T.tolist()
     return [points[start:end] for end, start in pairwise(spans)], lengths[:-1]
 
 
-@kernel(
-    "int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint64[:, ::1], int32[:, :, ::1],"
-    " int32[:, ::1])"
-)
+@kernel("int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], int32[:, :, ::1], int32[:, ::1])")
 def trace_outlines(
     mask: Mask,
     hidden: Mask,
     beside: Mask,
     marks: Mask,
-    eights: NDArray[np.uint64],
     points: NDArray[np.int32],
     ends: NDArray[np.int32],
 ) -> int:
@@ -133,12 +129,11 @@ def trace_outlines(
 
     mask : (h, w), 0 or 1. hidden, beside : of a `Hidden`; what is hidden is traced as if it belonged to the
     region, and what is beside it left out. marks : (h + 2, n), 0, changed; n a multiple of eight >= w + 2.
-    eights : (h + 2, n / 8), the same, of eight pixels each.
     points : (n, 1, 2), filled: x and y of the pixels where outlines turn or come out of what is hidden, one
     outline after another. ends : (outlines + 1, 2), filled: where the points of each outline end, and how
     many pixels it passes, after a 0.
     """
-    high, wide = mask.shape
+    (high, wide), eights = mask.shape, marks.view(np.uint64)
     for y in range(high):
         for x in range(wide):
             marks[y + 1, x + 1] = mask[y, x] | hidden[y, x] | beside[y, x] * BESIDE
