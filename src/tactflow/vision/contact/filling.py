@@ -69,7 +69,7 @@ class Region(NamedTuple):
 
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
-    return Region(filled, *_outlines(filled, Hidden(filled, np.zeros_like(filled))))
+    return Region(filled, *_outlines(filled, Hidden(filled, np.zeros(filled.shape, np.uint8))))
 
 
 def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:
@@ -94,7 +94,7 @@ def outlined(mask: Mask, hidden: Hidden | None) -> Mask:
     """
     if hidden is None:
         return _without_holes(mask.copy())
-    filled = np.zeros_like(mask)
+    filled = np.zeros(mask.shape, np.uint8)
     parts, _ = _outlines(mask, hidden)
     if parts:
         cv2.fillPoly(filled, parts, (1.0,))
@@ -244,7 +244,7 @@ def fill_bay(region: Region, faint: Mask) -> Region:
 
 def _hull(region: Region) -> Mask:
     """(h, w) uint8: 1 in the convex hull of a region that is not empty, else 0."""
-    hull = np.zeros_like(region.filled)
+    hull = np.zeros(region.filled.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(region.outlines)), (1.0,))
     return hull
 
