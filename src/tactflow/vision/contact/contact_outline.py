@@ -250,7 +250,8 @@ def spread_largest(values: Float, reach: int, least: float, around: Float, nearb
     span = 1
     while span < side:
         step = min(span, side - span)
-        for y in range(high + 4 * reach - step):
+        # Further up, there is nothing within reach.
+        for y in range(2 * reach - span - step + 1, high + 2 * reach):
             row, below = around[y], around[y + step]
             for x in range(broad):
                 row[x] = row[x] if row[x] > below[x] else below[x]
