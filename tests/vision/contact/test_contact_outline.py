@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.contact import ContactDetector
-from tactflow.vision.contact.contact_outline import contact_level
+from tactflow.vision.contact.border import INDEX, depth_of
+from tactflow.vision.contact.contact_outline import FAINT, _largest_nearby, contact_level
 from tactflow.vision.contact.filling import Hidden, enclosed, outlined, trace_outlines, traced
 from tests.oracles.border import change_of
 from tests.oracles.filling import plain_trace_outlines
@@ -192,11 +193,40 @@ def test_outlines_are_those_of_opencv_without_what_is_hidden(seed: int) -> None:
     hidden = Hidden(spots, np.asarray(cv2.dilate(spots, np.ones((3, 3), np.uint8)), np.uint8))
     found = []
     for trace in (trace_outlines, plain_trace_outlines):
-        marks = np.zeros((size[0] + 2, size[1] + 2), np.uint8)
+        marks = np.zeros((size[0] + 2, 8 * (size[1] // 8 + 2)), np.uint8)
         points, ends = np.zeros((4 * mask.size + 4, 1, 2), np.int32), np.zeros((mask.size + 2, 2), np.int32)
         count = trace(mask, *hidden, marks, points, ends)
         found.append((count, points.tolist(), ends.tolist()))
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_depths_and_the_nearest_pixels_outside_are_those_of_opencv(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    size = tuple(int(side) for side in random.integers(1, 60, 2))
+    noise = cv2.GaussianBlur(random.random(size), (0, 0), 0.5 + 0.3 * seed)
+    region = traced(outlined((noise > np.quantile(noise, random.random())).astype(np.uint8), None))
+    filled = region.filled
+    if filled.all() or not filled.any():
+        return
+    found = depth_of(region)
+    depth, labels = cv2.distanceTransformWithLabels(filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=1)
+    assert np.array_equal(found.depth, depth)
+    assert found.middle == depth.max()
+    nearest = found.nearest[2:-2, 2:-2][filled > 0] & INDEX
+    assert np.array_equal(nearest, np.flatnonzero(filled == 0)[labels[filled > 0] - 1])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (8, 2), (31, 40), (40, 33)])
+def test_the_largest_change_nearby_is_found_up_to_the_border(size: tuple[int, int]) -> None:
+    change = np.zeros(size, np.float32)
+    change[: -(-size[0] // 2)] = 1
+    near = _largest_nearby(change)
+    assert near.shape == size
+    # Nowhere less than a part of the largest; all of it where the change fills what is around.
+    assert near.min() >= FAINT * near.max()
+    assert near[0].max() == pytest.approx(near.max())
+    assert np.isfinite(near).all()
 
 
 def test_pockets_that_are_filled_leave_no_holes() -> None:

@@ -21,6 +21,7 @@ Float = NDArray[np.float32]
 Double = NDArray[np.float64]
 Mask = NDArray[np.uint8]
 Whole = NDArray[np.int32]
+Index = NDArray[np.int64]
 
 BORDER: Final = 0.85
 """The contact ends where the mean profile reaches this fraction of its peak: outside a contact the slope is
@@ -79,21 +80,38 @@ MIN_ARC_PIXELS: Final = 2
 LEVELS: Final = (SKIRT, TOP, BORDER)
 """Fractions of its peak at which a profile is measured."""
 
-_NOTHING: Final = np.zeros((0, 0), np.uint8)
-"""An empty mask."""
+STRAIGHT: Final = 1 << 16
+DIAGONAL: Final = 91750
+KNIGHT: Final = 143976
+"""Lengths of steps to the next pixel, to the diagonal one, and by a knight's move, in 65536ths of a pixel: 1,
+1.4 and 2.1969, as OpenCV has them (G. Borgefors, "Distance transformations in digital images", CVGIP 34,
+1986)."""
+FAR: Final = 1 << 29
+"""More than any distance, in the same unit."""
+ORDER: Final = 28
+LENGTH: Final = 32
+"""Where in a number are the parts that say how far what is outside a region is: up to here, the index of the
+pixel; from here on, the place in the order of neighbours of that by way of which it is reached; from here on,
+the distance."""
+INDEX: Final = (1 << ORDER) - 1
+REACHED: Final = ~(15 << ORDER)
+"""What takes only the index of such a number, and all but the place in the order."""
 
 
 class Depth(NamedTuple):
     """How deep inside a region each pixel is, and its outlines.
 
-    depth : (h, w) float32, distance to what is outside, px; 0 there. nearest : (h, w) int32, label of the
-    nearest pixel outside. middle : the largest depth. corners : (n, 2) int32, x and y of the pixels where
-    outlines turn, one outline after another. outlines : (outlines + 1, 3) int32, 0, and at the end of each
-    outline, how many corners and steps there are so far, and how many pixels it passes.
+    depth : (h, w) float32, distance to what is outside, px; 0 there. nearest : (h + 4, w + 4) int64, with a
+    border of two pixels; in its lower half, the index of the nearest pixel outside, in the order of rows.
+    spans : (h, 2) int32, of each row, where the region begins and ends. middle : the largest depth. corners :
+    (n, 2) int32, x and y of the pixels where outlines turn, one outline after another. outlines :
+    (outlines + 1, 3) int32, 0, and at the end of each outline, how many corners and steps there are so far,
+    and how many pixels it passes.
     """
 
     depth: Float
-    nearest: Whole
+    nearest: Index
+    spans: Whole
     middle: float
     corners: Whole
     outlines: Whole
@@ -101,21 +119,85 @@ class Depth(NamedTuple):
 
 def depth_of(region: Region) -> Depth:
     """Of a region with something outside."""
-    depth, nearest = cv2.distanceTransformWithLabels(
-        region.filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    middle, outlines, ends = cv2.minMaxLoc(depth)[1], region.outlines, [(0, 0, 0)]
+    high, wide = region.filled.shape
+    nearest, spans = np.empty((high + 4, wide + 4), np.int64), np.empty((high, 2), np.int32)
+    depth = np.zeros((high, wide), np.float32)
+    middle = inner_depth(region.filled, nearest, spans, depth)
+    outlines, ends = region.outlines, [(0, 0, 0)]
     corners = np.concatenate(outlines) if len(outlines) > 1 else outlines[0]
     for outline, length in zip(outlines, region.lengths, strict=True):
         arcs = min(max(round(length / max(middle, 1.0)), FEWEST_ARCS), MOST_ARCS)
         ends.append((ends[-1][0] + len(outline), ends[-1][1] + STEPS * arcs, length))
-    return Depth(
-        np.asarray(depth, np.float32),
-        np.asarray(nearest, np.int32),
-        middle,
-        corners.reshape(-1, 2),
-        np.array(ends, np.int32),
+    return Depth(depth, nearest, spans, middle, corners.reshape(-1, 2), np.array(ends, np.int32))
+
+
+@kernel("float64(uint8[:, ::1], int64[:, ::1], int32[:, ::1], float32[:, ::1])")
+def inner_depth(filled: Mask, nearest: Index, spans: Whole, depth: Float) -> float:
+    """Distance to what is outside a region; returns the largest.
+
+    As `cv2.distanceTransformWithLabels` finds it, but only where the region is. filled : (h, w), 0 or 1.
+    nearest, spans : of a `Depth`, filled. depth : of a `Depth`, 0, filled.
+    """
+    high, wide = filled.shape
+    for y in range(high):
+        mask, first, end = filled[y], 0, wide
+        while first < end and mask[first] == 0:
+            first += 1
+        while first < end and mask[end - 1] == 0:
+            end -= 1
+        spans[y, 0], spans[y, 1] = first, end
+    # What lies beyond the border is not known to be outside.
+    nearest[:2], nearest[high + 2 :] = FAR << LENGTH, FAR << LENGTH
+    nearest[:, :2], nearest[:, wide + 2 :] = FAR << LENGTH, FAR << LENGTH
+    for y in range(high):
+        first, end = wide, 0
+        for row in range(max(y - 2, 0), min(y + 3, high)):
+            first, end = min(first, spans[row, 0]), max(end, spans[row, 1])
+        first = max(first - 2, 0)
+        count, start = min(end + 2, wide) - first, y * wide + first
+        mask, line = filled[y, first:], nearest[y + 2, first + 2 :]
+        for i in range(count):
+            line[i] = FAR << LENGTH if mask[i] else start + i
+    # First over the neighbours above and to the left, then over the others.
+    for y in range(high):
+        first, count = spans[y, 0], spans[y, 1] - spans[y, 0]
+        far, near, here = nearest[y, first:], nearest[y + 1, first:], nearest[y + 2, first:]
+        beside = here[1]
+        for i in range(count):
+            beside = here[i + 2] = _reached(far, near, here, beside, i + 2, 1)
+    largest = 0
+    for k in range(high):
+        y = high - 1 - k
+        first, count = spans[y, 0], spans[y, 1] - spans[y, 0]
+        far, near, here = nearest[y + 4, first:], nearest[y + 3, first:], nearest[y + 2, first:]
+        depths, beside = depth[y, first:], here[count + 2]
+        for i in range(count):
+            x = count - 1 - i
+            beside = here[x + 2] = _reached(far, near, here, beside, x + 2, -1)
+            depths[x] = np.float32(beside >> LENGTH) * np.float32(1 / STRAIGHT)
+            largest = max(largest, beside)
+    return (largest >> LENGTH) / STRAIGHT
+
+
+@helper
+def _reached(far: Index, near: Index, here: Index, beside: int, x: int, turn: int) -> int:
+    """The nearest pixel outside, as known or by way of the neighbours on one side; of equal ones the first.
+
+    far, near, here : lines of `nearest`. beside : here, next to x on that side. turn : 1 if that is the left
+    side, -1 if it is the right one.
+    """
+    best: int = min(
+        here[x],
+        far[x - turn] + (KNIGHT << LENGTH | 1 << ORDER),
+        far[x + turn] + (KNIGHT << LENGTH | 2 << ORDER),
+        near[x - 2 * turn] + (KNIGHT << LENGTH | 3 << ORDER),
+        near[x - turn] + (DIAGONAL << LENGTH | 4 << ORDER),
+        near[x] + (STRAIGHT << LENGTH | 5 << ORDER),
+        near[x + turn] + (DIAGONAL << LENGTH | 6 << ORDER),
+        near[x + 2 * turn] + (KNIGHT << LENGTH | 7 << ORDER),
+        beside + (STRAIGHT << LENGTH | 8 << ORDER),
     )
+    return best & REACHED
 
 
 def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | None) -> Float:
@@ -129,10 +211,11 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
     border_level(
         parts,
         region.nearest,
+        region.spans,
         region.corners,
         region.outlines,
         strength,
-        _NOTHING if hidden is None else hidden,
+        np.zeros(parts.shape, np.uint8) if hidden is None else hidden,
         middle,
         level,
     )
@@ -140,50 +223,48 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
 
 
 @helper
-def _crossing(profile: Double, at: Double, wanted: float) -> float:
-    """Where, coming from outside, a profile first reaches a value."""
-    first = 0
-    while profile[first] < wanted:
-        first += 1
-    if first == 0:
-        return float(at[0])
-    fraction = (wanted - profile[first - 1]) / (profile[first] - profile[first - 1])
-    return float(at[first - 1] + fraction * (at[first] - at[first - 1]))
-
-
-@helper
-def _border_depth(bins: Double, least: int, middle: float, otherwise: float) -> float:
+def _border_depth(
+    bins: Double, least: int, middle: float, otherwise: float, at: Double, profile: Double
+) -> float:
     """How deep the border lies by one profile, or `otherwise` if too little of it is known.
 
     bins : (2 n,), number of pixels and sum of their strengths in bins of depth, in turns. least : pixels from
-    which on a bin counts. middle : the largest depth.
+    which on a bin counts. middle : the largest depth. at, profile : (n,) or more, changed.
     """
     # Bins with enough pixels: where they are, and what they hold.
-    at, means, known = np.empty(bins.size), np.empty(bins.size), 0
+    known, peak = 0, 0.0
     for k in range(bins.size // 2):
         if bins[2 * k] >= least:
-            at[known], means[known] = (k + 0.5) * BIN, bins[2 * k + 1] / bins[2 * k]
+            at[known], profile[known] = (k + 0.5) * BIN, bins[2 * k + 1] / bins[2 * k]
             known += 1
     if known < 2:
         return otherwise
-    # The largest value before the profile falls clearly for the first time.
-    profile, peak, fallen = np.empty(known), 0.0, False
+    # Smoothed, up to where the profile falls clearly for the first time; the largest value before.
+    before = profile[0]
     for k in range(known):
-        before, after = means[max(k - 1, 0)], means[min(k + 1, known - 1)]
-        profile[k] = before / 4 + means[k] / 2 + after / 4
-        fallen |= profile[k] < FALLEN * peak
-        if profile[k] > peak and not fallen:
+        here, after = profile[k], profile[min(k + 1, known - 1)]
+        profile[k], before = before / 4 + here / 2 + after / 4, here
+        if profile[k] < FALLEN * peak:
+            break
+        if profile[k] > peak:
             peak = profile[k]
+    # Where, coming from outside, it first reaches each of the levels.
     skirt = top = border = 0.0
     for level in LEVELS:
-        skirt, top, border = top, border, _crossing(profile, at, level * peak)
+        wanted, first = level * peak, 0
+        while profile[first] < wanted:
+            first += 1
+        skirt, top, border = top, border, at[first]
+        if first > 0:
+            step = profile[first] - profile[first - 1]
+            border = at[first - 1] + (wanted - profile[first - 1]) / step * (at[first] - at[first - 1])
     soft = top - skirt - SHARP_SKIRT * (middle - top) - SKIRT_BLUR
     return min(border + SOFTNESS * max(soft, 0.0), DEEPEST * middle)
 
 
 @helper
-def _place_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float, place: Whole) -> None:
-    """Label of a pixel outside -> 1 and the step of the outline that it is beside; `place`, 0, is filled."""
+def _place_beside(corners: Whole, outlines: Whole, nearest: Index, parts: Float, place: Whole) -> None:
+    """Index of a pixel outside -> 1 and the step of the outline that it is beside; `place`, 0, is filled."""
     high, wide = parts.shape
     for outline in range(1, outlines.shape[0]):
         first, last, length = outlines[outline - 1, 0], outlines[outline, 0], outlines[outline, 2]
@@ -195,8 +276,8 @@ def _place_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float,
             for row in range(max(y - 1, 0), min(y + 2, high)):
                 for column in range(max(x - 1, 0), min(x + 2, wide)):
                     if parts[row, column] <= 0:
-                        label = nearest[row, column]
-                        place[label] = max(mark, place[label])
+                        at = nearest[row + 2, column + 2] & INDEX
+                        place[at] = max(mark, place[at])
             if x == corners[ahead, 0] and y == corners[ahead, 1]:
                 ahead = ahead + 1 if ahead + 1 < last else first
             across, down = corners[ahead, 0] - x, corners[ahead, 1] - y
@@ -205,39 +286,35 @@ def _place_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float,
 
 
 @helper
-def _profile_around(bins: Double, step: int, first: int, last: int, around: Double) -> None:
-    """Sum of the bins along an outline from `first` to `last`, those near a step; what is nearer counts more.
-
-    bins : (steps * n,). around : (n,), filled.
-    """
-    around[:] = 0
-    other = step - STEPS
-    for beside in range(1 - STEPS, STEPS):
-        other += 1
-        start = other + (last - first if other < first else 0) - (last - first if other >= last else 0)
-        share, profile = 1 - abs(beside) / STEPS, bins[start * around.size :]
-        for k in range(around.size):
-            around[k] += share * profile[k]
-
-
-@helper
 def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, border: Double) -> float:
     """How deep the border lies at each step along the outlines, and in the mean, which is returned.
 
-    bins : as `border_level` fills them. around : (n,), the profile of all pixels, changed. border : (steps,),
-    filled.
+    bins : (steps, n), as `border_level` fills them. around : (n,), the profile of all pixels, changed.
+    border : (steps,), filled.
     """
     whole, sums, weights, outline = 0.5, 0.0, 0.0, 1
+    at, means = np.empty(around.size), np.empty(around.size)
     # First of all pixels together.
     for step in range(-1, border.size):
         if step == outlines[outline, 1]:
             outline += 1
         first, last, weight = outlines[outline - 1, 1], outlines[outline, 1], 0.0
         if step >= 0:
-            _profile_around(bins, step, first, last, around)
+            # The sum of the profiles near a step; what is nearer counts more.
+            around[:] = 0
+            for beside in range(1 - STEPS, STEPS):
+                other, share = step + beside, 1 - abs(beside) / STEPS
+                if other < first:
+                    other += last - first
+                if other >= last:
+                    other -= last - first
+                profile = bins[other]
+                for k in range(around.size):
+                    around[k] += share * profile[k]
         for k in range(0, around.size, 2):
             weight += around[k]
-        found = _border_depth(around, MIN_ARC_PIXELS if step >= 0 else MIN_BIN_PIXELS, middle, whole)
+        least = MIN_ARC_PIXELS if step >= 0 else MIN_BIN_PIXELS
+        found = _border_depth(around, least, middle, whole, at, means)
         if step < 0:
             whole = found
         else:
@@ -250,12 +327,13 @@ def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, b
 
 
 @kernel(
-    "void(float32[:, ::1], int32[:, ::1], int32[:, ::1], int32[:, ::1], float32[:, ::1], uint8[:, ::1],"
-    " float64, float32[:, ::1])"
+    "void(float32[:, ::1], int64[:, ::1], int32[:, ::1], int32[:, ::1], int32[:, ::1], float32[:, ::1],"
+    " uint8[:, ::1], float64, float32[:, ::1])"
 )
 def border_level(
     parts: Float,
-    nearest: Whole,
+    nearest: Index,
+    spans: Whole,
     corners: Whole,
     outlines: Whole,
     strength: Float,
@@ -265,32 +343,31 @@ def border_level(
 ) -> None:
     """What `inside_border` finds; `level` is filled.
 
-    nearest, corners, outlines : of a `Depth`. hidden : not 0 where a pixel does not count; (0, 0) if all do.
+    nearest, corners, outlines : of a `Depth`. hidden : not 0 where a pixel does not count.
     middle : the largest depth of the parts.
     """
     high, wide = parts.shape
-    place = np.zeros(parts.size + 1, np.int32)
+    place = np.zeros(parts.size, np.int32)
     _place_beside(corners, outlines, nearest, parts, place)
     # Of all pixels, and of those of each step: their number and the sum of their strengths in bins of depth.
     steps, around = outlines[-1, 1], np.zeros(2 * int(middle / BIN) + 4)
-    bins, border = np.zeros(steps * around.size), np.empty(steps)
+    bins, border = np.zeros((steps, around.size)), np.empty(steps)
     bins_per_pixel = np.float32(1 / BIN)
     for y in range(high):
-        for x in range(wide):
-            if parts[y, x] > 0:
-                step = place[nearest[y, x]] - 1
-                level[y, x] = step
-                if hidden.size == 0 or hidden[y, x] == 0:
-                    at = 2 * int(parts[y, x] * bins_per_pixel)
-                    around[at] += 1
-                    around[at + 1] += strength[y, x]
-                    if step >= 0:
-                        bins[step * around.size + at] += 1
-                        bins[step * around.size + at + 1] += strength[y, x]
+        for x in range(spans[y, 0], spans[y, 1]):
+            if parts[y, x] > 0 and hidden[y, x] == 0:
+                step = place[nearest[y + 2, x + 2] & INDEX] - 1
+                at = 2 * int(parts[y, x] * bins_per_pixel)
+                around[at] += 1
+                around[at + 1] += strength[y, x]
+                if step >= 0:
+                    bins[step, at] += 1
+                    bins[step, at + 1] += strength[y, x]
     whole = _step_depths(bins, outlines, middle, around, border)
     for y in range(high):
         for x in range(wide):
-            depth = whole
-            if parts[y, x] > 0 and level[y, x] >= 0:
-                depth = border[int(level[y, x])]
-            level[y, x] = parts[y, x] - np.float32(depth)
+            level[y, x] = parts[y, x] - np.float32(whole)
+        for x in range(spans[y, 0], spans[y, 1]):
+            step = place[nearest[y + 2, x + 2] & INDEX] - 1
+            if parts[y, x] > 0 and step >= 0:
+                level[y, x] = parts[y, x] - np.float32(border[step])

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.border import depth_of, inside_border
 from tactflow.vision.contact.components import STRAY
 from tactflow.vision.contact.filling import (
@@ -68,10 +69,6 @@ LEAST: Final = 0.1
 """A contact that has changed as a whole ends half way, but no further out than where this fraction of the
 largest change nearby is left. Chosen by hand."""
 
-COARSE: Final = 2
-"""Pixels of which one is taken where the largest change nearby is sought, which varies little from one to the
-next."""
-
 
 @dataclass(frozen=True, slots=True)
 class WindowChange:
@@ -112,7 +109,7 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     >>> bool(abs((contact_level(change) > 0).sum() / np.pi - 8**2) < 3)
     True
     """
-    below = None if hidden is None or not cv2.countNonZero(hidden) else _hidden(hidden)
+    below = hidden if hidden is not None and cv2.countNonZero(hidden) else None
     level, near = _level(change, bridge, below)
     if near is not None:
         # Faint changes that only touch the contact's, such as bands of light, have pulled what is typical.
@@ -120,19 +117,16 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     return level
 
 
-def _hidden(pixels: Mask) -> Hidden:
-    """What is hidden of a mask, (h, w) uint8, 0 or 1, and what is beside it."""
-    return Hidden(pixels, np.asarray(cv2.dilate(pixels, SQUARE), np.uint8))
-
-
-def _level(change: WindowChange, bridge: float, hidden: Hidden | None) -> tuple[Float, Float | None]:
+def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Float, Float | None]:
     """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0."""
-    seen = None if hidden is None else 1 - hidden.beside
-    cap = GLOSS * _typical(change.strength, seen)
-    strength = np.asarray(cv2.threshold(change.strength, cap, 0.0, cv2.THRESH_TRUNC)[1], np.float32)
-    even = cv2.norm(strength, cv2.NORM_L2SQR) / EVEN
+    shape = change.strength.shape
+    strength, beside, sums = np.empty(shape, np.float32), np.empty(shape, np.uint8), np.empty(3)
+    none = np.zeros(shape, np.uint8) if pixels is None else pixels
+    cut_gloss(change.strength, change.brightness, none, beside, strength, sums)
+    cap, squares, common = sums.tolist()
+    hidden, even = None if pixels is None else Hidden(pixels, beside), squares / EVEN
     # What is cut is no larger than before: where it is too little then, there is no need to cut it.
-    if cv2.norm(change.brightness, cv2.NORM_L2SQR) > even:
+    if common > even:
         tone = np.float32(cap / 3**0.5)
         brightness = np.clip(change.brightness, -tone, tone)
         if cv2.norm(brightness, cv2.NORM_L2SQR) > even:
@@ -140,10 +134,39 @@ def _level(change: WindowChange, bridge: float, hidden: Hidden | None) -> tuple[
     return _tilted(strength, bridge, hidden)
 
 
-def _typical(values: Float, seen: Mask | None) -> float:
-    """Mean of values >= 0, weighted by the values themselves; seen : 0 where one does not count."""
-    squares, total = cv2.norm(values, cv2.NORM_L2SQR, seen), cv2.norm(values, cv2.NORM_L1, seen)
-    return max(squares / max(total, 1e-9), 1e-9)
+@kernel(
+    "void(float32[:, ::1], float32[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, ::1], float64[::1])",
+    reorder=True,
+)
+def cut_gloss(
+    strength: Float, brightness: Float, hidden: Mask, beside: Mask, cut: Float, sums: NDArray[np.float64]
+) -> None:
+    """Cut what is a mirror image of a lamp.
+
+    strength, brightness : of a `WindowChange`. hidden : (h, w), 1 where a marker was removed. beside : as of
+    `Hidden`, filled; what is typical is told by the others. cut : (h, w), filled with the strength, but no
+    more than a cap. sums : (3,), filled with that, and the sums of the squares of `cut` and of `brightness`.
+    """
+    high, wide = strength.shape
+    near = np.zeros(wide + 2, np.uint8)
+    total = squares = common = 0.0
+    for y in range(high):
+        above, here, below, row = hidden[max(y - 1, 0)], hidden[y], hidden[min(y + 1, high - 1)], beside[y]
+        for x in range(wide):
+            near[x + 1] = above[x] | here[x] | below[x]
+        for x in range(wide):
+            row[x] = near[x] | near[x + 1] | near[x + 2]
+        for x in range(wide):
+            value = np.float64(strength[y, x] if row[x] == 0 else np.float32(0))
+            tone = np.float64(brightness[y, x])
+            total, squares, common = total + value, squares + value * value, common + tone * tone
+    sums[0], sums[2] = GLOSS * max(squares / max(total, 1e-9), 1e-9), common
+    cap, squares = np.float32(sums[0]), 0.0
+    for y in range(high):
+        for x in range(wide):
+            cut[y, x] = strength[y, x] if strength[y, x] < cap else cap
+            squares += np.float64(cut[y, x]) * np.float64(cut[y, x])
+    sums[1] = squares
 
 
 def _largest_nearby(values: Float, part: float = 1.0) -> Float:
@@ -153,17 +176,116 @@ def _largest_nearby(values: Float, part: float = 1.0) -> Float:
     it: it holds a side of the contact, but not its other end.
     """
     high, wide = values.shape
-    coarse = (-(-wide // COARSE), -(-high // COARSE))
-    smooth = cv2.blur(values, (3, 3))
-    peak = max(float(cv2.minMaxLoc(smooth)[1]), 1e-9)
-    radius = math.sqrt(np.count_nonzero(values > np.float32(OUTER * peak)) / math.pi)
-    reach = round(part * radius / COARSE)
-    side = 2 * reach + 1
-    largest = cv2.resize(smooth, coarse, interpolation=cv2.INTER_AREA)
-    largest = cv2.copyMakeBorder(largest, *(reach,) * 4, cv2.BORDER_CONSTANT, value=(0.0,))
-    largest = cv2.blur(cv2.dilate(largest, SQUARE, iterations=reach), (side, side))
-    largest = np.maximum(largest[reach:, reach:][: coarse[1], : coarse[0]], np.float32(FAINT * peak))
-    return np.asarray(cv2.resize(largest, (wide, high), interpolation=cv2.INTER_LINEAR), np.float32)
+    rows, columns = -(-high // 2), -(-wide // 2)
+    coarse, least = np.empty((rows, columns), np.float32), np.empty(1)
+    reach = halve_smoothed(values, part, coarse, least)
+    around = np.zeros((rows + 4 * reach + 1, columns + 2 * reach), np.float32)
+    nearby = np.empty((2 * rows, 2 * columns), np.float32)
+    spread_largest(coarse, reach, least[0], around, nearby)
+    return nearby[:high, :wide]
+
+
+@kernel("int64(float32[:, ::1], float64, float32[:, ::1], float64[::1])")
+def halve_smoothed(values: Float, part: float, halved: Float, least: NDArray[np.float64]) -> int:
+    """Means over 3 x 3 pixels, and over 2 x 2 of them; returns how far "around" reaches, two pixels.
+
+    values : (h, w). part : of the radius. halved : (h / 2, w / 2), rounded up, filled; the last line counts
+    twice then. least : (1,), filled with the least that counts.
+    """
+    high, wide = values.shape
+    sums, line = np.empty(wide + 2), np.empty(wide + 1, np.float32)
+    upper, largest = np.empty(wide + 1, np.float32), np.zeros(wide, np.float32)
+    for y in range(2 * len(halved)):
+        row = min(y, high - 1)
+        above = values[min(1, high - 1) if row == 0 else row - 1]
+        here, below = values[row], values[max(high - 2, 0) if row == high - 1 else row + 1]
+        for x in range(wide):
+            sums[x + 1] = np.float64(above[x]) + here[x] + below[x]
+        # Beyond the border are those mirrored about the last pixel.
+        sums[0], sums[wide + 1] = sums[min(2, wide)], sums[max(wide - 1, 1)]
+        for x in range(wide):
+            line[x] = (sums[x] + sums[x + 1] + sums[x + 2]) * (1 / 9)
+            largest[x] = line[x] if line[x] > largest[x] else largest[x]
+        line[wide] = line[wide - 1]
+        if y & 1:
+            for x in range(halved.shape[1]):
+                both = upper[2 * x] + upper[2 * x + 1] + (line[2 * x] + line[2 * x + 1])
+                halved[y >> 1, x] = both * np.float32(0.25)
+        upper, line = line, upper
+    peak, count = 1e-9, 0
+    for x in range(wide):
+        peak = max(peak, largest[x])
+    limit, least[0] = np.float32(OUTER * peak), FAINT * peak
+    for y in range(high):
+        for x in range(wide):
+            count += values[y, x] > limit
+    return round(part * math.sqrt(count / math.pi) / 2)
+
+
+@kernel("void(float32[:, ::1], int64, float64, float32[:, ::1], float32[:, ::1])")
+def spread_largest(values: Float, reach: int, least: float, around: Float, nearby: Float) -> None:
+    """The mean, over a square, of the largest values in as large ones, interpolated to twice the resolution.
+
+    values : (h, w). reach : half the side of a square. least : of what is interpolated, at least. around :
+    (h + 4 reach + 1, w + 2 reach), 0, changed. nearby : (2 h, 2 w), filled.
+    """
+    high, wide = values.shape
+    side, broad = 2 * reach + 1, wide + 2 * reach
+    # The largest of so many next to one another, of twice as many, and so on; along x, then along y.
+    line, wider = np.zeros(broad + 2 * reach, np.float32), np.zeros(broad + 2 * reach, np.float32)
+    for y in range(high):
+        for x in range(2 * reach):
+            line[x] = line[broad + x] = 0
+        for x in range(wide):
+            line[x + 2 * reach] = values[y, x]
+        span = 1
+        while 2 * span <= side:
+            ahead = line[span:]
+            for x in range(ahead.size):
+                wider[x] = line[x] if line[x] > ahead[x] else ahead[x]
+            line, wider, span = wider, line, 2 * span
+        ahead, row = line[side - span :], around[y + 2 * reach]
+        for x in range(broad):
+            row[x] = line[x] if line[x] > ahead[x] else ahead[x]
+    span = 1
+    while span < side:
+        step = min(span, side - span)
+        # Further up, there is nothing within reach.
+        for y in range(2 * reach - span - step + 1, high + 2 * reach):
+            row, below = around[y], around[y + step]
+            for x in range(broad):
+                row[x] = row[x] if row[x] > below[x] else below[x]
+        span += step
+    # Sums along y, and those of all to the left.
+    sums, left = np.zeros(broad), np.zeros(broad + 1)
+    means, share = np.empty((high, wide), np.float32), 1 / (side * side)
+    for y in range(high + 2 * reach):
+        row, old = around[y], around[y - side if y >= side else high + 4 * reach]
+        for x in range(broad):
+            sums[x] += np.float64(row[x]) - old[x]
+        if y >= 2 * reach:
+            for x in range(broad):
+                left[x + 1] = left[x] + sums[x]
+            right = left[side:]
+            for x in range(wide):
+                mean = (right[x] - left[x]) * share
+                means[y - 2 * reach, x] = mean if mean > least else least
+    near, far = np.float32(0.75), np.float32(0.25)
+    # With a pixel more on both sides, as its neighbour.
+    mixed = np.empty(wide + 2, np.float32)
+    for y in range(2 * high):
+        here, other = means[y // 2], means[min(max(y // 2 + 2 * (y & 1) - 1, 0), high - 1)]
+        for x in range(wide):
+            mixed[x + 1] = here[x] * near + other[x] * far
+        mixed[0], mixed[wide + 1] = mixed[1], mixed[wide]
+        for x in range(wide):
+            nearby[y, 2 * x] = mixed[x] * far + mixed[x + 1] * near
+            nearby[y, 2 * x + 1] = mixed[x + 1] * near + mixed[x + 2] * far
+
+
+def _typical(values: Float) -> float:
+    """Mean of values >= 0, weighted by the values themselves."""
+    return max(cv2.norm(values, cv2.NORM_L2SQR) / max(cv2.norm(values, cv2.NORM_L1), 1e-9), 1e-9)
 
 
 def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
@@ -172,13 +294,14 @@ def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
     darker = brighter - brightness
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         brightness, darker = -brightness, brighter
-    around = _typical(darker, None)
+    around = _typical(darker)
     nearby = _largest_nearby(brightness, BESIDE)
     half_way = np.maximum((nearby - np.float32(around)) / 2, np.float32(LEAST) * nearby)
     level = (brightness - half_way) / nearby
     if hidden is not None:
         # The change is smooth here: what is painted next to what is seen is nearly right.
-        hidden = _hidden(np.asarray(cv2.erode(hidden.pixels, SQUARE), np.uint8))
+        pixels = np.asarray(cv2.erode(hidden.pixels, SQUARE), np.uint8)
+        hidden = Hidden(pixels, np.asarray(cv2.dilate(pixels, SQUARE), np.uint8))
     inside = enclosed((level > 0).view(np.uint8), hidden).filled.view(np.bool_)
     # What is filled in is as deep inside as the middle of a plateau, what is left out as far outside.
     np.clip(level, -0.5, 0.5, out=level)

@@ -33,6 +33,9 @@ BESIDE: Final = 8
 """Marks of a pixel where outlines are traced: it belongs to the region; an outline passes it; one that has
 what is outside to its right does; it is hidden, or next to what is."""
 
+EIGHT_PIXELS: Final = np.uint64(0x0101010101010101)
+"""`PIXEL`, of eight pixels side by side."""
+
 ACROSS: Final = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 DOWN: Final = np.array([0, -1, -1, -1, 0, 1, 1, 1])
 """Steps to the eight neighbours of a pixel, counterclockwise from the right, y down."""
@@ -66,7 +69,7 @@ class Region(NamedTuple):
 
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
-    return Region(filled, *_outlines(filled, Hidden(filled, np.zeros_like(filled))))
+    return Region(filled, *_outlines(filled, Hidden(filled, np.zeros(filled.shape, np.uint8))))
 
 
 def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:
@@ -91,7 +94,7 @@ def outlined(mask: Mask, hidden: Hidden | None) -> Mask:
     """
     if hidden is None:
         return _without_holes(mask.copy())
-    filled = np.zeros_like(mask)
+    filled = np.zeros(mask.shape, np.uint8)
     parts, _ = _outlines(mask, hidden)
     if parts:
         cv2.fillPoly(filled, parts, (1.0,))
@@ -101,7 +104,7 @@ def outlined(mask: Mask, hidden: Hidden | None) -> Mask:
 def _outlines(mask: Mask, hidden: Hidden) -> tuple[list[NDArray[np.int32]], list[int]]:
     """Outlines as `trace_outlines` finds them, the last one first, as OpenCV has it; and their lengths."""
     high, wide = mask.shape
-    marks = np.zeros((high + 2, wide + 2), np.uint8)
+    marks = np.zeros((high + 2, (wide + 9) & ~7), np.uint8)
     # A pixel is passed at most once for each of its four neighbours that is outside.
     points = np.empty((2 * (high + 1) * (wide + 1), 1, 2), np.int32)
     ends = np.empty(((high + 1) * (wide + 1) // 2, 2), np.int32)
@@ -112,7 +115,12 @@ def _outlines(mask: Mask, hidden: Hidden) -> tuple[list[NDArray[np.int32]], list
 
 @kernel("int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], int32[:, :, ::1], int32[:, ::1])")
 def trace_outlines(
-    mask: Mask, hidden: Mask, beside: Mask, marks: Mask, points: NDArray[np.int32], ends: NDArray[np.int32]
+    mask: Mask,
+    hidden: Mask,
+    beside: Mask,
+    marks: Mask,
+    points: NDArray[np.int32],
+    ends: NDArray[np.int32],
 ) -> int:
     """Outer borders of a region's parts, counterclockwise, as far as they are seen; returns how many.
 
@@ -120,12 +128,12 @@ def trace_outlines(
     by border following", CVGIP 30 (1985); parts within holes are left out.
 
     mask : (h, w), 0 or 1. hidden, beside : of a `Hidden`; what is hidden is traced as if it belonged to the
-    region, and what is beside it left out. marks : (h + 2, w + 2), 0, changed.
+    region, and what is beside it left out. marks : (h + 2, n), 0, changed; n a multiple of eight >= w + 2.
     points : (n, 1, 2), filled: x and y of the pixels where outlines turn or come out of what is hidden, one
     outline after another. ends : (outlines + 1, 2), filled: where the points of each outline end, and how
     many pixels it passes, after a 0.
     """
-    high, wide = mask.shape
+    (high, wide), eights = mask.shape, marks.view(np.uint64)
     for y in range(high):
         for x in range(wide):
             marks[y + 1, x + 1] = mask[y, x] | hidden[y, x] | beside[y, x] * BESIDE
@@ -134,7 +142,7 @@ def trace_outlines(
         x, outside = 1, True
         while x <= wide:
             if marks[y, x] & PIXEL == 0:
-                x += 1
+                x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == 0 else 1
                 continue
             if outside and marks[y, x] & PASSED == 0:
                 end, length = _follow(marks, x, y, points, ends[found, 0])
@@ -142,7 +150,7 @@ def trace_outlines(
                     found += 1
                     ends[found, 0], ends[found, 1] = end, length
             while marks[y, x] & PIXEL:
-                x += 1
+                x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == EIGHT_PIXELS else 1
             # To the right of a part lies a hole of it, or what is outside.
             outside = marks[y, x - 1] & RIGHT != 0
     return found
@@ -196,7 +204,7 @@ def is_solid(region: Region) -> bool:
         # OpenCV refuses an outline that touches itself, at a neck of one pixel.
         return False
     # Depths come in 256ths of a pixel.
-    return bays is None or bool(bays.ravel()[3::4].max() <= BAY * 256)
+    return bays is None or bool(max(bays.ravel()[3::4].tolist()) <= BAY * 256)
 
 
 def fill_bay(region: Region, faint: Mask) -> Region:
@@ -236,7 +244,7 @@ def fill_bay(region: Region, faint: Mask) -> Region:
 
 def _hull(region: Region) -> Mask:
     """(h, w) uint8: 1 in the convex hull of a region that is not empty, else 0."""
-    hull = np.zeros_like(region.filled)
+    hull = np.zeros(region.filled.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(region.outlines)), (1.0,))
     return hull
 
