@@ -151,8 +151,8 @@ def inner_depth(filled: Mask, nearest: Index, spans: Whole, depth: Float) -> flo
     nearest[:, :2], nearest[:, wide + 2 :] = FAR << LENGTH, FAR << LENGTH
     for y in range(high):
         first, end = wide, 0
-        for row in range(max(y - 2, 0), min(y + 3, high)):
-            first, end = min(first, spans[row, 0]), max(end, spans[row, 1])
+        for near in range(max(y - 2, 0), min(y + 3, high)):
+            first, end = min(first, spans[near, 0]), max(end, spans[near, 1])
         first = max(first - 2, 0)
         count, start = min(end + 2, wide) - first, y * wide + first
         mask, line = filled[y, first:], nearest[y + 2, first + 2 :]
@@ -170,11 +170,11 @@ def inner_depth(filled: Mask, nearest: Index, spans: Whole, depth: Float) -> flo
         y = high - 1 - k
         first, count = spans[y, 0], spans[y, 1] - spans[y, 0]
         far, near, here = nearest[y + 4, first:], nearest[y + 3, first:], nearest[y + 2, first:]
-        depths, beside = depth[y, first:], here[count + 2]
+        line, beside = depth[y, first:], here[count + 2]
         for i in range(count):
             x = count - 1 - i
             beside = here[x + 2] = _reached(far, near, here, beside, x + 2, -1)
-            depths[x] = np.float32(beside >> LENGTH) * np.float32(1 / STRAIGHT)
+            line[x] = np.float32(beside >> LENGTH) * np.float32(1 / STRAIGHT)
             largest = max(largest, beside)
     return (largest >> LENGTH) / STRAIGHT
 
@@ -186,7 +186,7 @@ def _reached(far: Index, near: Index, here: Index, beside: int, x: int, turn: in
     far, near, here : lines of `nearest`. beside : here, next to x on that side. turn : 1 if that is the left
     side, -1 if it is the right one.
     """
-    best: int = min(
+    best = min(
         here[x],
         far[x - turn] + (KNIGHT << LENGTH | 1 << ORDER),
         far[x + turn] + (KNIGHT << LENGTH | 2 << ORDER),

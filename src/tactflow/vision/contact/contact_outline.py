@@ -283,18 +283,13 @@ def spread_largest(values: Float, reach: int, least: float, around: Float, nearb
             nearby[y, 2 * x + 1] = mixed[x + 1] * near + mixed[x + 2] * far
 
 
-def _typical(values: Float) -> float:
-    """Mean of values >= 0, weighted by the values themselves."""
-    return max(cv2.norm(values, cv2.NORM_L2SQR) / max(cv2.norm(values, cv2.NORM_L1), 1e-9), 1e-9)
-
-
 def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
     """Level set of a contact that has brightened or darkened as a whole, whichever is stronger."""
     brighter = np.clip(brightness, np.float32(0), np.float32(np.inf))
     darker = brighter - brightness
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         brightness, darker = -brightness, brighter
-    around = _typical(darker)
+    around = cv2.norm(darker, cv2.NORM_L2SQR) / max(cv2.norm(darker, cv2.NORM_L1), 1e-9)
     nearby = _largest_nearby(brightness, BESIDE)
     half_way = np.maximum((nearby - np.float32(around)) / 2, np.float32(LEAST) * nearby)
     level = (brightness - half_way) / nearby
