@@ -14,7 +14,6 @@ from tactflow.vision.contact.border import (
     DEEPEST,
     FALLEN,
     FEWEST_ARCS,
-    INDEX,
     LEANS,
     MIN_ARC_PIXELS,
     MIN_BIN_PIXELS,
@@ -26,7 +25,6 @@ from tactflow.vision.contact.border import (
     TOP,
     VARIES,
     border_level,
-    inner_depth,
 )
 from tactflow.vision.contact.contact_outline import WindowChange
 from tests.oracles.gains import Gain
@@ -45,8 +43,7 @@ def change_of(picture: Float, inside: Mask) -> WindowChange:
 
 def plain_border_level(
     parts: Float,
-    nearest: NDArray[np.int64],
-    spans: NDArray[np.int32],  # noqa: ARG001
+    nearest: NDArray[np.int32],
     corners: NDArray[np.int32],
     outlines: NDArray[np.int32],
     strength: Float,
@@ -60,11 +57,10 @@ def plain_border_level(
         x, y = _passed(corners[begin:end]).T
         marks[y, x] = 1 + first + np.arange(length) * ((last - first) / length)
     marks = np.asarray(cv2.dilate(marks, np.ones((3, 3), np.uint8)), np.float32)
-    place = np.zeros(parts.size, np.float32)
+    place = np.zeros(parts.size + 1, np.float32)
     beside = (parts <= 0) & (marks > 0)
-    outside = nearest[2:-2, 2:-2] & INDEX
-    place[outside[beside]] = marks[beside]
-    step = place[np.where(parts > 0, outside, 0)].astype(np.intp) - 1
+    place[nearest[beside]] = marks[beside]
+    step = place[nearest].astype(np.intp) - 1
     seen = (parts > 0) & (hidden == 0)
     at = (parts * np.float32(1 / BIN)).astype(np.intp)
     bins = np.zeros((outlines[-1, 1] + 1, 2, int(middle / BIN) + 2))
@@ -89,20 +85,6 @@ def plain_border_level(
     depth = np.full(parts.shape, whole)
     depth[inside] = np.maximum(border[step[inside]], BIN)
     level[:] = parts - depth.astype(np.float32)
-
-
-def plain_inner_depth(
-    filled: Mask,
-    nearest: NDArray[np.int64],  # noqa: ARG001
-    spans: NDArray[np.int32],
-    depth: Float,
-) -> float:
-    """OpenCV's distances, of the whole window."""
-    depth[:] = cv2.distanceTransformWithLabels(filled, cv2.DIST_L2, cv2.DIST_MASK_5)[0]
-    any_of = filled.any(axis=1)
-    spans[:, 0] = np.where(any_of, filled.argmax(axis=1), filled.shape[1])
-    spans[:, 1] = filled.shape[1] - np.where(any_of, filled[:, ::-1].argmax(axis=1), 0)
-    return float(depth.max())
 
 
 def _passed(corners: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -151,8 +133,4 @@ def _crossing(profile: list[float], at: list[float], wanted: float) -> float:
     return at[first - 1] + fraction * (at[first] - at[first - 1])
 
 
-GAINS = [
-    Gain(border_level, plain_border_level, tolerance=1e-4),
-    # Which pixel is the nearest, a test of the outline compares.
-    Gain(inner_depth, plain_inner_depth, scratch=("nearest",)),
-]
+GAINS = [Gain(border_level, plain_border_level, tolerance=1e-4)]

@@ -8,14 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.contact_outline import (
-    FAINT,
-    GLOSS,
-    OUTER,
-    cut_gloss,
-    halve_smoothed,
-    spread_largest,
-)
+from tactflow.vision.contact.contact_outline import GLOSS, cut_gloss
+from tactflow.vision.contact.nearby import FAINT, OUTER, halve_smoothed, spread_largest
 from tests.oracles.gains import Gain
 
 Float = NDArray[np.float32]

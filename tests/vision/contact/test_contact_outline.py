@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.contact import ContactDetector
-from tactflow.vision.contact.border import INDEX, depth_of
-from tactflow.vision.contact.contact_outline import FAINT, _largest_nearby, contact_level
+from tactflow.vision.contact.contact_outline import contact_level
 from tactflow.vision.contact.filling import Hidden, enclosed, outlined, trace_outlines, traced
+from tactflow.vision.contact.nearby import FAINT, largest_nearby
 from tests.oracles.border import change_of
 from tests.oracles.filling import plain_trace_outlines
 
@@ -200,28 +200,11 @@ def test_outlines_are_those_of_opencv_without_what_is_hidden(seed: int) -> None:
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_depths_and_the_nearest_pixels_outside_are_those_of_opencv(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    size = tuple(int(side) for side in random.integers(1, 60, 2))
-    noise = cv2.GaussianBlur(random.random(size), (0, 0), 0.5 + 0.3 * seed)
-    region = traced(outlined((noise > np.quantile(noise, random.random())).astype(np.uint8), None))
-    filled = region.filled
-    if filled.all() or not filled.any():
-        return
-    found = depth_of(region)
-    depth, labels = cv2.distanceTransformWithLabels(filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=1)
-    assert np.array_equal(found.depth, depth)
-    assert found.middle == depth.max()
-    nearest = found.nearest[2:-2, 2:-2][filled > 0] & INDEX
-    assert np.array_equal(nearest, np.flatnonzero(filled == 0)[labels[filled > 0] - 1])
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (8, 2), (31, 40), (40, 33)])
 def test_the_largest_change_nearby_is_found_up_to_the_border(size: tuple[int, int]) -> None:
     change = np.zeros(size, np.float32)
     change[: -(-size[0] // 2)] = 1
-    near = _largest_nearby(change)
+    near = largest_nearby(change)
     assert near.shape == size
     # Nowhere less than a part of the largest; all of it where the change fills what is around.
     assert near.min() >= FAINT * near.max()

@@ -21,7 +21,6 @@ Float = NDArray[np.float32]
 Double = NDArray[np.float64]
 Mask = NDArray[np.uint8]
 Whole = NDArray[np.int32]
-Index = NDArray[np.int64]
 
 BORDER: Final = 0.85
 """The contact ends where the mean profile reaches this fraction of its peak: outside a contact the slope is
@@ -80,38 +79,18 @@ MIN_ARC_PIXELS: Final = 2
 LEVELS: Final = (SKIRT, TOP, BORDER)
 """Fractions of its peak at which a profile is measured."""
 
-STRAIGHT: Final = 1 << 16
-DIAGONAL: Final = 91750
-KNIGHT: Final = 143976
-"""Lengths of steps to the next pixel, to the diagonal one, and by a knight's move, in 65536ths of a pixel: 1,
-1.4 and 2.1969, as OpenCV has them (G. Borgefors, "Distance transformations in digital images", CVGIP 34,
-1986)."""
-FAR: Final = 1 << 29
-"""More than any distance, in the same unit."""
-ORDER: Final = 28
-LENGTH: Final = 32
-"""Where in a number are the parts that say how far what is outside a region is: up to here, the index of the
-pixel; from here on, the place in the order of neighbours of that by way of which it is reached; from here on,
-the distance."""
-INDEX: Final = (1 << ORDER) - 1
-REACHED: Final = ~(15 << ORDER)
-"""What takes only the index of such a number, and all but the place in the order."""
-
 
 class Depth(NamedTuple):
     """How deep inside a region each pixel is, and its outlines.
 
-    depth : (h, w) float32, distance to what is outside, px; 0 there. nearest : (h + 4, w + 4) int64, with a
-    border of two pixels; in its lower half, the index of the nearest pixel outside, in the order of rows.
-    spans : (h, 2) int32, of each row, where the region begins and ends. middle : the largest depth. corners :
-    (n, 2) int32, x and y of the pixels where outlines turn, one outline after another. outlines :
-    (outlines + 1, 3) int32, 0, and at the end of each outline, how many corners and steps there are so far,
-    and how many pixels it passes.
+    depth : (h, w) float32, distance to what is outside, px; 0 there. nearest : (h, w) int32, label of the
+    nearest pixel outside. middle : the largest depth. corners : (n, 2) int32, x and y of the pixels where
+    outlines turn, one outline after another. outlines : (outlines + 1, 3) int32, 0, and at the end of each
+    outline, how many corners and steps there are so far, and how many pixels it passes.
     """
 
     depth: Float
-    nearest: Index
-    spans: Whole
+    nearest: Whole
     middle: float
     corners: Whole
     outlines: Whole
@@ -119,85 +98,21 @@ class Depth(NamedTuple):
 
 def depth_of(region: Region) -> Depth:
     """Of a region with something outside."""
-    high, wide = region.filled.shape
-    nearest, spans = np.empty((high + 4, wide + 4), np.int64), np.empty((high, 2), np.int32)
-    depth = np.zeros((high, wide), np.float32)
-    middle = inner_depth(region.filled, nearest, spans, depth)
-    outlines, ends = region.outlines, [(0, 0, 0)]
+    depth, nearest = cv2.distanceTransformWithLabels(
+        region.filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    middle, outlines, ends = cv2.minMaxLoc(depth)[1], region.outlines, [(0, 0, 0)]
     corners = np.concatenate(outlines) if len(outlines) > 1 else outlines[0]
     for outline, length in zip(outlines, region.lengths, strict=True):
         arcs = min(max(round(length / max(middle, 1.0)), FEWEST_ARCS), MOST_ARCS)
         ends.append((ends[-1][0] + len(outline), ends[-1][1] + STEPS * arcs, length))
-    return Depth(depth, nearest, spans, middle, corners.reshape(-1, 2), np.array(ends, np.int32))
-
-
-@kernel("float64(uint8[:, ::1], int64[:, ::1], int32[:, ::1], float32[:, ::1])")
-def inner_depth(filled: Mask, nearest: Index, spans: Whole, depth: Float) -> float:
-    """Distance to what is outside a region; returns the largest.
-
-    As `cv2.distanceTransformWithLabels` finds it, but only where the region is. filled : (h, w), 0 or 1.
-    nearest, spans : of a `Depth`, filled. depth : of a `Depth`, 0, filled.
-    """
-    high, wide = filled.shape
-    for y in range(high):
-        mask, first, end = filled[y], 0, wide
-        while first < end and mask[first] == 0:
-            first += 1
-        while first < end and mask[end - 1] == 0:
-            end -= 1
-        spans[y, 0], spans[y, 1] = first, end
-    # What lies beyond the border is not known to be outside.
-    nearest[:2], nearest[high + 2 :] = FAR << LENGTH, FAR << LENGTH
-    nearest[:, :2], nearest[:, wide + 2 :] = FAR << LENGTH, FAR << LENGTH
-    for y in range(high):
-        first, end = wide, 0
-        for near in range(max(y - 2, 0), min(y + 3, high)):
-            first, end = min(first, spans[near, 0]), max(end, spans[near, 1])
-        first = max(first - 2, 0)
-        count, start = min(end + 2, wide) - first, y * wide + first
-        mask, line = filled[y, first:], nearest[y + 2, first + 2 :]
-        for i in range(count):
-            line[i] = FAR << LENGTH if mask[i] else start + i
-    # First over the neighbours above and to the left, then over the others.
-    for y in range(high):
-        first, count = spans[y, 0], spans[y, 1] - spans[y, 0]
-        far, near, here = nearest[y, first:], nearest[y + 1, first:], nearest[y + 2, first:]
-        beside = here[1]
-        for i in range(count):
-            beside = here[i + 2] = _reached(far, near, here, beside, i + 2, 1)
-    largest = 0
-    for k in range(high):
-        y = high - 1 - k
-        first, count = spans[y, 0], spans[y, 1] - spans[y, 0]
-        far, near, here = nearest[y + 4, first:], nearest[y + 3, first:], nearest[y + 2, first:]
-        line, beside = depth[y, first:], here[count + 2]
-        for i in range(count):
-            x = count - 1 - i
-            beside = here[x + 2] = _reached(far, near, here, beside, x + 2, -1)
-            line[x] = np.float32(beside >> LENGTH) * np.float32(1 / STRAIGHT)
-            largest = max(largest, beside)
-    return (largest >> LENGTH) / STRAIGHT
-
-
-@helper
-def _reached(far: Index, near: Index, here: Index, beside: int, x: int, turn: int) -> int:
-    """The nearest pixel outside, as known or by way of the neighbours on one side; of equal ones the first.
-
-    far, near, here : lines of `nearest`. beside : here, next to x on that side. turn : 1 if that is the left
-    side, -1 if it is the right one.
-    """
-    best = min(
-        here[x],
-        far[x - turn] + (KNIGHT << LENGTH | 1 << ORDER),
-        far[x + turn] + (KNIGHT << LENGTH | 2 << ORDER),
-        near[x - 2 * turn] + (KNIGHT << LENGTH | 3 << ORDER),
-        near[x - turn] + (DIAGONAL << LENGTH | 4 << ORDER),
-        near[x] + (STRAIGHT << LENGTH | 5 << ORDER),
-        near[x + turn] + (DIAGONAL << LENGTH | 6 << ORDER),
-        near[x + 2 * turn] + (KNIGHT << LENGTH | 7 << ORDER),
-        beside + (STRAIGHT << LENGTH | 8 << ORDER),
+    return Depth(
+        np.asarray(depth, np.float32),
+        np.asarray(nearest, np.int32),
+        middle,
+        corners.reshape(-1, 2),
+        np.array(ends, np.int32),
     )
-    return best & REACHED
 
 
 def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | None) -> Float:
@@ -211,7 +126,6 @@ def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | N
     border_level(
         parts,
         region.nearest,
-        region.spans,
         region.corners,
         region.outlines,
         strength,
@@ -263,8 +177,8 @@ def _border_depth(
 
 
 @helper
-def _place_beside(corners: Whole, outlines: Whole, nearest: Index, parts: Float, place: Whole) -> None:
-    """Index of a pixel outside -> 1 and the step of the outline that it is beside; `place`, 0, is filled."""
+def _place_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float, place: Whole) -> None:
+    """Label of a pixel outside -> 1 and the step of the outline that it is beside; `place`, 0, is filled."""
     high, wide = parts.shape
     for outline in range(1, outlines.shape[0]):
         first, last, length = outlines[outline - 1, 0], outlines[outline, 0], outlines[outline, 2]
@@ -276,8 +190,8 @@ def _place_beside(corners: Whole, outlines: Whole, nearest: Index, parts: Float,
             for row in range(max(y - 1, 0), min(y + 2, high)):
                 for column in range(max(x - 1, 0), min(x + 2, wide)):
                     if parts[row, column] <= 0:
-                        at = nearest[row + 2, column + 2] & INDEX
-                        place[at] = max(mark, place[at])
+                        label = nearest[row, column]
+                        place[label] = max(mark, place[label])
             if x == corners[ahead, 0] and y == corners[ahead, 1]:
                 ahead = ahead + 1 if ahead + 1 < last else first
             across, down = corners[ahead, 0] - x, corners[ahead, 1] - y
@@ -327,13 +241,12 @@ def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, b
 
 
 @kernel(
-    "void(float32[:, ::1], int64[:, ::1], int32[:, ::1], int32[:, ::1], int32[:, ::1], float32[:, ::1],"
-    " uint8[:, ::1], float64, float32[:, ::1])"
+    "void(float32[:, ::1], int32[:, ::1], int32[:, ::1], int32[:, ::1], float32[:, ::1], uint8[:, ::1],"
+    " float64, float32[:, ::1])"
 )
 def border_level(
     parts: Float,
-    nearest: Index,
-    spans: Whole,
+    nearest: Whole,
     corners: Whole,
     outlines: Whole,
     strength: Float,
@@ -347,27 +260,28 @@ def border_level(
     middle : the largest depth of the parts.
     """
     high, wide = parts.shape
-    place = np.zeros(parts.size, np.int32)
+    place = np.zeros(parts.size + 1, np.int32)
     _place_beside(corners, outlines, nearest, parts, place)
     # Of all pixels, and of those of each step: their number and the sum of their strengths in bins of depth.
     steps, around = outlines[-1, 1], np.zeros(2 * int(middle / BIN) + 4)
     bins, border = np.zeros((steps, around.size)), np.empty(steps)
     bins_per_pixel = np.float32(1 / BIN)
     for y in range(high):
-        for x in range(spans[y, 0], spans[y, 1]):
-            if parts[y, x] > 0 and hidden[y, x] == 0:
-                step = place[nearest[y + 2, x + 2] & INDEX] - 1
-                at = 2 * int(parts[y, x] * bins_per_pixel)
-                around[at] += 1
-                around[at + 1] += strength[y, x]
-                if step >= 0:
-                    bins[step, at] += 1
-                    bins[step, at + 1] += strength[y, x]
+        for x in range(wide):
+            if parts[y, x] > 0:
+                step = place[nearest[y, x]] - 1
+                level[y, x] = step
+                if hidden[y, x] == 0:
+                    at = 2 * int(parts[y, x] * bins_per_pixel)
+                    around[at] += 1
+                    around[at + 1] += strength[y, x]
+                    if step >= 0:
+                        bins[step, at] += 1
+                        bins[step, at + 1] += strength[y, x]
     whole = _step_depths(bins, outlines, middle, around, border)
     for y in range(high):
         for x in range(wide):
-            level[y, x] = parts[y, x] - np.float32(whole)
-        for x in range(spans[y, 0], spans[y, 1]):
-            step = place[nearest[y + 2, x + 2] & INDEX] - 1
-            if parts[y, x] > 0 and step >= 0:
-                level[y, x] = parts[y, x] - np.float32(border[step])
+            depth = whole
+            if parts[y, x] > 0 and level[y, x] >= 0:
+                depth = border[int(level[y, x])]
+            level[y, x] = parts[y, x] - np.float32(depth)

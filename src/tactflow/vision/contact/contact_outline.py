@@ -9,12 +9,12 @@ first ridge of the change from outside. The ridge itself is a poor thing to trac
 comes along the border, and has gaps); its distance from the outer edge of the change is not: averaged along
 the whole outline, the profile of the change across it has a clear peak.
 
-Light is never even, so every change is measured by the largest one nearby, not in the whole contact.
+Light is never even, so every change is measured by the largest one nearby (`nearby`), not in the whole
+contact.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -35,22 +35,14 @@ from tactflow.vision.contact.filling import (
     is_solid,
     traced,
 )
+from tactflow.vision.contact.nearby import FAINT, OUTER, largest_nearby
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
 
-OUTER: Final = 0.45
-"""Fraction of the largest change nearby at which a change of slope is cut. Lower takes in more of the
-surroundings of a contact and of gel that wrinkles; higher opens the ring where the light is faint. Chosen on
-mini_ball, handmade_dots, gelslim_ball and the simulator: 0.4 to 0.5 overlap as well within 0.04."""
-
 DIM: Final = 0.5
 """Part of `OUTER` at which a change is seen in a bay of the outline, where lights hardly reach the border.
 Chosen by hand; 0.33 to 0.7 give the same outlines of real gels within 0.05."""
-
-FAINT: Final = 0.3
-"""Fraction of the largest change of the whole contact that the largest one nearby counts for at least.
-Chosen by hand."""
 
 GLOSS: Final = 1.6
 """A change of more than so many times its typical value (the mean weighted by the change itself) is a mirror
@@ -169,118 +161,9 @@ def cut_gloss(
     sums[1] = squares
 
 
-def _largest_nearby(values: Float, part: float = 1.0) -> Float:
-    """(h, w): the largest value around, smoothed; no less than `FAINT` of the largest anywhere.
-
-    "Around" reaches as far as the radius of a disc of as many pixels as have clearly changed, or a part of
-    it: it holds a side of the contact, but not its other end.
-    """
-    high, wide = values.shape
-    rows, columns = -(-high // 2), -(-wide // 2)
-    coarse, least = np.empty((rows, columns), np.float32), np.empty(1)
-    reach = halve_smoothed(values, part, coarse, least)
-    around = np.zeros((rows + 4 * reach + 1, columns + 2 * reach), np.float32)
-    nearby = np.empty((2 * rows, 2 * columns), np.float32)
-    spread_largest(coarse, reach, least[0], around, nearby)
-    return nearby[:high, :wide]
-
-
-@kernel("int64(float32[:, ::1], float64, float32[:, ::1], float64[::1])")
-def halve_smoothed(values: Float, part: float, halved: Float, least: NDArray[np.float64]) -> int:
-    """Means over 3 x 3 pixels, and over 2 x 2 of them; returns how far "around" reaches, two pixels.
-
-    values : (h, w). part : of the radius. halved : (h / 2, w / 2), rounded up, filled; the last line counts
-    twice then. least : (1,), filled with the least that counts.
-    """
-    high, wide = values.shape
-    sums, line = np.empty(wide + 2), np.empty(wide + 1, np.float32)
-    upper, largest = np.empty(wide + 1, np.float32), np.zeros(wide, np.float32)
-    for y in range(2 * len(halved)):
-        row = min(y, high - 1)
-        above = values[min(1, high - 1) if row == 0 else row - 1]
-        here, below = values[row], values[max(high - 2, 0) if row == high - 1 else row + 1]
-        for x in range(wide):
-            sums[x + 1] = np.float64(above[x]) + here[x] + below[x]
-        # Beyond the border are those mirrored about the last pixel.
-        sums[0], sums[wide + 1] = sums[min(2, wide)], sums[max(wide - 1, 1)]
-        for x in range(wide):
-            line[x] = (sums[x] + sums[x + 1] + sums[x + 2]) * (1 / 9)
-            largest[x] = line[x] if line[x] > largest[x] else largest[x]
-        line[wide] = line[wide - 1]
-        if y & 1:
-            for x in range(halved.shape[1]):
-                both = upper[2 * x] + upper[2 * x + 1] + (line[2 * x] + line[2 * x + 1])
-                halved[y >> 1, x] = both * np.float32(0.25)
-        upper, line = line, upper
-    peak, count = 1e-9, 0
-    for x in range(wide):
-        peak = max(peak, largest[x])
-    limit, least[0] = np.float32(OUTER * peak), FAINT * peak
-    for y in range(high):
-        for x in range(wide):
-            count += values[y, x] > limit
-    return round(part * math.sqrt(count / math.pi) / 2)
-
-
-@kernel("void(float32[:, ::1], int64, float64, float32[:, ::1], float32[:, ::1])")
-def spread_largest(values: Float, reach: int, least: float, around: Float, nearby: Float) -> None:
-    """The mean, over a square, of the largest values in as large ones, interpolated to twice the resolution.
-
-    values : (h, w). reach : half the side of a square. least : of what is interpolated, at least. around :
-    (h + 4 reach + 1, w + 2 reach), 0, changed. nearby : (2 h, 2 w), filled.
-    """
-    high, wide = values.shape
-    side, broad = 2 * reach + 1, wide + 2 * reach
-    # The largest of so many next to one another, of twice as many, and so on; along x, then along y.
-    line, wider = np.zeros(broad + 2 * reach, np.float32), np.zeros(broad + 2 * reach, np.float32)
-    for y in range(high):
-        for x in range(2 * reach):
-            line[x] = line[broad + x] = 0
-        for x in range(wide):
-            line[x + 2 * reach] = values[y, x]
-        span = 1
-        while 2 * span <= side:
-            ahead = line[span:]
-            for x in range(ahead.size):
-                wider[x] = line[x] if line[x] > ahead[x] else ahead[x]
-            line, wider, span = wider, line, 2 * span
-        ahead, row = line[side - span :], around[y + 2 * reach]
-        for x in range(broad):
-            row[x] = line[x] if line[x] > ahead[x] else ahead[x]
-    span = 1
-    while span < side:
-        step = min(span, side - span)
-        # Further up, there is nothing within reach.
-        for y in range(2 * reach - span - step + 1, high + 2 * reach):
-            row, below = around[y], around[y + step]
-            for x in range(broad):
-                row[x] = row[x] if row[x] > below[x] else below[x]
-        span += step
-    # Sums along y, and those of all to the left.
-    sums, left = np.zeros(broad), np.zeros(broad + 1)
-    means, share = np.empty((high, wide), np.float32), 1 / (side * side)
-    for y in range(high + 2 * reach):
-        row, old = around[y], around[y - side if y >= side else high + 4 * reach]
-        for x in range(broad):
-            sums[x] += np.float64(row[x]) - old[x]
-        if y >= 2 * reach:
-            for x in range(broad):
-                left[x + 1] = left[x] + sums[x]
-            right = left[side:]
-            for x in range(wide):
-                mean = (right[x] - left[x]) * share
-                means[y - 2 * reach, x] = mean if mean > least else least
-    near, far = np.float32(0.75), np.float32(0.25)
-    # With a pixel more on both sides, as its neighbour.
-    mixed = np.empty(wide + 2, np.float32)
-    for y in range(2 * high):
-        here, other = means[y // 2], means[min(max(y // 2 + 2 * (y & 1) - 1, 0), high - 1)]
-        for x in range(wide):
-            mixed[x + 1] = here[x] * near + other[x] * far
-        mixed[0], mixed[wide + 1] = mixed[1], mixed[wide]
-        for x in range(wide):
-            nearby[y, 2 * x] = mixed[x] * far + mixed[x + 1] * near
-            nearby[y, 2 * x + 1] = mixed[x + 1] * near + mixed[x + 2] * far
+def _typical(values: Float) -> float:
+    """Mean of values >= 0, weighted by the values themselves."""
+    return max(cv2.norm(values, cv2.NORM_L2SQR) / max(cv2.norm(values, cv2.NORM_L1), 1e-9), 1e-9)
 
 
 def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
@@ -289,8 +172,8 @@ def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
     darker = brighter - brightness
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         brightness, darker = -brightness, brighter
-    around = cv2.norm(darker, cv2.NORM_L2SQR) / max(cv2.norm(darker, cv2.NORM_L1), 1e-9)
-    nearby = _largest_nearby(brightness, BESIDE)
+    around = _typical(darker)
+    nearby = largest_nearby(brightness, BESIDE)
     half_way = np.maximum((nearby - np.float32(around)) / 2, np.float32(LEAST) * nearby)
     level = (brightness - half_way) / nearby
     if hidden is not None:
@@ -305,7 +188,7 @@ def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
 
 def _tilted(strength: Float, bridge: float, hidden: Hidden | None) -> tuple[Float, Float | None]:
     """`_level` of a contact that shows its slopes."""
-    local = strength / _largest_nearby(strength)
+    local = strength / largest_nearby(strength)
     region, solid, specks = _sloping_region(local, strength, bridge, hidden)
     if cv2.countNonZero(region.filled) == region.filled.size:
         return np.ones_like(strength), None

@@ -40,6 +40,7 @@ from tactflow.vision.contact import (
     contact_outline,
     filling,
     illumination,
+    nearby,
     resolution,
     response,
 )
@@ -202,6 +203,7 @@ class ContactDetector:
                 downsample,
                 filling,
                 illumination,
+                nearby,
                 resolution,
                 response,
             )

@@ -204,7 +204,7 @@ def is_solid(region: Region) -> bool:
         # OpenCV refuses an outline that touches itself, at a neck of one pixel.
         return False
     # Depths come in 256ths of a pixel.
-    return bays is None or max(bays.ravel()[3::4].tolist()) <= BAY * 256
+    return bays is None or bool(max(bays.ravel()[3::4].tolist()) <= BAY * 256)
 
 
 def fill_bay(region: Region, faint: Mask) -> Region:
