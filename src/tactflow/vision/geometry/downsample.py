@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel, prefetch
+from tactflow.vision.compiled import kernel, prefetch
 
 Bytes = NDArray[np.uint8]
 
-_STEP = 16
-"""Columns of a line computed at a time. Measured: a number that the compiler knows saves a sixth of the time,
-and of 16, 32, 48, 64 and 80 none is faster."""
+_STEP = 320
+"""Bytes of a line computed at a time where what comes next is asked for. Measured: 192 is as good, 96 and 640
+take a twentieth to a tenth more time."""
 _CACHE_LINE = 64
 """Bytes that memory gives at a time, on most processors."""
-_AHEAD = 4
-"""Lines of the picture from those that are read to those that are asked for. Measured: 2 are as good, 8 take
-a fifth more time."""
+_AHEAD = 2
+"""Lines of the picture from those that are read to those that are asked for. Measured: 1 and 4 are as good, 8
+are not."""
 
 
 @kernel(
@@ -46,35 +46,29 @@ def halve_block(
     """
     stride = picture.shape[1]
     values = picture.reshape(-1)
+    # The means around every px of a line; every other one is kept. Both loops become whole vectors: half to
+    # two thirds of the time of computing only those that are kept.
+    means = np.empty(6 * width, np.uint8)
+    count = 6 * width - 3
+    step = _STEP if far else max(count, 1)
     # Bytes that a step asks for, of two whole lines: memory is faster in its own order, without gaps.
-    share = 2 * stride * _STEP // max(width, 1)
+    share = 2 * stride * step // max(6 * width, 1)
     for y in range(height):
         start = (top + 2 * y) * stride + 3 * left
-        line = half[half_top + (height - 1 - y if upside_down else y), 3 * half_left :]
-        if width < _STEP:
-            for x in range(width):
-                upper = values[start + 6 * x :]
-                _halve_line(upper, upper[stride:], line[3 * x :], 1)
-            continue
         ahead = start + _AHEAD * stride
-        for step in range(0, width, _STEP):
+        for first in range(0, count, step):
             if far:
                 for place in range(ahead, ahead + share, _CACHE_LINE):
                     prefetch(values, place)
                 ahead += share
-            # The last step takes as many columns as the others, and some of them again.
-            x = min(step, width - _STEP)
-            upper = values[start + 6 * x :]
-            _halve_line(upper, upper[stride:], line[3 * x :], _STEP)
-
-
-@helper
-def _halve_line(upper: Bytes, lower: Bytes, line: Bytes, width: int) -> None:
-    """Means over 2 x 2 px of two lines, (6 width,) each, into one of (3 width,)."""
-    for x in range(width):
-        for c in range(3):
-            left, right = 6 * x + c, 6 * x + c + 3
-            line[3 * x + c] = (upper[left] + upper[right] + lower[left] + lower[right] + 2) >> 2
+            upper, part = values[start + first :], means[first:]
+            lower = upper[stride:]
+            for i in range(min(step, count - first)):
+                part[i] = (upper[i] + upper[i + 3] + lower[i] + lower[i + 3] + 2) >> 2
+        line = half[half_top + (height - 1 - y if upside_down else y), 3 * half_left :]
+        for x in range(width):
+            for c in range(3):
+                line[3 * x + c] = means[6 * x + c]
 
 
 def halved(

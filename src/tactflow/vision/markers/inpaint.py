@@ -320,6 +320,7 @@ def fill_masked(mask: Bytes, masked: Flags, windows: Float, line: Float, fill: B
                     part[x] *= line[x]
     most, rest = np.float32(0.75), np.float32(0.25)
     inner = line[1:]
+    colours, chosen = np.empty(12 * width, np.uint8), np.empty(12 * width, np.uint8)
     for y in range(2 * height):
         cell = y // 2
         if not masked[cell]:
@@ -339,11 +340,17 @@ def fill_masked(mask: Bytes, masked: Flags, windows: Float, line: Float, fill: B
             fill[4 * x + 2] = right
             fill[4 * x + 3] = right
         blue, green, red = fill, fill[4 * section :], fill[8 * section :]
+        for x in range(4 * width):
+            colours[3 * x] = blue[x]
+            colours[3 * x + 1] = green[x]
+            colours[3 * x + 2] = red[x]
         for row in (2 * y, 2 * y + 1):
-            hidden, pixels = mask[row], picture[row]
+            hidden, values = mask[row], picture[row]
             for x in range(4 * width):
-                # Bits instead of a choice: so it takes a tenth of the time.
-                chosen = np.uint8(255) if hidden[x] else np.uint8(0)
-                pixels[3 * x] ^= (pixels[3 * x] ^ blue[x]) & chosen
-                pixels[3 * x + 1] ^= (pixels[3 * x + 1] ^ green[x]) & chosen
-                pixels[3 * x + 2] ^= (pixels[3 * x + 2] ^ red[x]) & chosen
+                bits = np.uint8(255) if hidden[x] else np.uint8(0)
+                chosen[3 * x] = bits
+                chosen[3 * x + 1] = bits
+                chosen[3 * x + 2] = bits
+            # Bits instead of a choice: so it takes a tenth of the time.
+            for x in range(12 * width):
+                values[x] ^= (values[x] ^ colours[x]) & chosen[x]
