@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -187,10 +187,53 @@ def test_the_loops_draw_a_level_set_as_the_plain_version(
 def test_the_loops_close_changes_as_the_plain_version(size: tuple[int, int], seed: int) -> None:
     rng = np.random.default_rng(seed)
     squared = (rng.random(size) < rng.uniform(0, 1)).astype(np.float32)
-    fast, slow = np.empty(size, np.uint8), np.empty(size, np.uint8)
-    components.close_changes(squared, 0.5, fast)
-    plain_close_changes(squared, 0.5, slow)
+    _same_cells_and_box(squared, 0.5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES, st.integers(0, 2**16), st.floats(1, 8))
+def test_the_loop_bounds_what_is_one_piece_as_the_plain_version(
+    size: tuple[int, int], seed: int, blur: float
+) -> None:
+    noise = np.random.default_rng(seed).random(size).astype(np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), blur), np.float32)
+    # One blob, or a few of them, some of which have bays, holes or parts.
+    boxes = [_same_cells_and_box(smooth, float(np.quantile(smooth, part))) for part in (0.5, 0.9, 0.98)]
+    event(f"one piece: {sum(box[4] > 0 for box in boxes)} of 3")
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES, st.integers(0, 2**16), st.floats(1, 8))
+def test_a_contact_in_one_piece_is_what_opencv_outlines(
+    size: tuple[int, int], seed: int, blur: float
+) -> None:
+    noise = np.random.default_rng(seed).random(size).astype(np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), blur), np.float32)
+    weak, largest = float(np.quantile(smooth, 0.9)), float(smooth.max())
+    for before in (None, noise > 0.5):
+        limits = smooth, weak, largest, largest if before is None else 1e9, weak, before
+        fast = components.contact_components(*limits)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(components, "close_changes", _never_one_piece)
+            slow = components.contact_components(*limits)
+        assert [found[:2] for found in fast] == [found[:2] for found in slow]
+        assert all(np.array_equal(one.inside, other.inside) for one, other in zip(fast, slow, strict=True))
+
+
+def _never_one_piece(*arguments: Any) -> None:
+    plain_close_changes(*arguments)
+    arguments[-1][:] = 0
+
+
+def _same_cells_and_box(squared: NDArray[np.float32], weak: float) -> NDArray[np.int64]:
+    """What both versions of `close_changes` find to be the box of one piece."""
+    fast, slow = np.empty(squared.shape, np.uint8), np.empty(squared.shape, np.uint8)
+    box, plain_box = np.empty(5, np.int64), np.empty(5, np.int64)
+    components.close_changes(squared, weak, fast, box)
+    plain_close_changes(squared, np.float32(weak), slow, plain_box)
     assert np.array_equal(fast, slow)
+    assert np.array_equal(box, plain_box)
+    return box
 
 
 def _contacts(seed: int) -> list[Image]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel
 
 Float = NDArray[np.float32]
 Cells = NDArray[np.bool_]
+Mask = NDArray[np.uint8]
 
 STRAY: Final = 0.04
 """Separate changes with less of the summed squared deviation than this part of the strongest one's are no
@@ -47,7 +49,9 @@ def union(components: list[Component], shape: tuple[int, ...]) -> Cells:
     """
     cells = np.zeros(shape, np.bool_)
     for rows, columns, inside in components:
-        cells[rows, columns] |= inside
+        window = cells[rows, columns]
+        # Windows of several may overlap.
+        window[:] = inside if len(components) == 1 else window | inside
     return cells
 
 
@@ -72,46 +76,70 @@ def wide_change(colour: Float, extent: float) -> Cells | None:
 
 
 def contact_components(
-    squared: Float, weak: float, start: float, stay: float, before: Cells | None
+    squared: Float, weak: float, largest: float, start: float, stay: float, before: Cells | None
 ) -> list[Component]:
     """Connected changes that are contact, the strongest first if there are several.
 
     squared : (h, w) float32, squared deviations. weak : a cell above belongs to a contact if connected to it.
-    start : a peak that makes a new contact. stay : a peak that keeps one. before : (h, w) bool, the cells
-    in contact in the previous frame.
+    largest : of `squared`. start : a peak that makes a new contact. stay : a peak that keeps one. before :
+    (h, w) bool, the cells in contact in the previous frame.
 
     >>> import numpy as np
     >>> squared = np.zeros((9, 9), np.float32)
     >>> squared[2:6, 2:6] = 20
-    >>> [(found.rows, found.columns) for found in contact_components(squared, 5, 10, 10, None)]
+    >>> [(found.rows, found.columns) for found in contact_components(squared, 5, 20, 10, 10, None)]
     [(slice(1, 7, None), slice(1, 7, None))]
     """
-    changed = np.empty(squared.shape, np.uint8)
-    close_changes(squared, weak, changed)
-    outlines, _ = cv2.findContours(changed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    height, width = squared.shape
+    changed, box = np.empty(squared.shape, np.uint8), np.empty(5, np.int64)
+    close_changes(squared, weak, changed, box)
+    *bounds, cells = box.tolist()
     least = min(MIN_CELLS, squared.size // 4)
-    found: list[Component] = []
-    for outline in outlines:
-        left, top, wide, high = cv2.boundingRect(outline)
-        if wide * high < least:
+    if cells:
+        window = _window(bounds, squared.shape)
+        parts = [(Component(*window, changed[window].copy().view(np.bool_)), cells, largest)]
+    else:
+        parts = _several_parts(changed, squared, least)
+    found = []
+    for component, cells, peak in parts:
+        kept = before is not None and peak >= stay and _overlaps(component, before)
+        if cells >= least and (peak >= start or kept):
+            found.append(component)
+    return _strongest(found, squared)
+
+
+def _several_parts(changed: Mask, squared: Float, least: int) -> list[tuple[Component, int, float]]:
+    """Each connected part of what has changed, how many cells it has, and its peak.
+
+    least : cells of a part's bounding box, below which it is left out.
+    """
+    outlines, _ = cv2.findContours(changed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    parts = []
+    for index, outline in enumerate(outlines):
+        bounds = cv2.boundingRect(outline)
+        if bounds[2] * bounds[3] < least:
             continue
-        rows = slice(max(top - 1, 0), min(top + high + 1, height))
-        columns = slice(max(left - 1, 0), min(left + wide + 1, width))
-        filled = changed[rows, columns].copy()
+        rows, columns = window = _window(bounds, changed.shape)
+        filled = changed[window].copy()
         if len(outlines) > 1:
             own = np.zeros_like(filled)
-            cv2.drawContours(own, [outline], 0, 1, cv2.FILLED, offset=(-columns.start, -rows.start))
+            cv2.drawContours(own, outlines, index, 1, cv2.FILLED, offset=(-columns.start, -rows.start))
             filled &= own
-        if cv2.countNonZero(filled) < least:
-            continue
-        inside = filled.view(np.bool_)
-        peak = cv2.minMaxLoc(squared[rows, columns], filled)[1]
-        if peak >= start or (
-            before is not None and peak >= stay and bool((before[rows, columns] & inside).any())
-        ):
-            found.append(Component(rows, columns, inside))
-    return _strongest(found, squared)
+        peak = cv2.minMaxLoc(squared[window], filled)[1]
+        parts.append((Component(*window, filled.view(np.bool_)), cv2.countNonZero(filled), peak))
+    return parts
+
+
+def _window(bounds: Sequence[int], shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of a bounding box (left, top, width, height), and a cell more on all sides."""
+    left, top, wide, high = bounds
+    rows = slice(max(top - 1, 0), min(top + high + 1, shape[0]))
+    return rows, slice(max(left - 1, 0), min(left + wide + 1, shape[1]))
+
+
+def _overlaps(component: Component, cells: Cells) -> bool:
+    """Whether a component has any of these cells, (h, w)."""
+    rows, columns, inside = component
+    return bool((cells[rows, columns] & inside).any())
 
 
 def _strongest(components: list[Component], squared: Float) -> list[Component]:
@@ -123,9 +151,13 @@ def _strongest(components: list[Component], squared: Float) -> list[Component]:
     return [components[index] for index in order[:MAX_COMPONENTS] if sums[index] >= STRAY * sums[order[0]]]
 
 
-@kernel("void(float32[:, ::1], float32, uint8[:, ::1])")
-def close_changes(squared: Float, weak: float, closed: NDArray[np.uint8]) -> None:
-    """1 where `squared` is above `weak`, after closing by 3 x 3, else 0; `closed` is filled."""
+@kernel("void(float32[:, ::1], float32, uint8[:, ::1], int64[::1])")
+def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int64]) -> None:
+    """1 where `squared` is above `weak`, after closing by 3 x 3, else 0; `closed` is filled.
+
+    box : (5,), filled with the left and upper end, width, height and number of these cells if they are one
+    piece without a gap in any row, as most contacts are; else with 0.
+    """
     high, wide = squared.shape
     # A border of one cell for each step: what is outside neither grows nor erodes.
     grown = np.ones((high + 2, wide + 2), np.uint8)
@@ -147,3 +179,31 @@ def close_changes(squared: Float, weak: float, closed: NDArray[np.uint8]) -> Non
             line[x] = upper[x] & here[x] & lower[x]
         for x in range(wide):
             row[x] = line[x] & line[x + 1] & line[x + 2]
+    _bound_one_piece(closed, box)
+
+
+@helper
+def _bound_one_piece(closed: Mask, box: NDArray[np.int64]) -> None:
+    """Fill `box` as `close_changes` does."""
+    high, wide = closed.shape
+    top, bottom, left, right, cells = high, 0, wide, 0, 0
+    before = before_end = 0
+    box[:] = 0
+    for y in range(high):
+        row, count, first = closed[y], 0, 0
+        for x in range(wide):
+            count += row[x]
+        if count == 0:
+            continue
+        while not row[first]:
+            first += 1
+        end = first + count
+        for x in range(first, min(end, wide)):
+            count -= row[x]
+        # Also cells that touch at a corner are connected.
+        if count or (bottom and (bottom < y or first > before_end or end < before)):
+            return
+        cells, top, bottom, before, before_end = cells + end - first, min(top, y), y + 1, first, end
+        left, right = min(left, first), max(right, end)
+    if cells:
+        box[0], box[1], box[2], box[3], box[4] = left, top, right - left, bottom - top, cells

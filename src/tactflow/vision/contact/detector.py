@@ -306,7 +306,7 @@ class ContactDetector:
         assert self._background is not None
         rows, columns, inside = component
         top, left = CELL * rows.start, CELL * columns.start
-        side = 1 if self._crowded or np.count_nonzero(inside) < FEW_CELLS else 2
+        side = 1 if self._crowded or cv2.countNonZero(inside.view(np.uint8)) < FEW_CELLS else 2
         window = self._background.window_change(change, rows, columns, inside, side)
         below = None if hidden is None else window_mask(hidden, top, left, inside, side)
         draw_level(contact_level(window, 2 * BRIDGE / side, below), top, left, mask, side)
@@ -322,7 +322,7 @@ class ContactDetector:
             stay = max(stay, remembered)
         if change.largest < (start if before is None else stay):
             return []
-        return contact_components(change.squared, CONNECTED * limit, start, stay, before)
+        return contact_components(change.squared, CONNECTED * limit, change.largest, start, stay, before)
 
     def _faint(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
         """Contact by the extent of a change of colour, in two frames; or one that fades while it is lifted.
@@ -348,7 +348,8 @@ class ContactDetector:
             belongs = before if belongs is None else before | belongs
         if belongs is None:
             return []
-        return contact_components(change.evidence, CONNECTED * limit, math.inf, 0.0, belongs)
+        largest = max(change.largest, change.largest_colour)
+        return contact_components(change.evidence, CONNECTED * limit, largest, math.inf, 0.0, belongs)
 
     def _extent(self, cells: int) -> float:
         """Cells that a change of colour covers which is contact for its extent."""
