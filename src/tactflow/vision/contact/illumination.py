@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel
 
 Float = NDArray[np.float32]
 
@@ -103,7 +103,7 @@ class IlluminationModel:
         frame), and the offset, grey levels.
         """
         coefficients = np.zeros((3, 4), np.float32)
-        excess, limit = np.empty((2, *self._reference.shape), np.float32)
+        excess, limit = np.empty_like(self._reference), np.empty_like(self._reference)
         compare_blocks(
             cells,
             self._row_weights,
@@ -200,15 +200,27 @@ def compare_blocks(
                     ratios[count] = excess[c, at] * per_brightness[c, at]
                     most = max(most, ratios[count])
                     count += limit[c, at] > 0
-        for i in range(count):
+        coefficients[c, 0] = _median(ratios, count) if count else most
+
+
+@helper
+def _median(values: Float, count: int) -> np.float32:
+    """Of `count` values, > 0, that of which at most half are smaller, and more than half no larger."""
+    least, most = np.float32(-np.inf), np.float32(np.inf)
+    for i in range(count):
+        # Only between those that were too small and those that were too large.
+        if least < values[i] < most:
             below = up_to = 0
             for j in range(count):
-                below += ratios[j] < ratios[i]
-                up_to += ratios[j] <= ratios[i]
-            if below <= count // 2 < up_to:
-                most = ratios[i]
-                break
-        coefficients[c, 0] = most
+                below += values[j] < values[i]
+                up_to += values[j] <= values[i]
+            if below > count // 2:
+                most = values[i]
+            elif up_to <= count // 2:
+                least = values[i]
+            else:
+                return values[i]
+    return most
 
 
 @kernel(
