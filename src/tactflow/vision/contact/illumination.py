@@ -205,21 +205,22 @@ def compare_blocks(
 
 @helper
 def _median(values: Float, count: int) -> np.float32:
-    """Of `count` values, > 0, that of which at most half are smaller, and more than half no larger."""
+    """That of `count` finite values of which half are smaller, rounded down; by bisection."""
     least, most = np.float32(-np.inf), np.float32(np.inf)
     for i in range(count):
+        value: np.float32 = values[i]
         # Only between those that were too small and those that were too large.
-        if least < values[i] < most:
+        if least < value < most:
             below = up_to = 0
             for j in range(count):
-                below += values[j] < values[i]
-                up_to += values[j] <= values[i]
+                below += values[j] < value
+                up_to += values[j] <= value
+            if below <= count // 2 < up_to:
+                return value
             if below > count // 2:
-                most = values[i]
-            elif up_to <= count // 2:
-                least = values[i]
+                most = value
             else:
-                return values[i]
+                least = value
     return most
 
 
