@@ -228,7 +228,7 @@ def _never_one_piece(*arguments: Any) -> None:
 def _same_cells_and_box(squared: NDArray[np.float32], weak: float) -> NDArray[np.int64]:
     """What both versions of `close_changes` find to be the box of one piece."""
     fast, slow = np.empty(squared.shape, np.uint8), np.empty(squared.shape, np.uint8)
-    box, plain_box = np.empty(5, np.int64), np.empty(5, np.int64)
+    box, plain_box = np.zeros(5, np.int64), np.zeros(5, np.int64)
     components.close_changes(squared, weak, fast, box)
     plain_close_changes(squared, np.float32(weak), slow, plain_box)
     assert np.array_equal(fast, slow)

@@ -90,7 +90,7 @@ def contact_components(
     >>> [(found.rows, found.columns) for found in contact_components(squared, 5, 20, 10, 10, None)]
     [(slice(1, 7, None), slice(1, 7, None))]
     """
-    changed, box = np.empty(squared.shape, np.uint8), np.empty(5, np.int64)
+    changed, box = np.empty(squared.shape, np.uint8), np.zeros(5, np.int64)
     close_changes(squared, weak, changed, box)
     *bounds, cells = box.tolist()
     least = min(MIN_CELLS, squared.size // 4)
@@ -155,8 +155,8 @@ def _strongest(components: list[Component], squared: Float) -> list[Component]:
 def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int64]) -> None:
     """1 where `squared` is above `weak`, after closing by 3 x 3, else 0; `closed` is filled.
 
-    box : (5,), filled with the left and upper end, width, height and number of these cells if they are one
-    piece without a gap in any row, as most contacts are; else with 0.
+    box : (5,), 0, filled with the left and upper end, width, height and number of these cells if they are one
+    piece without a gap in any row, as most contacts are.
     """
     high, wide = squared.shape
     # A border of one cell for each step: what is outside neither grows nor erodes.
@@ -186,9 +186,8 @@ def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int
 def _bound_one_piece(closed: Mask, box: NDArray[np.int64]) -> None:
     """Fill `box` as `close_changes` does."""
     high, wide = closed.shape
-    top, bottom, left, right, cells = high, 0, wide, 0, 0
-    before = before_end = 0
-    box[:] = 0
+    top, left = high, wide
+    bottom = right = cells = before = before_end = 0
     for y in range(high):
         row, count, first = closed[y], 0, 0
         for x in range(wide):
@@ -203,7 +202,9 @@ def _bound_one_piece(closed: Mask, box: NDArray[np.int64]) -> None:
         # Also cells that touch at a corner are connected.
         if count or (bottom and (bottom < y or first > before_end or end < before)):
             return
-        cells, top, bottom, before, before_end = cells + end - first, min(top, y), y + 1, first, end
+        top, bottom, cells = min(top, y), y + 1, cells + end - first
+        before, before_end = first, end
         left, right = min(left, first), max(right, end)
     if cells:
-        box[0], box[1], box[2], box[3], box[4] = left, top, right - left, bottom - top, cells
+        box[0], box[1] = left, top
+        box[2], box[3], box[4] = right - left, bottom - top, cells

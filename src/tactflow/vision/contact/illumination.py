@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import kernel
 
 Float = NDArray[np.float32]
 
@@ -200,28 +200,22 @@ def compare_blocks(
                     ratios[count] = excess[c, at] * per_brightness[c, at]
                     most = max(most, ratios[count])
                     count += limit[c, at] > 0
-        coefficients[c, 0] = _median(ratios, count) if count else most
-
-
-@helper
-def _median(values: Float, count: int) -> np.float32:
-    """That of `count` finite values of which half are smaller, rounded down; by bisection."""
-    least, most = np.float32(-np.inf), np.float32(np.inf)
-    for i in range(count):
-        value: np.float32 = values[i]
-        # Only between those that were too small and those that were too large.
-        if least < value < most:
-            below = up_to = 0
-            for j in range(count):
-                below += values[j] < value
-                up_to += values[j] <= value
-            if below <= count // 2 < up_to:
-                return value
-            if below > count // 2:
-                most = value
-            else:
-                least = value
-    return most
+        # The median by bisection: of the others, only those between too small and too large ones.
+        least, largest = np.float32(-np.inf), np.float32(np.inf)
+        for i in range(count):
+            if least < ratios[i] < largest:
+                below = up_to = 0
+                for j in range(count):
+                    below += ratios[j] < ratios[i]
+                    up_to += ratios[j] <= ratios[i]
+                if below > count // 2:
+                    largest = ratios[i]
+                elif up_to <= count // 2:
+                    least = ratios[i]
+                else:
+                    most = ratios[i]
+                    break
+        coefficients[c, 0] = most
 
 
 @kernel(
