@@ -109,8 +109,7 @@ def plain_sample_region(
     """Each cell's motion as a product, and its share by sums over squares, interpolated between pixels."""
     height, width = size = np.array(covered.shape) - 1
     step = 1 if size.prod() < many else 2
-    spacing, side = place[2], int(place[3 + step])
-    margin = place[3] + (side + 1) / 2
+    spacing, margin, side = place[2], place[3], int(place[3 + step])
     least, most = planes[:2].min(axis=1) - margin, planes[:2].max(axis=1) + margin
     corner = np.array([left, top]) - place[:2]
     begin = np.clip(np.floor((corner - most) / spacing), 0, to_markers.shape[1::-1])

@@ -166,7 +166,7 @@ class FieldModel:
         self.grid = _grid(size, self.pitch)
         spacing = self.grid.spacing
         sides = [2 * round((step * spacing - 1) / 2) + 1 for step in (1, 2)]
-        self.place = np.array([*self.grid.first, spacing, OVERSHOOT * self.pitch, *sides])
+        self.place = np.array([*self.grid.first, spacing, OVERSHOOT * self.pitch + spacing, *sides])
         """(6,), see `sample_region`."""
         self._length = LENGTH * self.pitch
         kernel = self._kernel(self.origin)

@@ -243,9 +243,9 @@ def sample_region(
     height, width = covered.shape[0] - 1, covered.shape[1] - 1
     window[2] = step = 1 if width * height < many else 2
     side = int(place[3 + step])
-    # The cells whose square may overlap the part, and for each of them where its square may be.
-    least_x, most_x = _extent(planes, 0, place[3] + (side + 1) / 2)
-    least_y, most_y = _extent(planes, 1, place[3] + (side + 1) / 2)
+    # The cells whose gel may be in the part, and for each of them where its gel may be.
+    least_x, most_x = _extent(planes, 0, place[3])
+    least_y, most_y = _extent(planes, 1, place[3])
     first_row = _within((top - place[1] - most_y) / place[2], to_markers.shape[0])
     first_column = _within((left - place[0] - most_x) / place[2], to_markers.shape[1])
     end_row = _within((top + height - place[1] - least_y) / place[2] + 2, to_markers.shape[0])
