@@ -20,6 +20,7 @@ from tactflow.vision.contact import (
     components,
     contact_outline,
     illumination,
+    nearby,
     resolution,
     response,
 )
@@ -136,7 +137,7 @@ def both(compute: Callable[[], Any], *modules: Any) -> tuple[Any, Any]:
 def test_single_precision_costs_the_contact_nothing(method: str) -> None:
     pictures = gel(dots=False)
 
-    rooms = border, components, contact_outline, illumination, resolution, response
+    rooms = border, components, contact_outline, illumination, nearby, resolution, response
 
     def compute() -> contact.ContactResult:
         detector = DIFFERENCES[method]()
@@ -165,7 +166,7 @@ def test_single_precision_costs_the_outline_nothing(kind: str) -> None:
     def compute() -> NDArray[Any]:
         return contact_outline.contact_level(change_of(answer.astype(contact_outline.np.float32), inside))
 
-    single, double = both(compute, border, contact_outline, oracle)
+    single, double = both(compute, border, contact_outline, nearby, oracle)
     assert (single > 0).any()
     assert double.dtype == np.float64
     # The bound of the docstring.
