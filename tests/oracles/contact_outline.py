@@ -30,22 +30,16 @@ def plain_cut_gloss(
     sums[:] = cap, cv2.norm(cut, cv2.NORM_L2SQR), cv2.norm(brightness, cv2.NORM_L2SQR)
 
 
-def plain_halve_smoothed(values: Float, part: float, halved: Float, least: NDArray[np.float64]) -> int:
+def plain_halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, float]:
     """OpenCV's blur, and its resizing by areas."""
     smooth = np.asarray(cv2.blur(values, (3, 3)), np.float32)
     halved[:] = cv2.resize(smooth, halved.shape[::-1], interpolation=cv2.INTER_AREA)
     peak = max(float(smooth.max()), 1e-9)
-    least[0] = FAINT * peak
-    return round(part * math.sqrt(np.count_nonzero(values > np.float32(OUTER * peak)) / math.pi) / 2)
+    radius = math.sqrt(np.count_nonzero(values > np.float32(OUTER * peak)) / math.pi)
+    return round(part * radius / 2), FAINT * peak
 
 
-def plain_spread_largest(
-    values: Float,
-    reach: int,
-    least: float,
-    around: Float,  # noqa: ARG001
-    nearby: Float,
-) -> None:
+def plain_spread_largest(values: Float, reach: int, least: float, nearby: Float) -> None:
     """OpenCV's dilation, blur and bilinear resizing."""
     side = 2 * reach + 1
     largest = cv2.copyMakeBorder(values, *(reach,) * 4, cv2.BORDER_CONSTANT, value=(0.0,))
@@ -59,5 +53,5 @@ GAINS = [
     Gain(cut_gloss, plain_cut_gloss, tolerance=1e-6),
     # Of numbers of up to 50, in single precision.
     Gain(halve_smoothed, plain_halve_smoothed, tolerance=1e-5),
-    Gain(spread_largest, plain_spread_largest, tolerance=1e-5, scratch=("around",)),
+    Gain(spread_largest, plain_spread_largest, tolerance=1e-5),
 ]

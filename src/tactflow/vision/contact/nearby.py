@@ -30,20 +30,20 @@ def largest_nearby(values: Float, part: float = 1.0) -> Float:
     """
     high, wide = values.shape
     rows, columns = -(-high // 2), -(-wide // 2)
-    coarse, least = np.empty((rows, columns), np.float32), np.empty(1)
-    reach = halve_smoothed(values, part, coarse, least)
-    around = np.zeros((rows + 4 * reach + 1, columns + 2 * reach), np.float32)
-    nearby = np.empty((2 * rows, 2 * columns), np.float32)
-    spread_largest(coarse, reach, least[0], around, nearby)
+    coarse, nearby = np.empty((rows, columns), np.float32), np.empty((2 * rows, 2 * columns), np.float32)
+    reach, least = halve_smoothed(values, part, coarse)
+    spread_largest(coarse, reach, least, nearby)
     return nearby[:high, :wide]
 
 
-@kernel("int64(float32[:, ::1], float64, float32[:, ::1], float64[::1])")
-def halve_smoothed(values: Float, part: float, halved: Float, least: NDArray[np.float64]) -> int:
-    """Means over 3 x 3 pixels, and over 2 x 2 of them; returns how far "around" reaches, two pixels.
+@kernel("Tuple((int64, float64))(float32[:, ::1], float64, float32[:, ::1])")
+def halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, float]:
+    """Means over 3 x 3 pixels, and over 2 x 2 of them.
+
+    Returns how far "around" reaches, two pixels, and the least that counts.
 
     values : (h, w). part : of the radius. halved : (h / 2, w / 2), rounded up, filled; the last line counts
-    twice then. least : (1,), filled with the least that counts.
+    twice then.
     """
     high, wide = values.shape
     sums, line = np.empty(wide + 2), np.empty(wide + 1, np.float32)
@@ -68,23 +68,24 @@ def halve_smoothed(values: Float, part: float, halved: Float, least: NDArray[np.
     peak, count = 1e-9, 0
     for x in range(wide):
         peak = max(peak, largest[x])
-    limit, least[0] = np.float32(OUTER * peak), FAINT * peak
+    limit = np.float32(OUTER * peak)
     for y in range(high):
         for x in range(wide):
             count += values[y, x] > limit
-    return round(part * math.sqrt(count / math.pi) / 2)
+    return round(part * math.sqrt(count / math.pi) / 2), FAINT * peak
 
 
-@kernel("void(float32[:, ::1], int64, float64, float32[:, ::1], float32[:, ::1])")
-def spread_largest(values: Float, reach: int, least: float, around: Float, nearby: Float) -> None:
+@kernel("void(float32[:, ::1], int64, float64, float32[:, ::1])")
+def spread_largest(values: Float, reach: int, least: float, nearby: Float) -> None:
     """The mean, over a square, of the largest values in as large ones, interpolated to twice the resolution.
 
-    values : (h, w). reach : half the side of a square. least : of what is interpolated, at least. around :
-    (h + 4 reach + 1, w + 2 reach), 0, changed. nearby : (2 h, 2 w), filled.
+    values : (h, w). reach : half the side of a square. least : of what is interpolated, at least.
+    nearby : (2 h, 2 w), filled.
     """
     high, wide = values.shape
     side, broad = 2 * reach + 1, wide + 2 * reach
     # The largest of so many next to one another, of twice as many, and so on; along x, then along y.
+    around = np.zeros((high + 4 * reach + 1, broad), np.float32)
     line, wider = np.zeros(broad + 2 * reach, np.float32), np.zeros(broad + 2 * reach, np.float32)
     for y in range(high):
         for x in range(2 * reach):
