@@ -22,13 +22,14 @@ import tempfile
 import textwrap
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import CodeType, FrameType
+from types import BuiltinFunctionType, CodeType, FrameType
 from typing import Any
 
+import cv2
 import numpy as np
 
 from tactflow.bench.lockstep import LockstepPipeline
@@ -64,21 +65,24 @@ PARTS = (
 
 @dataclass
 class Call:
-    """A call of a stage: its name, begin and end, s, and the bytes of the arrays that it takes and gives."""
+    """A call of a stage: its name, begin and end, s, and the bytes of the arrays that it takes and gives.
+
+    native : begin and end of each call of a compiled loop or of OpenCV in it, s.
+    """
 
     name: str
     begin: float
     end: float
     moved: int
-    loops: list[tuple[float, float]] = field(default_factory=list)
+    native: list[tuple[float, float]] = field(default_factory=list)
 
 
 class Watch:
-    """Notes every call of a stage, and of a compiled loop in it, while it is installed."""
+    """Notes every call of a stage, and of compiled loops and OpenCV in it, while it is installed."""
 
     def __init__(self) -> None:
         self.calls: list[Call] = []
-        self._loops: list[tuple[float, float]] = []
+        self._native: list[tuple[float, float]] = []
 
     @contextmanager
     def installed(self) -> Iterator[None]:
@@ -86,25 +90,31 @@ class Watch:
         node, kernel = RunningNode.__call__, Kernel.__call__
 
         def call(this: RunningNode, inputs: Sequence[Any], tick: Any) -> Sequence[Any]:
-            self._loops = []
+            self._native = []
             begin = time.perf_counter()
             outputs = node(this, inputs, tick)
             end = time.perf_counter()
             moved = _bytes(inputs) + _bytes(outputs)
-            self.calls.append(Call(this.id, begin, end, moved, self._loops))
+            self.calls.append(Call(this.id, begin, end, moved, self._native))
             return outputs
 
-        def loop(this: Kernel[..., Any], *args: Any) -> Any:
-            begin = time.perf_counter()
-            result = kernel(this, *args)
-            self._loops.append((begin, time.perf_counter()))
-            return result
+        def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+            def run(*args: Any, **options: Any) -> Any:
+                begin = time.perf_counter()
+                result = function(*args, **options)
+                self._native.append((begin, time.perf_counter()))
+                return result
 
-        RunningNode.__call__, Kernel.__call__ = call, loop  # type: ignore[method-assign, assignment]
+            return run
+
+        opencv = {name: value for name, value in vars(cv2).items() if isinstance(value, BuiltinFunctionType)}
+        RunningNode.__call__, Kernel.__call__ = call, timed(kernel)  # type: ignore[method-assign, assignment]
+        vars(cv2).update({name: timed(value) for name, value in opencv.items()})
         try:
             yield
         finally:
             RunningNode.__call__, Kernel.__call__ = node, kernel  # type: ignore[method-assign]
+            vars(cv2).update(opencv)
 
 
 CHOICES = frozenset({"min", "max", "abs", "round", "rint", "sqrt", "exp", "floor", "hypot"})
@@ -269,11 +279,13 @@ def write_page() -> None:
         worked = operations(Path(name))
         for scene in SCENES:
             stages: dict[str, list[float]] = defaultdict(list)
+            native: list[float] = []
             best: dict[str, float] = {}
             for _ in range(ROUNDS):
                 times, frames = frames_of(scene, Path(name), unit)
                 best = {kind: min(value, best.get(kind, value)) for kind, value in times.items()}
                 for calls in frames:
+                    native.append(1e3 * sum(end - begin for call in calls for begin, end in call.native))
                     for call in calls:
                         stages[call.name].append(1e3 * (call.end - call.begin))
                         moved[call.name] = call.moved
@@ -283,7 +295,9 @@ def write_page() -> None:
             told = "; ".join(
                 f"{kind} {ms:.2f} ms, {ms / unit.copy_ms:.1f} copies" for kind, ms in best.items()
             )
-            lines.append(f"- `{scene}`: {told}.")
+            lines.append(
+                f"- `{scene}`: {told}; contact in loops and OpenCV {statistics.median(native):.2f} ms."
+            )
         pipeline = load_pipeline(ROOT / "pipeline.yaml")
         grown = growth(pipeline, Rendered(Case("press", GROWTH_FRAMES), Path(name)), Path(name), unit)
     assert grown is not None
@@ -339,7 +353,7 @@ def typical(frames: list[list[Call]]) -> list[Call]:
 
 
 def picture(calls: list[Call]) -> str:
-    """One frame as an SVG: when each stage ran, and in it the compiled loops."""
+    """One frame as an SVG: when each stage ran, and in it what is not Python."""
     start, end = calls[0].begin, calls[-1].end
     wide, left, high = 900, 110, 22
     scale = (wide - left - 70) / (end - start)
@@ -357,7 +371,7 @@ def picture(calls: list[Call]) -> str:
             *(
                 f'<rect x="{left + scale * (a - start):.1f}" y="{y}" width="{max(scale * (b - a), 0.5):.1f}" '
                 f'height="{high - 6}" fill="#08519c"/>'
-                for a, b in call.loops
+                for a, b in call.native
             ),
             f'<text x="{x + width + 5:.1f}" y="{y + 13}" fill="#555">{1e3 * width / scale:.2f}</text>',
         ]
