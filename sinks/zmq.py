@@ -82,8 +82,8 @@ class Zmq(Sink):
         send_buffer: int = Field(
             SEND_BUFFER,
             ge=1024,
-            description="kernel send buffer per subscriber, bytes; large ones hold seconds of stale messages, "
-            "smaller ones than this slow down messages that are longer (depth maps, field)",
+            description="kernel send buffer per subscriber, bytes; large ones hold seconds of stale "
+            "messages, smaller ones than this slow down messages that are longer (depth maps, field)",
         )
         linger: float = Field(
             1.0, ge=0, le=60, description="time to deliver the last messages at the end of a run, s"

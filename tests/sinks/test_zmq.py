@@ -483,7 +483,7 @@ def test_pictures_have_their_rate_and_are_off_unless_asked_for(subscribe: Subscr
 
 
 def test_the_send_buffer_holds_a_segment_of_the_loopback_device() -> None:
-    # Else messages that are longer, such as depth maps, wait for delayed acknowledgements, and others are lost.
+    # Else messages that are longer, such as depth maps, wait for acknowledgements, and others are lost.
     loopback = Path("/sys/class/net/lo/mtu")
     if not loopback.exists():
         pytest.skip("the size of a segment is told by Linux")

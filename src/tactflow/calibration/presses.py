@@ -58,9 +58,8 @@ class Session:
 
 Report = Callable[[int, list["Press"], bool], bool]
 """Called with each frame: how many there were, the presses so far, and whether the last one still lasts.
-Returns whether that is enough for a live source, which then ends when its reference is complete; of a recording
-all is read. A press that is over may be
-taken out of the list: it was undone."""
+Returns whether that is enough for a live source, which then ends when its reference is complete; of a
+recording all is read. A press that is over may be taken out of the list: it was undone."""
 
 
 class Keeper(Protocol):
