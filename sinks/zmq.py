@@ -23,7 +23,7 @@ from tactflow.network.address import is_reachable, picks_a_port
 from tactflow.network.bound_socket import FloodError
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
-from tactflow.network.publisher import Publisher
+from tactflow.network.publisher import SEND_BUFFER, Publisher
 
 log = logging.getLogger("tactflow")
 
@@ -80,9 +80,10 @@ class Zmq(Sink):
             "bridges its pauses, fewer keep it fresher",
         )
         send_buffer: int = Field(
-            32768,
+            SEND_BUFFER,
             ge=1024,
-            description="kernel send buffer per subscriber, bytes; large ones hold seconds of stale messages",
+            description="kernel send buffer per subscriber, bytes; large ones hold seconds of stale "
+            "messages, smaller ones than this slow down messages that are longer (depth maps, field)",
         )
         linger: float = Field(
             1.0, ge=0, le=60, description="time to deliver the last messages at the end of a run, s"

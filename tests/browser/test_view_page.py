@@ -858,6 +858,7 @@ def test_everything_can_be_reached_by_keyboard_and_has_a_name(
         ("view-dark", {}),
         ("view-light", {"color_scheme": "light"}),
         ("view-wide", {"viewport": {"width": 1920, "height": 1000}}),
+        ("view-narrow", {"viewport": {"width": 320, "height": 600}}),
         (
             "view-phone",
             {

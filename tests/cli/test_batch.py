@@ -67,6 +67,17 @@ def test_what_fails_is_listed_with_its_reason_and_the_exit_code_is_3(
     assert "not a .npy file" in page
 
 
+def test_what_is_done_with_a_warning_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = folder / "rec" / "film.avi"
+    assert main(["sim", "press?frames=6", "--out", str(film), "--quiet"]) == 0
+    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    assert run() == 0
+    told = capsys.readouterr().err
+    assert "3 done now" in told
+    assert "1 done with warnings: " in told
+    assert "of 6 frames; the file may be damaged; the table of runs has all" in told
+
+
 def test_the_last_shard_leaves_all_in_the_table(folder: Path) -> None:
     assert run("--shard", "2/2") == 0
     assert [row["status"] for row in rows(folder)] == ["not done", "done"]

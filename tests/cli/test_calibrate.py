@@ -137,3 +137,19 @@ def test_what_gives_no_calibration_is_refused_in_words(
     assert calibrate(*words) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.yaml"))
+
+
+def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert calibrate("--from", "sim:ball?frames=60", "--pitch", "1.724", "--out", "film.yaml") == 0
+    told = capsys.readouterr().err
+    assert "press 1" not in told
+    assert "--set calibration=film.yaml" in told
+    # As a camera, for ten minutes, unless it ends when it knows what it needs.
+    live = ["--from", "sim:idle?frames=36000", "--realtime", "--pitch", "1.724", "--out", "camera.yaml"]
+    assert calibrate(*live) == 0
+    assert "Leave the gel untouched." in capsys.readouterr().err
+    scales = [yaml.safe_load(Path(name).read_text())["scale"] for name in ("film.yaml", "camera.yaml")]
+    assert scales[0]["mm_per_pixel"] == pytest.approx(scales[1]["mm_per_pixel"], rel=5e-3)

@@ -60,3 +60,12 @@ def test_a_session_that_goes_on_says_where_it_stands() -> None:
         "going on with 1 presses of before; nothing yet at the upper left, upper centre, upper right, "
         "middle left, ..."
     ]
+
+
+def test_presses_of_a_recording_beyond_those_that_are_wanted_are_counted_alone() -> None:
+    said: list[str] = []
+    guide = Guide(1, said.append)
+    guide(1, [], False)
+    guide(2, [press(45, 45), press(20, 20)], False)
+    assert said[0].startswith("press 1 of 1: good")
+    assert said[1].startswith("press 2: good")

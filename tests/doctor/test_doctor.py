@@ -89,6 +89,14 @@ def test_each_fault_is_named_and_no_other(
     assert not [f.name for f in findings if f.verdict == "unknown" and f.name != "latency"]
 
 
+def test_a_single_clipped_pixel_is_no_share_to_speak_of(clean: list[Image], tmp_path: Path) -> None:
+    frames = [image.copy() for image in clean]
+    for image in frames:
+        image[150, 200] = 255
+    findings = examine(observe(str(written(tmp_path / "recording.avi", frames, 60.0)), 60.0))
+    assert [f.says for f in findings if f.name == "clipping"] == ["0 % of the gel is clipped"]
+
+
 def test_missing_and_repeated_frames_of_a_camera_are_counted(
     clean: list[Image], monkeypatch: pytest.MonkeyPatch
 ) -> None:

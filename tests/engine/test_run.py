@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -654,6 +655,18 @@ def test_segments_that_feed_each_other_in_a_circle_are_refused(toy_runner: MakeR
         toy_runner({"level": {"segment": "a"}, "heavy": {"segment": "b"}, "gated": {"segment": "a"}})
     assert "toy.yaml:" in str(caught.value)
     assert type(caught.value).__name__ == "ConfigError"
+
+
+def test_a_frame_whose_source_does_not_say_when_it_was_captured_gets_the_time_at_which_it_came(
+    toy_runner: MakeRunner,
+) -> None:
+    runner = toy_runner({"capture": {"says_when": False}}, {"out": {"use": "FrameArchive"}})
+    before = time.perf_counter()
+    ran(runner)
+    captured = [frame.captured for frame in runner.nodes["out"].instance.frames]
+    assert captured
+    assert captured == sorted(captured)
+    assert before <= captured[0] <= captured[-1] <= time.perf_counter()
 
 
 def test_statistics_have_the_promised_shape(toy_runner: MakeRunner) -> None:

@@ -42,6 +42,7 @@ class Ramp(contract.Source):
         preroll: bool = False
         overtaken: int = 0
         reader: int | None = None
+        says_when: bool = True
 
     def __init__(self, params: Params, sensor: str) -> None:
         self.params, self.sensor = params, sensor
@@ -76,7 +77,8 @@ class Ramp(contract.Source):
     def frame(self, seq: int, epoch: int) -> Frame:
         image = np.full((4, 6, 3), max(seq, 0) % 256, np.uint8)
         image.flags.writeable = False
-        return Frame(self.sensor, seq, seq / 50, image, time.perf_counter(), seq <= 0, epoch)
+        captured = time.perf_counter() if self.params.says_when else 0.0
+        return Frame(self.sensor, seq, seq / 50, image, captured, seq <= 0, epoch)
 
     def stop(self) -> None:
         self.stopped.set()
@@ -337,8 +339,13 @@ class FrameArchive(Counted, Sink):
     threaded = True
     when_live = "block"
 
+    def __init__(self, params: Counted.Params) -> None:
+        super().__init__(params)
+        self.frames: list[Frame] = []
+
     def write(self, frame: Frame) -> None:
         self.saw(frame.seq)
+        self.frames.append(frame)
 
 
 class Onlooker(Collect):

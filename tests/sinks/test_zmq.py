@@ -20,6 +20,7 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results
 from tactflow.network import bound_socket
+from tactflow.network.publisher import SEND_BUFFER
 from tactflow.sinks.zmq import MOST_OTHERS, Zmq
 from tactflow.vision.types import Depth, Markers
 from tests.clock import PATIENCE, until
@@ -479,3 +480,12 @@ def test_pictures_have_their_rate_and_are_off_unless_asked_for(subscribe: Subscr
     until(lambda: silent.wants() or silent.counters()["subscriptions"])
     assert not silent.wants()
     silent.close()
+
+
+def test_the_send_buffer_holds_a_segment_of_the_loopback_device() -> None:
+    # Else messages that are longer, such as depth maps, wait for acknowledgements, and others are lost.
+    loopback = Path("/sys/class/net/lo/mtu")
+    if not loopback.exists():
+        pytest.skip("the size of a segment is told by Linux")
+    assert Zmq.Params().send_buffer >= int(loopback.read_text())
+    assert Zmq.Params().send_buffer == SEND_BUFFER

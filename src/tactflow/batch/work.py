@@ -40,7 +40,7 @@ from tactflow.engine.run import Progress
 
 DEADLY = 2
 """Workers that a recording may kill before it is set aside."""
-_SRC = Mark("SRC", 0, 0)
+_SRC = Mark("recording", 0, 0)
 """Where the source stands: not in the pipeline file, which is not to blame for it."""
 _MOST_NOTES = 5
 """Warnings that are kept of one recording. Chosen by hand."""

@@ -58,8 +58,8 @@ class Session:
 
 Report = Callable[[int, list["Press"], bool], bool]
 """Called with each frame: how many there were, the presses so far, and whether the last one still lasts.
-Returns whether that is enough for a live source; of a recording all is read. A press that is over may be
-taken out of the list: it was undone."""
+Returns whether that is enough for a live source, which then ends when its reference is complete; of a
+recording all is read. A press that is over may be taken out of the list: it was undone."""
 
 
 class Keeper(Protocol):
@@ -120,6 +120,7 @@ class _Collect(Sink):
         self._open = False
         self._keeper: Keeper | None = None
         self._checked = False
+        self._enough = False
 
     def open(self) -> None:
         """Go on with the presses of before."""
@@ -153,10 +154,12 @@ class _Collect(Sink):
                 self._checked = True
                 self._keeper.check(self.untouched(), mapping or PixelMapping.identity(self.size()))
             self._add(Press(tick.frame.seq, unmarked, contact_mask, hidden, contact.center, radius))
-        enough = self.report(self.frames, self.presses, self._open)
+        self._enough = self.report(self.frames, self.presses, self._open) or self._enough
         if self._keeper is not None:
             self._keeper.sync(self.presses[: len(self.presses) - self._open])
-        if enough and self._control.source is not None and self._control.source.live:
+        live = self._control.source is not None and self._control.source.live
+        # All frames of the reference count, whenever it is said that there is enough.
+        if self._enough and live and not tick.frame.reference:
             self._control.stop()
 
     def untouched(self) -> NDArray[np.uint8]:

@@ -287,6 +287,9 @@ def _closing(results: Sequence[Result]) -> list[str]:
     lines += [f"  {o.status}: {o.name}: {in_short(o)}" for o in failed[:_FAILED_SHOWN]]
     if len(failed) > _FAILED_SHOWN:
         lines.append(f"  and {len(failed) - _FAILED_SHOWN} more; the table of runs has all")
+    notes = [outcome.notes[0] for outcome in outcomes if outcome.notes and outcome.status == "done"]
+    if notes:
+        lines.append(f"{len(notes)} done with warnings: {notes[0]}; the table of runs has all")
     return lines
 
 

@@ -119,12 +119,19 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
             f"all over the gel and to several depths. {args.presses} presses will do. Type u and Enter to "
             "undo the last one, q and Enter or Ctrl-C to end earlier; what was pressed is kept."
         )
+    else:
+        say("Leave the gel untouched.")
     kept = KeptPresses(out.with_suffix(".presses"))
     if args.fresh:
         kept.clear()
     guide = Guide(args.presses, say, typed_lines())
+    page = _page(args, pipeline, guide) if args.view else None
     with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
-        session = find_presses(loaded, guide, kept, _page(args, pipeline, guide) if args.view else None)
+        if args.ball_radius is None:
+            # The untouched gel is enough for a scale.
+            session = find_presses(loaded, lambda _frames, _presses, _lasts: True, watchers=page)
+        else:
+            session = find_presses(loaded, guide, kept, page)
     try:
         calibration = _learned(args, loaded, session)
     except ConfigError as error:
@@ -135,11 +142,14 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
             "on, or with --fresh to begin anew"
         ) from None
     calibration.save(out)
-    if len(kept.presses) >= args.presses:
+    if args.ball_radius is not None and len(kept.presses) >= args.presses:
         kept.clear()
     elif kept.presses:
         say(f"to go on to {args.presses} presses, run the command again with --overwrite")
-    say(f"{out} is written. To use it, write into the pipeline file: calibration: {out}")
+    say(
+        f"{out} is written. To use it, write into the pipeline file: calibration: {out}\n"
+        f"or give it to a run: --set calibration={out}"
+    )
     return 0
 
 

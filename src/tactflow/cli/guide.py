@@ -47,7 +47,9 @@ class Guide:
             if over:
                 self._say(f"going on with {over} presses of before; {_missing(presses[:over])}")
         for number in range(self._told, over):
-            self._say(f"press {number + 1} of {self._wanted}: {judged(presses[:over], number)}")
+            # A recording may show more than are wanted.
+            of = f" of {self._wanted}" if number < self._wanted else ""
+            self._say(f"press {number + 1}{of}: {judged(presses[:over], number)}")
         self._told = over
         ended = False
         for word in (*self._typed(), *(self._asked.get() for _ in range(self._asked.qsize()))):

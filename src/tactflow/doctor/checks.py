@@ -270,7 +270,7 @@ def _clipping(seen: Observation) -> Finding:
         Finding(
             "clipping",
             CLIPPED_SHARES.verdict(share),
-            f"{100 * share:.2g} % of the gel is clipped",
+            f"{round(100 * share, 2):.2g} % of the gel is clipped",
             100 * share,
             "%",
             "a contact there shows no shades: " + _grown(CLIPPED, share, "its centre is off"),

@@ -23,7 +23,8 @@ class Frame:
         that was loaded from a file and is not part of the source.
     t : capture time, s: for a recording, time from its start; for a live source, Unix time.
     image : (H, W, 3) uint8 BGR, as it came from the source, not writeable.
-    captured : monotonic clock (`time.perf_counter`) when the source handed the frame over, s.
+    captured : monotonic clock (`time.perf_counter`) when the source handed the frame over, s; where it is 0,
+        the run says when it got the frame.
     reference : True if this frame shows the untouched gel that later frames are compared with.
     epoch : grows by one each time a new reference is taken; stages are reset between epochs.
 

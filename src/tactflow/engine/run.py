@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from tactflow.engine.conformance import OFFERED, build
@@ -379,6 +379,8 @@ class Runner:
                 if self._paused and not self._may_go_on():
                     continue
                 ended = time.perf_counter()
+                if not frame.captured:
+                    frame = replace(frame, captured=ended)
                 self._source_stats.durations.add(ended - began)
                 if segment.track is not None:
                     segment.track.add(node.id, began, ended, {"seq": frame.seq})

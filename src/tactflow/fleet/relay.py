@@ -11,11 +11,8 @@ import zmq
 
 from tactflow.engine.errors import StageError
 from tactflow.network.bound_socket import FloodError
-from tactflow.network.publisher import Publisher
+from tactflow.network.publisher import SEND_BUFFER, Publisher
 
-SEND_BUFFER = 32_768
-"""Kernel send buffer per subscriber, bytes, the ZeroMQ sink's default. Large ones hold seconds of messages.
-Chosen by hand."""
 LINGER = 0.5
 """Time to deliver the last messages at the end, s. Chosen by hand."""
 POLL_MS = 100

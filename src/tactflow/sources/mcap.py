@@ -67,7 +67,7 @@ class Recording:
         frames = "an unknown number of" if contents.frames is None else str(contents.frames)
         self.description = f"{spec}, {frames} frames, {self.size[0]} x {self.size[1]}"
         if not contents.finished:
-            log.info(
+            log.warning(
                 "%s: was not finished (killed?); it is played up to where it ends; "
                 "tactflow repair makes it whole for other programs too",
                 self._path,
