@@ -285,7 +285,7 @@ class DisplacementField:
     def motion(self, mask: NDArray[np.uint8], box: Sequence[int] | None = None) -> GelMotion | None:
         """How the gel inside a region has moved, each bit of it counted by its area at rest.
 
-        mask : (H, W) uint8, 0 or 255 inside, in the current frame: what counts is where the gel is now.
+        mask : (H, W) uint8, 255 inside, else 0, in the current frame: what counts is where the gel is now.
         box : (left, top, width, height) of the region, px, where it is known.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
@@ -304,7 +304,7 @@ class DisplacementField:
         return _motion(numbers, spacing) if numbers[0] > 0 else None
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
-        """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
+        """The cells of the gel that are in a region now, (H, W) uint8, 255 inside; None if there are none."""
         check_mask(mask, 0)
         window, cells = self._cells(mask, cv2.boundingRect(mask), self._model.fine)
         top, left, rows, columns = window.tolist()

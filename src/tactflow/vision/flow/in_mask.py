@@ -75,7 +75,8 @@ def flow_of_field(
 ) -> Flow:
     """Summarise the displacement of the gel inside the contact, between its markers.
 
-    field : of this frame. markers, mask, dilate : as `flow_in_mask` takes them; they tell `count`.
+    field : of this frame. mask : (H, W) uint8, 255 inside the contact, else 0.
+    markers, dilate : as `flow_in_mask` takes them; with the mask they tell `count`.
     coarse : whether the mask is only where a contact is to be found, as one that markers alone show: then the
         standard error of the mean is how much the displacement differs within it.
     region : properties of the mask, where they are known; those of another one do not count.
