@@ -10,7 +10,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
 from tactflow.vision import compiled
 from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field, loops
-from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Evidence, Flow, Markers
 
 
@@ -46,12 +46,12 @@ class FlowInMask(Stage):
         contact_mask: ContactMask,
         field: DisplacementField | None = None,
         evidence: Evidence | None = None,
-        outlines: Outlines | None = None,
+        region: RegionProperties | None = None,
     ) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside, or none near."""
         dilate = self._params.dilate
         if field is None or self._params.method == "mean":
             return flow_in_mask(markers, contact_mask, dilate=dilate)
         return flow_of_field(
-            field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots", outlines=outlines
+            field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots", region=region
         )

@@ -13,20 +13,20 @@ from tactflow.vision.contact.fusion import fuse_contact
 from tactflow.vision.flow import loops
 from tactflow.vision.flow.motion import MotionTest
 from tactflow.vision.geometry import moments
-from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Evidence, Markers
 
 
 class FusedPorts(NamedTuple):
     """contact_mask : 255 in contact. touching : whether anything is. evidence : what showed it.
 
-    outlines : of the contact_mask, where they were needed to tell.
+    region : properties of the contact_mask, where they were needed to tell.
     """
 
     contact_mask: ContactMask
     touching: Touching
     evidence: Evidence | None
-    outlines: Outlines | None = None
+    region: RegionProperties | None = None
 
 
 class Fusion(Stage):
@@ -95,4 +95,4 @@ class Fusion(Stage):
         self._changed = self._changed + 1 if fused.light_changed else 0
         if self._changed == self.params.patience > 0:
             self.wants_reference = "light_changed"
-        return FusedPorts(fused.mask, fused.touching, fused.evidence, fused.outlines)
+        return FusedPorts(fused.mask, fused.touching, fused.evidence, fused.region)

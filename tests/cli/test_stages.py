@@ -22,7 +22,7 @@ def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFix
     assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT", "IT", "DOES"]
     assert [row.split()[:2] for row in rows] == [[c.name, c.kind] for c in available()]
     hull = next(row for row in rows if row.startswith("hull "))
-    ports = ["contact_mask,", "evidence?,", "outlines?", "contact"]
+    ports = ["contact_mask,", "evidence?,", "region?", "contact"]
     assert hull.split()[:7] == ["hull", "stage", *ports, "built-in"]
 
 

@@ -100,7 +100,6 @@ def plain_sample_region(
     left: int,
     top: int,
     place: FloatArray,
-    many: float,
     planes: FloatArray,
     to_markers: FloatArray,
     window: IntArray,
@@ -108,22 +107,21 @@ def plain_sample_region(
 ) -> None:
     """Each cell's motion as a product, and its share by sums over squares, interpolated between pixels."""
     height, width = size = np.array(covered.shape) - 1
-    step = 1 if size.prod() < many else 2
-    spacing, margin, side = place[2], place[3], int(place[3 + step])
+    spacing, margin, side = place[2], place[3], int(place[4])
     least, most = planes[:2].min(axis=1) - margin, planes[:2].max(axis=1) + margin
     corner = np.array([left, top]) - place[:2]
     begin = np.clip(np.floor((corner - most) / spacing), 0, to_markers.shape[1::-1])
     end = np.clip(np.floor((corner + size[::-1] - least) / spacing) + 2, 0, to_markers.shape[1::-1])
-    columns, rows = np.ceil((end - begin) / step).astype(int).tolist()
-    window[:] = *begin[::-1], step, rows, columns
+    columns, rows = (end - begin).astype(int).tolist()
+    window[:] = *begin[::-1], rows, columns
     count = rows * columns
     down, across = np.divmod(np.arange(count), columns)
-    at = begin * spacing - corner + step * spacing * np.column_stack([across, down])
+    at = begin * spacing - corner + spacing * np.column_stack([across, down])
     (first, top), (last, bottom) = (
         np.clip((at + way).astype(int) + more, 0, (width, height)).T for way, more in ((least, 0), (most, 1))
     )
     there = covered[bottom, last] - covered[bottom, first] - covered[top, last] + covered[top, first] != 0
-    moved = _of_window(to_markers, window, rows) @ planes[2:4].T * there[:, None]
+    moved = _of_window(to_markers, window) @ planes[2:4].T * there[:, None]
     cells[0, :count], cells[1:3, :count] = 0, moved.T
     # Around the region there is nothing. Sums over the squares at each pixel of this.
     total = np.pad(covered.astype(np.int64), side + 1, "edge")
@@ -138,10 +136,10 @@ def plain_sample_region(
     cells[0, here] = (upper * (1 - below) + lower * below) / (255 * side**2)
 
 
-def _of_window(to_markers: FloatArray, window: IntArray, rows: int) -> FloatArray:
+def _of_window(to_markers: FloatArray, window: IntArray) -> FloatArray:
     """(n, N), kernel between the cells of a window and the markers."""
-    top, left, step, _, columns = window.tolist()
-    chosen: Any = to_markers[top : top + step * rows : step, left : left + step * columns : step]
+    top, left, rows, columns = window.tolist()
+    chosen: Any = to_markers[top : top + rows, left : left + columns]
     return np.asarray(chosen.reshape(rows * columns, -1))
 
 
@@ -155,7 +153,7 @@ def plain_sum_region(
     to_region: FloatArray,
 ) -> None:
     """Means and second moments as matrix products; the whole matrix of the kernel between all cells."""
-    rows, columns = window[3:].tolist()
+    rows, columns = window[2:].tolist()
     chosen = cells[:, : rows * columns]
     inside, moved, weights = chosen[0], chosen[1:3].T, chosen[3:]
     share = inside / inside.sum()
@@ -173,7 +171,7 @@ def plain_sum_region(
     kernel = table[abs(down[:, None] - down), table.shape[1] // 2 + across[:, None] - across]
     common = weights @ kernel @ weights.T
     sums[13:17] = common[0, 0], common[1, 1], common[1, 2], common[2, 2]
-    to_region[:] = weights @ _of_window(to_markers, window, rows)
+    to_region[:] = weights @ _of_window(to_markers, window)
 
 
 def plain_sum_markers(

@@ -30,7 +30,7 @@ def test_it_takes_markers_and_a_contact_mask_and_gives_a_flow() -> None:
         "contact_mask",
         "field",
         "evidence",
-        "outlines",
+        "region",
     ]
     assert [(port.name, port.optional) for port in ports.outputs] == [("flow", False)]
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from tactflow.engine.frame import Absent
 from tactflow.engine.ports import read_ports
 from tactflow.stages.hull import Hull
-from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Contact
 
 
@@ -32,16 +32,16 @@ def test_it_takes_a_contact_mask_and_may_give_a_contact() -> None:
     assert [(port.name, port.optional) for port in ports.inputs] == [
         ("contact_mask", False),
         ("evidence", True),
-        ("outlines", True),
+        ("region", True),
     ]
     assert [(port.name, port.optional) for port in ports.outputs] == [("contact", True)]
 
 
-def test_outlines_serve_for_the_mask_that_they_are_of_and_for_no_other() -> None:
+def test_properties_serve_for_the_mask_that_they_are_of_and_for_no_other() -> None:
     mask, other = bar(), bar(30)
     hull = Hull(Hull.Params())
     alone, known, stale = (
-        hull.process(mask, None, of) for of in (None, Outlines.of(mask), Outlines.of(other))
+        hull.process(mask, None, of) for of in (None, RegionProperties.of(mask), RegionProperties.of(other))
     )
     for contact in (alone, known, stale):
         assert isinstance(contact, Contact)

@@ -94,7 +94,7 @@ def test_separate_pictures_are_no_video_and_the_first_one_is_the_reference() -> 
     assert settling.best() == 0
 
 
-@pytest.mark.parametrize("shape", [(3, 4), (1, 1, 3), (48, 64, 1), (700, 30, 3)])
+@pytest.mark.parametrize("shape", [(3, 4), (1, 1, 3), (48, 64, 1), (700, 30, 3), (1, 640), (2000, 2, 3)])
 def test_pictures_of_any_size_can_be_looked_at(shape: tuple[int, ...]) -> None:
     settling = settled([np.full(shape, 100, np.uint8)] * CALM)
     assert settling.steady

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.geometry.moments import Outlines, measure_region, wrap_rows
+from tactflow.vision.geometry.moments import RegionProperties, measure_region, wrap_rows
 from tests.oracles.moments import plain_measure_region, plain_wrap_rows
 
 SIZES = [(1, 1), (1, 37), (41, 1), (2, 3), (63, 65), (150, 180), (260, 333)]
@@ -41,19 +41,19 @@ def test_box_sums_and_ends_of_rows_are_those_of_opencv(size: tuple[int, int]) ->
         np.testing.assert_array_equal(ends, expected_ends)
         for other in (np.asfortranarray(mask), mask[::1]):
             other.setflags(write=False)
-            outlines = Outlines(other)
-            assert [*outlines.box, *outlines.moments, outlines.connected] == expected.tolist()
+            region = RegionProperties(other)
+            assert [*region.box, *region.moments, region.connected] == expected.tolist()
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_the_hull_of_rows_is_that_of_opencv_and_so_are_contours(size: tuple[int, int]) -> None:
     for mask in masks(size):
-        outlines = Outlines(mask, (5, -3))
+        region = RegionProperties(mask, (5, -3))
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(5, -3))
-        assert [part.tolist() for part in outlines.contours] == [part.tolist() for part in contours]
+        assert [part.tolist() for part in region.contours] == [part.tolist() for part in contours]
         if not contours:
             continue
-        polygon, pixels = outlines.hull()
+        polygon, pixels = region.hull()
         hull = cv2.convexHull(np.concatenate(contours))[:, 0].tolist()
         start = hull.index(polygon[0].tolist())
         assert polygon.tolist() == hull[start:] + hull[:start]

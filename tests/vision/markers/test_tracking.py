@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import astuple
 from functools import cache
 from pathlib import Path
 
@@ -102,6 +104,16 @@ def test_identities_survive_a_jump_of_up_to_nine_tenths_of_the_pitch(fraction: f
     assert np.abs(errors(markers, now)).max() < 0.1
     back = under_test.track(picture(TRUTH, seed=3))
     assert np.abs(back.displacement).max() < 0.1
+
+
+def test_a_mark_that_may_go_anywhere_goes_no_farther_than_across_the_frame() -> None:
+    reference, now = picture(TRUTH, seed=99), picture(TRUTH + np.array([0.0, 0.7 * PITCH]), seed=2)
+    found = [
+        MarkerTracker(reference, detect_markers(reference), max_displacement=farthest).track(now)
+        for farthest in (math.hypot(*SIZE), 1e6)
+    ]
+    for one, other in zip(*map(astuple, found), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 ISLANDS = np.concatenate([

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
-from tactflow.vision.geometry.moments import Box, Outlines
+from tactflow.vision.geometry.moments import Box, RegionProperties
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
 
 Mask = NDArray[np.uint8]
@@ -45,13 +45,13 @@ class FusedContact(NamedTuple):
 
     mask : (H, W) uint8, 255 in contact. evidence : what showed it; None where nothing touches.
     light_changed : whether there is a change of the light that is no contact.
-    outlines : of the mask; None where they were not needed.
+    region : properties of the mask; None where they were not needed.
     """
 
     mask: Mask
     evidence: Evidence | None
     light_changed: bool = False
-    outlines: Outlines | None = None
+    region: RegionProperties | None = None
 
     @property
     def touching(self) -> bool:
@@ -82,19 +82,19 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
     >>> fused.evidence, fused.mask[20, 40]
     ('dots', np.uint8(255))
     """
-    motion, outlines = test(markers), Outlines(light)
-    if not outlines.moments.pixels:
+    motion, region = test(markers), RegionProperties(light)
+    if not region.moments.pixels:
         if not motion.clearly:
             return FusedContact(light, None)
         return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        mask = _without_strays(outlines, markers, motion, test.pitch)
-        return FusedContact(mask, "both", outlines=outlines if mask is light else None)
+        mask = _without_strays(region, markers, motion, test.pitch)
+        return FusedContact(mask, "both", region=region if mask is light else None)
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
-    mask = _without_rims(light, outlines.box, markers)
+    mask = _without_rims(light, region.box, markers)
     if mask is light:
-        return FusedContact(light, "light", outlines=outlines)
+        return FusedContact(light, "light", region=region)
     return FusedContact(mask, "light" if cv2.countNonZero(mask) else None)
 
 
@@ -106,18 +106,18 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     return len(resting) >= UNMOVED and bool(resting.all())
 
 
-def _without_strays(outlines: Outlines, markers: Markers, motion: Motion, reach: float) -> Mask:
+def _without_strays(region: RegionProperties, markers: Markers, motion: Motion, reach: float) -> Mask:
     """Of several regions those that are neither reflections nor rims of markers; none is left out alone.
 
     reach : how far around a region markers tell what it is, px.
     """
-    light = outlines.mask
-    if outlines.connected or len(outlines.contours) < 2:
+    light = region.mask
+    if region.connected or len(region.contours) < 2:
         return light
-    moved = _without_reflections(light, outlines.contours, markers, motion, reach)
-    if all(pixels > _largest_rim(markers) for pixels in _fewest_pixels(outlines)):
+    moved = _without_reflections(light, region.contours, markers, motion, reach)
+    if all(pixels > _largest_rim(markers) for pixels in _fewest_pixels(region)):
         return moved
-    left = _without_rims(moved, outlines.box, markers)
+    left = _without_rims(moved, region.box, markers)
     return left if cv2.countNonZero(left) else moved
 
 
@@ -126,14 +126,14 @@ def _largest_rim(markers: Markers) -> float:
     return 0.0 if markers.radius is None else np.pi * (markers.radius + SPREAD) ** 2
 
 
-def _fewest_pixels(outlines: Outlines) -> Iterator[int]:
+def _fewest_pixels(region: RegionProperties) -> Iterator[int]:
     """How many pixels each region has at least: those in its box, less where boxes of others overlap it.
 
     To tell the regions apart pixel by pixel takes fifty times as long.
     """
-    boxes = [cv2.boundingRect(outline) for outline in outlines.contours]
+    boxes = [cv2.boundingRect(outline) for outline in region.contours]
     for number, (left, top, width, height) in enumerate(boxes):
-        pixels = cv2.countNonZero(outlines.mask[top : top + height, left : left + width])
+        pixels = cv2.countNonZero(region.mask[top : top + height, left : left + width])
         for x, y, wide, high in boxes[:number] + boxes[number + 1 :]:
             across = min(left + width, x + wide) - max(left, x)
             down = min(top + height, y + high) - max(top, y)

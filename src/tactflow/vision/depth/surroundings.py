@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.depth.slopes import BAND, Bytes
-from tactflow.vision.geometry.moments import Moments, Outlines
+from tactflow.vision.geometry.moments import Moments, RegionProperties
 
 MARGIN: Final = 1.25
 """How far the gel may have sunk beyond the contact, relative to half of the contact's shorter axis. Chosen on
@@ -61,7 +61,7 @@ def surroundings(mask: Bytes, whole: Window, relative: float = MARGIN) -> Surrou
 
     relative : how far, in halves of the contact's shorter axis; `LEAST_MARGIN` at least.
     """
-    contact = Outlines(mask)
+    contact = RegionProperties(mask)
     x, y, width, height = contact.box
     margin = max(LEAST_MARGIN, round(relative * _shorter_axis(contact.moments) / 4))
     left, right = max(0, x // 2 - margin), min((x + width + 1) // 2 + margin, whole.right)

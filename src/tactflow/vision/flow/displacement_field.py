@@ -18,7 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.flow.inside import check_mask
-from tactflow.vision.flow.loops import sample_region, sum_markers, sum_region, weigh_markers
+from tactflow.vision.flow.loops import (
+    COEFFICIENTS,
+    PRECISION,
+    SHARE,
+    VARIANCE,
+    sample_region,
+    sum_markers,
+    sum_region,
+    weigh_markers,
+)
 from tactflow.vision.markers.family import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -38,8 +47,8 @@ MOST_CELLS: Final = 2500
 """Cells of a grid at most; where a quarter of the pitch would make more, the spacing is larger. Chosen by
 hand."""
 MANY: Final = 400
-"""Cells of a region from which on every other one, along each axis, stands for its neighbours: such a region
-is five pitches wide or more, and the field varies over one and a half. Chosen by hand."""
+"""Cells of a region's bounding box from which on a grid with twice the spacing will do: such a region is five
+pitches wide or more, and the field varies over one and a half. Chosen by hand."""
 OUTLINE: Final = 4.0
 """How uncertain a contact's outline is: the square of its error times the length over which it errs alike,
 px^3; 0.5 px over 16 px. Measured on 22 simulated recordings, by what it does to the mean."""
@@ -69,6 +78,26 @@ class Grid(NamedTuple):
         x = self.first[0] + self.spacing * np.arange(columns)
         y = self.first[1] + self.spacing * np.arange(rows)
         return np.stack(np.meshgrid(x, y), axis=-1)
+
+    def coarser(self) -> Grid:
+        """Every other row and column, from the first on. It may reach half a cell less far."""
+        rows, columns = self.shape
+        return Grid(((rows + 1) // 2, (columns + 1) // 2), self.first, 2 * self.spacing)
+
+
+class Samples(NamedTuple):
+    """A grid of cells over which the field is summed.
+
+    place : (5,) float64, see `sample_region`. to_markers : (rows, columns, N) float64, the kernel between
+        cells and markers.
+    between : (rows, 2 columns - 1) float64, the kernel between two cells, by how many rows and columns they
+        are apart, 0 columns in the middle.
+    """
+
+    grid: Grid
+    place: FloatArray
+    to_markers: FloatArray
+    between: FloatArray
 
 
 class Gradient(NamedTuple):
@@ -163,11 +192,6 @@ class FieldModel:
             raise ValueError(f"required a size of at least 1 x 1 px, got {size}")
         self.origin = np.array(origin, np.float64)
         self.pitch = max(pitch_of(self.origin), 1.0)
-        self.grid = _grid(size, self.pitch)
-        spacing = self.grid.spacing
-        sides = [2 * round((step * spacing - 1) / 2) + 1 for step in (1, 2)]
-        self.place = np.array([*self.grid.first, spacing, OVERSHOOT * self.pitch + spacing, *sides])
-        """(6,), see `sample_region`."""
         self._length = LENGTH * self.pitch
         kernel = self._kernel(self.origin)
         self.inverse: FloatArray = np.asarray(
@@ -175,14 +199,20 @@ class FieldModel:
         )
         self.rest = np.ascontiguousarray(self.origin.T)
         """(2, N), x and y of each marker in the reference, px."""
-        rows, columns = self.grid.shape
-        self.to_markers = self._kernel(self.grid.points.reshape(-1, 2)).reshape(rows, columns, -1)
-        """(rows, columns, N), the kernel between cells and markers."""
-        down, across = np.mgrid[:rows, 1 - columns : columns] * self.grid.spacing
-        between = matern(np.hypot(down, across) / self._length)
-        self.between = {1: between, 2: np.ascontiguousarray(between[::2, (columns - 1) % 2 :: 2])}
-        """Kernel between two cells, by how many rows and columns they are apart, 0 columns in the middle: of
-        all cells, and of every other row and column."""
+        grid = _grid(size, self.pitch)
+        self._margin = OVERSHOOT * self.pitch + grid.spacing
+        self.fine, self.coarse = self._samples(grid), self._samples(grid.coarser())
+        """For small and for large regions. Both are fixed to the frame, so that what is told of a region does
+        not depend on where its bounding box begins."""
+
+    def _samples(self, grid: Grid) -> Samples:
+        """What the loops need to know of a grid."""
+        (rows, columns), spacing = grid.shape, grid.spacing
+        side = 2 * round((spacing - 1) / 2) + 1
+        place = np.array([*grid.first, spacing, self._margin, side])
+        to_markers = self._kernel(grid.points.reshape(-1, 2)).reshape(rows, columns, -1)
+        down, across = np.mgrid[:rows, 1 - columns : columns] * spacing
+        return Samples(grid, place, to_markers, matern(np.hypot(down, across) / self._length))
 
     def _kernel(self, points: FloatArray) -> FloatArray:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
@@ -195,7 +225,7 @@ class FieldModel:
     @cached_property
     def weights(self) -> FloatArray:
         """(cells, N): how much each marker counts in each cell where all are seen."""
-        return self.to_markers.reshape(-1, len(self.origin)) @ self.inverse
+        return self.fine.to_markers.reshape(-1, len(self.origin)) @ self.inverse
 
     def __call__(self, markers: Markers) -> DisplacementField | None:
         """The field of one frame; None where fewer than three markers are seen.
@@ -227,7 +257,7 @@ class DisplacementField:
     """
 
     def __init__(self, model: FieldModel, markers: Markers, seen: NDArray[np.bool_], noise: float) -> None:
-        self.grid, self.noise = model.grid, noise
+        self.grid, self.noise = model.fine.grid, noise
         self._model, self._seen = model, seen
         position = np.ascontiguousarray(markers.position, np.float64)
         stderr = np.ascontiguousarray(markers.stderr, np.float64)
@@ -241,71 +271,61 @@ class DisplacementField:
     @cached_property
     def displacement(self) -> FloatArray:
         """(rows, columns, 2) float64, px."""
-        return np.asarray(self._model.to_markers @ self._planes[2:4].T)
+        return np.asarray(self._model.fine.to_markers @ self._planes[COEFFICIENTS].T)
 
     @cached_property
     def stderr(self) -> FloatArray:
         """(rows, columns) float64, standard error of each component of `displacement`, px."""
-        kernel = self._model.to_markers.reshape(-1, len(self._seen))
+        kernel = self._model.fine.to_markers.reshape(-1, len(self._seen))
         weights = self._model.weights - kernel @ self._removed.T @ self._removed
         unknown = np.maximum(1 - np.einsum("gn,gn->g", weights, kernel), 0)
-        squares = self._scale(kernel) * unknown + (weights * weights) @ self._planes[4]
+        squares = self._scale(kernel) * unknown + (weights * weights) @ self._planes[VARIANCE]
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
 
     def motion(self, mask: NDArray[np.uint8], box: Sequence[int] | None = None) -> GelMotion | None:
         """How the gel inside a region has moved, each bit of it counted by its area at rest.
 
-        mask : (H, W) uint8, 0 or 255 inside, in the current frame: what counts is where the gel is now.
+        mask : (H, W) uint8, 255 inside, else 0, in the current frame: what counts is where the gel is now.
         box : (left, top, width, height) of the region, px, where it is known.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
         check_mask(mask, 0)
-        window, cells = self._cells(mask, box or cv2.boundingRect(mask), MANY * self.grid.spacing**2)
-        model, step = self._model, int(window[2])
-        spacing = step * self.grid.spacing
+        box = box or cv2.boundingRect(mask)
+        model, many = self._model, MANY * self.grid.spacing**2
+        samples = model.fine if box[2] * box[3] < many else model.coarse
+        window, cells = self._cells(mask, box, samples)
+        spacing = samples.grid.spacing
         # Between region and markers, and how much each marker counts.
         kernel, counts = np.zeros((3, len(model.origin))), np.empty((3, len(model.origin)))
         sums = np.zeros(26)
-        sum_region(cells, model.to_markers, window, spacing, model.between[step], sums, kernel)
+        sum_region(cells, samples.to_markers, window, spacing, samples.between, sums, kernel)
         sum_markers(kernel, model.inverse, self._removed, self._planes, counts, sums)
         numbers = sums.tolist()
         return _motion(numbers, spacing) if numbers[0] > 0 else None
 
     def part(self, mask: NDArray[np.uint8]) -> Part | None:
-        """The cells of the gel that are in a region now, (H, W) uint8; None where there are none."""
+        """The cells of the gel that are in a region now, (H, W) uint8, 255 inside; None if there are none."""
         check_mask(mask, 0)
-        window, cells = self._cells(mask, cv2.boundingRect(mask), math.inf)
-        top, left, _, rows, columns = window.tolist()
-        inside = cells[0, : rows * columns]
+        window, cells = self._cells(mask, cv2.boundingRect(mask), self._model.fine)
+        top, left, rows, columns = window.tolist()
+        inside = cells[SHARE, : rows * columns]
         total = float(inside.sum())
         return Part(inside.reshape(rows, columns), total, (top, left)) if total > 0 else None
 
     def _cells(
-        self, mask: NDArray[np.uint8], box: Sequence[int], many: float
+        self, mask: NDArray[np.uint8], box: Sequence[int], samples: Samples
     ) -> tuple[NDArray[np.int64], FloatArray]:
-        """The cells around a region, of a region in a box of `many` px^2 every other one.
-
-        Returns window and cells of `sample_region`.
-        """
+        """The cells around a region that lies in a box, px: window and cells of `sample_region`."""
         left, top, width, height = box
-        model, (rows, columns) = self._model, self.grid.shape
-        window, cells = np.empty(5, np.int64), np.empty((6, rows * columns))
-        sample_region(
-            np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32),
-            left,
-            top,
-            model.place,
-            many,
-            self._planes,
-            model.to_markers,
-            window,
-            cells,
-        )
+        place, to_markers = samples.place, samples.to_markers
+        window, cells = np.empty(4, np.int64), np.empty((6, math.prod(samples.grid.shape)))
+        covered = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
+        sample_region(covered, left, top, place, self._planes, to_markers, window, cells)
         return window, cells
 
     def _scale(self, kernel: FloatArray) -> FloatArray:
         """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""
-        squares = (self._planes[2:4] ** 2).sum(axis=0) * self._planes[5]
+        squares = (self._planes[COEFFICIENTS] ** 2).sum(axis=0) * self._planes[PRECISION]
         return np.asarray(kernel @ squares / np.maximum(kernel @ self._seen, 1e-12))
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tactflow.vision.flow.displacement_field import DisplacementField, GelMotion
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.similarity import Similarity, fit_similarity
-from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 UNKNOWN: Final = 0.1
@@ -71,14 +71,15 @@ def flow_of_field(
     *,
     dilate: float = 0.0,
     coarse: bool = False,
-    outlines: Outlines | None = None,
+    region: RegionProperties | None = None,
 ) -> Flow:
     """Summarise the displacement of the gel inside the contact, between its markers.
 
-    field : of this frame. markers, mask, dilate : as `flow_in_mask` takes them; they tell `count`.
+    field : of this frame. mask : (H, W) uint8, 255 inside the contact, else 0.
+    markers, dilate : as `flow_in_mask` takes them; with the mask they tell `count`.
     coarse : whether the mask is only where a contact is to be found, as one that markers alone show: then the
         standard error of the mean is how much the displacement differs within it.
-    outlines : of the mask, where they are known; those of another one do not count.
+    region : properties of the mask, where they are known; those of another one do not count.
 
     The mean is an integral over the contact, each bit of gel counted by its area at rest. A marker at the
     outline in or out makes no jump: it counts as much as before. Rotation, divergence and shear are those of
@@ -100,7 +101,7 @@ def flow_of_field(
     """
     found = inside_mask(markers.position, mask, dilate)
     count = int(np.count_nonzero(found & (markers.status != _LOST)))
-    box = outlines.box if outlines is not None and outlines.mask is mask else None
+    box = region.box if region is not None and region.mask is mask else None
     motion = field.motion(mask, box) if count else None
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)

@@ -18,6 +18,12 @@ BoolArray = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 
 _TRACKED: Final = int(MarkerStatus.TRACKED)
+MOVED_X, MOVED_Y, COEFFICIENT_X, COEFFICIENT_Y, VARIANCE, PRECISION = range(6)
+"""Rows of what `weigh_markers` tells of each marker."""
+COEFFICIENTS: Final = slice(COEFFICIENT_X, COEFFICIENT_Y + 1)
+"""Both rows of coefficients."""
+SHARE, MOTION_X, MOTION_Y, WEIGHT, WEIGHT_X, WEIGHT_Y = range(6)
+"""Rows of what `sample_region` and `sum_region` tell of each cell."""
 _LEAST: Final = 1e-5
 """What the inverse of the kernel must be, 1, at least: a marker whose place all others leave open. Chosen by
 hand."""
@@ -138,25 +144,25 @@ def weigh_markers(
     position : (N, 2), px. rest : (2, N), in the reference, px. seen : (N,). stderr : (N,), px, NaN or
     infinite where unknown. usual : what stands for an unknown one, px. largest : of a marker that counts in
     full, px. inverse : (N, N), of the kernel between markers, symmetric.
-    planes : (6, N), filled. The displacements, x and y, px, 0 where unseen; their products with the inverse,
-    which is without the markers that are not seen, and with the variance of those that are seen poorly; the
-    squares of the standard errors; 1 over twice the variance of each marker given all others, relative to the
-    field's, 0 where unseen.
+    planes : (6, N), filled. MOVED: the displacements, px, 0 where unseen. COEFFICIENT: their products with
+    the inverse, which is without the markers that are not seen, and with the variance of those that are seen
+    poorly. VARIANCE: squares of the standard errors, px^2. PRECISION: 1 over twice the variance of each
+    marker given all others, relative to the field's, 0 where unseen.
     removed : (N, N), of which S rows are filled: the inverse is less by their squares, removed.T @ removed.
     """
     energy, along = 0.0, np.empty((2, seen.size))
     for i in range(seen.size):
         error = stderr[i] if seen[i] and math.isfinite(stderr[i]) else usual
-        planes[0, i] = position[i, 0] - rest[0, i] if seen[i] else 0.0
-        planes[1, i] = position[i, 1] - rest[1, i] if seen[i] else 0.0
-        planes[4, i] = error * error
+        planes[MOVED_X, i] = position[i, 0] - rest[0, i] if seen[i] else 0.0
+        planes[MOVED_Y, i] = position[i, 1] - rest[1, i] if seen[i] else 0.0
+        planes[VARIANCE, i] = error * error
     for i in range(seen.size):
         x = y = 0.0
         for n in range(seen.size):
-            x += inverse[i, n] * planes[0, n]
-            y += inverse[i, n] * planes[1, n]
-        planes[2, i], planes[3, i], planes[5, i] = x, y, inverse[i, i]
-        energy += x * planes[0, i] + y * planes[1, i]
+            x += inverse[i, n] * planes[MOVED_X, n]
+            y += inverse[i, n] * planes[MOVED_Y, n]
+        planes[COEFFICIENT_X, i], planes[COEFFICIENT_Y, i], planes[PRECISION, i] = x, y, inverse[i, i]
+        energy += x * planes[MOVED_X, i] + y * planes[MOVED_Y, i]
     # First without all that are left out: that tells the variance of the field to compare errors with.
     count, scale = 0, 0.0
     for _ in range(2):
@@ -165,18 +171,18 @@ def weigh_markers(
         for s in range(count):
             x = y = 0.0
             for n in range(seen.size):
-                x += removed[s, n] * planes[0, n]
-                y += removed[s, n] * planes[1, n]
+                x += removed[s, n] * planes[MOVED_X, n]
+                y += removed[s, n] * planes[MOVED_Y, n]
             along[0, s], along[1, s] = x, y
             scale -= x * x + y * y
         scale = scale / (2 * (seen.size - count)) if count < seen.size else 0.0
     for s in range(count):
         for n in range(seen.size):
-            planes[2, n] -= along[0, s] * removed[s, n]
-            planes[3, n] -= along[1, s] * removed[s, n]
-            planes[5, n] -= removed[s, n] * removed[s, n]
+            planes[COEFFICIENT_X, n] -= along[0, s] * removed[s, n]
+            planes[COEFFICIENT_Y, n] -= along[1, s] * removed[s, n]
+            planes[PRECISION, n] -= removed[s, n] * removed[s, n]
     for i in range(seen.size):
-        planes[5, i] = 0.5 / max(planes[5, i], _LEAST) if seen[i] else 0.0
+        planes[PRECISION, i] = 0.5 / max(planes[PRECISION, i], _LEAST) if seen[i] else 0.0
     return count
 
 
@@ -195,7 +201,7 @@ def _remove(
     """
     count = 0
     for i in range(seen.size):
-        if seen[i] and planes[4, i] <= largest * largest:
+        if seen[i] and planes[VARIANCE, i] <= largest * largest:
             continue
         for n in range(seen.size):
             removed[count, n] = inverse[i, n]
@@ -203,7 +209,7 @@ def _remove(
             factor = removed[s, i]
             for n in range(seen.size):
                 removed[count, n] -= factor * removed[s, n]
-        factor = 1 / math.sqrt(removed[count, i] + (scale / planes[4, i] if seen[i] else 0.0))
+        factor = 1 / math.sqrt(removed[count, i] + (scale / planes[VARIANCE, i] if seen[i] else 0.0))
         for n in range(seen.size):
             removed[count, n] *= factor
         count += 1
@@ -211,8 +217,8 @@ def _remove(
 
 
 @kernel(
-    "void(int32[:, ::1], int64, int64, float64[::1], float64, float64[:, ::1], float64[:, :, ::1],"
-    " int64[::1], float64[:, ::1])",
+    "void(int32[:, ::1], int64, int64, float64[::1], float64[:, ::1], float64[:, :, ::1], int64[::1],"
+    " float64[:, ::1])",
     reorder=True,
 )
 def sample_region(
@@ -220,7 +226,6 @@ def sample_region(
     left: int,
     top: int,
     place: FloatArray,
-    many: float,
     planes: FloatArray,
     to_markers: FloatArray,
     window: IntArray,
@@ -230,46 +235,44 @@ def sample_region(
 
     covered : (h + 1, w + 1), sums over the pixels above and to the left in the part of a mask with 255 inside
     that bounds the region. They may overflow: differences are right. left, top : where that part begins, px.
-    place : (6,), of the grid: x and y of its first cell, the spacing of its cells, how much farther they may
-    have moved than any marker, and the side of the square that counts around each cell, and around every
-    other one, a whole number, px. many : px^2; in a part that is larger, every other cell stands for its
-    neighbours. planes : (6, N), of `weigh_markers`.
-    to_markers : (R, C, N), kernel between the grid's cells and the markers.
-    window : (5,), filled: the first row and column of the cells that may be in the region, every how many
-    they are, and how many rows and columns of them.
-    cells : (6, R C), of which the beginning of the first three rows is filled for these cells, row by row:
-    their share in the region, and their motion, x and y, px; 0 for those whose gel cannot be in the region.
+    place : (5,), of the grid: x and y of its first cell, the spacing of its cells, how much farther they may
+    have moved than any marker, and the side of the square that counts around each cell, a whole number, px.
+    planes : (6, N), of `weigh_markers`. to_markers : (R, C, N), kernel between the grid's cells and the
+    markers.
+    window : (4,), filled: the first row and column of the cells that may be in the region, and how many rows
+    and columns of them there are.
+    cells : (6, R C), of which three rows are filled from the beginning on, for these cells row by row. SHARE:
+    of each in the region. MOTION: px; both are 0 for those whose gel cannot be in the region.
     """
-    height, width = covered.shape[0] - 1, covered.shape[1] - 1
-    window[2] = step = 1 if width * height < many else 2
-    side = int(place[3 + step])
+    height, width, side = covered.shape[0] - 1, covered.shape[1] - 1, int(place[4])
+    first_x, first_y, spacing, margin = place[0], place[1], place[2], place[3]
     # The cells whose gel may be in the part, and for each of them where its gel may be.
-    least_x, most_x = _extent(planes, 0, place[3])
-    least_y, most_y = _extent(planes, 1, place[3])
-    first_row = _within((top - place[1] - most_y) / place[2], to_markers.shape[0])
-    first_column = _within((left - place[0] - most_x) / place[2], to_markers.shape[1])
-    end_row = _within((top + height - place[1] - least_y) / place[2] + 2, to_markers.shape[0])
-    end_column = _within((left + width - place[0] - least_x) / place[2] + 2, to_markers.shape[1])
-    rows, columns = (end_row - first_row + step - 1) // step, (end_column - first_column + step - 1) // step
-    window[0], window[1], window[3], window[4] = first_row, first_column, rows, columns
+    least_x, most_x = _extent(planes, MOVED_X, margin)
+    least_y, most_y = _extent(planes, MOVED_Y, margin)
+    first_row = _within((top - first_y - most_y) / spacing, to_markers.shape[0])
+    first_column = _within((left - first_x - most_x) / spacing, to_markers.shape[1])
+    end_row = _within((top + height - first_y - least_y) / spacing + 2, to_markers.shape[0])
+    end_column = _within((left + width - first_x - least_x) / spacing + 2, to_markers.shape[1])
+    rows, columns = end_row - first_row, end_column - first_column
+    window[0], window[1], window[2], window[3] = first_row, first_column, rows, columns
     for k in range(rows * columns):
-        cells[0, k] = cells[1, k] = cells[2, k] = 0.0
+        cells[SHARE, k] = cells[MOTION_X, k] = cells[MOTION_Y, k] = 0.0
     for row in range(rows):
         for column in range(columns):
-            i, j, k = first_row + step * row, first_column + step * column, row * columns + column
-            x, y = place[0] + place[2] * j - left, place[1] + place[2] * i - top
+            i, j, k = first_row + row, first_column + column, row * columns + column
+            x, y = first_x + spacing * j - left, first_y + spacing * i - top
             up, down = _within(y + least_y, height), _within(y + most_y + 1, height)
             if not _box(covered, up, _within(x + least_x, width), down, _within(x + most_x + 1, width)):
                 continue
             u = v = 0.0
             for n in range(planes.shape[1]):
-                u += to_markers[i, j, n] * planes[2, n]
-                v += to_markers[i, j, n] * planes[3, n]
-            cells[1, k], cells[2, k] = u, v
+                u += to_markers[i, j, n] * planes[COEFFICIENT_X, n]
+                v += to_markers[i, j, n] * planes[COEFFICIENT_Y, n]
+            cells[MOTION_X, k], cells[MOTION_Y, k] = u, v
             # The left and upper end of the square, from the outer corner of the part.
             x, y = x + u + 0.5 - 0.5 * side, y + v + 0.5 - 0.5 * side
             if -side < x < width and -side < y < height:
-                cells[0, k] = _square(covered, x, y, side) / (255.0 * side * side)
+                cells[SHARE, k] = _square(covered, x, y, side) / (255.0 * side * side)
 
 
 @helper
@@ -325,8 +328,8 @@ def sum_region(
 ) -> None:
     """Sums over the cells of a region, for its mean motion and its slopes.
 
-    cells, to_markers, window : of `sample_region`; the last three rows of cells are filled with the share of
-    each cell, in sum 1, and that times a_x and a_y. spacing : of the window's cells, px.
+    cells, to_markers, window : of `sample_region`. Of cells, three more rows are filled. WEIGHT: the share of
+    each, in sum 1; WEIGHT_X and WEIGHT_Y: that times a_x and a_y. spacing : of the cells, px.
     table : (R, 2 C - 1), kernel between cells so many rows and columns apart, the latter from 1 - C on.
     sums : (26,) of 0, filled up to the 17th. Cells count by their share in the region, in sum 1; a is the way
     from the middle to a cell, m its motion, r what that is beyond the mean. The shares; mean m (x, y); a a'
@@ -335,14 +338,14 @@ def sum_region(
     to_region : (3, N) of 0, filled with the kernel between the region and the markers, times 1, a_x and a_y.
     """
     total = x = y = u = v = 0.0
-    rows, columns = window[3], window[4]
+    first_row, first_column, rows, columns = window[0], window[1], window[2], window[3]
     for row in range(rows):
         for column in range(columns):
             k = row * columns + column
-            share = cells[0, k]
+            share = cells[SHARE, k]
             total += share
             x, y = x + share * column, y + share * row
-            u, v = u + share * cells[1, k], v + share * cells[2, k]
+            u, v = u + share * cells[MOTION_X, k], v + share * cells[MOTION_Y, k]
     if total == 0:
         return
     x, y, u, v = x / total, y / total, u / total, v / total
@@ -350,14 +353,14 @@ def sum_region(
     for row in range(rows):
         for column in range(columns):
             k = row * columns + column
-            share = cells[0, k] / total
+            share = cells[SHARE, k] / total
             across, down = spacing * (column - x), spacing * (row - y)
-            right, below = cells[1, k] - u, cells[2, k] - v
+            right, below = cells[MOTION_X, k] - u, cells[MOTION_Y, k] - v
             at_x, at_y = share * across, share * down
-            cells[3, k], cells[4, k], cells[5, k] = share, at_x, at_y
+            cells[WEIGHT, k], cells[WEIGHT_X, k], cells[WEIGHT_Y, k] = share, at_x, at_y
             if share == 0:
                 continue
-            edge = cells[0, k] * (1 - cells[0, k])
+            edge = cells[SHARE, k] * (1 - cells[SHARE, k])
             sums[3] += at_x * across
             sums[4] += at_x * down
             sums[5] += at_y * down
@@ -368,7 +371,7 @@ def sum_region(
             sums[10] += share * (right * right + below * below)
             sums[11] += edge * right * right
             sums[12] += edge * below * below
-            near = to_markers[window[0] + window[2] * row, window[1] + window[2] * column]
+            near = to_markers[first_row + row, first_column + column]
             for n in range(near.size):
                 to_region[0, n] += share * near[n]
                 to_region[1, n] += at_x * near[n]
@@ -384,9 +387,9 @@ def _sum_pairs(cells: FloatArray, table: FloatArray, rows: int, columns: int, su
     ends = np.empty((rows, 2), np.int64)
     for row in range(rows):
         first, end = row * columns, row * columns + columns
-        while first < end and cells[3, first] == 0:
+        while first < end and cells[WEIGHT, first] == 0:
             first += 1
-        while first < end and cells[3, end - 1] == 0:
+        while first < end and cells[WEIGHT, end - 1] == 0:
             end -= 1
         ends[row, 0], ends[row, 1] = first - row * columns, end - row * columns
         for before in range(row + 1 if first < end else 0):
@@ -394,14 +397,14 @@ def _sum_pairs(cells: FloatArray, table: FloatArray, rows: int, columns: int, su
             times = 1.0 if before == row else 2.0
             for column in range(ends[before, 0], ends[before, 1]):
                 other = before * columns + column
-                one, across, down = cells[3, other], cells[4, other], cells[5, other]
+                one, across, down = cells[WEIGHT, other], cells[WEIGHT_X, other], cells[WEIGHT_Y, other]
                 with_one = with_x = 0.0
                 for k in range(first, end):
                     near = table[row - before, middle - column + k - row * columns]
-                    with_one += cells[3, k] * near
-                    with_x += cells[4, k] * near
+                    with_one += cells[WEIGHT, k] * near
+                    with_x += cells[WEIGHT_X, k] * near
                 # All cells of a row are equally far down.
-                with_y = with_one * cells[5, first] / cells[3, first]
+                with_y = with_one * cells[WEIGHT_Y, first] / cells[WEIGHT, first]
                 sums[13] += times * one * with_one
                 sums[14] += times * across * with_x
                 sums[15] += times * (across * with_y + down * with_x) / 2
@@ -446,9 +449,9 @@ def sum_markers(
                 weights[2, n] -= y * removed[i - count, n]
     near = squares = 0.0
     for i in range(count):
-        x, y, variance = planes[2, i], planes[3, i], planes[4, i]
-        squares += to_region[0, i] * planes[5, i] * (x * x + y * y)
-        near += to_region[0, i] if planes[5, i] > 0 else 0.0
+        x, y, variance = planes[COEFFICIENT_X, i], planes[COEFFICIENT_Y, i], planes[VARIANCE, i]
+        squares += to_region[0, i] * planes[PRECISION, i] * (x * x + y * y)
+        near += to_region[0, i] if planes[PRECISION, i] > 0 else 0.0
         one, x, y = weights[0, i], weights[1, i], weights[2, i]
         sums[18] += one * to_region[0, i]
         sums[19] += x * to_region[1, i]

@@ -98,7 +98,7 @@ class SlipTest:
     def __call__(self, field: DisplacementField, mask: NDArray[np.uint8]) -> Slip | None:
         """Judge the next frame; None where the contact is too small or too far from markers to tell.
 
-        field : of this frame. mask : (H, W) uint8, non-zero in contact.
+        field : of this frame. mask : (H, W) uint8, 255 in contact, else 0.
         Raises ValueError if mask is not (H, W) uint8.
         """
         now = _touched(field, mask)

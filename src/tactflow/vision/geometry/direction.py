@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.geometry.moments import Outlines
+from tactflow.vision.geometry.moments import RegionProperties
 
 FALSE_DIRECTION: Final = 1e-3
 """Share of directionless regions that may be given a direction by chance. Chosen by hand."""
@@ -52,7 +52,7 @@ def axis_direction(theta: float) -> tuple[float, float | None]:
     return angle + 0.0, slope
 
 
-def anisotropy_limit(region: Outlines, confidence: float) -> float:
+def anisotropy_limit(region: RegionProperties, confidence: float) -> float:
     """Anisotropy that a directionless region reaches by chance in a share `FALSE_DIRECTION` of cases.
 
     confidence : the region's anisotropy, in [0, 1].
@@ -82,7 +82,7 @@ def anisotropy_limit(region: Outlines, confidence: float) -> float:
     return min(max(limit, rough), _LINEAR_LIMIT)
 
 
-def _outline_power(region: Outlines) -> NDArray[np.float64]:
+def _outline_power(region: RegionProperties) -> NDArray[np.float64]:
     """Power of the outline's `_HARMONICS`, relative to the ellipse with the region's second moments."""
     moments, count = region.moments, region.moments.pixels
     center = moments.x / count + region.box.left, moments.y / count + region.box.top

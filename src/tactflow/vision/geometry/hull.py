@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.geometry.direction import anisotropy_limit, axis_direction
-from tactflow.vision.geometry.moments import Box, Outlines
+from tactflow.vision.geometry.moments import Box, RegionProperties
 from tactflow.vision.types import Contact, Ellipse, Evidence
 
 Contours = Sequence[NDArray[Any]]
@@ -24,7 +24,7 @@ _WIDTH_OF_A_LINE: Final = 1 / 12 + 1e-9
 
 
 def contact_geometry(
-    mask: NDArray[np.uint8] | Outlines,
+    mask: NDArray[np.uint8] | RegionProperties,
     *,
     min_area: float = 1.0,
     max_gap: float | None = None,
@@ -32,7 +32,7 @@ def contact_geometry(
 ) -> Contact | None:
     """Describe the contact region of a mask; None where there is none.
 
-    mask : (H, W) uint8, non-zero inside the contact; or its outlines, where they are known.
+    mask : (H, W) uint8, non-zero inside the contact; or its properties, where they are known.
     min_area : px^2; components (8-connected, holes filled) with fewer pixels are ignored. Larger is safer
         against specks and misses small contacts.
     max_gap : px; components whose nearest pixels are at most this far apart (to within 1 px and 2 %) belong
@@ -61,7 +61,7 @@ def contact_geometry(
     >>> contact.center, contact.area, contact.angle
     ((29.5, 24.5), 400.0, 0.0)
     """
-    seen = _large_enough(_outlines(mask, min_area, max_gap, min_confidence), min_area)
+    seen = _large_enough(_region(mask, min_area, max_gap, min_confidence), min_area)
     if seen is None:
         return None
     if max_gap is not None and not seen.connected:
@@ -71,7 +71,7 @@ def contact_geometry(
 
 
 def contact_parts(
-    mask: NDArray[np.uint8] | Outlines,
+    mask: NDArray[np.uint8] | RegionProperties,
     *,
     min_area: float = 1.0,
     max_gap: float = 0.0,
@@ -88,7 +88,7 @@ def contact_parts(
     >>> [contact.region_area for contact in contact_parts(mask)]
     [400.0, 50.0]
     """
-    seen = _large_enough(_outlines(mask, min_area, max_gap, min_confidence), min_area)
+    seen = _large_enough(_region(mask, min_area, max_gap, min_confidence), min_area)
     if seen is None:
         return []
     if seen.connected:
@@ -97,44 +97,44 @@ def contact_parts(
     return [_describe(_only(seen, group), min_confidence, evidence) for group in groups]
 
 
-def _large_enough(outlines: Outlines, min_area: float) -> Outlines | None:
+def _large_enough(region: RegionProperties, min_area: float) -> RegionProperties | None:
     """The regions of a mask that are large enough; None where there is none."""
-    if outlines.connected and outlines.moments.pixels >= min_area:
-        return outlines
-    kept = [contour for contour in outlines.contours if _filled_area(contour) >= min_area]
-    return _only(outlines, kept) if kept else None
+    if region.connected and region.moments.pixels >= min_area:
+        return region
+    kept = [contour for contour in region.contours if _filled_area(contour) >= min_area]
+    return _only(region, kept) if kept else None
 
 
-def _only(outlines: Outlines, contours: Contours) -> Outlines:
+def _only(region: RegionProperties, contours: Contours) -> RegionProperties:
     """Those regions that some of the contours are of, with what lies in their holes."""
-    if len(contours) == len(outlines.contours):
-        return outlines
+    if len(contours) == len(region.contours):
+        return region
     left, top, width, height = cv2.boundingRect(np.concatenate(contours))
     filled = np.zeros((height, width), np.uint8)
     cv2.drawContours(filled, contours, -1, 255, cv2.FILLED, offset=(-left, -top))
-    x, y = left - outlines.corner[0], top - outlines.corner[1]
-    seen = cv2.bitwise_and(outlines.mask[y : y + height, x : x + width], filled)
-    return Outlines(np.asarray(seen, np.uint8), (left, top), contours)
+    x, y = left - region.corner[0], top - region.corner[1]
+    seen = cv2.bitwise_and(region.mask[y : y + height, x : x + width], filled)
+    return RegionProperties(np.asarray(seen, np.uint8), (left, top), contours)
 
 
-def _outlines(
-    mask: NDArray[np.uint8] | Outlines, min_area: float, max_gap: float | None, min_confidence: float
-) -> Outlines:
-    """Those of a mask; ValueError if anything is out of its range."""
+def _region(
+    mask: NDArray[np.uint8] | RegionProperties, min_area: float, max_gap: float | None, min_confidence: float
+) -> RegionProperties:
+    """The properties of a mask; ValueError if anything is out of its range."""
     if not (min_area >= 0 and math.isfinite(min_area)):
         raise ValueError(f"required min_area >= 0 px^2, got {min_area}")
     if max_gap is not None and not max_gap >= 0:
         raise ValueError(f"required max_gap >= 0 px or None, got {max_gap}")
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
-    if isinstance(mask, Outlines):
+    if isinstance(mask, RegionProperties):
         return mask
     if mask.ndim != 2 or mask.dtype != np.uint8:
         raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
-    return Outlines(mask)
+    return RegionProperties(mask)
 
 
-def _describe(seen: Outlines, min_confidence: float, evidence: Evidence = "light") -> Contact:
+def _describe(seen: RegionProperties, min_confidence: float, evidence: Evidence = "light") -> Contact:
     """The contact that these regions are together."""
     polygon, area = seen.hull()
     # Whole numbers: no cancellation, a vertical bar is exactly vertical.

@@ -1,4 +1,4 @@
-"""Shape of a mask's regions: bounding box, moments, convex hull and outlines."""
+"""Region properties of a mask: bounding box, moments, convex hull and contours."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Moments(NamedTuple):
         return count * xx - x * x, count * xy - x * y, count * yy - y * y
 
 
-class Outlines:
-    """What a mask shows, all its regions together, measured once for the stages that need it.
+class RegionProperties:
+    """Properties of all regions of a mask together, measured once for the stages that need them.
 
     mask : (H, W) uint8, not 0 inside: a frame's, or a window of it.
     corner : (x, y) of the window's first pixel in the frame, px.
@@ -59,13 +59,13 @@ class Outlines:
     --------
     >>> mask = np.zeros((20, 20), np.uint8)
     >>> mask[5:7, 5:8] = 255
-    >>> outlines = Outlines(mask)
-    >>> outlines.box, outlines.moments.pixels, outlines.connected
+    >>> region = RegionProperties(mask)
+    >>> region.box, region.moments.pixels, region.connected
     (Box(left=5, top=5, width=3, height=2), 6, True)
-    >>> polygon, area = outlines.hull()
+    >>> polygon, area = region.hull()
     >>> polygon.tolist(), area
     ([[7.0, 5.0], [7.0, 6.0], [5.0, 6.0], [5.0, 5.0]], 6.0)
-    >>> [len(contour) for contour in outlines.contours]
+    >>> [len(contour) for contour in region.contours]
     [6]
     """
 
@@ -86,7 +86,7 @@ class Outlines:
         self._contours = contours if self.moments.pixels else ()
 
     @classmethod
-    def of(cls, mask: NDArray[np.uint8], known: Outlines | None = None) -> Outlines:
+    def of(cls, mask: NDArray[np.uint8], known: RegionProperties | None = None) -> RegionProperties:
         """Measure a mask, unless what is known is of this very mask."""
         return known if known is not None and known.mask is mask else cls(mask)
 

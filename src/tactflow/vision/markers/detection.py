@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
@@ -204,11 +205,12 @@ def detect_markers(
     gray = to_gray(image).astype(np.float32)
     _require_options(dot_radius, polarity, valid, gray.shape)
     last = next(iter(_LAST), None)
-    if last is not None and last.is_of(image, dot_radius, polarity, valid):
-        return last.found
-    found = _found_in(gray, dot_radius, polarity, valid)
-    _LAST[:] = [_Answer(image.copy(), dot_radius, polarity, None if valid is None else valid.copy(), found)]
-    return found
+    if last is None or not last.is_of(image, dot_radius, polarity, valid):
+        found = _found_in(gray, dot_radius, polarity, valid)
+        last = _Answer(image.copy(), dot_radius, polarity, None if valid is None else valid.copy(), found)
+        _LAST[:] = [last]
+    # Who gets it may write to it.
+    return deepcopy(last.found)
 
 
 class _Answer(NamedTuple):

@@ -170,7 +170,9 @@ class MarkerTracker:
         self._shape = grays[0].shape
         self._shapes = (self._shape, (*self._shape, 3))
         self._pitch, self._radius = detection.pitch, detection.dot_radius
-        self._farthest = max_displacement or MAX_DISPLACEMENT * self._pitch
+        # Nothing that is seen goes farther than across the frame; the votes for a jump take memory.
+        across = float(np.hypot(*self._shape))
+        self._farthest = min(max_displacement or MAX_DISPLACEMENT * self._pitch, across)
         dark = detection.polarity == "dark"
         self._origin = np.array(detection.centers, np.float64)
         if len(grays) > 1:
