@@ -177,6 +177,17 @@ def test_a_source_that_fails_raises_in_the_loop() -> None:
 
 
 @pytest.mark.usefixtures("folder")
+def test_an_interrupt_reaches_who_has_started_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tactflow.engine.run.Runner._wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        tactflow.run()
+    assert not background()
+
+
+@pytest.mark.usefixtures("folder")
 def test_a_mistake_in_the_pipeline_is_told_before_anything_starts() -> None:
     with pytest.raises(tactflow.ConfigError, match="min_area"):
         tactflow.stream(settings={"stages.hull.min_aera": 5})

@@ -646,6 +646,40 @@ def test_a_stage_that_hangs_is_named(toy_runner: MakeRunner, monkeypatch: pytest
         thread.join(PATIENCE)
 
 
+def interrupt_in_join(runner: Runner) -> RunResult:
+    """Run, and interrupt as soon as `join` is being called."""
+
+    def interrupt(_: object) -> None:
+        if "compute" in runner.calls():
+            raise KeyboardInterrupt
+
+    return runner.run(on_progress=interrupt, interval_s=0.001)
+
+
+def test_nothing_is_closed_while_a_thread_is_in_it(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.engine.run.LEAVE_SECONDS", 0.1)
+    runner = toy_runner({"join": {"seconds": PATIENCE}, "capture": {"frames": 3}})
+    assert interrupt_in_join(runner).exit_code == run.INTERRUPTED
+    closed = {name: node.instance.closed for name, node in runner.nodes.items()}
+    assert closed.pop("join") == 0
+    assert set(closed.values()) == {1}
+    runner.nodes["join"].instance.release.set()
+    for thread in runner._threads.values():
+        thread.join(PATIENCE)
+
+
+def test_an_interrupted_run_lets_its_threads_end_before_it_closes(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.engine.run.LEAVE_SECONDS", PATIENCE)
+    runner = toy_runner({"join": {"seconds": 0.2}, "capture": {"frames": 3}})
+    assert interrupt_in_join(runner).exit_code == run.INTERRUPTED
+    assert not any(thread.is_alive() for thread in runner._threads.values())
+    assert runner.nodes["join"].instance.closed == 1
+
+
 # -- the graph --------------------------------------------------------------------------------------------
 
 
