@@ -465,8 +465,16 @@ def test_a_file_that_claims_an_absurd_picture_is_refused_before_memory_is_taken(
 def test_a_link_to_a_device_is_no_picture(tmp_path: Path) -> None:
     link = tmp_path / "a.png"
     link.symlink_to("/dev/zero")
-    with pytest.raises(SourceError, match="required a file, not a folder or a device"):
+    with pytest.raises(SourceError, match="is a pipe or a device, not a file"):
         open_source(str(link))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
+@pytest.mark.parametrize("name", ["a.mcap", "a.mcap?start=2", "a.npy", "a.avi", "a.png", "a.h5?dataset=/a"])
+def test_nobody_waits_for_who_may_write_to_a_pipe(name: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / name.partition("?")[0])
+    with pytest.raises(SourceError, match="is a pipe or a device, not a file"):
+        open_source(str(tmp_path / name))
 
 
 def test_a_pattern_for_all_folders_follows_no_links_in_circles(tmp_path: Path) -> None:
