@@ -38,3 +38,12 @@ def picks_a_port(endpoint: str) -> bool:
     (True, False, False)
     """
     return endpoint.startswith("tcp://") and endpoint.endswith((":*", ":0"))
+
+
+def is_ipv6(endpoint: str) -> bool:
+    """Whether an address is one of IPv6, which ZeroMQ takes only where it is told to.
+
+    >>> is_ipv6("tcp://[::1]:5556"), is_ipv6("tcp://127.0.0.1:5556"), is_ipv6("ipc:///tmp/a[1]")
+    (True, False, False)
+    """
+    return endpoint.startswith("tcp://[")
