@@ -226,6 +226,20 @@ def test_settings_may_be_paths_and_any_text(folder: Path) -> None:
     assert pipeline.source.params.source.endswith("\N{HERB}.npy")  # type: ignore[attr-defined]
 
 
+def test_settings_may_be_numbers_and_arrays_of_numpy(folder: Path) -> None:
+    settings = {
+        "skipping": np.bool_(False),
+        "stages.hull.min_area": np.float32(5),
+        "stages.preprocess.downsample": np.int64(1),
+        "stages.preprocess.crop": np.array([0, 0, 400, 300]),
+    }
+    pipeline = tactflow.load(settings=settings)
+    assert not pipeline.skipping
+    preprocess, hull = (pipeline.nodes[id_].params.model_dump() for id_ in ("preprocess", "hull"))
+    assert (preprocess["downsample"], list(preprocess["crop"])) == (1, [0, 0, 400, 300])
+    assert hull["min_area"] == 5
+
+
 def test_a_loaded_pipeline_can_be_streamed_twice(folder: Path) -> None:
     pipeline = tactflow.load(folder / "pipeline.yaml")
     first, second = (
