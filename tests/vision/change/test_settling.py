@@ -99,3 +99,9 @@ def test_pictures_of_any_size_can_be_looked_at(shape: tuple[int, ...]) -> None:
     settling = settled([np.full(shape, 100, np.uint8)] * CALM)
     assert settling.steady
     assert settling.best() == 0
+
+
+@pytest.mark.parametrize("size", [(3, 2000), (2000, 3), (600, 1), (1, 1)])
+def test_a_picture_may_be_a_narrow_strip(size: tuple[int, int]) -> None:
+    settling = settled([np.full((*size, 3), 100, np.uint8)] * 20)
+    assert (len(settling), settling.best()) == (CALM, 0)

@@ -71,7 +71,9 @@ def look_at(frame: NDArray[np.uint8]) -> Look:
     (30, 40, 3)
     """
     step = max(1, max(frame.shape[:2]) // (COLUMNS * SIDE))
-    points = np.atleast_3d(frame[step // 2 :: step, step // 2 :: step])
+    # A strip may be narrower than a step.
+    y, x = (min(step // 2, length - 1) for length in frame.shape[:2])
+    points = np.atleast_3d(frame[y::step, x::step])
     side = min(SIDE, *points.shape[:2])
     high, wide = points.shape[0] // side, points.shape[1] // side
     cells = points[: high * side, : wide * side].reshape(high, side, wide, side, -1)
