@@ -226,7 +226,8 @@ def test_settings_may_be_paths_and_any_text(folder: Path) -> None:
     assert pipeline.source.params.source.endswith("\N{HERB}.npy")  # type: ignore[attr-defined]
 
 
-def test_settings_may_be_numbers_and_arrays_of_numpy(folder: Path) -> None:
+@pytest.mark.usefixtures("folder")
+def test_settings_may_be_numbers_and_arrays_of_numpy() -> None:
     settings = {
         "skipping": np.bool_(False),
         "stages.hull.min_area": np.float32(5),
