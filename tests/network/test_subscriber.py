@@ -207,6 +207,12 @@ def test_an_address_that_makes_no_sense_is_refused(endpoint: str) -> None:
         Subscriber(endpoint)
 
 
+@pytest.mark.parametrize("connect", [Subscriber, RemoteControl])
+def test_a_port_that_there_is_not_is_not_taken_for_another(connect: type) -> None:
+    with pytest.raises(ValueError, match="required a port up to 65535, got 70000"):
+        connect("tcp://127.0.0.1:70000")
+
+
 def test_a_subscriber_needs_no_opencv() -> None:
     program = (
         "import sys, tactflow.network.subscriber; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"

@@ -16,7 +16,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from tactflow.files import expanded
-from tactflow.network.address import is_ipv6
+from tactflow.network.address import is_ipv6, refuse_high_port
 from tactflow.network.keys import WrongKeysError, secure_subscriber
 
 REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
@@ -111,6 +111,7 @@ class Connection:
         keys: str | Path | None,
         example: str,
     ) -> None:
+        refuse_high_port(endpoint)
         self.endpoint = endpoint
         self._is_refused = False
         self._has_keys = keys is not None
