@@ -450,11 +450,26 @@ def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
     assert f"  in {where.co_filename}:{where.co_firstlineno}\n" in str(result.error)
 
 
-def test_a_stage_that_exits_while_it_is_built_is_named(toy_runner: MakeRunner) -> None:
-    result = toy_runner({"quitter": {"use": "Quitter"}, "heavy": {"in": {"level": "quitter"}}}).run()
+@pytest.mark.parametrize(
+    ("when", "words"),
+    [
+        ("built", "cannot be opened: SystemExit: 7"),
+        ("called", "quitter failed at frame 3: SystemExit: 7"),
+        ("closed", "closing failed: 7"),
+    ],
+)
+def test_a_stage_that_exits_is_named_and_the_others_are_closed(
+    toy_runner: MakeRunner, when: str, words: str
+) -> None:
+    quitter = {"use": "Quitter", "when_it_is": when}
+    runner = toy_runner({"quitter": quitter, "heavy": {"in": {"level": "quitter"}}})
+    result = runner.run()
     assert result.exit_code == 3
     assert "quitter" in str(result.error)
-    assert "cannot be opened: SystemExit: 7" in str(result.error)
+    assert words in str(result.error)
+    assert {node.instance.closed for node in runner.nodes.values()} == {1}
+    assert runner.source is not None
+    assert runner.source.closed == 1  # type: ignore[attr-defined]
 
 
 # -- live -------------------------------------------------------------------------------------------------

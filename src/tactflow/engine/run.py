@@ -371,7 +371,7 @@ class Runner:
                 continue
             try:
                 instance.close()
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 self.fail(StageError(f"{node_id}: closing failed: {error}"), error)
         self._opened.clear()
 
