@@ -221,6 +221,18 @@ def test_few_bits_in_a_16_bit_file_are_pointed_out(tmp_path: Path, caplog: pytes
     assert "multiply the values by 16" in caplog.text
 
 
+@pytest.mark.parametrize("pages", [1, 5])
+def test_pictures_behind_the_first_of_a_file_are_pointed_out(
+    pages: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "stack.tiff"
+    cv2.imwritemulti(str(path), [np.full((48, 64, 3), page, np.uint8) for page in range(pages)])
+    reader = open_source(str(path))
+    assert reader.total == 1
+    told = f"{path}: holds {pages} pictures, of which only the first is read" in caplog.text
+    assert told == (pages > 1)
+
+
 def test_a_relative_path_is_looked_for_here_first_and_then_beside_the_pipeline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
