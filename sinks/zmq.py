@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import threading
 import time
 
@@ -19,7 +18,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.rate import RateLimit
 from tactflow.jpeg import encode_jpeg
 from tactflow.message import Results, encode_message
-from tactflow.network.address import is_reachable, picks_a_port
+from tactflow.network.address import is_reachable, picks_a_port, refuse_high_port
 from tactflow.network.bound_socket import FloodError
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
@@ -32,8 +31,8 @@ EVENTS_AT_ONCE = 100
 """Subscriptions that are looked at for one frame, so that a flood of them holds nothing up."""
 MOST_OTHERS = 1000
 """Subscriptions up to which also those to other sensors are counted."""
-HIGHEST_PORT = 65535
-"""Ports are numbers of 16 bits."""
+LARGEST = 2**31 - 1
+"""ZeroMQ takes its numbers as `int` of C."""
 
 
 class Zmq(Sink):
@@ -76,12 +75,14 @@ class Zmq(Sink):
         backlog: int = Field(
             32,
             ge=1,
+            le=LARGEST,
             description="messages that may wait for each subscriber (32: half a second at 60 Hz); more "
             "bridges its pauses, fewer keep it fresher",
         )
         send_buffer: int = Field(
             SEND_BUFFER,
             ge=1024,
+            le=LARGEST,
             description="kernel send buffer per subscriber, bytes; large ones hold seconds of stale "
             "messages, smaller ones than this slow down messages that are longer (depth maps, field)",
         )
@@ -127,10 +128,7 @@ class Zmq(Sink):
         @field_validator("endpoint", "control")
         @classmethod
         def _port_is_one(cls, endpoint: str | None) -> str | None:
-            # ZeroMQ takes a larger number and binds another port.
-            port = re.fullmatch(r"tcp://.*:(\d+)", endpoint or "")
-            if port is not None and int(port[1]) > HIGHEST_PORT:
-                raise ValueError(f"required a port up to {HIGHEST_PORT}, got {port[1]}")
+            refuse_high_port(endpoint or "")
             return endpoint
 
         @model_validator(mode="after")

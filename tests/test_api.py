@@ -177,6 +177,17 @@ def test_a_source_that_fails_raises_in_the_loop() -> None:
 
 
 @pytest.mark.usefixtures("folder")
+def test_an_interrupt_reaches_who_has_started_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tactflow.engine.run.Runner._wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        tactflow.run()
+    assert not background()
+
+
+@pytest.mark.usefixtures("folder")
 def test_a_mistake_in_the_pipeline_is_told_before_anything_starts() -> None:
     with pytest.raises(tactflow.ConfigError, match="min_area"):
         tactflow.stream(settings={"stages.hull.min_aera": 5})
@@ -213,6 +224,21 @@ def test_settings_may_be_paths_and_any_text(folder: Path) -> None:
     settings = {"stages.capture.source": folder / "\N{HERB}.npy", "sensor": "left"}
     pipeline = tactflow.load(settings=settings)
     assert pipeline.source.params.source.endswith("\N{HERB}.npy")  # type: ignore[attr-defined]
+
+
+@pytest.mark.usefixtures("folder")
+def test_settings_may_be_numbers_and_arrays_of_numpy() -> None:
+    settings = {
+        "skipping": np.bool_(False),
+        "stages.hull.min_area": np.float32(5),
+        "stages.preprocess.downsample": np.int64(1),
+        "stages.preprocess.crop": np.array([0, 0, 400, 300]),
+    }
+    pipeline = tactflow.load(settings=settings)
+    assert not pipeline.skipping
+    preprocess, hull = (pipeline.nodes[id_].params.model_dump() for id_ in ("preprocess", "hull"))
+    assert (preprocess["downsample"], list(preprocess["crop"])) == (1, [0, 0, 400, 300])
+    assert hull["min_area"] == 5
 
 
 def test_a_loaded_pipeline_can_be_streamed_twice(folder: Path) -> None:

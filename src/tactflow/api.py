@@ -20,7 +20,7 @@ from tactflow.config.yamlmap import Problems, wrap
 from tactflow.engine.conformance import build
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Mark, Pipeline
-from tactflow.engine.run import Runner, RunResult
+from tactflow.engine.run import INTERRUPTED, Runner, RunResult
 
 Settings = Mapping[str, Any]
 """Values of the pipeline file to replace, as in `{"stages.preprocess.rotate": 0, "sinks.zmq": None}`."""
@@ -108,6 +108,7 @@ def run(
     ------
     ConfigError : the pipeline file is wrong; nothing was started.
     TactflowError : a stage, a sink or the source failed.
+    KeyboardInterrupt : Ctrl-C; the run has ended, without what was under way.
 
     Examples
     --------
@@ -119,6 +120,8 @@ def run(
     if not isinstance(pipeline, Pipeline):
         pipeline = load(pipeline, source=source, settings=settings, sensor=sensor, realtime=realtime)
     result = make_runner(pipeline, max_frames=max_frames).run()
+    if result.exit_code == INTERRUPTED:
+        raise KeyboardInterrupt
     if result.failure is not None:
         raise result.failure
     return result

@@ -160,7 +160,8 @@ class LineFile:
 
     Raises
     ------
-    OSError : it cannot be opened, or another run writes to it.
+    OSError : it cannot be opened, or another run writes to it. StageError : what it is to continue holds
+    something else.
 
     Attributes
     ----------
@@ -250,7 +251,10 @@ class LineFile:
 
 
 def _continue_at(file: BinaryIO, path: Path) -> int:
-    """Seek to the end of the last complete line, completing or cutting off what follows it; its offset."""
+    """Seek to the end of the last complete line, completing or cutting off what follows it; its offset.
+
+    Raises StageError if what follows is no beginning of a message: it is not ours to cut off.
+    """
     end = file.seek(0, os.SEEK_END)
     tail = b""
     start = end
@@ -263,6 +267,11 @@ def _continue_at(file: BinaryIO, path: Path) -> int:
         try:
             json.loads(rest)
         except ValueError:
+            # A power cut may leave NULs. Anything else is of another program, or of the user.
+            if not rest.startswith(b"{") and rest.strip(b"\0"):
+                raise StageError(
+                    f"{path}: cannot be continued: it does not end with a result message; give another path"
+                ) from None
             end -= len(rest)
             file.truncate(end)
             log.warning("%s: its last line was cut off (%d bytes) and has been removed", path, len(rest))

@@ -239,3 +239,28 @@ def test_statistics_replace_only_older_statistics(
     assert main(command) == 2
     assert "holds something else" in capsys.readouterr().err
     assert file.read_text() == "a year of work"
+
+
+@pytest.mark.parametrize(
+    ("files", "writer"),
+    [
+        ({"--jsonl": "a.jsonl", "--stats": "./a.jsonl"}, "jsonl"),
+        ({"--jsonl": "a.jsonl", "--trace": "a.jsonl"}, "jsonl"),
+        ({"--stats": "a.json", "--trace": "a.json"}, "--stats"),
+    ],
+)
+@pytest.mark.parametrize("sensors", ["", "sensors: {left: , right: }\n"], ids=["one", "two"])
+def test_a_report_replaces_nothing_that_the_run_writes(
+    tmp_path: Path,
+    files: dict[str, str],
+    writer: str,
+    sensors: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "pipeline.yaml").write_text(sensors + "stages: {capture: {source: 'sim:press?frames=2'}}\n")
+    monkeypatch.chdir(tmp_path)
+    options = [word for option in files.items() for word in option]
+    assert main(["run", "--quiet", *options]) == 2
+    assert f"{writer} writes it already; choose another file" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["pipeline.yaml"]

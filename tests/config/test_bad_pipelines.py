@@ -92,6 +92,10 @@ CASES: dict[str, tuple[str, list[str]]] = {
         "opencv_threads: §-1\n" + HEAD + SINK,
         ["opencv_threads: expected a whole number >= 0"],
     ),
+    "more threads than a system has": (
+        "opencv_threads: §99999999999\n" + HEAD + SINK,
+        ["opencv_threads: expected a whole number >= 0 and <= 1024, got 99999999999"],
+    ),
     "bad segment": (
         HEAD + "  prepare: {use: './parts.py:Prepare', segment: §[a]}\n" + SINK,
         ["stages.prepare.segment: expected a word", "got a list"],

@@ -451,11 +451,26 @@ def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
     assert f"  in {where.co_filename}:{where.co_firstlineno}\n" in str(result.error)
 
 
-def test_a_stage_that_exits_while_it_is_built_is_named(toy_runner: MakeRunner) -> None:
-    result = toy_runner({"quitter": {"use": "Quitter"}, "heavy": {"in": {"level": "quitter"}}}).run()
+@pytest.mark.parametrize(
+    ("when", "words"),
+    [
+        ("built", "cannot be opened: SystemExit: 7"),
+        ("called", "quitter failed at frame 3: SystemExit: 7"),
+        ("closed", "closing failed: 7"),
+    ],
+)
+def test_a_stage_that_exits_is_named_and_the_others_are_closed(
+    toy_runner: MakeRunner, when: str, words: str
+) -> None:
+    quitter = {"use": "Quitter", "when_it_is": when}
+    runner = toy_runner({"quitter": quitter, "heavy": {"in": {"level": "quitter"}}})
+    result = runner.run()
     assert result.exit_code == 3
     assert "quitter" in str(result.error)
-    assert "cannot be opened: SystemExit: 7" in str(result.error)
+    assert words in str(result.error)
+    assert {node.instance.closed for node in runner.nodes.values()} == {1}
+    assert runner.source is not None
+    assert runner.source.closed == 1  # type: ignore[attr-defined]
 
 
 # -- live -------------------------------------------------------------------------------------------------
@@ -645,6 +660,40 @@ def test_a_stage_that_hangs_is_named(toy_runner: MakeRunner, monkeypatch: pytest
     runner.nodes["join"].instance.release.set()
     for thread in runner._threads.values():
         thread.join(PATIENCE)
+
+
+def interrupt_in_join(runner: Runner) -> RunResult:
+    """Run, and interrupt as soon as `join` is being called."""
+
+    def interrupt(_: object) -> None:
+        if "compute" in runner.calls():
+            raise KeyboardInterrupt
+
+    return runner.run(on_progress=interrupt, interval_s=0.001)
+
+
+def test_nothing_is_closed_while_a_thread_is_in_it(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.engine.run.LEAVE_SECONDS", 0.1)
+    runner = toy_runner({"join": {"seconds": PATIENCE}, "capture": {"frames": 3}})
+    assert interrupt_in_join(runner).exit_code == run.INTERRUPTED
+    closed = {name: node.instance.closed for name, node in runner.nodes.items()}
+    assert closed.pop("join") == 0
+    assert set(closed.values()) == {1}
+    runner.nodes["join"].instance.release.set()
+    for thread in runner._threads.values():
+        thread.join(PATIENCE)
+
+
+def test_an_interrupted_run_lets_its_threads_end_before_it_closes(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.engine.run.LEAVE_SECONDS", PATIENCE)
+    runner = toy_runner({"join": {"seconds": 0.2}, "capture": {"frames": 3}})
+    assert interrupt_in_join(runner).exit_code == run.INTERRUPTED
+    assert not any(thread.is_alive() for thread in runner._threads.values())
+    assert runner.nodes["join"].instance.closed == 1
 
 
 # -- the graph --------------------------------------------------------------------------------------------

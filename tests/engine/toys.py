@@ -252,14 +252,27 @@ class LateTick(Counted, Sink):
 
 
 class Quitter(Counted, Stage):
-    """Ends the program where it should only complain."""
+    """Ends the program where it should only complain: when it is built, called or closed."""
 
-    def __init__(self, params: Counted.Params) -> None:
+    class Params(Counted.Params):
+        when_it_is: str = "built"
+
+    def __init__(self, params: Params) -> None:
         super().__init__(params)
-        sys.exit(7)
+        self.exits = params.when_it_is
+        self.leave("built")
+
+    def leave(self, now: str) -> None:
+        if self.exits == now:
+            sys.exit(7)
 
     def process(self, level: Number) -> Number:
+        self.leave("called")
         return level
+
+    def close(self) -> None:
+        super().close()
+        self.leave("closed")
 
 
 class Vandal(Counted, Stage):

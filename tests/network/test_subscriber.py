@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -20,6 +21,7 @@ from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message import Results, encode_message
 from tactflow.network import subscriber
+from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import LONGEST_MESSAGE, Subscriber
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
@@ -205,6 +207,12 @@ def test_an_address_that_makes_no_sense_is_refused(endpoint: str) -> None:
         Subscriber(endpoint)
 
 
+@pytest.mark.parametrize("connect", [Subscriber, RemoteControl])
+def test_a_port_that_there_is_not_is_not_taken_for_another(connect: type) -> None:
+    with pytest.raises(ValueError, match="required a port up to 65535, got 70000"):
+        connect("tcp://127.0.0.1:70000")
+
+
 def test_a_subscriber_needs_no_opencv() -> None:
     program = (
         "import sys, tactflow.network.subscriber; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"
@@ -373,3 +381,28 @@ def test_invented_sensors_take_no_memory() -> None:
         results._count("sensor0", 3)
         assert len(results._last_seq) == subscriber.MOST_SENSORS
         assert results.lost == 2
+
+
+def has_ipv6() -> bool:
+    """Whether this machine has the address ::1."""
+    try:
+        with socket.socket(socket.AF_INET6) as probe:
+            probe.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
+def test_results_and_commands_go_over_ipv6_too() -> None:
+    sink = Zmq(Zmq.Params(endpoint="tcp://[::1]:*", control="tcp://[::1]:*"))
+    sink.open()
+    try:
+        with Subscriber(sink.endpoint, timeout=LONG) as messages:
+            sink._wait_for_subscriber(LONG)
+            sink.write(Tick(Frame("main", 0, 0.0, IMAGE)), Results(IMAGE))
+            assert messages.receive()["seq"] == 0
+        with RemoteControl(str(sink.control_endpoint), timeout=LONG) as run:
+            assert run.ping()["message"] == "here"
+    finally:
+        sink.close()

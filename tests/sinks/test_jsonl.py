@@ -144,6 +144,15 @@ def test_appending_to_a_file_that_ends_within_a_line_starts_a_clean_one(
     assert ("has been removed" in caplog.text) == warns
 
 
+@pytest.mark.parametrize("theirs", [b"a letter without a last line end", b"two\nlines", b"\0\0\xff\xd8"])
+def test_append_cuts_nothing_off_a_file_of_others(theirs: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "letter.txt"
+    path.write_bytes(theirs)
+    with pytest.raises(StageError, match="does not end with a result message; give another path"):
+        opened(path, append=True)
+    assert path.read_bytes() == theirs
+
+
 def test_overwrite_and_append_exclude_each_other() -> None:
     with pytest.raises(ValidationError, match="exclude each other"):
         Jsonl.Params(overwrite=True, append=True)

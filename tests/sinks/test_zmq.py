@@ -243,6 +243,12 @@ def test_a_port_that_there_is_not_is_refused() -> None:
         Zmq.Params(endpoint="tcp://127.0.0.1:99999")
 
 
+@pytest.mark.parametrize("name", ["backlog", "send_buffer"])
+def test_numbers_that_zeromq_cannot_take_are_refused(name: str) -> None:
+    with pytest.raises(ValidationError, match="less than or equal to 2147483647"):
+        Zmq.Params.model_validate({name: 2**31})
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such addresses")
 def test_an_ipc_address_takes_no_file_and_no_other_runs_place(tmp_path: Path) -> None:
     file, place = tmp_path / "notes.txt", tmp_path / "tactflow"

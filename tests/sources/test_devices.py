@@ -20,6 +20,7 @@ from tactflow.sources import CameraRequest, devices, open_source
     ("present", "device", "expected"),
     [
         ([], "0", "no camera is plugged in"),
+        ([], "99999999999999999999", "no camera is plugged in"),
         (
             ["/dev/video2", "/dev/video10"],
             "63",

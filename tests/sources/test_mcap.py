@@ -225,6 +225,7 @@ def test_a_new_reference_can_be_taken_during_replay(tmp_path: Path) -> None:
     [
         ("start=-1", "start=-1: required start=SECONDS"),
         ("start=soon", "required start=SECONDS"),
+        ("start=1e300", "required start=SECONDS"),
         ("loop=1.5", "required .*loop=N"),
         ("speed=2", "speed=2: required"),
         ("start=nan", "required"),

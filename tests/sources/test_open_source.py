@@ -221,6 +221,18 @@ def test_few_bits_in_a_16_bit_file_are_pointed_out(tmp_path: Path, caplog: pytes
     assert "multiply the values by 16" in caplog.text
 
 
+@pytest.mark.parametrize("pages", [1, 5])
+def test_pictures_behind_the_first_of_a_file_are_pointed_out(
+    pages: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "stack.tiff"
+    cv2.imwritemulti(str(path), [np.full((48, 64, 3), page, np.uint8) for page in range(pages)])
+    reader = open_source(str(path))
+    assert reader.total == 1
+    told = f"{path}: holds {pages} pictures, of which only the first is read" in caplog.text
+    assert told == (pages > 1)
+
+
 def test_a_relative_path_is_looked_for_here_first_and_then_beside_the_pipeline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -465,8 +477,16 @@ def test_a_file_that_claims_an_absurd_picture_is_refused_before_memory_is_taken(
 def test_a_link_to_a_device_is_no_picture(tmp_path: Path) -> None:
     link = tmp_path / "a.png"
     link.symlink_to("/dev/zero")
-    with pytest.raises(SourceError, match="required a file, not a folder or a device"):
+    with pytest.raises(SourceError, match="is a pipe or a device, not a file"):
         open_source(str(link))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
+@pytest.mark.parametrize("name", ["a.mcap", "a.mcap?start=2", "a.npy", "a.avi", "a.png", "a.h5?dataset=/a"])
+def test_nobody_waits_for_who_may_write_to_a_pipe(name: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / name.partition("?")[0])
+    with pytest.raises(SourceError, match="is a pipe or a device, not a file"):
+        open_source(str(tmp_path / name))
 
 
 def test_a_pattern_for_all_folders_follows_no_links_in_circles(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -23,6 +23,7 @@ from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline, positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.cli.progress import progress_display, summary, with_statistics
+from tactflow.config.files_read import files_written
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
@@ -122,15 +123,19 @@ def _run_all(
     if problems:
         raise ConfigError("\n".join(problems))
     sinks = {sensor: _added_sinks(args, sensor) | extra_sinks(sensor) for sensor in sensors}
+    pipelines = {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors}
+    reports = {option: path for option, path in _statistics_files(args).items() if path is not None}
+    for sensor, pipeline in pipelines.items():
+        _refuse_shared({option: with_name(path, sensor) for option, path in reports.items()}, pipeline)
     request = Request(
         file,
         args.overrides,
         added={option for added in sinks.values() for option in added},
-        files={option: path for option, path in _statistics_files(args).items() if path is not None},
+        files=reports,
         hang_after=args.hang_after,
         options=_options(args),
     )
-    return run_fleet(request, {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors})
+    return run_fleet(request, pipelines)
 
 
 def _options(args: argparse.Namespace) -> list[str]:
@@ -182,6 +187,7 @@ def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks
 
 def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     """Run one sensor's pipeline in this process."""
+    _refuse_shared(_statistics_files(args), pipeline)
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     trace = None if args.trace is None else Trace(f"tactflow {pipeline.sensor}")
     runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
@@ -264,6 +270,25 @@ def _refuse_unwritable(option: str, path: str | None, begins: str) -> None:
         raise ConfigError(f"{option} {path}: cannot be written: {error.strerror}") from None
     if there not in (b"", begins.encode()):
         raise ConfigError(f"{option} {path}: holds something else; choose another file, or delete it")
+
+
+def _refuse_shared(reports: Mapping[str, str | None], pipeline: Pipeline) -> None:
+    """Refuse a report into a file that a sink, or another report, writes: it would replace what is there.
+
+    reports : option -> its file.
+    """
+    writers = {
+        place: node.id
+        for node in pipeline.nodes.values()
+        for place in files_written(node.component.cls, node.params)
+    }
+    for option, path in reports.items():
+        if path is None or is_device(path):
+            continue
+        place = os.path.realpath(path)
+        if place in writers:
+            raise ConfigError(f"{option} {path}: {writers[place]} writes it already; choose another file")
+        writers[place] = option
 
 
 @contextmanager

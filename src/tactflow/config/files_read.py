@@ -1,4 +1,4 @@
-"""Which files a pipeline reads, so that nothing in it writes over them."""
+"""Which files a pipeline reads and writes, so that nothing writes over them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from tactflow.files import expanded
+from tactflow.engine.contract import Sink, StageParams
+from tactflow.files import expanded, is_device
 
 FileId = tuple[int, int]
 """Device and inode: the same for all names of a file, links too."""
@@ -53,6 +54,15 @@ def files_named(params: BaseModel, directory: Path) -> Iterator[Path]:
         for name in (names | {_folder_of_pattern(name) for name in names}) - {""}:
             path = expanded(name)
             yield from (path, directory / path)
+
+
+def files_written(cls: type, params: StageParams) -> list[str]:
+    """The files and folders that a sink writes, however they are spelled; no devices. None of a stage."""
+    if not issubclass(cls, Sink):
+        return []
+    paths = [str(output.path) for output in cls.outputs(params)]
+    # No file has a name with NUL; the sink will say so.
+    return [os.path.realpath(path) for path in paths if "\0" not in path and not is_device(path)]
 
 
 def _texts(value: Any) -> Iterator[str]:

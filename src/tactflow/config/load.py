@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -13,7 +12,7 @@ from pydantic import ValidationError
 
 from tactflow.config import sensors, wiring
 from tactflow.config.complaints import complain
-from tactflow.config.files_read import FileId, file_id, files_read
+from tactflow.config.files_read import FileId, file_id, files_read, files_written
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import add_sinks, apply, replaced
 from tactflow.config.registry import Section, code_place, did_you_mean, resolve
@@ -24,7 +23,7 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
-from tactflow.files import expanded, is_device
+from tactflow.files import expanded
 from tactflow.redaction import public_address
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
@@ -285,13 +284,10 @@ def _does_as_much(there: Draft, added: Draft) -> bool:
 
 
 def _written(draft: Draft) -> list[str]:
-    """The files and folders that a sink writes, however they are spelled; no devices."""
-    cls = draft.component.cls if draft.component else None
-    if cls is None or not issubclass(cls, Sink) or draft.params is None:
+    """The files and folders that a sink writes, as far as it is known to be one."""
+    if draft.component is None or draft.params is None:
         return []
-    paths = [str(output.path) for output in cls.outputs(draft.params)]
-    # No file has a name with NUL; the sink will say so.
-    return [os.path.realpath(path) for path in paths if "\0" not in path and not is_device(path)]
+    return files_written(draft.component.cls, draft.params)
 
 
 def _check_needs(drafts: Sequence[Draft], problems: Problems) -> None:

@@ -7,7 +7,7 @@ From these models come both the checks of a file and its JSON Schema. What depen
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Literal, LiteralString
+from typing import Annotated, Any, Final, Literal, LiteralString
 
 from pydantic import (
     AfterValidator,
@@ -28,6 +28,10 @@ STATISTICS = "stats"
 """The topic of a run's statistics, so that no sensor may have this name."""
 
 WORD = "^[A-Za-z0-9_-]+$"
+
+MOST_THREADS: Final = 1024
+"""OpenCV starts as many threads as it is told, and the system refuses some ten thousand. Chosen by hand: more
+than a computer has processors."""
 
 
 def is_word(text: str) -> bool:
@@ -98,6 +102,7 @@ SensorKey = Annotated[
     AfterValidator(_free),
 ]
 Count = Annotated[int, Field(ge=0), _says("a whole number >= 0")]
+Threads = Annotated[int, Field(ge=0, le=MOST_THREADS), _says("a whole number >= 0 and <= 1024")]
 Capacity = Annotated[int, Field(ge=1), _says("a whole number >= 1")]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), _says("a rate in Hz, > 0")]
 Output = Annotated[str, _says("stage.port")]
@@ -250,7 +255,7 @@ class PipelineFile(Part):
         "null: results in pixels only",
     )
     skipping: bool = Field(True, description="false runs every stage in every frame")
-    opencv_threads: Count | None = Field(
+    opencv_threads: Threads | None = Field(
         None, description="threads of OpenCV; 1: none beside the caller's; null: OpenCV's choice"
     )
     realtime_priority: bool = Field(

@@ -6,6 +6,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from tactflow.config.registry import did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems, read_value, wrap
 from tactflow.engine.errors import ConfigError
@@ -14,13 +16,18 @@ from tactflow.redaction import public_setting
 
 
 def as_yaml(value: Any) -> str:
-    """A value as `--set` takes it: JSON, which is YAML too.
+    """A value as `--set` takes it: JSON, which is YAML too. Numbers and arrays of NumPy are plain ones.
 
     >>> from pathlib import Path
-    >>> as_yaml({"path": Path("out/a.jsonl")})
-    '{"path": "out/a.jsonl"}'
+    >>> import numpy as np
+    >>> as_yaml({"path": Path("out/a.jsonl"), "rate": np.float32(0.5), "size": np.arange(2)})
+    '{"path": "out/a.jsonl", "rate": 0.5, "size": [0, 1]}'
     """
-    return json.dumps(value, ensure_ascii=False, default=str)
+    return json.dumps(value, ensure_ascii=False, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
 
 
 def apply(root: Item, text: str, problems: Problems) -> Item:

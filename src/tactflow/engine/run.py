@@ -32,6 +32,9 @@ INTERRUPTED = 130
 CLOSE_SECONDS = 10.0
 """How long, s, no stage and no link may get on after the run was stopped or has failed, before the one that
 hangs is named. Chosen by hand: the slowest stage takes a second."""
+LEAVE_SECONDS = 1.0
+"""How long the threads get, s, to come out of what they are in when a run ends at once. Chosen by hand: the
+slowest stage takes as long."""
 MOST_STEPS = 1000
 """Steps that may wait while a run is paused. Chosen by hand: more than anybody presses a key."""
 
@@ -133,6 +136,7 @@ class Runner:
             self.stop("signal")
             for link in self._links:
                 link.abort()
+            self._let_threads_end()
         finally:
             self._close()
         stats = self._stats(time.perf_counter() - self._began)
@@ -346,12 +350,28 @@ class Runner:
         delivered = [link.stats().delivered for link in self._links]
         return delivered + [node.stats.runs for node in self.nodes.values()]
 
+    def _let_threads_end(self) -> None:
+        """Give the threads a moment to end, so that nothing is closed while one of them uses it."""
+        until = time.perf_counter() + LEAVE_SECONDS
+        for thread in self._threads.values():
+            # An interrupt may have come before it was started.
+            if thread.is_alive():
+                thread.join(max(0.0, until - time.perf_counter()))
+
     def _close(self) -> None:
-        """Close whatever was opened, last opened first; every one gets its turn."""
+        """Close whatever was opened, last opened first; every one gets its turn.
+
+        What a thread still is in is left as it is: to close a video while it is read, or a file while it is
+        written, may wait for ever.
+        """
+        alive = [name for name, thread in self._threads.items() if thread.is_alive()]
+        in_use = {self._segments[name].current for name in alive}
         for node_id, instance in reversed(self._opened):
+            if node_id in in_use:
+                continue
             try:
                 instance.close()
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 self.fail(StageError(f"{node_id}: closing failed: {error}"), error)
         self._opened.clear()
 

@@ -191,7 +191,7 @@ class Segment:
         began = perf_counter()
         try:
             outputs = node(inputs, tick)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self._failed(node, tick, inputs, error)
             return
         ended = perf_counter()
@@ -212,7 +212,9 @@ class Segment:
         else:
             self.run.retake_reference()
 
-    def _failed(self, node: RunningNode, tick: TickState, inputs: Sequence[Any], error: Exception) -> None:
+    def _failed(
+        self, node: RunningNode, tick: TickState, inputs: Sequence[Any], error: Exception | SystemExit
+    ) -> None:
         node.stats.errors += 1
         policy = node.node.on_error
         failure = describe_failure(node.node, tick.frame, inputs, error)

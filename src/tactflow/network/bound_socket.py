@@ -15,6 +15,7 @@ import zmq
 
 from tactflow.engine.errors import StageError
 from tactflow.files import expanded, files_left
+from tactflow.network.address import is_ipv6
 from tactflow.network.keys import DOMAIN, WrongKeysError, secure_publisher, subscribers_folder
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ class BoundSocket:
         self.socket = socket = self._context.socket(self._kind)
         socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_REQUEST)
         socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        socket.setsockopt(zmq.IPV6, is_ipv6(endpoint))
         socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
         socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, KEEPALIVE_S)
         for option, value in self._options.items():

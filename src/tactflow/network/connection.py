@@ -16,6 +16,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from tactflow.files import expanded
+from tactflow.network.address import is_ipv6, refuse_high_port
 from tactflow.network.keys import WrongKeysError, secure_subscriber
 
 REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
@@ -110,12 +111,14 @@ class Connection:
         keys: str | Path | None,
         example: str,
     ) -> None:
+        refuse_high_port(endpoint)
         self.endpoint = endpoint
         self._is_refused = False
         self._has_keys = keys is not None
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(kind)
         self._socket.linger = 0
+        self._socket.setsockopt(zmq.IPV6, is_ipv6(endpoint))
         for option, value in options.items():
             self._socket.setsockopt(option, value)
         self._refused = self._socket.get_monitor_socket(REFUSALS | BROKEN_OFF)

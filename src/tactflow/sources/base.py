@@ -264,7 +264,8 @@ def find_path(spec: str, directory: Path | None) -> Path:
     Raises
     ------
     SourceError
-        If nothing is there; names files whose names are close.
+        If nothing is there; names files whose names are close. If it is a pipe or a device: to open one may
+        wait for ever, and no signal ends that.
     """
     path = expanded(spec)
     candidates = [path]
@@ -272,6 +273,8 @@ def find_path(spec: str, directory: Path | None) -> Path:
         candidates.append(directory / path)
     for candidate in candidates:
         if candidate.exists():
+            if is_device(str(candidate)):
+                raise SourceError(f"{spec}: is a pipe or a device, not a file")
             return candidate
     raise SourceError(f"{spec}: no such file or folder{_near(candidates)}")
 

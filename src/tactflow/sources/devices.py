@@ -16,6 +16,9 @@ from tactflow.engine.errors import SourceError
 from tactflow.redaction import public_address
 from tactflow.sources.base import BgrImage, Normaliser, frame_size, log, quiet_opencv
 
+LARGEST_INDEX = 2**31 - 1
+"""OpenCV takes the index of a camera as an `int` of C."""
+
 
 @dataclass(frozen=True, slots=True)
 class CameraRequest:
@@ -71,6 +74,8 @@ class Camera:
         # OpenCV reads this once, at its first camera.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(self.READ_TIMEOUT))
         backend = cv2.CAP_V4L2 if sys.platform == "linux" else cv2.CAP_ANY
+        if device.isdecimal() and int(device) > LARGEST_INDEX:
+            raise SourceError(f"{self._name}: cannot be opened; {_camera_hint(device)}")
         with quiet_opencv():
             if device.isdecimal():
                 self._capture: cv2.VideoCapture | None = cv2.VideoCapture(int(device), backend)

@@ -149,6 +149,7 @@ class ImageFiles:
         self._first: BgrImage | None = self._load(0)
         self.size = self._normalise.size
         self.description = f"{description}, {len(files)} images"
+        _warn_of_pages(files[0])
 
     def _load(self, index: int) -> BgrImage:
         path = self._files[index]
@@ -170,6 +171,20 @@ class ImageFiles:
         """Read no more."""
         self._index = len(self._files)
         self._first = None
+
+
+def _warn_of_pages(path: Path) -> None:
+    """Say that only the first picture of a TIFF is read: some programs write a whole recording into one."""
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return
+    with quiet_opencv():
+        pages = cv2.imcount(str(path))
+    if pages > 1:
+        log.warning(
+            "%s: holds %d pictures, of which only the first is read; save each as a file of its own",
+            path,
+            pages,
+        )
 
 
 def open_folder(folder: Path, fps: float | None = None) -> ImageFiles:

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 OPTIONS = "start=SECONDS (from the beginning), loop=N (play N times; 0 is for ever)"
 
+LATEST_START = 1e9
+"""A beginning beyond this, s, is behind the end of every recording: 30 years. Chosen by hand."""
+
 
 class Recording:
     """An .mcap file that tactflow recorded.
@@ -183,7 +186,7 @@ def _parse(spec: str, directory: Path | None) -> tuple[str, float, int]:
     start, laps = 0.0, 1
     for key, value in parse_qsl(query, keep_blank_values=True):
         try:
-            if key == "start" and 0 <= float(value) < float("inf"):
+            if key == "start" and 0 <= float(value) <= LATEST_START:
                 start = float(value)
             elif key == "loop" and int(value) >= 0:
                 laps = int(value)
