@@ -36,7 +36,7 @@ def smooth_cells(half: Byte, smooth: Float) -> None:
 
     half : (2 h, 6 w), a picture of which 2 x 2 pixels are a cell; their mean is rounded, as `halved` does.
     """
-    high, wide = smooth.shape[1:]
+    _, high, wide = smooth.shape
     # Of each pixel and the next one, of two lines; lines of cells, of which three are in use.
     means, cells = np.empty(6 * wide, np.uint8), np.empty((3, 3 * wide), np.uint8)
     sums, squares = np.empty(3 * wide + 6, np.int16), np.empty(3 * wide, np.int16)

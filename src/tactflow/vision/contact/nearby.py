@@ -45,10 +45,10 @@ def halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, floa
     values : (h, w). part : of the radius. halved : (h / 2, w / 2), rounded up, filled; the last line counts
     twice then.
     """
-    high, wide = values.shape
+    (high, wide), (rows, columns) = values.shape, halved.shape
     sums, line = np.empty(wide + 2), np.empty(wide + 1, np.float32)
     upper, largest = np.empty(wide + 1, np.float32), np.zeros(wide, np.float32)
-    for y in range(2 * len(halved)):
+    for y in range(2 * rows):
         row = min(y, high - 1)
         above = values[min(1, high - 1) if row == 0 else row - 1]
         here, below = values[row], values[max(high - 2, 0) if row == high - 1 else row + 1]
@@ -61,7 +61,7 @@ def halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, floa
             largest[x] = line[x] if line[x] > largest[x] else largest[x]
         line[wide] = line[wide - 1]
         if y & 1:
-            for x in range(halved.shape[1]):
+            for x in range(columns):
                 both = upper[2 * x] + upper[2 * x + 1] + (line[2 * x] + line[2 * x + 1])
                 halved[y >> 1, x] = both * np.float32(0.25)
         upper, line = line, upper

@@ -448,7 +448,7 @@ def align_marks(
             safe = max(gain, LEAST_DIVISOR)
             now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -radius), radius)
             now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -radius), radius)
-            far = (now_x - x) ** 2 + (now_y - y) ** 2 > converged
+            far = (now_x - x) * (now_x - x) + (now_y - y) * (now_y - y) > converged
             x, y = now_x, now_y
             if number == ROUNDS or not (far and r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
                 break
