@@ -139,7 +139,8 @@ def trace_outlines(
             marks[y + 1, x + 1] = mask[y, x] | hidden[y, x] | beside[y, x] * BESIDE
     found = ends[0, 0] = ends[0, 1] = 0
     for y in range(1, high + 1):
-        x, outside = 1, True
+        # No constant: for one, numba would compile `_follow` a second time.
+        x, outside = np.int64(1), True
         while x <= wide:
             if marks[y, x] & PIXEL == 0:
                 x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == 0 else 1
