@@ -1,4 +1,8 @@
-"""Connected components of the cells that have changed."""
+"""Connected components of the cells that have changed: which of them are contacts, and where.
+
+`contact_components` closes small gaps between the cells, parts them, keeps the parts that are strong enough,
+and leaves out stray ones. `wide_change` finds those that are faint, but wide.
+"""
 
 from __future__ import annotations
 

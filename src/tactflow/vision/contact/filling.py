@@ -1,4 +1,10 @@
-"""Filling a region: holes, gaps, and pockets at the border of the frame."""
+"""Filling a region: holes, gaps, and pockets at the border of the frame.
+
+A mask of what has changed becomes a `Region` by `enclosed`: `outlined` fills the holes of its parts, `traced`
+finds their outlines, `fill_pockets` adds what they enclose together with the border of the frame. A region
+that is not solid then (`is_solid`) may be a ring with a gap: `fill_bay` fills the largest bay where there is
+a faint change, `close_gaps` bridges a gap.
+"""
 
 from __future__ import annotations
 
