@@ -266,11 +266,13 @@ def border_level(
     middle : the largest depth of the parts.
     """
     high, wide = parts.shape
-    beside = np.zeros(parts.size + 1, np.int32)
+    beside = np.empty(parts.size + 1, np.int32)
+    beside[:] = 0
     _steps_beside(corners, outlines, nearest, parts, beside)
     # Of all pixels, and of those of each step: their number and the sum of their strengths in bins of depth.
-    steps, around = outlines[-1, 1], np.zeros(2 * int(middle / BIN) + 4)
-    bins, border = np.zeros((steps, around.size)), np.empty(steps)
+    steps, around = outlines[-1, 1], np.empty(2 * int(middle / BIN) + 4)
+    bins, border = np.empty((steps, around.size)), np.empty(steps)
+    around[:] = bins[:] = 0
     bins_per_pixel = np.float32(1 / BIN)
     for y in range(high):
         for x in range(wide):

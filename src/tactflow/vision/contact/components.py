@@ -164,8 +164,8 @@ def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int
     """
     high, wide = squared.shape
     # A border of one cell for each step: what is outside neither grows nor erodes.
-    grown = np.ones((high + 2, wide + 2), np.uint8)
-    above = np.zeros((high + 2, wide + 2), np.uint8)
+    grown, above = np.empty((high + 2, wide + 2), np.uint8), np.empty((high + 2, wide + 2), np.uint8)
+    grown[:], above[:] = 1, 0
     line = np.empty(wide + 2, np.uint8)
     for y in range(high):
         row = above[y + 1, 1:]

@@ -149,7 +149,8 @@ def cut_gloss(
     more than a cap. sums : (3,), filled with that, and the sums of the squares of `cut` and of `brightness`.
     """
     high, wide = strength.shape
-    near = np.zeros(wide + 2, np.uint8)
+    near = np.empty(wide + 2, np.uint8)
+    near[0] = near[wide + 1] = 0
     total = squares = common = 0.0
     for y in range(high):
         above, here, below, row = hidden[max(y - 1, 0)], hidden[y], hidden[min(y + 1, high - 1)], beside[y]

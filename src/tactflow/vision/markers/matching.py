@@ -345,9 +345,11 @@ def propagate_beliefs(
     source, target = np.empty(2 * links, np.int64), np.empty(2 * links, np.int64)
     pair = np.empty((2 * links, states, states))
     link_costs(origin, edges, slot, spots, label, source, target, pair)
-    message, latest = np.zeros((2 * links, states)), np.empty((2 * links, states))
+    message, latest = np.empty((2 * links, states)), np.empty((2 * links, states))
+    message[:] = 0.0
     belief, total = unary.copy(), np.empty((count, states))
-    choice = np.empty(count, np.int64)
+    choice, owner = np.empty(count, np.int64), np.empty(len(spots), np.int64)
+    owner[:] = -1
     for n in range(count):
         choice[n] = cheapest(belief[n])
     unchanged = 0
@@ -364,4 +366,4 @@ def propagate_beliefs(
         unchanged = unchanged + 1 if same else 0
         if unchanged == STABLE_ROUNDS:
             break
-    assign_spots(belief, choice, label, np.full(len(spots), -1, np.int64), chosen)
+    assign_spots(belief, choice, label, owner, chosen)

@@ -424,7 +424,8 @@ def align_marks(
     offsets = np.empty(disc.shape[1], np.int64)
     for p in range(len(offsets)):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
-    words, patch = np.empty(len(offsets), np.int32), np.zeros(weights.shape[2], np.int16)
+    words, patch = np.empty(len(offsets), np.int32), np.empty(weights.shape[2], np.int16)
+    patch[:] = 0
     for n in range(len(marks)):
         # The next mark's template and patch are asked for while this one is aligned.
         if n + 1 < len(marks):
