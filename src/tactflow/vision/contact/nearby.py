@@ -88,10 +88,9 @@ def spread_largest(values: Float, reach: int, least: float, nearby: Float) -> No
     # The largest of so many next to one another, of twice as many, and so on; along x, then along y.
     around = np.empty((high + 4 * reach + 1, broad), np.float32)
     line, wider = np.empty(broad + 2 * reach, np.float32), np.empty(broad + 2 * reach, np.float32)
-    around[:] = line[:] = wider[:] = 0
+    around[:] = 0
     for y in range(high):
-        for x in range(2 * reach):
-            line[x] = line[broad + x] = 0
+        line[:] = 0
         for x in range(wide):
             line[x + 2 * reach] = values[y, x]
         span = 1
