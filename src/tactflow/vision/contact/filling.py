@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -144,9 +144,10 @@ def trace_outlines(
         for x in range(wide):
             marks[y + 1, x + 1] = mask[y, x] | hidden[y, x] | beside[y, x] * BESIDE
     found = ends[0, 0] = ends[0, 1] = 0
+    # Not simply 1: for a constant, numba would compile `_follow` a second time.
+    first: Any = np.int64(1)
     for y in range(1, high + 1):
-        # No constant: for one, numba would compile `_follow` a second time.
-        x, outside = np.int64(1), True
+        x, outside = first, True
         while x <= wide:
             if marks[y, x] & PIXEL == 0:
                 x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == 0 else 1
