@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -91,6 +93,13 @@ def test_what_the_removal_of_a_marker_leaves_at_its_rim_is_no_contact() -> None:
     with_contact = sliver | light(125, 100, 140, 110)
     fused = fuse_contact(with_contact, markers(), MotionTest(ORIGIN))
     assert (fused.mask == light(125, 100, 140, 110)).all()
+
+
+def test_beside_markers_of_unknown_size_nothing_is_taken_for_a_rim() -> None:
+    sliver, sizes_unknown = light(24, 16, 28, 24), replace(markers(), radius=None)
+    fused = fuse_contact(sliver, sizes_unknown, MotionTest(ORIGIN))
+    assert fused.evidence == "light"
+    assert fused.mask is sliver
 
 
 def test_the_rim_of_a_marker_beside_a_contact_is_no_second_one() -> None:

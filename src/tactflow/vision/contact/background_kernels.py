@@ -36,7 +36,7 @@ def smooth_cells(half: Byte, smooth: Float) -> None:
 
     half : (2 h, 6 w), a picture of which 2 x 2 pixels are a cell; their mean is rounded, as `halved` does.
     """
-    high, wide = smooth.shape[1:]
+    _, high, wide = smooth.shape
     # Of each pixel and the next one, of two lines; lines of cells, of which three are in use.
     means, cells = np.empty(6 * wide, np.uint8), np.empty((3, 3 * wide), np.uint8)
     sums, squares = np.empty(3 * wide + 6, np.int16), np.empty(3 * wide, np.int16)
@@ -96,9 +96,9 @@ def weigh_change(
     now and then.
     """
     high, wide = squared.shape
-    largest = np.full(wide, -np.inf, np.float32)
-    largest_colour = np.full(wide, -np.inf, np.float32)
     along = np.empty(wide, np.float32)
+    largest, largest_colour = np.empty(wide, np.float32), np.empty(wide, np.float32)
+    largest[:] = largest_colour[:] = -np.inf
     now = was = 0.0
     for y in range(high):
         total, rest, both = squared[y], colour[y], evidence[y]
@@ -169,9 +169,9 @@ def scaled_change(
     _find_spans(inside, side, spans)
     light = _light_along(coefficients, across[left : left + wide])
     # With a pixel more on both sides.
-    line, most = np.empty(3 * wide + 6, np.float32), np.zeros(3 * wide, np.float32)
+    line, most = np.empty(3 * wide + 6, np.float32), np.empty(3 * wide, np.float32)
     begin, end = 0, 0
-    peaks[:] = 0
+    most[:] = peaks[:] = 0
     for y in range(high):
         if y % side == 0:
             begin, end = _neighbours(spans, y // side, wide)

@@ -4,6 +4,11 @@ The mean profile of the change across the outline has a clear peak at the border
 is from the outer edge differs from side to side: lamps reach one flank better than the other, and an object
 leans. So each arc of the outline has a profile of its own, too. It tells how the arc differs from the others;
 where the border lies on the whole is told by the profile of all of them together, which is less noisy.
+
+`depth_of` gives the depth of each pixel of a region, and the outlines; `inside_border` subtracts the depth of
+the border. An outline is divided into steps, several to an arc: a pixel outside gets the step that it lies
+beside (`_steps_beside`), a pixel inside that of the nearest pixel outside. So each step has a profile; those
+within an arc's length, together, tell how deep the border lies there (`_step_depths`).
 """
 
 from __future__ import annotations
@@ -115,19 +120,20 @@ def depth_of(region: Region) -> Depth:
     )
 
 
-def inside_border(region: Depth, parts: Float, strength: Float, hidden: Mask | None) -> Float:
+def inside_border(inner: Depth, parts: Float, strength: Float, hidden: Mask | None) -> Float:
     """Level set of a contact: how far inside its border each pixel is, pixels at half resolution.
 
-    region : of the change. parts : (h, w), its depth, but below 0 where it does not belong to the contact.
-    strength : (h, w), relative to the largest nearby. hidden : (h, w), 1 where a marker was removed; or None.
+    inner : of the changed region. parts : (h, w), its depth, but below 0 where it does not belong to the
+    contact. strength : (h, w), relative to the largest nearby. hidden : (h, w), 1 where a marker was removed;
+    or None.
     """
-    middle = region.middle if parts is region.depth else cv2.minMaxLoc(parts)[1]
+    middle = inner.middle if parts is inner.depth else cv2.minMaxLoc(parts)[1]
     level = np.empty_like(parts)
     border_level(
         parts,
-        region.nearest,
-        region.corners,
-        region.outlines,
+        inner.nearest,
+        inner.corners,
+        inner.outlines,
         strength,
         np.zeros(parts.shape, np.uint8) if hidden is None else hidden,
         middle,
@@ -177,8 +183,8 @@ def _border_depth(
 
 
 @helper
-def _place_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float, place: Whole) -> None:
-    """Label of a pixel outside -> 1 and the step of the outline that it is beside; `place`, 0, is filled."""
+def _steps_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float, beside: Whole) -> None:
+    """Label of a pixel outside -> 1 and the step of the outline that it is beside; `beside`, 0, is filled."""
     high, wide = parts.shape
     for outline in range(1, outlines.shape[0]):
         first, last, length = outlines[outline - 1, 0], outlines[outline, 0], outlines[outline, 2]
@@ -191,7 +197,7 @@ def _place_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float,
                 for column in range(max(x - 1, 0), min(x + 2, wide)):
                     if parts[row, column] <= 0:
                         label = nearest[row, column]
-                        place[label] = max(mark, place[label])
+                        beside[label] = max(mark, beside[label])
             if x == corners[ahead, 0] and y == corners[ahead, 1]:
                 ahead = ahead + 1 if ahead + 1 < last else first
             across, down = corners[ahead, 0] - x, corners[ahead, 1] - y
@@ -260,16 +266,18 @@ def border_level(
     middle : the largest depth of the parts.
     """
     high, wide = parts.shape
-    place = np.zeros(parts.size + 1, np.int32)
-    _place_beside(corners, outlines, nearest, parts, place)
+    beside = np.empty(parts.size + 1, np.int32)
+    beside[:] = 0
+    _steps_beside(corners, outlines, nearest, parts, beside)
     # Of all pixels, and of those of each step: their number and the sum of their strengths in bins of depth.
-    steps, around = outlines[-1, 1], np.zeros(2 * int(middle / BIN) + 4)
-    bins, border = np.zeros((steps, around.size)), np.empty(steps)
+    steps, around = outlines[-1, 1], np.empty(2 * int(middle / BIN) + 4)
+    bins, border = np.empty((steps, around.size)), np.empty(steps)
+    around[:] = bins[:] = 0
     bins_per_pixel = np.float32(1 / BIN)
     for y in range(high):
         for x in range(wide):
             if parts[y, x] > 0:
-                step = place[nearest[y, x]] - 1
+                step = beside[nearest[y, x]] - 1
                 level[y, x] = step
                 if hidden[y, x] == 0:
                     at = 2 * int(parts[y, x] * bins_per_pixel)

@@ -1,4 +1,8 @@
-"""Connected components of the cells that have changed."""
+"""Connected components of the cells that have changed: which of them are contacts, and where.
+
+`contact_components` closes small gaps between the cells, parts them, keeps the parts that are strong enough,
+and leaves out stray ones. `wide_change` finds those that are faint, but wide.
+"""
 
 from __future__ import annotations
 
@@ -160,8 +164,8 @@ def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int
     """
     high, wide = squared.shape
     # A border of one cell for each step: what is outside neither grows nor erodes.
-    grown = np.ones((high + 2, wide + 2), np.uint8)
-    above = np.zeros((high + 2, wide + 2), np.uint8)
+    grown, above = np.empty((high + 2, wide + 2), np.uint8), np.empty((high + 2, wide + 2), np.uint8)
+    grown[:], above[:] = 1, 0
     line = np.empty(wide + 2, np.uint8)
     for y in range(high):
         row = above[y + 1, 1:]

@@ -11,6 +11,11 @@ the whole outline, the profile of the change across it has a clear peak.
 
 Light is never even, so every change is measured by the largest one nearby (`nearby`), not in the whole
 contact.
+
+`contact_level` takes mirror images of lamps out of a window's change (`cut_gloss`), tells which of the two it
+is, and has `_level_of_brightness` or `_level_of_slopes` find the level set, positive inside. Where slopes
+show, what is clear beside the largest change nearby, closed by `filling`, is a region; `border` tells how far
+inside the region the contact ends. Small separate parts, specks, are left out.
 """
 
 from __future__ import annotations
@@ -48,16 +53,16 @@ GLOSS: Final = 1.6
 """A change of more than so many times its typical value (the mean weighted by the change itself) is a mirror
 image of a lamp, and is cut to that. Chosen by hand."""
 
-EVEN: Final = 6.0
+COLOURED: Final = 6.0
 """A change has brightened as a whole where its mean over the channels, squared and summed, is more than one
 part in so many of its length's: of three equal channels it is one in three. Chosen by hand, half of that."""
 
-BESIDE: Final = 0.7
+PLATEAU_REACH: Final = 0.7
 """Part of the contact's radius within which the largest change of a contact that has changed as a whole is
 sought: its border is half as high as the plateau beside it, which darkens with its slope, not as the middle.
 Chosen on handmade_dots, sts_640 and the simulator: 0.5 overlaps more there, but less on `halo`."""
 
-LEAST: Final = 0.1
+FURTHEST_OUT: Final = 0.1
 """A contact that has changed as a whole ends half way, but no further out than where this fraction of the
 largest change nearby is left. Chosen by hand."""
 
@@ -101,29 +106,33 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     >>> bool(abs((contact_level(change) > 0).sum() / np.pi - 8**2) < 3)
     True
     """
-    below = hidden if hidden is not None and cv2.countNonZero(hidden) else None
-    level, near = _level(change, bridge, below)
+    if hidden is not None and not cv2.countNonZero(hidden):
+        hidden = None
+    level, near = _level(change, bridge, hidden)
     if near is not None:
         # Faint changes that only touch the contact's, such as bands of light, have pulled what is typical.
-        level, _ = _level(WindowChange(change.strength * near, change.brightness * near), bridge, below)
+        level, _ = _level(WindowChange(change.strength * near, change.brightness * near), bridge, hidden)
     return level
 
 
 def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Float, Float | None]:
-    """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0."""
+    """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0.
+
+    pixels : of a `Hidden`; None where nothing is hidden.
+    """
     shape = change.strength.shape
     strength, beside, sums = np.empty(shape, np.float32), np.empty(shape, np.uint8), np.empty(3)
     none = np.zeros(shape, np.uint8) if pixels is None else pixels
     cut_gloss(change.strength, change.brightness, none, beside, strength, sums)
     cap, squares, common = sums.tolist()
-    hidden, even = None if pixels is None else Hidden(pixels, beside), squares / EVEN
+    hidden, even = None if pixels is None else Hidden(pixels, beside), squares / COLOURED
     # What is cut is no larger than before: where it is too little then, there is no need to cut it.
     if common > even:
         tone = np.float32(cap / 3**0.5)
         brightness = np.clip(change.brightness, -tone, tone)
         if cv2.norm(brightness, cv2.NORM_L2SQR) > even:
-            return _without_specks(_changed_as_a_whole(brightness, hidden), strength), None
-    return _tilted(strength, bridge, hidden)
+            return _without_specks(_level_of_brightness(brightness, hidden), strength), None
+    return _level_of_slopes(strength, bridge, hidden)
 
 
 @kernel(
@@ -140,7 +149,8 @@ def cut_gloss(
     more than a cap. sums : (3,), filled with that, and the sums of the squares of `cut` and of `brightness`.
     """
     high, wide = strength.shape
-    near = np.zeros(wide + 2, np.uint8)
+    near = np.empty(wide + 2, np.uint8)
+    near[0] = near[wide + 1] = 0
     total = squares = common = 0.0
     for y in range(high):
         above, here, below, row = hidden[max(y - 1, 0)], hidden[y], hidden[min(y + 1, high - 1)], beside[y]
@@ -166,15 +176,15 @@ def _typical(values: Float) -> float:
     return max(cv2.norm(values, cv2.NORM_L2SQR) / max(cv2.norm(values, cv2.NORM_L1), 1e-9), 1e-9)
 
 
-def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
+def _level_of_brightness(brightness: Float, hidden: Hidden | None) -> Float:
     """Level set of a contact that has brightened or darkened as a whole, whichever is stronger."""
     brighter = np.clip(brightness, np.float32(0), np.float32(np.inf))
     darker = brighter - brightness
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         brightness, darker = -brightness, brighter
     around = _typical(darker)
-    nearby = largest_nearby(brightness, BESIDE)
-    half_way = np.maximum((nearby - np.float32(around)) / 2, np.float32(LEAST) * nearby)
+    nearby = largest_nearby(brightness, PLATEAU_REACH)
+    half_way = np.maximum((nearby - np.float32(around)) / 2, np.float32(FURTHEST_OUT) * nearby)
     level = (brightness - half_way) / nearby
     if hidden is not None:
         # The change is smooth here: what is painted next to what is seen is nearly right.
@@ -186,20 +196,20 @@ def _changed_as_a_whole(brightness: Float, hidden: Hidden | None) -> Float:
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
-def _tilted(strength: Float, bridge: float, hidden: Hidden | None) -> tuple[Float, Float | None]:
+def _level_of_slopes(strength: Float, bridge: float, hidden: Hidden | None) -> tuple[Float, Float | None]:
     """`_level` of a contact that shows its slopes."""
     local = strength / largest_nearby(strength)
     region, solid, specks = _sloping_region(local, strength, bridge, hidden)
     if cv2.countNonZero(region.filled) == region.filled.size:
         return np.ones_like(strength), None
-    inner, below = depth_of(region), None if hidden is None else hidden.pixels
+    inner, pixels = depth_of(region), None if hidden is None else hidden.pixels
     if specks is None:
-        level = inside_border(inner, inner.depth, local, below)
+        level = inside_border(inner, inner.depth, local, pixels)
         return level if solid else _without_specks(level, strength), None
     parts = np.where(specks, np.float32(-1), inner.depth)
     away = cv2.distanceTransform((parts <= 0).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     near = np.asarray((away < parts.max()) & ~specks, np.float32)
-    return inside_border(inner, parts, local, below), near
+    return inside_border(inner, parts, local, pixels), near
 
 
 def _sloping_region(

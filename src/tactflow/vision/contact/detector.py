@@ -308,8 +308,8 @@ class ContactDetector:
         top, left = CELL * rows.start, CELL * columns.start
         side = 1 if self._crowded or cv2.countNonZero(inside.view(np.uint8)) < FEW_CELLS else 2
         window = self._background.window_change(change, rows, columns, inside, side)
-        below = None if hidden is None else window_mask(hidden, top, left, inside, side)
-        draw_level(contact_level(window, 2 * BRIDGE / side, below), top, left, mask, side)
+        removed = None if hidden is None else window_mask(hidden, top, left, inside, side)
+        draw_level(contact_level(window, 2 * BRIDGE / side, removed), top, left, mask, side)
 
     def _clear(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
         """Contact by the size of the change, so that its outline can be seen.

@@ -1,11 +1,17 @@
-"""Filling a region: holes, gaps, and pockets at the border of the frame."""
+"""Filling a region: holes, gaps, and pockets at the border of the frame.
+
+A mask of what has changed becomes a `Region` by `enclosed`: `outlined` fills the holes of its parts, `traced`
+finds their outlines, `fill_pockets` adds what they enclose together with the border of the frame. A region
+that is not solid then (`is_solid`) may be a ring with a gap: `fill_bay` fills the largest bay where there is
+a faint change, `close_gaps` bridges a gap.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -138,8 +144,10 @@ def trace_outlines(
         for x in range(wide):
             marks[y + 1, x + 1] = mask[y, x] | hidden[y, x] | beside[y, x] * BESIDE
     found = ends[0, 0] = ends[0, 1] = 0
+    # Not simply 1: for a constant, numba would compile `_follow` a second time.
+    first: Any = np.int64(1)
     for y in range(1, high + 1):
-        x, outside = 1, True
+        x, outside = first, True
         while x <= wide:
             if marks[y, x] & PIXEL == 0:
                 x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == 0 else 1

@@ -179,7 +179,7 @@ def compare_blocks(
     per_brightness : (3, n), one over the brightness, 0 where it is not lit: a gain is the median of the
     relative change of the blocks that are lit and not saturated, or the largest one where all are saturated.
     """
-    high, wide = cells.shape[1:]
+    _, high, wide = cells.shape
     down, across = len(row_weights), len(column_weights)
     line, ratios = np.empty(wide, np.float32), np.empty(down * across, np.float32)
     for c in range(3):

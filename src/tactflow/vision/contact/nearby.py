@@ -45,10 +45,11 @@ def halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, floa
     values : (h, w). part : of the radius. halved : (h / 2, w / 2), rounded up, filled; the last line counts
     twice then.
     """
-    high, wide = values.shape
+    (high, wide), (rows, columns) = values.shape, halved.shape
     sums, line = np.empty(wide + 2), np.empty(wide + 1, np.float32)
-    upper, largest = np.empty(wide + 1, np.float32), np.zeros(wide, np.float32)
-    for y in range(2 * len(halved)):
+    upper, largest = np.empty(wide + 1, np.float32), np.empty(wide, np.float32)
+    largest[:] = 0
+    for y in range(2 * rows):
         row = min(y, high - 1)
         above = values[min(1, high - 1) if row == 0 else row - 1]
         here, below = values[row], values[max(high - 2, 0) if row == high - 1 else row + 1]
@@ -61,7 +62,7 @@ def halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, floa
             largest[x] = line[x] if line[x] > largest[x] else largest[x]
         line[wide] = line[wide - 1]
         if y & 1:
-            for x in range(halved.shape[1]):
+            for x in range(columns):
                 both = upper[2 * x] + upper[2 * x + 1] + (line[2 * x] + line[2 * x + 1])
                 halved[y >> 1, x] = both * np.float32(0.25)
         upper, line = line, upper
@@ -85,11 +86,11 @@ def spread_largest(values: Float, reach: int, least: float, nearby: Float) -> No
     high, wide = values.shape
     side, broad = 2 * reach + 1, wide + 2 * reach
     # The largest of so many next to one another, of twice as many, and so on; along x, then along y.
-    around = np.zeros((high + 4 * reach + 1, broad), np.float32)
-    line, wider = np.zeros(broad + 2 * reach, np.float32), np.zeros(broad + 2 * reach, np.float32)
+    around = np.empty((high + 4 * reach + 1, broad), np.float32)
+    line, wider = np.empty(broad + 2 * reach, np.float32), np.empty(broad + 2 * reach, np.float32)
+    around[:] = 0
     for y in range(high):
-        for x in range(2 * reach):
-            line[x] = line[broad + x] = 0
+        line[:] = 0
         for x in range(wide):
             line[x + 2 * reach] = values[y, x]
         span = 1
@@ -111,7 +112,8 @@ def spread_largest(values: Float, reach: int, least: float, nearby: Float) -> No
                 row[x] = row[x] if row[x] > below[x] else below[x]
         span += step
     # Sums along y, and those of all to the left.
-    sums, left = np.zeros(broad), np.zeros(broad + 1)
+    sums, left = np.empty(broad), np.empty(broad + 1)
+    sums[:] = left[:] = 0
     means, share = np.empty((high, wide), np.float32), 1 / (side * side)
     for y in range(high + 2 * reach):
         row, old = around[y], around[y - side if y >= side else high + 4 * reach]

@@ -79,13 +79,13 @@ def raise_mask(level: Float, top: int, left: int, mask: Mask) -> None:
 @kernel("void(uint8[:, ::1], int64, int64, uint8[:, ::1], uint8[:, ::1])")
 def halve_window(mask: Mask, top: int, left: int, inside: Mask, halved: Mask) -> None:
     """What `window_mask` does at half resolution; `halved`, (2 h, 2 w), is filled."""
-    high = min(halved.shape[0], (mask.shape[0] - top + 1) // 2)
-    wide = min(halved.shape[1], (mask.shape[1] - left + 1) // 2)
+    (rows, columns), (high, wide) = mask.shape, halved.shape
+    high, wide = min(high, (rows - top + 1) // 2), min(wide, (columns - left + 1) // 2)
     halved[:] = 0
     any_of = np.empty(wide, np.uint8)
     for y in range(high):
         first, row = top + 2 * y, halved[y]
-        upper, lower = mask[first, left:], mask[min(first + 1, mask.shape[0] - 1), left:]
+        upper, lower = mask[first, left:], mask[min(first + 1, rows - 1), left:]
         whole = min(wide, upper.size // 2)
         for x in range(whole):
             any_of[x] = upper[2 * x] | upper[2 * x + 1] | lower[2 * x] | lower[2 * x + 1]

@@ -108,7 +108,7 @@ def weigh_colours(change: Float, inside: NDArray[np.uint8], response: Float) -> 
     if second * elongation >= first:
         return
     raised = first / max(second * elongation, 1e-6 * first)
-    gain = min(raised, LARGEST_GAIN**2) ** min((LONG - elongation) / (LONG - ROUND), 1.0)
+    gain = min(raised, LARGEST_GAIN * LARGEST_GAIN) ** min((LONG - elongation) / (LONG - ROUND), 1.0)
     scale = whole / (gain * whole - (gain - 1) * first)
     length = math.sqrt((gain - 1) * scale)
     response[0] = gain * scale

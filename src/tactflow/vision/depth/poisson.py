@@ -96,8 +96,8 @@ def solve_columns(values: Float, stiffness: Float, turn: Float) -> None:
     """
     height, width = values.shape
     pivots = np.empty((height, width), np.float32)
-    beyond = np.zeros(width, np.float32)
-    carried = np.zeros(width, np.float32)
+    beyond, carried = np.empty(width, np.float32), np.empty(width, np.float32)
+    beyond[:] = carried[:] = 0
     one = np.float32(1)
     _mirror(values, turn)
     for y in range(height):

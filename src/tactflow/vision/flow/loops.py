@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,8 @@ def rate_motion(
     shift_x = shift_y = middle = 0.0
     # The shift by x and by y, then the turn: each marker's motion across its arm, over the arm's length.
     for part in range(3):
-        count = 0
+        # Not simply 0: for a constant, numba would compile `_median` a second time.
+        count: Any = np.int64(0)
         for i in range(status.size):
             if status[i] == _TRACKED:
                 x, y = position[i, 0] - rest[0, i] - shift_x, position[i, 1] - rest[1, i] - shift_y

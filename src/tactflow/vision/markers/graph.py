@@ -139,8 +139,8 @@ def largest_components(
     waiting = seen.copy()
     # The marks of a component, one component after the other.
     order = np.empty(count, np.int64)
-    heaviest = np.zeros(count, np.int64)
-    begin, end = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    heaviest, begin, end = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
+    heaviest[:] = begin[:] = end[:] = 0
     filled = 0
     for seed in range(count):
         if not waiting[seed]:

@@ -424,7 +424,8 @@ def align_marks(
     offsets = np.empty(disc.shape[1], np.int64)
     for p in range(len(offsets)):
         offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
-    words, patch = np.empty(len(offsets), np.int32), np.zeros(weights.shape[2], np.int16)
+    words, patch = np.empty(len(offsets), np.int32), np.empty(weights.shape[2], np.int16)
+    patch[:] = 0
     for n in range(len(marks)):
         # The next mark's template and patch are asked for while this one is aligned.
         if n + 1 < len(marks):
@@ -448,7 +449,7 @@ def align_marks(
             safe = max(gain, LEAST_DIVISOR)
             now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -radius), radius)
             now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -radius), radius)
-            far = (now_x - x) ** 2 + (now_y - y) ** 2 > converged
+            far = (now_x - x) * (now_x - x) + (now_y - y) * (now_y - y) > converged
             x, y = now_x, now_y
             if number == ROUNDS or not (far and r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
                 break
