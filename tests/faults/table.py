@@ -156,7 +156,7 @@ RECORDINGS = (
     ("video file", "cut", False, "a warning", 0, "ended after .* may be damaged", "up to there"),
     ("recording (.mcap)", "not there", True, ERROR, 4, "no such file or folder", "nothing"),
     ("recording (.mcap)", "something else", True, ERROR, 4, "is not an MCAP file", "nothing"),
-    ("recording (.mcap)", "cut", True, "it is played up to there", 0, "^$", "up to there"),
+    ("recording (.mcap)", "cut", True, "a warning", 0, "was not finished.*tactflow repair", "up to there"),
     ("recording (.mcap)", "corrupt", True, ERROR, 4, "is damaged.*tactflow repair", "up to there"),
     ("recording (.mcap)", "removed", False, FINISHED, 0, "^$", "all results"),
     ("recording (.mcap)", "something else", False, ERROR, 4, "is damaged", "up to there"),
