@@ -250,3 +250,5 @@ class View(Guiding):
         self._closing[1].close()
         if self._server is not None:
             self._server.close()
+        # What is told at the end of a run shall not name a page that is gone.
+        self.description = None

@@ -153,7 +153,10 @@ class Capture(Source):
         p = self.params
         request = CameraRequest(p.width, p.height, p.fps, p.format)
         if isinstance(p.reference, str):
-            self._reference_image = load_image(p.reference, self._directory)
+            try:
+                self._reference_image = load_image(p.reference, self._directory)
+            except SourceError as error:
+                raise SourceError(f"reference: {error}") from error
         watch = Watch(p.reconnect, p.no_frame_timeout, p.frozen_after, p.black_after)
         self._source = self._opener(
             p.source, directory=self._directory, fps=p.fps, camera=request, watch=watch

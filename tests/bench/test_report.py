@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -13,7 +14,7 @@ from tactflow.bench.quantities import QUANTITIES, format_number
 from tactflow.bench.report import html
 from tactflow.bench.results import Measurement, Result, Target
 from tactflow.bench.scatter import scatter
-from tactflow.bench.table import print_result
+from tactflow.bench.table import print_result, terminal
 
 
 def measurement(method: str, scene: str, cost: float, **errors: float) -> Measurement:
@@ -154,3 +155,21 @@ def test_the_terminal_shows_methods_and_promises(result: Result) -> None:
 )
 def test_numbers_have_three_digits(value: float, text: str) -> None:
     assert format_number(value) == text
+
+
+@pytest.mark.parametrize("width", [80, 1000])
+def test_nothing_in_the_terminal_is_cut(result: Result, width: int) -> None:
+    result.measurements += [
+        replace(m, group="pipeline", method=f"{m.method} of the whole") for m in result.measurements
+    ]
+    out = io.StringIO()
+    print_result(result, Console(file=out, width=width))
+    text = out.getvalue()
+    assert "\u2026" not in text
+    assert max(map(len, text.splitlines())) <= width
+    for word in ("only on easy scenes of the whole", "slow & <exact>", "0.015 (0.02) *", "missed"):
+        assert word in text
+
+
+def test_what_is_no_terminal_has_no_width() -> None:
+    assert terminal(io.StringIO()).width > 500

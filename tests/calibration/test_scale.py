@@ -34,6 +34,32 @@ def test_the_standard_error_of_a_scale_is_honest() -> None:
     assert 0.5 < off.std() < 1.5
 
 
+def rings(pitch: float, noise: float, seed: int) -> NDArray[np.float64]:
+    """Dots on 8 rings, 10 px a mm: so far apart are rings, and dots along a ring."""
+    random = np.random.default_rng(seed)
+    dots = [[0.0, 0.0]]
+    for ring in range(1, 9):
+        angles = 2 * np.pi * (np.arange(6 * ring) / (6 * ring) + random.uniform())
+        dots += (10 * ring * pitch * np.column_stack([np.cos(angles), np.sin(angles)])).tolist()
+    return np.array(dots) + random.normal(0, noise, (len(dots), 2))
+
+
+@pytest.mark.parametrize("form", ["rings", "askew", "wide"])
+def test_dots_in_no_square_grid_have_the_error_that_they_make(form: str) -> None:
+    off = []
+    for seed in range(50):
+        dots = {
+            "rings": lambda seed: rings(2.0, 0.5, seed),
+            "askew": lambda seed: grid(0.1, 0.1, 2.0, 45.0, 1.0, seed),
+            # The columns are a twentieth further apart than the pitch says.
+            "wide": lambda seed: grid(0.1, 0.1, 2.0, 0.0, 0.3, seed) * (1.05, 1.0),
+        }[form](seed)
+        scale = scale_from_pitch(dots, 2.0, SIZE)
+        off += [(scale.x - 0.1) / scale.stderr[0], (scale.y - 0.1) / scale.stderr[1]]
+    assert np.percentile(np.abs(off), 95) < 2
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
+
+
 def test_a_grid_at_45_degrees_gives_one_scale_for_both_axes() -> None:
     scale = scale_from_pitch(grid(0.1, 0.1, 2.0, 45.0, 0.0, 1), 2.0, SIZE)
     assert scale.x == scale.y == pytest.approx(0.1, rel=1e-6)

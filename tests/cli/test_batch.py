@@ -76,6 +76,10 @@ def test_what_is_done_with_a_warning_is_told(folder: Path, capsys: pytest.Captur
     assert "3 done now" in told
     assert "1 done with warnings: " in told
     assert "of 6 frames; the file may be damaged; the table of runs has all" in told
+    page = (folder / "out" / "index.html").read_text()
+    # With the name, where it is seen without scrolling sideways.
+    row = page[page.index('<tr data-done><td data-value="film.avi">') :]
+    assert "the file may be damaged" in row[: row.index("</td>")]
 
 
 def test_the_last_shard_leaves_all_in_the_table(folder: Path) -> None:

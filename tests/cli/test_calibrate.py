@@ -110,6 +110,27 @@ def test_a_printed_target_gives_the_scale(
     assert said["found_by"] == "target of 5x7, pitch of 3 mm"
 
 
+@pytest.mark.parametrize(("rows_apart", "told"), [(30, False), (28, True)])
+def test_a_scale_from_dots_in_no_square_grid_is_told(
+    rows_apart: int,
+    told: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    picture = np.full((240, 320, 3), 150, np.uint8)
+    for x, y in np.ndindex(10, 7):
+        cv2.circle(picture, (25 + 30 * x, 25 + rows_apart * y), 5, (30, 30, 30), -1, cv2.LINE_AA)
+    cv2.imwrite("gel.png", picture)
+    assert calibrate("mini", "--from", "gel.png", "--pitch", "3") == 0
+    said = capsys.readouterr().err
+    assert ("--pitch is for dots in a square grid" in said) == told
+    scale = yaml.safe_load(Path("calibration/mini.yaml").read_text())["scale"]
+    apart = abs(scale["mm_per_pixel"][0] - scale["mm_per_pixel"][1])
+    assert min(scale["stderr"]) >= 0.9 * apart / np.sqrt(2)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

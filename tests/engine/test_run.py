@@ -437,6 +437,25 @@ def test_inputs_cannot_be_written_to_under_check(toy_runner: MakeRunner) -> None
     assert "read-only" in str(result.error)
 
 
+def test_who_gave_a_wrong_value_is_told_where_it_makes_another_stage_fail(toy_runner: MakeRunner) -> None:
+    stages = {
+        "bad": {"use": "BadKind"},
+        "vandal": {"use": "Vandal", "in": {"grid": "bad"}},
+        "gated": {"when": []},
+    }
+    result = toy_runner({**stages, "heavy": {"in": {"level": "vandal"}}}).run()
+    assert result.exit_code == 3
+    assert result.error is not None
+    assert "vandal failed at frame 0: ValueError: assignment destination is read-only" in result.error
+    assert "\n  bad gave a wrong value: port grid: required dtype uint8, got bool" in result.error
+
+
+def test_nobody_is_blamed_where_all_inputs_are_right(toy_runner: MakeRunner) -> None:
+    result = toy_runner({"level": {"fail_at": 3}}).run()
+    assert "level failed at frame 3" in str(result.error)
+    assert "wrong value" not in str(result.error)
+
+
 def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
     stages = {
         "bad": {"use": "BadShape"},

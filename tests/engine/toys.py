@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -288,6 +288,15 @@ class BadShape(Counted, Stage):
         self, grid: Grid
     ) -> Annotated[NDArray[np.uint8], ArrayPort("half", ("H", "W"), "uint8", "1")]:
         return grid[:2].copy()
+
+
+class BadKind(Counted, Stage):
+    """Gives another dtype than its port promises."""
+
+    def process(self, grid: Grid) -> Grid:
+        wrong: Any = grid > 0
+        wrong.flags.writeable = False
+        return wrong
 
 
 class Collect(Counted, Sink):

@@ -640,6 +640,13 @@ def test_a_websocket_under_a_foreign_name_is_refused(view: Callable[..., View]) 
     assert refusal.value.response.status_code == 403
 
 
+def test_a_page_that_is_gone_has_no_address(view: Callable[..., View]) -> None:
+    sink = view()
+    assert str(sink.description).startswith("http://127.0.0.1:")
+    sink.close()
+    assert sink.description is None
+
+
 def test_connections_that_ask_for_nothing_keep_nobody_out(
     view: Callable[..., View], stack: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -761,10 +768,11 @@ def test_a_taken_port_gives_way_to_the_next_free_one(
 def test_a_port_just_left_is_taken_again(view: Callable[..., View], page: Callable[..., Page]) -> None:
     first = view()
     page(first).next("hello")
-    assert first.description is not None
+    left = first.description
+    assert left is not None
     first.close()
-    port = int(first.description.rstrip("/").rpartition(":")[2])
-    assert view(port=port).description == first.description
+    port = int(left.rstrip("/").rpartition(":")[2])
+    assert view(port=port).description == left
 
 
 def test_the_address_is_logged(view: Callable[..., View], caplog: pytest.LogCaptureFixture) -> None:

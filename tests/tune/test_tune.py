@@ -84,6 +84,7 @@ def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     (tmp_path / "tuned.yaml").write_text(text)
     assert "field" in tactflow.load(tmp_path / "tuned.yaml").nodes
     assert f"{chosen.ms.value:.2f}" in text
+    assert "time: CPU of a frame with contact, on the recording" in text
     assert report.html(tuned).count("<circle") == sum(not one.failure for one in tuned.found)
 
 
@@ -103,6 +104,10 @@ def test_a_budget_that_is_over_ends_the_search_after_a_group_of_candidates(
     ]
     # The recording was not shown any more: the times are of the simulated one.
     assert not any(one.checks for one in tuned.found)
+    told = "\n".join(report.lines(tuned))
+    assert "time: CPU of a frame with contact, simulated" in told
+    assert "on the recording" not in told
+    assert "frames of the recording" not in told
     assert all(one.ms.value > 0 for one in tuned.found)
 
 

@@ -108,6 +108,9 @@ def _row(folder: Folder, row: Row) -> str:
     if outcome is not None and outcome.result is not None:
         name += f' <a href="results/{quote(outcome.result)}">result</a>'
     name += "" if where == escape(row.recording.name) else f"<small>{where}</small>"
+    # Beside the name they are seen without scrolling sideways.
+    notes = () if outcome is None else outcome.notes
+    name += "".join(f'<small class="bad">{escape(note)}</small>' for note in notes)
     status = "not done" if outcome is None else outcome.status
     kind = "good" if status == "done" else "bad"
     cells = [_cell(row.recording.name, name), _cell(status, f'<span class="{kind}">{status}</span>')]
@@ -117,9 +120,8 @@ def _row(folder: Folder, row: Row) -> str:
         return f'<tr>{"".join(cells)}<td class="why" colspan="{across}">{why}</td></tr>\n'
     cells += _numbers(outcome)
     record = folder.record(outcome.key) or {"curve": [], "pictures": []}
-    notes = "".join(f"<small>{escape(note)}</small>" for note in outcome.notes)
     cells.append(f'<td class="wide">{plots(record["curve"], outcome.duration)}</td>')
-    cells.append(f'<td class="wide"><div class="pictures">{_pictures(record)}</div>{notes}</td>')
+    cells.append(f'<td class="wide"><div class="pictures">{_pictures(record)}</div></td>')
     return f"<tr data-done>{''.join(cells)}</tr>\n"
 
 

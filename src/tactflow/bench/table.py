@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from statistics import median
+from typing import Final, TextIO
 
-from rich.console import Console
+from rich.cells import cell_len
+from rich.console import Console, JustifyMethod
 from rich.table import Table
+from rich.text import Text
 
 from tactflow.bench.pareto import limit_of, pareto, points
 from tactflow.bench.quantities import QUANTITIES, format_number
 from tactflow.bench.report import PRIMARY, TITLES
 from tactflow.bench.results import RECORDING, Measurement, Result
+
+UNLIMITED: Final = 1000
+"""Columns of what is no terminal: more than any table has."""
+BORDER: Final = 3
+"""Columns that a column takes beside its text: a line and a space on both sides."""
+
+
+def terminal(file: TextIO) -> Console:
+    """Where tables go: as wide as the terminal, or without a limit where `file` is none, such as a pipe."""
+    return Console(file=file, highlight=False, width=None if file.isatty() else UNLIMITED)
 
 
 def print_result(result: Result, console: Console) -> None:
@@ -21,26 +35,25 @@ def print_result(result: Result, console: Console) -> None:
         f"{result.touch_ms / result.copy_ms:.2f} copies; times are CPU times in one thread"
     )
     for group in result.groups():
-        console.print(_methods(result, group))
-    console.print(_scenes(result))
+        console.print(*_methods(result, group, console.width), sep="\n")
+        console.print("median over scenes (worst); * on the Pareto front of time and error", style="dim")
+    console.print(*_scenes(result, console.width), sep="\n")
     console.print(_targets(result))
     for measurement in result.measurements:
         if measurement.failure:
             console.print(f"{measurement.key}: {measurement.failure}", style="red", markup=False)
 
 
-def _methods(result: Result, group: str) -> Table:
+def _methods(result: Result, group: str, width: int) -> Iterator[Table]:
     """One line per method: median over the scenes, in brackets the worst one."""
     quantities = [QUANTITIES[name] for name in PRIMARY.get(group, ())]
     fronts = {q.key: {p.method for p in pareto(points(result, group, q))} for q in quantities}
-    table = Table(title=TITLES.get(group, group), title_justify="left", title_style="bold")
-    table.add_column("method")
-    for heading in ("contact, copies", "idle, copies", "x classic"):
-        table.add_column(heading, justify="right")
+    heads = ["method", "contact, copies", "idle, copies", "x classic"]
     for quantity in quantities:
         heading = quantity.title + (f", {quantity.unit}" if quantity.unit else "")
         limit = limit_of(result, group, quantity)
-        table.add_column(heading + (f" (limit {format_number(limit)})" if limit else ""), justify="right")
+        heads.append(heading + (f" (limit {format_number(limit)})" if limit else ""))
+    lines = []
     for method in result.methods(group):
         rows = [m for m in result.of(group, method) if not m.scene.startswith(RECORDING)]
         if not rows:
@@ -55,10 +68,36 @@ def _methods(result: Result, group: str) -> Table:
             text = f"{format_number(median(values))} ({format_number(worst)})"
             on_front = method in fronts[quantity.key] and len(result.methods(group)) > 1
             cells.append(f"[green]{text} *[/green]" if on_front else text)
-        table.add_row(*cells)
-    table.caption = "median over scenes (worst scene); * on the Pareto front of time and error"
-    table.caption_justify = "left"
-    return table
+        lines.append(cells)
+    return _blocks(TITLES.get(group, group), heads, [lines], width)
+
+
+def _blocks(
+    title: str, heads: Sequence[str], sections: Sequence[Sequence[Sequence[str]]], width: int, keys: int = 1
+) -> Iterator[Table]:
+    """Tables of as many columns as fit into `width`, each with the first `keys` of them: no cell is cut.
+
+    heads : a heading for each column, broken between words. sections : of rows of cells, with markup.
+    """
+    rows = [row for section in sections for row in section]
+    widths = [
+        max(map(cell_len, [*head.split(), *(Text.from_markup(row[k]).plain for row in rows)]))
+        for k, head in enumerate(heads)
+    ]
+    left = list(range(keys, len(heads)))
+    while left:
+        taken = [*range(keys), left.pop(0)]
+        while left and sum(widths[k] + BORDER for k in [*taken, left[0]]) < width:
+            taken.append(left.pop(0))
+        table = Table(title=title, title_justify="left", title_style="bold")
+        for k in taken:
+            justify: JustifyMethod = "left" if k < keys else "right"
+            table.add_column(heads[k], justify=justify, width=widths[k], overflow="fold")
+        for section in sections:
+            for row in section:
+                table.add_row(*(row[k] for k in taken))
+            table.add_section()
+        yield table
 
 
 def _median(rows: list[Measurement], kind: str) -> str:
@@ -72,7 +111,7 @@ def _ratio(rows: list[Measurement]) -> str:
     return format_number(median(known)) if known else "-"
 
 
-def _scenes(result: Result) -> Table:
+def _scenes(result: Result, width: int) -> Iterator[Table]:
     """Whole pipelines, scene by scene."""
     names = (
         "displacement_rms",
@@ -98,22 +137,18 @@ def _scenes(result: Result) -> Table:
         "false %",
         "missed %",
     )
-    table = Table(title="Whole pipelines, scene by scene", title_justify="left", title_style="bold")
-    table.add_column("scene")
-    table.add_column("pipeline")
-    table.add_column("copies", justify="right")
-    table.add_column("x classic", justify="right")
-    for heading in short:
-        table.add_column(heading, justify="right")
     rows = [m for m in result.of("pipeline") if not m.scene.startswith(RECORDING)]
+    sections = []
     for scene in dict.fromkeys(m.scene for m in rows):
+        lines = []
         for m in (m for m in rows if m.scene == scene):
             copies = m.copies.get("contact", m.copies.get("idle"))
             faster = m.faster.get("contact", m.faster.get("idle"))
             cells = [_cell(copies), _cell(faster), *(_cell(m.errors.get(name)) for name in names)]
-            table.add_row(scene, m.method, *cells)
-        table.add_section()
-    return table
+            lines.append([scene, m.method, *cells])
+        sections.append(lines)
+    heads = ["scene", "pipeline", "copies", "x classic", *short]
+    return _blocks("Whole pipelines, scene by scene", heads, sections, width, keys=2)
 
 
 def _cell(value: float | None) -> str:
@@ -124,7 +159,7 @@ def _targets(result: Result) -> Table:
     """Promise beside result."""
     table = Table(title="Promises and results", title_justify="left", title_style="bold")
     for heading in ("quantity", "target", "result", "", "measured on"):
-        table.add_column(heading)
+        table.add_column(heading, overflow="fold")
     marks = {True: "[green]met[/green]", False: "[red]missed[/red]", None: "-"}
     for target in result.targets:
         table.add_row(target.quantity, target.target, target.result, marks[target.met], target.on)

@@ -41,8 +41,10 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
 
     Returns
     -------
-    The scale, with standard errors from how the links scatter: that of their mean, where the middle of the
-    picture stands for all of it.
+    The scale, with standard errors from how the links scatter (that of their mean, where the middle of the
+    picture stands for all of it), and from how far the dots are from a square grid: what x and y differ by,
+    since the dots alone cannot tell a picture that is stretched from a grid that is not square; and what
+    single links differ in length from their mean, as those of rings do, which point everywhere.
 
     Raises
     ------
@@ -54,6 +56,8 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
     >>> scale = scale_from_pitch(np.column_stack([x.ravel(), y.ravel()]), 2.0, (120, 120))
     >>> round(scale.x, 6), round(scale.y, 6)
     (0.1, 0.08)
+    >>> round(scale.stderr[0], 3)
+    0.016
     """
     if not (np.isfinite(pitch) and pitch > 0):
         raise ValueError(f"pitch: required > 0 mm, got {pitch:g}")
@@ -65,20 +69,30 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
             f"found {fewest}; give the corners of a known rectangle instead"
         )
     means = np.array([np.median(group, axis=0) for group in groups])
+    x, y = _square(means, pitch)
     spread = np.array([1.4826 * np.median(np.abs(g - m), axis=0) for g, m in zip(groups, means, strict=True)])
     error = spread / np.sqrt([[len(group)] for group in groups])
-    squares = means**2
-    if abs(np.linalg.det(squares)) < 0.25 * squares.sum() ** 2 / 4:
-        both = pitch / np.sqrt(squares.sum(axis=1)).mean()
-        x = y = float(both)
-    else:
-        x, y = np.sqrt(np.maximum(np.linalg.solve(squares, [pitch**2, pitch**2]), 0)).tolist()
-        if not (x > 0 and y > 0):
-            raise ValueError("scale by pitch: the dots stand in no square grid; give corners instead")
     # Along an axis the relative error of the scale is that of the links that run along it.
     along = np.argmax(np.abs(means), axis=0)
-    relative = [float(error[along[k], k] / abs(means[along[k], k])) for k in (0, 1)]
-    return Scale(x, y, (x * relative[0], y * relative[1]), centre(size))
+    scattered = np.array([error[along[k], k] / abs(means[along[k], k]) for k in (0, 1)])
+    lengths = np.array([np.median(np.hypot(*(group * (x, y)).T)) for group in groups])
+    bent = lengths[along] / pitch - 1
+    # Of the difference, what the scatter explains is no second error.
+    apart = max((2 * (x - y) / (x + y)) ** 2 - float((scattered**2).sum()), 0.0) / 2
+    relative = np.sqrt(scattered**2 + bent**2 + apart)
+    return Scale(x, y, (float(x * relative[0]), float(y * relative[1])), centre(size))
+
+
+def _square(means: NDArray[np.float64], pitch: float) -> tuple[float, float]:
+    """Scales of x and y that make both mean links, (2, 2) px, one pitch long."""
+    squares = means**2
+    if abs(np.linalg.det(squares)) < 0.25 * squares.sum() ** 2 / 4:
+        both = float(pitch / np.sqrt(squares.sum(axis=1)).mean())
+        return both, both
+    x, y = np.sqrt(np.maximum(np.linalg.solve(squares, [pitch**2, pitch**2]), 0)).tolist()
+    if not (x > 0 and y > 0):
+        raise ValueError("scale by pitch: the dots stand in no square grid; give corners instead")
+    return x, y
 
 
 def scale_from_corners(pixels: ArrayLike, millimetres: ArrayLike, size: tuple[int, int]) -> Scale:

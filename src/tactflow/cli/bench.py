@@ -22,7 +22,7 @@ from tactflow.bench.run import DEFAULT, MARKERLESS, WEDGE, Plan, run_bench
 from tactflow.bench.skipping import Pipelines, compare_all
 from tactflow.bench.skipping_table import print_comparisons
 from tactflow.bench.stress import measure_drift
-from tactflow.bench.table import print_result
+from tactflow.bench.table import print_result, terminal
 from tactflow.bench.timing import CopyUnit
 from tactflow.cli.notes import without_notes
 from tactflow.cli.options import positive
@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
     )
     with without_notes(), _progress_bar() as progress:
         result = run_bench(plan, progress)
-    print_result(result, Console(file=sys.stdout, highlight=False))
+    print_result(result, terminal(sys.stdout))
     _write(args, result)
     for word in left_out(args.data) if args.data is not None else ():
         print(f"tactflow: --data: {word}", file=sys.stderr)
@@ -169,7 +169,7 @@ def _stress(given: list[str], frames: int) -> int:
     table = Table("frames", "marker error", "lost", "CPU a frame", "memory", box=None)
     for row in drift.rows():
         table.add_row(*row)
-    Console(file=sys.stdout, highlight=False).print(table)
+    terminal(sys.stdout).print(table)
     complaints = drift.complaints()
     for complaint in complaints:
         print(f"tactflow: {complaint}", file=sys.stderr)

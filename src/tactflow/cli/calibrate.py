@@ -28,6 +28,9 @@ from tactflow.vision.types import Scale
 
 WORSE: Final = 1.5
 """Error on new presses over that in the file, from which on a calibration is called drifted. By hand."""
+LOOSE: Final = 0.02
+"""Relative error of a scale by pitch from which on it is told how to get a better one. Chosen by hand: grids
+of the simulator have less than 0.01, the rings of a TacTip 0.1 to 0.15."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,7 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
     parser.add_argument(
-        "--pitch", type=float, metavar="MM", help="distance of neighbouring dots of the gel, or of the target"
+        "--pitch",
+        type=float,
+        metavar="MM",
+        help="distance of neighbouring dots of the gel, which stand in a square grid, or of the target",
     )
     parser.add_argument(
         "--area",
@@ -157,6 +163,13 @@ def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Ca
     """What a session gives. Raises ConfigError if that is no calibration."""
     scale = _scale(args, loaded, session)
     say(f"scale: {_scale_words(scale)}")
+    error = max(scale.stderr[0] / scale.x, scale.stderr[1] / scale.y)
+    if args.pitch is not None and args.target is None and error > LOOSE:
+        say(
+            f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid, and these are "
+            "in none (rings are not, for one), or the picture is stretched. Measure a length instead: --area "
+            "WIDTH HEIGHT takes what the whole processed picture shows, --target a printed grid"
+        )
     found = None
     if args.ball_radius is not None:
         say(f"{len(session.presses)} presses; learning from them ...")

@@ -37,6 +37,23 @@ class ArrayCheck:
                 _check_value(port, value, sizes)
 
 
+def wrong_input(node: Node, values: Sequence[Any]) -> str | None:
+    """Which node gave a value that its port does not allow, and what is wrong with it; None if all are right.
+
+    values : of the inputs, in the order of the ports. Each is looked at alone: of two that differ in size,
+    either may be the wrong one.
+    """
+    for port, value in zip(node.component.ports.inputs, values, strict=True):
+        giver = node.inputs[port.name]
+        if value is None or giver is None:
+            continue
+        try:
+            _check_value(port, value, {})
+        except (TypeError, ValueError) as error:
+            return f"{giver.node} gave a wrong value: {error}"
+    return None
+
+
 def _check_value(port: Port, value: Any, sizes: dict[str, int]) -> None:
     spec = port_type(port.annotation)
     if isinstance(spec, ArrayPort):

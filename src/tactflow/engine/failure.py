@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
+from tactflow.engine.check import wrong_input
 from tactflow.engine.conformance import METHODS
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.engine.frame import Frame
@@ -16,7 +17,8 @@ from tactflow.engine.graph import Node
 def describe_failure(
     node: Node, frame: Frame, values: Sequence[Any], error: Exception | SystemExit
 ) -> StageError:
-    """An error that says which node failed on which frame, where in its code, and with what inputs.
+    """An error that says which node failed on which frame, where in its code, and with what inputs; and who
+    gave an input that its port does not allow.
 
     values : of its inputs, in the order of its ports.
     """
@@ -32,9 +34,11 @@ def describe_failure(
     inputs = ", ".join(
         f"{port.name}: {describe_value(value)}" for port, value in zip(ports, values, strict=True)
     )
+    culprit = wrong_input(node, values)
     return StageError(
         f"{node.id} failed at frame {frame.seq}: {type(error).__name__}: {error}\n"
         f"  in {where}\n  set up at {node.mark}\n  inputs: {inputs or 'none'}"
+        + (f"\n  {culprit}" if culprit else "")
     )
 
 

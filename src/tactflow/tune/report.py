@@ -28,8 +28,12 @@ def lines(tuned: Tuned) -> Iterator[str]:
     """The table of the terminal."""
     yield f"simulated sensor fitted to {tuned.recording.source}: {tuned.look.words()}"
     rounds = ", ".join(f"{count} on {frames} frames" for count, frames in tuned.rounds)
-    yield f"tried: {rounds}; the last ones on {tuned.recording.frames} frames of the recording"
-    yield "errors: px of the camera's picture, simulated; time: CPU of a frame with contact, on the recording"
+    shown = f"; the last ones on {tuned.recording.frames} frames of the recording"
+    yield f"tried: {rounds}{shown if tuned.timed_on_recording else ''}"
+    timed = "simulated"
+    if tuned.timed_on_recording:
+        timed = f"on the recording ({ORIGINAL}: simulated)"
+    yield f"errors: px of the camera's picture, simulated; time: CPU of a frame with contact, {timed}"
     yield ""
     yield f"  {'':<8} {'ms':>6} {'interval':>14} " + "".join(
         f"{k:>8} {'interval':>14} " for k in _kinds(tuned)

@@ -100,6 +100,7 @@ class Tuned:
     the pipeline as given and the original script. front : names of those that no other beats in both time
     and error. chosen : the candidate, or None where none keeps the budgets. tried : how many candidates.
     words : what was decided on the way. rounds : candidates, frames of each round. settings : of all tried.
+    timed_on_recording : whether times are of the recording, else of the simulated one.
     """
 
     recording: Recording
@@ -111,6 +112,7 @@ class Tuned:
     tried: int
     words: list[str] = field(default_factory=list[str])
     rounds: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
+    timed_on_recording: bool = False
 
 
 class Search:
@@ -142,6 +144,7 @@ class Search:
         self._seed, self._refine, self._say = seed, refine, say
         self._unit = CopyUnit()
         self._words: list[str] = []
+        self._timed_on_recording = False
         self._rounds: list[tuple[int, int]] = []
         self._known: dict[str, Candidate] = {}
         self._pace = 0.0
@@ -176,6 +179,7 @@ class Search:
             *(recording, look, self._goal, self._goal.order(found), names, chosen, len(many)),
             words=self._words,
             rounds=self._rounds,
+            timed_on_recording=self._timed_on_recording,
         )
 
     @property
@@ -275,8 +279,11 @@ class Search:
         self._say(f"the recording: {len(good)} candidates, {recording.frames} frames, forward and backward")
         pipelines = {one.name: self._known[one.name].load(self._file, self._sensor) for one in good}
         compared, times, failures = checks.run(pipelines, recording, folder, self._unit, self._late)
+        self._timed_on_recording = self._timed_on_recording or bool(times)
         if self._late():
-            told = "some checks on the recording are missing" if times else "times are of the simulated one"
+            told = "some checks on the recording are missing"
+            if not self._timed_on_recording:
+                told = "times are of the simulated one"
             self._words.append(f"the budget was over while the recording was shown: {told}")
         for one in good:
             one.failure = failures.get(one.name)

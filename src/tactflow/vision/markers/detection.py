@@ -75,7 +75,10 @@ CENTROID_CONVERGED: Final = 1e-3
 """Step of all windows, px, below which they have converged. Chosen by hand: a tenth of a
 marker's error."""
 
-_NO_MARKERS: Final = "0 markers found: is the sensor marker-less? then use pipelines/markerless.yaml"
+_NO_MARKERS: Final = (
+    "0 markers found: is the sensor marker-less? then use pipelines/markerless.yaml, or one that is made for "
+    "your sensor without dots (tactflow pipelines)"
+)
 _FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels)"
 
 
