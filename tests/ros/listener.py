@@ -86,7 +86,8 @@ def main() -> None:
     kept: list[Any] = []
     for topic, kind in TOPICS.items():
         name = topic if topic.startswith("/") else f"{NODE}/{topic}"
-        qos = 10 if topic == "/diagnostics" else qos_profile_sensor_data
+        # What is sent to be received in full is asked for in full.
+        qos = 10 if topic in ("/diagnostics", "/hold/width") else qos_profile_sensor_data
 
         def receive(message: Any, topic: str = topic) -> None:
             tell(topic=topic, at=time.monotonic_ns(), message=plain(message))

@@ -327,7 +327,7 @@ def test_the_example_closes_until_something_touches_and_tightens_while_it_slips(
     example = Program(str(REPOSITORY / "examples" / "ros2" / "hold.py"), "--ros-args", "-p", "sensor:=left")
     try:
         pair.receive("touching", without_contact(RESULTS))
-        assert closing(pair) == pytest.approx(0.0005)
+        until(lambda: closing(pair) == pytest.approx(0.0005))
         pair.receive("slipping", RESULTS._replace(slip=Slip(False, 1.0)))
         until(lambda: closing(pair) == 0)
         pair.receive("slipping", RESULTS)
