@@ -55,7 +55,10 @@ def main():
     topics = {name: rospy.Publisher(f"~{name}", kind, queue_size=10) for name, kind in kinds.items()}
     socket = zmq.Context().socket(zmq.SUB)
     socket.subscribe(f"tactflow.{sensor} ".encode())
-    socket.connect(rospy.get_param("~endpoint", "tcp://127.0.0.1:5556"))
+    endpoint = rospy.get_param("~endpoint", "tcp://127.0.0.1:5556")
+    # ZeroMQ takes addresses of IPv6 only where it is told to.
+    socket.setsockopt(zmq.IPV6, endpoint.startswith("tcp://["))
+    socket.connect(endpoint)
     while not rospy.is_shutdown():
         if socket.poll(100):
             message = json.loads(socket.recv().partition(b" ")[2])

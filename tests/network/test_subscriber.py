@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import runpy
 import socket
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from tactflow.network.subscriber import LONGEST_MESSAGE, Subscriber
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
 from tests.clock import PATIENCE, ManualClock, until
+from tests.ros.programs import PACKAGE
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 CONTACT = Contact(5123.5, (150.2, 201.7), -12.31, 0.218, np.zeros((3, 2)), None)
@@ -404,5 +406,16 @@ def test_results_and_commands_go_over_ipv6_too() -> None:
             assert messages.receive()["seq"] == 0
         with RemoteControl(str(sink.control_endpoint), timeout=LONG) as run:
             assert run.ping()["message"] == "here"
+    finally:
+        sink.close()
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
+def test_the_bridge_to_ros_takes_addresses_of_ipv6_too() -> None:
+    link = runpy.run_path(str(PACKAGE / "tactflow_ros" / "link.py"))
+    sink = Zmq(Zmq.Params(endpoint="tcp://[::1]:*", control="tcp://[::1]:*"))
+    sink.open()
+    try:
+        assert link["ask"](sink.control_endpoint, "ping", "", LONG) == (True, "here")
     finally:
         sink.close()

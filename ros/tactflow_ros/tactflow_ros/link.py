@@ -50,6 +50,8 @@ def connect(socket: zmq.Socket, endpoint: str, keys: str, what: str) -> None:
     """
     socket.linger = 0
     socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_MESSAGE)
+    # ZeroMQ takes addresses of IPv6 only where it is told to.
+    socket.setsockopt(zmq.IPV6, endpoint.startswith("tcp://["))
     show_keys(socket, keys)
     try:
         socket.connect(endpoint)
