@@ -195,8 +195,7 @@ def test_the_loops_close_changes_as_the_plain_version(size: tuple[int, int], see
 def test_the_loop_bounds_what_is_one_piece_as_the_plain_version(
     size: tuple[int, int], seed: int, blur: float
 ) -> None:
-    noise = np.random.default_rng(seed).random(size).astype(np.float32)
-    smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), blur), np.float32)
+    _, smooth = _blobs(size, seed, blur)
     # One blob, or a few of them, some of which have bays, holes or parts.
     boxes = [_same_cells_and_box(smooth, float(np.quantile(smooth, part))) for part in (0.5, 0.9, 0.98)]
     event(f"one piece: {sum(box[4] > 0 for box in boxes)} of 3")
@@ -207,8 +206,7 @@ def test_the_loop_bounds_what_is_one_piece_as_the_plain_version(
 def test_a_contact_in_one_piece_is_what_opencv_outlines(
     size: tuple[int, int], seed: int, blur: float
 ) -> None:
-    noise = np.random.default_rng(seed).random(size).astype(np.float32)
-    smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), blur), np.float32)
+    noise, smooth = _blobs(size, seed, blur)
     weak, largest = float(np.quantile(smooth, 0.9)), float(smooth.max())
     for before in (None, noise > 0.5):
         limits = smooth, weak, largest, largest if before is None else 1e9, weak, before
@@ -218,6 +216,12 @@ def test_a_contact_in_one_piece_is_what_opencv_outlines(
             slow = components.contact_components(*limits)
         assert [found[:2] for found in fast] == [found[:2] for found in slow]
         assert all(np.array_equal(one.inside, other.inside) for one, other in zip(fast, slow, strict=True))
+
+
+def _blobs(size: tuple[int, int], seed: int, blur: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """White noise, and what is left of it after a blur, px."""
+    noise = np.random.default_rng(seed).random(size).astype(np.float32)
+    return noise, np.asarray(cv2.GaussianBlur(noise, (0, 0), blur), np.float32)
 
 
 def _never_one_piece(*arguments: Any) -> None:
