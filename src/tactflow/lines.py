@@ -160,8 +160,8 @@ class LineFile:
 
     Raises
     ------
-    OSError : it cannot be opened, or another run writes to it. StageError : what it is to continue holds
-    something else.
+    OSError : it cannot be opened, or another run writes to it.
+    StageError : what it is to continue holds something else.
 
     Attributes
     ----------

@@ -18,7 +18,7 @@ import orjson
 
 import tactflow
 from tactflow.batch.recordings import Recording
-from tactflow.config.files_read import files_named
+from tactflow.config.files_used import files_named
 from tactflow.engine.errors import SourceError, StageError
 from tactflow.engine.graph import Node, Pipeline
 

@@ -23,7 +23,7 @@ from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline, positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.cli.progress import progress_display, summary, with_statistics
-from tactflow.config.files_read import files_written
+from tactflow.config.files_used import files_written
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError

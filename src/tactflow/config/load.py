@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from tactflow.config import sensors, wiring
 from tactflow.config.complaints import complain
-from tactflow.config.files_read import FileId, file_id, files_read, files_written
+from tactflow.config.files_used import FileId, file_id, files_read, files_written
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import add_sinks, apply, replaced
 from tactflow.config.registry import Section, code_place, did_you_mean, resolve
