@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -12,6 +13,14 @@ ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if h
 """Ctrl-C, a service manager, a terminal that is closed."""
 
 Handler = Callable[[int, FrameType | None], None]
+
+
+class Interrupted(KeyboardInterrupt):
+    """What a handler raises in the main thread to end what is under way.
+
+    After a KeyboardInterrupt itself, raised within `exec` of a text, as numba does it, `python -m` ends by
+    SIGINT whatever the exit code is, even if it was caught.
+    """
 
 
 def leave(_number: int, _frame: FrameType | None) -> None:
@@ -43,3 +52,22 @@ def ending_handled(handler: Handler) -> Iterator[None]:
     finally:
         for number, earlier in before.items():
             signal.signal(number, signal.SIG_IGN if earlier is leave else earlier)  # type: ignore[arg-type]
+
+
+@contextmanager
+def ending_held_back() -> Iterator[None]:
+    """Handle those that come in a block after it: what the block does is whole, and its result is known."""
+    if threading.current_thread() is not threading.main_thread():
+        # Handlers are called in the main thread.
+        yield
+        return
+    came: list[int] = []
+    handled = [number for number in ENDING if callable(signal.getsignal(number))]
+    before = [signal.signal(number, lambda number, _: came.append(number)) for number in handled]
+    try:
+        yield
+    finally:
+        for number, earlier in zip(handled, before, strict=True):
+            signal.signal(number, earlier)
+    for number in came:
+        signal.raise_signal(number)

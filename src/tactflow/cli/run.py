@@ -34,7 +34,7 @@ from tactflow.files import is_device
 from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
-from tactflow.signals import ending_handled
+from tactflow.signals import Interrupted, ending_handled
 from tactflow.vision import compiled
 
 STATISTICS_BEGIN = '{\n "frames":'
@@ -305,7 +305,7 @@ def _signals(runner: Runner) -> Iterator[Sequence[int]]:
             runner.stop("signal")
             return
         signal.signal(number, signal.SIG_DFL)
-        raise KeyboardInterrupt
+        raise Interrupted
 
     with ending_handled(handle):
         yield caught

@@ -49,6 +49,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.signals import ending_held_back
 from tactflow.vision.kernel_cache import POLL_S, claimed, dispatcher_of
 
 logger = logging.getLogger("tactflow")
@@ -342,8 +343,13 @@ def _compile(pending: list[Kernel[..., Any]], *, shared: bool) -> None:
     total = len(pending) + 1
     logger.info("compiling %d loops for this processor, once", total)
     pending.sort(key=_length, reverse=True)
-    kernels, workers = list(pending), _start_workers(pending) if shared else []
+    kernels: list[Kernel[..., Any]] = list(pending)
+    workers: list[subprocess.Popen[str]] = []
     try:
+        if shared:
+            # A KeyboardInterrupt in between would leave one that nobody ends.
+            with ending_held_back():
+                workers += _start_workers(pending)
         while pending:
             done = next((kernel for kernel in pending if kernel.load(wait=False)), None)
             if done is None:
