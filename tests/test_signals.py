@@ -48,7 +48,6 @@ def test_other_threads_need_not_wait() -> None:
     assert entered == [True]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="a process of Windows does not end by a signal")
 def test_the_exit_code_stands_wherever_the_signal_came(tmp_path: Path) -> None:
     # Seen to end by SIGINT in CPython 3.11 where a KeyboardInterrupt itself is raised.
     (tmp_path / "ending.py").write_text("""
