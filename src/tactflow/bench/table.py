@@ -69,15 +69,16 @@ def _methods(result: Result, group: str, width: int) -> Iterator[Table]:
             on_front = method in fronts[quantity.key] and len(result.methods(group)) > 1
             cells.append(f"[green]{text} *[/green]" if on_front else text)
         lines.append(cells)
-    return _blocks(TITLES.get(group, group), heads, [lines], width)
+    return tables_of(TITLES.get(group, group), heads, [lines], width)
 
 
-def _blocks(
+def tables_of(
     title: str, heads: Sequence[str], sections: Sequence[Sequence[Sequence[str]]], width: int, keys: int = 1
 ) -> Iterator[Table]:
     """Tables of as many columns as fit into `width`, each with the first `keys` of them: no cell is cut.
 
     heads : a heading for each column, broken between words. sections : of rows of cells, with markup.
+    width : columns of the terminal.
     """
     rows = [row for section in sections for row in section]
     widths = [
@@ -148,7 +149,7 @@ def _scenes(result: Result, width: int) -> Iterator[Table]:
             lines.append([scene, m.method, *cells])
         sections.append(lines)
     heads = ["scene", "pipeline", "copies", "x classic", *short]
-    return _blocks("Whole pipelines, scene by scene", heads, sections, width, keys=2)
+    return tables_of("Whole pipelines, scene by scene", heads, sections, width, keys=2)
 
 
 def _cell(value: float | None) -> str:

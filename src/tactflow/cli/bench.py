@@ -154,7 +154,7 @@ def _skipping(given: list[str], frames: int, data: Path | None) -> int:
     copies = CopyUnit()
     with without_notes(), _progress_bar() as progress:
         found = list(compare_all(pipelines, frames, data, copies, progress))
-    print_comparisons(found, copies, Console(file=sys.stdout, highlight=False, width=240))
+    print_comparisons(found, copies, terminal(sys.stdout))
     for one in found:
         for fault in one.faults:
             print(f"tactflow: {one.scene}: {fault}", file=sys.stderr)

@@ -102,7 +102,7 @@ SensorKey = Annotated[
     AfterValidator(_free),
 ]
 Count = Annotated[int, Field(ge=0), _says("a whole number >= 0")]
-Threads = Annotated[int, Field(ge=0, le=MOST_THREADS), _says("a whole number >= 0 and <= 1024")]
+Threads = Annotated[int, Field(ge=0, le=MOST_THREADS), _says(f"a whole number >= 0 and <= {MOST_THREADS}")]
 Capacity = Annotated[int, Field(ge=1), _says("a whole number >= 1")]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), _says("a rate in Hz, > 0")]
 Output = Annotated[str, _says("stage.port")]
