@@ -46,9 +46,9 @@ def _ended(number: int, folder: Path, moment: float, *, starting: bool) -> Seen:
     sinks = {id_: settings for kind in WRITES for id_, settings in _settings(kind, folder).items()}
     with start(folder, sinks) as process:
         if not starting:
-            # The film is the last that anything reaches.
-            film = folder / KINDS["video .avi"].output
-            until(lambda: film.exists() and film.stat().st_size)
+            # The film and the tables, each with a thread of its own, are the last that anything reaches.
+            film, tables = (folder / KINDS[kind].output for kind in ("video .avi", "parquet"))
+            until(lambda: film.exists() and film.stat().st_size and [*tables.glob("frames/part-*.parquet")])
         time.sleep(moment)
         process.send_signal(number)
         _, said = process.communicate(timeout=PATIENCE)
