@@ -86,6 +86,12 @@ def test_lerobot_opens_it(dataset: Path) -> None:
     assert done.stdout.strip() == "2; 70; 60; press; (3, 400, 300); (5,); 1"
 
 
+def test_notes_of_the_runs_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "press")
+    assert main(["export", "lerobot", "sim:press?frames=2", "--out", out, "--pipeline", "markerless"]) == 0
+    assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in capsys.readouterr().err
+
+
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
