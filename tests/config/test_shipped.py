@@ -19,6 +19,16 @@ def test_a_shipped_pipeline_has_no_mistakes_and_says_what_it_is_for(name: str) -
     assert 10 < len(described_pipelines()[name]) < 90
 
 
+@pytest.mark.parametrize("name", sorted({*packaged_pipelines()} - {"classic"}))
+def test_a_shipped_pipeline_publishes_writes_and_shows_its_results_as_the_readme_says(name: str) -> None:
+    sinks = {id_: node for id_, node in tactflow.load(name).nodes.items() if node.component.kind == "sink"}
+    values = {id_: node.params.model_dump() for id_, node in sinks.items()}
+    assert list(values) == ["zmq", "jsonl", "view"]
+    assert values["zmq"]["endpoint"] == "tcp://127.0.0.1:5556"
+    assert values["jsonl"]["path"] == "out/results.jsonl"
+    assert values["view"]["port"] == 8780
+
+
 @pytest.mark.parametrize("name", sorted({*packaged_pipelines()} - {"default", "classic", "wedge"}))
 def test_a_shipped_pipeline_sees_a_simulated_press(name: str) -> None:
     scene = "unmarked" if name in PLAIN else "bright_dots" if name == "tactip" else "press"
