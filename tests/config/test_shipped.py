@@ -48,6 +48,15 @@ def test_a_name_that_is_no_file_finds_the_shipped_pipeline(
     assert find_pipeline("mini") == Path("mini")
 
 
+def test_a_calibration_that_is_missing_is_told_with_both_places_where_it_may_lie(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (said,) = tactflow.check("mini", settings={"calibration": "gel.yaml"})
+    assert str(find_pipeline("mini").with_name("gel.yaml")) in str(said)
+    assert f"or {tmp_path / 'gel.yaml'}" in str(said)
+
+
 def test_an_unknown_name_is_told_with_those_that_there_are() -> None:
     with pytest.raises(ConfigError, match=r"did you mean tactip\?.*digit, gelslim"):
         find_pipeline("tactipp")
