@@ -83,8 +83,8 @@ def test_real_rolls_give_a_valid_message_a_frame_with_every_marker_found(
 ) -> None:
     out = tmp_path / "out.jsonl"
     pipeline, source = str(REPOSITORY / "pipelines" / "wedge.yaml"), str(shared_data / "wedge_roll")
-    words = ("--set", "sinks.zmq=null", "--source", source, "--jsonl", str(out), "--quiet")
-    assert main(["run", pipeline, *words]) == 0
+    sinks = ("--set", "sinks.zmq=null", "--set", "sinks.view=null", "--set", f"sinks.jsonl.path={out}")
+    assert main(["run", pipeline, *sinks, "--source", source, "--quiet"]) == 0
     rows = messages(out.read_text())
     validator = jsonschema.Draft202012Validator(message_schema())
     for row in rows:

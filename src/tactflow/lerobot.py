@@ -85,6 +85,8 @@ class DatasetWriter:
                 rows.append(self._row(result, image, index, episode))
                 if film is not None:
                     film.write(image)
+            if film is not None:
+                film.finish()
         finally:
             if film is not None:
                 film.close()
@@ -286,9 +288,12 @@ class _Film:
 
         self._file.mux(self._stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
 
-    def close(self) -> None:
-        """Write what is left."""
+    def finish(self) -> None:
+        """Write what is left; not after a write that failed, which would end the process."""
         self._file.mux(self._stream.encode(None))
+
+    def close(self) -> None:
+        """Let go of the file, finished or not."""
         self._file.close()
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 import pytest
 from pydantic import Field
 
-from tactflow.bench.methods import alternatives, methods_of
+from tactflow.bench.methods import alternatives, measure_methods, methods_of
 from tactflow.bench.scenes import (
     FULL,
     FULL_STAGES,
@@ -17,6 +17,7 @@ from tactflow.bench.scenes import (
     Case,
     Rendered,
 )
+from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.contract import StageParams
@@ -50,6 +51,35 @@ def test_every_method_of_a_stage_is_an_alternative_and_the_scripts_is_the_yardst
     assert ways.keys() >= {"telea", "ns", "none"}
     assert [name for name, way in ways.items() if way.yardstick] == ["telea"]
     assert ways["telea"].params == pipelines["classic"].nodes["inpaint"].params
+
+
+OWN_TRACKER = """
+import numpy as np
+from tactflow import Markers, Stage
+from tactflow.ports import MarkerMask, Unmarked
+
+
+class Own(Stage):
+    memory = "stateful"
+
+    def process(self, marker_mask: MarkerMask, unmarked: Unmarked) -> Markers:
+        place = np.argwhere(marker_mask)[:1, ::-1].astype(float)
+        return Markers(place, place, np.zeros(1, np.uint8), np.full(1, np.nan))
+"""
+
+
+def test_a_tracker_of_ones_own_is_measured_alone_whichever_ports_of_the_chain_it_takes(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "own.py").write_text(OWN_TRACKER)
+    default = find_pipeline("default")
+    own = load_pipeline(default, overrides=[f"stages.tracker={{use: {tmp_path / 'own.py'}}}"])
+    pipelines = {"default": load_pipeline(default), "own": own}
+    made = measure_methods(pipelines, Rendered(Case("press", 3), tmp_path), CopyUnit(), lambda: None)
+    found = {m.method: m for m in made if m.group == "tracker"}
+    assert found["own"].failure is None
+    assert found["own"].errors["displacement_rms"] >= 0
+    assert found.keys() == {"default", "own"}
 
 
 def test_a_scenes_name_tells_its_settings_apart() -> None:

@@ -63,6 +63,22 @@ def test_equal_errors_leave_the_faster_one_on_the_front() -> None:
     assert pareto([b, a]) == [a]
 
 
+def test_a_faster_method_is_no_better_while_another_of_its_errors_is_larger(result: Result) -> None:
+    result.measurements = [
+        replace(measurement(method, "press", cost, displacement_rms=0.01, center_error=off), group="pipeline")
+        for method, cost, off in (("exact", 10, 0.25), ("careless", 5, 20), ("slow", 20, 0.25))
+    ]
+    answer = html(result).partition("Run time against error")[0]
+    said = re.findall(r"</span> <b>(\w+)</b></td><td>(.*?)</td>", answer)
+    assert said == [
+        ("careless", "the fastest; 80 times the error of the best: contact centre error, mean"),
+        ("exact", "the most accurate; 2 times the time of the fastest"),
+        ("slow", "no reason to use it here: exact is faster and at least as accurate"),
+    ]
+    result.measurements = result.measurements[::2]
+    assert "use this: the fastest and the most accurate" in html(result)
+
+
 class _Collector(HTMLParser):
     def __init__(self) -> None:
         super().__init__()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 
@@ -50,3 +52,16 @@ def test_a_press_taken_out_of_the_list_is_no_part_of_the_session() -> None:
     assert seen[0][0] == session.presses[0].center
     assert seen[0][1] not in [one.center for one in session.presses]
     assert len(session.presses) == 2
+
+
+def test_the_untouched_gel_is_the_reference_also_where_that_is_no_frame_of_the_session(
+    tmp_path: Path,
+) -> None:
+    scene = tactflow.open_scene("ball")
+    darker = (scene.frame(0) * 0.8).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "rest.png"), darker)
+    settings = {"stages.capture.reference": str(tmp_path / "rest.png")}
+    session = find_presses(tactflow.load(source="sim:ball?frames=30", settings=settings))
+    own = find_presses(tactflow.load(source="sim:ball?frames=30"))
+    assert session.untouched.mean() < 0.85 * own.untouched.mean()
+    assert session.frames == own.frames == 30

@@ -168,6 +168,8 @@ def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
     told = capsys.readouterr().err
     assert "press 1" not in told
     assert "--set calibration=film.yaml" in told
+    assert calibrate("check", "film.yaml", "--from", "sim:ball?frames=2") == 0
+    assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in capsys.readouterr().err
     # As a camera, for ten minutes, unless it ends when it knows what it needs.
     live = ["--from", "sim:idle?frames=36000", "--realtime", "--pitch", "1.724", "--out", "camera.yaml"]
     assert calibrate(*live) == 0

@@ -76,6 +76,20 @@ print(dataset.num_episodes, dataset.num_frames, dataset.fps, item["task"], tuple
 """
 
 
+FULL_DISK = """
+import sys
+import tactflow
+from pathlib import Path
+from tactflow.lerobot import DatasetWriter
+settings = {"sinks": {}}
+try:
+    DatasetWriter(Path(sys.argv[1]), 60, "press").add(
+        tactflow.stream("markerless", source=sys.argv[2], settings=settings, images=True))
+except OSError as error:
+    print(error.strerror)
+"""
+
+
 def test_lerobot_opens_it(dataset: Path) -> None:
     # Not in the environment of the tests: LeRobot takes other versions of numpy and OpenCV, and torch.
     python = os.environ.get("LEROBOT_PYTHON")
@@ -84,6 +98,12 @@ def test_lerobot_opens_it(dataset: Path) -> None:
     command = [python, "-W", "ignore", "-c", OPENED, str(dataset), KEY]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "2; 70; 60; press; (3, 400, 300); (5,); 1"
+
+
+def test_notes_of_the_runs_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "press")
+    assert main(["export", "lerobot", "sim:press?frames=2", "--out", out, "--pipeline", "markerless"]) == 0
+    assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in capsys.readouterr().err
 
 
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
@@ -112,6 +132,18 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
     out.mkdir()
     assert main(["export", "lerobot", first, "--out", str(out)]) == 2
     assert "is already there" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev/full stands for a full disk")
+@pytest.mark.parametrize("frames", [1, 30])
+def test_a_disk_that_is_full_from_the_first_byte_of_the_video_is_told(tmp_path: Path, frames: int) -> None:
+    # In a process of its own: libav ends it where it is told to go on after such a failure.
+    video = tmp_path / "press" / "videos" / KEY / "chunk-000" / "file-000.mp4"
+    video.parent.mkdir(parents=True)
+    video.symlink_to("/dev/full")
+    command = [sys.executable, "-c", FULL_DISK, str(tmp_path / "press"), f"sim:press?frames={frames}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "No space left on device\n"), done.stderr
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows refuses by itself")

@@ -19,6 +19,16 @@ def test_a_shipped_pipeline_has_no_mistakes_and_says_what_it_is_for(name: str) -
     assert 10 < len(described_pipelines()[name]) < 90
 
 
+@pytest.mark.parametrize("name", sorted({*packaged_pipelines()} - {"classic"}))
+def test_a_shipped_pipeline_publishes_writes_and_shows_its_results_as_the_readme_says(name: str) -> None:
+    sinks = {id_: node for id_, node in tactflow.load(name).nodes.items() if node.component.kind == "sink"}
+    values = {id_: node.params.model_dump() for id_, node in sinks.items()}
+    assert list(values) == ["zmq", "jsonl", "view"]
+    assert values["zmq"]["endpoint"] == "tcp://127.0.0.1:5556"
+    assert values["jsonl"]["path"] == "out/results.jsonl"
+    assert values["view"]["port"] == 8780
+
+
 @pytest.mark.parametrize("name", sorted({*packaged_pipelines()} - {"default", "classic", "wedge"}))
 def test_a_shipped_pipeline_sees_a_simulated_press(name: str) -> None:
     scene = "unmarked" if name in PLAIN else "bright_dots" if name == "tactip" else "press"
@@ -36,6 +46,15 @@ def test_a_name_that_is_no_file_finds_the_shipped_pipeline(
     assert find_pipeline("mini").name == "mini.yaml"
     (tmp_path / "mini").touch()
     assert find_pipeline("mini") == Path("mini")
+
+
+def test_a_calibration_that_is_missing_is_told_with_both_places_where_it_may_lie(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (said,) = tactflow.check("mini", settings={"calibration": "gel.yaml"})
+    assert str(find_pipeline("mini").with_name("gel.yaml")) in str(said)
+    assert f"or {tmp_path / 'gel.yaml'}" in str(said)
 
 
 def test_an_unknown_name_is_told_with_those_that_there_are() -> None:

@@ -35,13 +35,15 @@ CLASSIC = "classic"
 class Alternative:
     """One way to do a stage's work.
 
-    inputs : names of its input ports. yardstick : whether the original script does it so.
+    inputs : names of its input ports. required : those of them that it needs. yardstick : whether the
+    original script does it so.
     """
 
     name: str
     cls: type
     params: StageParams
     inputs: frozenset[str]
+    required: frozenset[str]
     yardstick: bool = False
 
     def build(self) -> Any:
@@ -73,15 +75,17 @@ def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Alt
         if node is None:
             continue
         cls = node.component.cls
-        inputs = frozenset(port.name for port in node.component.ports.inputs)
+        ports = node.component.ports.inputs
+        inputs = frozenset(port.name for port in ports)
+        required = frozenset(port.name for port in ports if not port.optional)
         method = str(getattr(node.params, "method", name))
         if name == CLASSIC:
-            found[method] = Alternative(method, cls, node.params, inputs, yardstick=True)
+            found[method] = Alternative(method, cls, node.params, inputs, required, yardstick=True)
         elif not any((way.cls, way.params) == (cls, node.params) for way in found.values()):
-            found.setdefault(method, Alternative(method, cls, node.params, inputs))
+            found.setdefault(method, Alternative(method, cls, node.params, inputs, required))
         for other in methods_of(node.component.params):
             params = node.params.model_copy(update={"method": other})
-            found.setdefault(other, Alternative(other, cls, params, inputs))
+            found.setdefault(other, Alternative(other, cls, params, inputs, required))
     return found
 
 
@@ -97,6 +101,12 @@ class _Inputs:
     unmarked: NDArray[np.uint8]
     markers: Any
     field: Any
+
+    @property
+    def ports(self) -> dict[str, Any]:
+        """What any way to do a stage's work is given if it requires it."""
+        names = ("frame", "image", "marker_mask", "unmarked", "markers")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def touching(self) -> bool:
@@ -256,13 +266,16 @@ def _measure_group(
     failures: dict[str, str] = {}
 
     def call(name: str) -> Callable[[Any], Any]:
-        process, inputs = instances[name].process, ways[name].inputs
+        process, way = instances[name].process, ways[name]
 
         def run(arguments: Any) -> Any:
             if name in failures:
                 return None
+            _, given, others = arguments
+            ports = {port: given[port] for port in way.inputs & given.keys()}
+            more = {port: others[port] for port in way.required & others.keys()}
             try:
-                return process(**{port: arguments[1][port] for port in inputs & arguments[1].keys()})
+                return process(**more | ports)
             except Exception as error:
                 failures[name] = f"{type(error).__name__}: {error}"
                 return None
@@ -278,7 +291,7 @@ def _measure_group(
             arguments = group.feed(item)
             if arguments is not None:
                 unit.take()
-                yield item.kind, (item, arguments)
+                yield item.kind, (item, arguments, item.ports)
 
     times = interleaved({name: call(name) for name in ways}, feed(), see=see)
     yardstick = next((name for name, way in ways.items() if way.yardstick), None)

@@ -7,11 +7,12 @@ then everything that was measured.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from statistics import median
 
-from tactflow.bench.pareto import Point, limit_of, pareto, points
+from tactflow.bench.pareto import Point, limit_of, points
 from tactflow.bench.quantities import QUANTITIES, Quantity, format_number
 from tactflow.bench.results import RECORDING, Result
 from tactflow.bench.scatter import scatter
@@ -41,29 +42,71 @@ PRIMARY = {
     "depth": ("depth_rms", "volume_error"),
     "motion": ("field_rms",),
 }
-"""Group -> quantities that are plotted; the first one decides the answer."""
+"""Group -> quantities that are plotted; methods without the first one are left out of the answer."""
 
 
-def _verdict(point: Point, everyone: Sequence[Point], front: Sequence[Point], quantity: Quantity) -> str:
+def _errors(result: Result, group: str) -> dict[str, dict[str, float]]:
+    """Title of each quantity of a group -> method -> its error, infinite where scenes are missing."""
+    found = {}
+    for quantity in (QUANTITIES[name] for name in PRIMARY.get(group, ())):
+        known = {p.method: math.inf if p.missing else p.error for p in points(result, group, quantity)}
+        if known:
+            found[quantity.title] = {name: known.get(name, math.inf) for name in result.methods(group)}
+    return found
+
+
+def _beats(one: Point, other: Point, errors: Mapping[str, Mapping[str, float]]) -> bool:
+    """Whether a method is at least as fast and in every quantity at least as accurate, and not the same."""
+    pairs = [(by[one.method], by[other.method]) for by in errors.values()]
+    pairs.append((one.cost, other.cost))
+    return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
+
+
+def _front(everyone: Sequence[Point], errors: Mapping[str, Mapping[str, float]]) -> list[Point]:
+    """The methods that no other beats; see `_beats`."""
+    whole = [p for p in everyone if not p.missing]
+    return [p for p in whole if not any(_beats(other, p, errors) for other in whole)]
+
+
+def _verdict(
+    point: Point, everyone: Sequence[Point], errors: Mapping[str, Mapping[str, float]], quantity: Quantity
+) -> str:
     if len(everyone) == 1:
         return "the only method"
     if point.missing:
         return f"fails: nothing to show in {point.missing} of {point.missing + point.scenes} scenes"
     if quantity.best == 1 and point.error > 0.95:
         return "fails in most scenes"
-    whole = [p for p in everyone if not p.missing]
-    most_accurate = min(whole, key=lambda p: (p.error, p.cost))
-    fastest = min(whole, key=lambda p: (p.cost, p.error))
-    if point is most_accurate and point is fastest:
-        return "use this: the fastest and the most accurate"
-    if point is most_accurate:
-        return f"the most accurate; {_times(point.cost / fastest.cost)} the time of the fastest"
-    if point is fastest:
-        return f"the fastest; {_factor(point.error, most_accurate.error)} the error of the best"
-    if point in front:
+    front = _front(everyone, errors)
+    if point not in front:
+        better = next(p for p in front if _beats(p, point, errors))
+        return f"no reason to use it here: {better.method} is faster and at least as accurate"
+    least = min(p.cost for p in front)
+    title, error, best = _weakness(point, front, errors)
+    if error == best:
+        fastest = point.cost == least
+        return (
+            "use this: the fastest and the most accurate"
+            if fastest
+            else f"the most accurate; {_times(point.cost / least)} the time of the fastest"
+        )
+    if point.cost > least:
         return "a compromise on the Pareto front"
-    beaten = [p for p in front if p.cost <= point.cost and p.error <= point.error]
-    return f"no reason to use it here: {beaten[0].method} is faster and at least as accurate"
+    if math.isinf(error):
+        return f"the fastest; nothing to show in some scenes: {title}"
+    return f"the fastest; {_factor(error, best)} the error of the best: {title}"
+
+
+def _weakness(
+    point: Point, front: Sequence[Point], errors: Mapping[str, Mapping[str, float]]
+) -> tuple[str, float, float]:
+    """The quantity in which a method is farthest from the best one, relative to that; its error; the best."""
+    found = []
+    for title, by in errors.items():
+        error, best = by[point.method], min(by[p.method] for p in front)
+        ratio = 1.0 if error == best else math.inf if best == 0 else error / best
+        found.append((ratio, title, error, best))
+    return max(found, key=lambda one: one[0])[1:]
 
 
 def _times(ratio: float) -> str:
@@ -96,7 +139,8 @@ def _answers(result: Result) -> str:
             candidates = points(result, group, quantity)
             if not candidates:
                 continue
-            front = pareto(candidates)
+            errors = _errors(result, group)
+            front = _front(candidates, errors)
             others = [QUANTITIES[q] for q in PRIMARY[group] if q != name]
             rows = []
             for point in sorted(candidates, key=lambda p: p.cost):
@@ -104,7 +148,7 @@ def _answers(result: Result) -> str:
                 row = [
                     f'<span class="{"on" if point in front else "off"}">{mark}</span> '
                     f"<b>{escape(point.method)}</b>",
-                    escape(_verdict(point, candidates, front, quantity)),
+                    escape(_verdict(point, candidates, errors, quantity)),
                     format_number(point.cost),
                     f"{point.cost * result.copy_ms:.2f}",
                     _value_with_worst(result, group, point.method, quantity),
@@ -296,9 +340,9 @@ def html(result: Result) -> str:
         f"<b>copies</b>: one copy of a raw 800 × 600 × 3 frame took {result.copy_ms:.3f} ms in this run.</p>",
         f'<p class="soft">{kind} · {result.wall_s:.0f} s · {machine}</p>',
         "<h2>The answer, stage by stage</h2>",
-        '<p><span class="on">●</span> is on the Pareto front: nothing else is both faster and more accurate. '
-        '<span class="off">○</span> is beaten. Errors are the median over the scenes; in brackets the worst '
-        "scene.</p>",
+        '<p><span class="on">●</span> is on the Pareto front: nothing else is faster and, in every column, '
+        'as accurate. <span class="off">○</span> is beaten. Errors are the median over the scenes; in '
+        "brackets the worst scene.</p>",
         _answers(result),
     ]
     times = _where_time_goes(result)

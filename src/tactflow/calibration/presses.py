@@ -106,6 +106,8 @@ def find_presses(
 class _Collect(Sink):
     """Keeps the largest contact of each press."""
 
+    # A better reference than the first frame comes before it, as a reference image does: see capture.
+    takes_references = True
     report: Report
     keeper: Callable[[], Keeper | None]
 
@@ -139,7 +141,7 @@ class _Collect(Sink):
         mapping: PixelMapping | None,
     ) -> None:
         """Look at one frame."""
-        self.frames += 1
+        self.frames += tick.frame.seq >= 0
         if not self.rest or tick.frame.reference:
             self.rest.append(unmarked.copy())
             self.mapping = mapping

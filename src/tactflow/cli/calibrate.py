@@ -94,7 +94,11 @@ def run(args: argparse.Namespace) -> int:
     TactflowError
         If options are wrong, or what was recorded gives no calibration.
     """
-    words = list(args.what)
+    with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
+        return _run(args, list(args.what))
+
+
+def _run(args: argparse.Namespace, words: list[str]) -> int:
     if words[:1] == ["check"]:
         if len(words) not in (2, 3):
             raise ConfigError("calibrate check: required a calibration file, and a pipeline if wanted")
@@ -132,12 +136,11 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         kept.clear()
     guide = Guide(args.presses, say, typed_lines())
     page = _page(args, pipeline, guide) if args.view else None
-    with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
-        if args.ball_radius is None:
-            # The untouched gel is enough for a scale.
-            session = find_presses(loaded, lambda _frames, _presses, _lasts: True, watchers=page)
-        else:
-            session = find_presses(loaded, guide, kept, page)
+    if args.ball_radius is None:
+        # The untouched gel is enough for a scale.
+        session = find_presses(loaded, lambda _frames, _presses, _lasts: True, watchers=page)
+    else:
+        session = find_presses(loaded, guide, kept, page)
     try:
         calibration = _learned(args, loaded, session)
     except ConfigError as error:

@@ -9,7 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tactflow.cli.notes import say
+from rich.console import Console
+
+from tactflow.cli.notes import notes_on, say
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.files import claim_path, make_folder
 
@@ -62,8 +64,9 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--fps: required 1 to {FASTEST}, got {fps}")
     settings: dict[str, object] = {"sinks": {}}
     recording = ""
+    notes = notes_on(Console(stderr=True, highlight=False, soft_wrap=True))
     try:
-        with _unfinished(args.out) as folder:
+        with notes, _unfinished(args.out) as folder:
             writer = DatasetWriter(folder, fps, args.task, film=args.pictures == "video")
             for recording in args.recordings:
                 frames = writer.add(stream(args.pipeline, source=recording, settings=settings, images=True))

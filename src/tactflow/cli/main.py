@@ -147,4 +147,6 @@ def _refuse(command: argparse.ArgumentParser, unknown: Sequence[str]) -> NoRetur
     option = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)
     guess = difflib.get_close_matches(option, options, n=1) if option else []
     hint = f"; did you mean {guess[0]}?" if guess else ""
+    if "--source" in options and os.path.isfile(unknown[0]):
+        hint = "; to give many files as one source, quote the pattern: --source 'FOLDER/*.png'"
     command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")

@@ -266,13 +266,12 @@ def _calibration(root: Item, directory: Path, problems: Problems) -> Path | None
     if entry is None or not isinstance(entry.item.content, str):
         return None
     named = expanded(entry.item.content)
-    for path in (directory / named, named):
+    paths = (directory / named, named)
+    for path in paths:
         if path.is_file():
             return path
-    problems.add(
-        entry.item.mark,
-        f"calibration: there is no file {directory / named}; `tactflow calibrate` makes one",
-    )
+    looked = " or ".join(dict.fromkeys(str(path.absolute()) for path in paths))
+    problems.add(entry.item.mark, f"calibration: there is no file {looked}; `tactflow calibrate` makes one")
     return None
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import is_dataclass
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -80,6 +81,24 @@ def _check_value(port: Port, value: Any, sizes: dict[str, int]) -> None:
             raise TypeError(f"port {port.name}: required a bool, got {type(value).__name__}")
     elif isinstance(spec, type) and not isinstance(value, spec):
         raise TypeError(f"port {port.name}: required {spec.__name__}, got {type(value).__name__}")
+    elif is_dataclass(value):
+        for field, dtype in _array_fields(type(value)):
+            got = getattr(getattr(value, field), "dtype", type(getattr(value, field)).__name__)
+            if got != dtype:
+                raise TypeError(f"port {port.name}, {field}: required an array of {dtype}, got {got}")
+
+
+def _array_fields(record: type) -> Iterator[tuple[str, str]]:
+    """Name and dtype of each field that is annotated as an array, such as NDArray[np.uint8]."""
+    try:
+        hints = get_type_hints(record)
+    except NameError:  # a name that only type checkers see
+        return
+    for name, hint in hints.items():
+        if get_origin(hint) is np.ndarray:
+            scalar = get_args(get_args(hint)[1])[0]
+            if isinstance(scalar, type):
+                yield name, np.dtype(scalar).name
 
 
 def _text(shape: Sequence[int | str]) -> str:
