@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -36,3 +37,18 @@ def test_a_killed_worker_is_replaced_and_what_kills_two_is_set_aside(tmp_path: P
         **{"a": "done", "b": "done", "unlucky": "done", "deadly": "set aside"}
     }
     assert not list(tmp_path.iterdir())
+
+
+def test_no_signal_arrives_in_a_worker_that_starts() -> None:
+    # What Python starts with the first process lets them arrive again.
+    program = """
+import signal
+from multiprocessing import resource_tracker
+from tactflow.batch.local import _signals_held
+from tactflow.signals import ENDING
+with _signals_held():
+    resource_tracker.ensure_running()
+    print(set(ENDING) <= signal.pthread_sigmask(signal.SIG_BLOCK, []))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"

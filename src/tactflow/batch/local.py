@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
@@ -157,6 +158,8 @@ def _signals_held() -> Iterator[None]:
     if sys.platform == "win32":
         yield
         return
+    # Python starts it with the first process, and then lets Ctrl-C and SIGTERM arrive again.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
         yield
