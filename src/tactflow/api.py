@@ -20,7 +20,8 @@ from tactflow.config.yamlmap import Problems, wrap
 from tactflow.engine.conformance import build
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Mark, Pipeline
-from tactflow.engine.run import INTERRUPTED, Runner, RunResult
+from tactflow.engine.run import Runner, RunResult
+from tactflow.signals import INTERRUPTED
 
 Settings = Mapping[str, Any]
 """Values of the pipeline file to replace, as in `{"stages.preprocess.rotate": 0, "sinks.zmq": None}`."""

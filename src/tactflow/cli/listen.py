@@ -13,6 +13,7 @@ from tactflow.cli.options import positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.network.subscriber import DEFAULT_ENDPOINT, Subscriber
+from tactflow.signals import ending_handled, interrupt
 
 Message = dict[str, Any]
 
@@ -58,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     if sys.stderr.isatty():
         print(f"listening to {args.endpoint}; Ctrl-C ends", file=sys.stderr)
     show = _table if args.table else _json_lines if args.json else _lines
-    with subscriber:
+    with ending_handled(interrupt), subscriber:
         try:
             show(subscriber, math.inf if args.count is None else args.count)
         except TimeoutError as error:

@@ -28,13 +28,13 @@ from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.run import INTERRUPTED, Runner, RunResult
+from tactflow.engine.run import Runner, RunResult
 from tactflow.engine.trace import TRACE_BEGINS, Trace
 from tactflow.files import is_device
 from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
-from tactflow.signals import Interrupted, ending_handled
+from tactflow.signals import INTERRUPTED, Interrupted, ending_handled
 from tactflow.vision import compiled
 
 STATISTICS_BEGIN = '{\n "frames":'
@@ -304,7 +304,8 @@ def _signals(runner: Runner) -> Iterator[Sequence[int]]:
         if len(caught) == 1 and not compiled.is_loading():
             runner.stop("signal")
             return
-        signal.signal(number, signal.SIG_DFL)
+        if len(caught) > 1:
+            signal.signal(number, signal.SIG_DFL)
         raise Interrupted
 
     with ending_handled(handle):
