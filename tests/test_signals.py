@@ -34,6 +34,23 @@ def test_a_ctrl_c_waits_for_the_end_of_the_block() -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_each_ctrl_c_is_handled_after_the_block_whatever_the_first_one_raises() -> None:
+    handled: list[int] = []
+
+    def handle(number: int, _: object) -> None:
+        handled.append(number)
+        raise KeyboardInterrupt
+
+    def work() -> None:
+        with ending_handled(handle), ending_held_back():
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert handled == [signal.SIGINT, signal.SIGTERM]
+
+
 def test_what_fails_in_the_block_is_told() -> None:
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(OSError, match="no process"), ending_held_back():

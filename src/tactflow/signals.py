@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -93,5 +93,7 @@ def ending_held_back() -> Iterator[None]:
     finally:
         for number, earlier in zip(handled, before, strict=True):
             signal.signal(number, earlier)
-    for number in came:
-        signal.raise_signal(number)
+    # Each of them, whatever the handler raises for the first.
+    with ExitStack() as stack:
+        for number in reversed(came):
+            stack.callback(signal.raise_signal, number)
