@@ -10,8 +10,7 @@ from threading import Thread
 
 import pytest
 
-from tactflow.api import load, make_runner
-from tactflow.cli.run import _signals
+from tactflow.api import ended_by_signals, load, make_runner
 from tactflow.signals import ENDING, ending_handled, ending_held_back, interrupt
 from tests.clock import PATIENCE, until
 
@@ -155,7 +154,7 @@ def test_the_third_signal_is_not_caught_also_where_the_first_ends_a_run_at_once(
 ) -> None:
     monkeypatch.setattr("tactflow.vision.compiled.is_loading", lambda: True)
     pipeline = load(source="sim:idle?frames=2", settings={"sinks": {}})
-    with _signals(make_runner(pipeline)) as caught:
+    with ended_by_signals(make_runner(pipeline)) as caught:
         for _ in range(2):
             assert signal.getsignal(signal.SIGINT) is not signal.SIG_DFL
             with pytest.raises(KeyboardInterrupt):
