@@ -6,6 +6,7 @@ import argparse
 import json
 import logging
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,6 +34,7 @@ from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 from tactflow.signals import INTERRUPTED
+from tactflow.vision import compiled
 
 STATISTICS_BEGIN = '{\n "frames":'
 """How a file of statistics begins."""
@@ -240,6 +242,9 @@ def _stop_at_end_of_input(runner: Runner) -> None:
         while os.read(sys.stdin.fileno(), 4096):
             pass
     runner.stop("signal")
+    if compiled.is_loading():
+        # This is not waited for after a signal.
+        signal.raise_signal(signal.SIGTERM)
 
 
 def _seconds(text: str) -> float:
