@@ -44,9 +44,9 @@ def test_no_signal_arrives_in_a_worker_that_starts() -> None:
     program = """
 import signal
 from multiprocessing import resource_tracker
-from tactflow.batch.local import _signals_held
+from tactflow.batch.local import signals_held
 from tactflow.signals import ENDING
-with _signals_held():
+with signals_held(ENDING):
     resource_tracker.ensure_running()
     print(set(ENDING) <= signal.pthread_sigmask(signal.SIG_BLOCK, []))
 """

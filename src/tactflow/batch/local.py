@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -47,7 +47,7 @@ class _Worker:
         self.total: int | None = None
         self.connection, theirs = _CONTEXT.Pipe()
         self.process: BaseProcess = _CONTEXT.Process(target=_serve, args=(theirs, work), daemon=True)
-        with _signals_held():
+        with signals_held(ENDING):
             self.process.start()
         theirs.close()
 
@@ -150,8 +150,8 @@ class LocalProcesses:
 
 
 @contextmanager
-def _signals_held() -> Iterator[None]:
-    """Let a process start in which no signal that asks to end arrives.
+def signals_held(numbers: Collection[int]) -> Iterator[None]:
+    """Let processes, and threads that start some, begin in which these signals do not arrive.
 
     Ctrl-C on a terminal reaches every process there; the one of the command line decides.
     """
@@ -160,7 +160,7 @@ def _signals_held() -> Iterator[None]:
         return
     # Python starts it with the first process, and then lets Ctrl-C and SIGTERM arrive again.
     resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:
