@@ -52,3 +52,21 @@ with signals_held(ENDING):
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+def test_a_terminal_that_is_closed_does_not_end_what_python_starts_with_the_first_process() -> None:
+    program = """
+import re, signal
+from multiprocessing import resource_tracker
+from pathlib import Path
+from tactflow.batch.local import signals_held
+from tactflow.signals import ENDING
+with signals_held(ENDING):
+    resource_tracker.ensure_running()
+status = Path(f"/proc/{resource_tracker._resource_tracker._pid}/status").read_text()
+blocked = int(re.search("SigBlk:\\t(.*)", status)[1], 16)
+print(bool(blocked >> (signal.SIGHUP - 1) & 1))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"

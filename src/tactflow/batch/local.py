@@ -158,10 +158,11 @@ def signals_held(numbers: Collection[int]) -> Iterator[None]:
     if sys.platform == "win32":
         yield
         return
-    # Python starts it with the first process, and then lets Ctrl-C and SIGTERM arrive again.
-    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
+        # Python starts it with the first process, and then lets Ctrl-C and SIGTERM arrive again.
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
