@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
@@ -161,6 +162,16 @@ def test_the_third_signal_is_not_caught_also_where_the_first_ends_a_run_at_once(
                 signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
         assert len(caught) == 2
+
+
+def test_a_run_is_told_to_end_also_where_python_drops_what_is_raised(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tactflow.vision.compiled.is_loading", lambda: True)
+    runner = make_runner(load(source="sim:idle?frames=2", settings={"sinks": {}}))
+    with ended_by_signals(runner), suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    assert runner.hurried
 
 
 def test_a_signal_while_nobody_takes_the_last_of_the_output(

@@ -151,9 +151,11 @@ def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
 
     def handle(number: int, _: FrameType | None) -> None:
         caught.append(number)
-        if len(caught) == 1 and not compiled.is_loading():
+        if len(caught) == 1:
+            # In any case: Python drops what is raised while it frees an object or imports a module.
             runner.stop("signal")
-            return
+            if not compiled.is_loading():
+                return
         if len(caught) > 1:
             signal.signal(number, signal.SIG_DFL)
         raise Interrupted
