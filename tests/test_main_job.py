@@ -237,6 +237,40 @@ def test_a_second_signal_ends_at_once_with_130(tmp_path: Path) -> None:
     assert process.returncode == 130
 
 
+NEVER_DONE = """
+from pathlib import Path
+import cv2
+import numpy as np
+from tactflow.engine.contract import Stage
+from tactflow.ports import Image
+
+class NeverDone(Stage):
+    memory = "pure"
+    def process(self, image: Image) -> Image:
+        pixels = np.zeros((200, 200), np.float32)
+        Path("began").touch()
+        while True:
+            cv2.blur(pixels, (3, 3))
+"""
+
+
+def test_a_thread_that_is_in_opencv_does_not_change_the_exit_code(tmp_path: Path) -> None:
+    (tmp_path / "busy.py").write_text(NEVER_DONE)
+    (tmp_path / "pipeline.yaml").write_text(
+        "stages:\n  capture: {source: 'sim:idle?frames=50'}\n  preprocess: {}\n"
+        "  busy: {use: './busy.py:NeverDone'}\nsinks:\n  jsonl: {path: out.jsonl}\n"
+    )
+    command = [sys.executable, "-m", "tactflow", "run", "--quiet"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        until(lambda: process.poll() is not None or (tmp_path / "began").exists())
+        process.send_signal(signal.SIGINT)
+        # Two at once may arrive as one.
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, errors) == (130, "")
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [

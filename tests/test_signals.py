@@ -5,12 +5,18 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
 import pytest
 
-from tactflow.signals import ending_held_back
+from tactflow.api import ended_by_signals, load, make_runner
+from tactflow.signals import ENDING, ending_handled, ending_held_back, interrupt
+from tests.clock import PATIENCE, until
+
+ENDS = [number for number in ENDING if sys.platform != "win32"]
+"""Windows ends another process at once instead of sending it one of them."""
 
 
 def test_a_ctrl_c_waits_for_the_end_of_the_block() -> None:
@@ -26,6 +32,23 @@ def test_a_ctrl_c_waits_for_the_end_of_the_block() -> None:
         work()
     assert done == [True]
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_each_ctrl_c_is_handled_after_the_block_whatever_the_first_one_raises() -> None:
+    handled: list[int] = []
+
+    def handle(number: int, _: object) -> None:
+        handled.append(number)
+        raise KeyboardInterrupt
+
+    def work() -> None:
+        with ending_handled(handle), ending_held_back():
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert handled == [signal.SIGINT, signal.SIGTERM]
 
 
 def test_what_fails_in_the_block_is_told() -> None:
@@ -59,3 +82,117 @@ except KeyboardInterrupt:
     sys.exit(7)
 """)
     assert subprocess.run([sys.executable, "-m", "ending"], cwd=tmp_path, check=False).returncode == 7
+
+
+def interrupted(folder: Path, words: list[str], *numbers: int) -> tuple[int, str]:
+    """Exit code and standard error of a program that gets signals.
+
+    Each waits for a file of the program's, `ready-1`, `ready-2`, ..., and there is `sent-1`, ... after it.
+    """
+    command = [sys.executable, "-m", "tactflow", *words]
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
+        for count, number in enumerate(numbers, start=1):
+            ready = folder / f"ready-{count}"
+            until(lambda ready=ready: process.poll() is not None or ready.exists())
+            process.send_signal(number)
+            (folder / f"sent-{count}").touch()
+        _, errors = process.communicate(timeout=PATIENCE)
+    return process.returncode, errors
+
+
+BLOCKS = f"open('ready-1', 'w').close(); import time; time.sleep({PATIENCE})"
+
+
+@pytest.mark.parametrize("number", ENDS)
+@pytest.mark.parametrize(("command", "code"), [("check", 130), ("listen", 0), ("run", 0)])
+def test_a_signal_while_the_program_is_imported(command: str, code: int, number: int, tmp_path: Path) -> None:
+    # Stands in for the module of that name, which the program imports first.
+    (tmp_path / "difflib.py").write_text(BLOCKS)
+    assert interrupted(tmp_path, [command], number) == (code, "")
+
+
+LATE = ["stages", "./late.py:Late"]
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_a_signal_while_a_command_is_at_work(number: int, tmp_path: Path) -> None:
+    # Within `exec` of a text, a KeyboardInterrupt itself ends Python by SIGINT.
+    (tmp_path / "late.py").write_text(f"exec({BLOCKS!r})")
+    assert interrupted(tmp_path, LATE, number) == (130, "")
+
+
+TIDIES = f"""
+import time
+from pathlib import Path
+
+try:
+    {BLOCKS}
+finally:
+    Path("ready-2").touch()
+    while not Path("sent-2").exists():
+        time.sleep(0.001)
+    Path("tidied").touch()
+"""
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_a_second_signal_does_not_keep_a_command_from_tidying_up(number: int, tmp_path: Path) -> None:
+    (tmp_path / "late.py").write_text(TIDIES)
+    assert interrupted(tmp_path, LATE, number, number) == (130, "")
+    assert (tmp_path / "tidied").exists()
+
+
+def test_a_third_signal_is_not_caught() -> None:
+    with ending_handled(interrupt):
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+
+
+def test_the_third_signal_is_not_caught_also_where_the_first_ends_a_run_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tactflow.vision.compiled.is_loading", lambda: True)
+    pipeline = load(source="sim:idle?frames=2", settings={"sinks": {}})
+    with ended_by_signals(make_runner(pipeline)) as caught:
+        for _ in range(2):
+            assert signal.getsignal(signal.SIGINT) is not signal.SIG_DFL
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+        assert len(caught) == 2
+
+
+def test_a_run_is_told_to_end_also_where_python_drops_what_is_raised(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tactflow.vision.compiled.is_loading", lambda: True)
+    runner = make_runner(load(source="sim:idle?frames=2", settings={"sinks": {}}))
+    with ended_by_signals(runner), suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    assert runner.hurried
+
+
+def test_a_signal_while_nobody_takes_the_last_of_the_output(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "ending.py").write_text("""
+import sys
+from tactflow.cli import main
+from tactflow.signals import Interrupted
+
+def interrupted():
+    sys.stdout.flush = lambda: None
+    raise Interrupted
+
+def print_little(_):
+    sys.stdout.flush = interrupted
+    return 0
+
+main.main = print_little
+main.entry()
+""")
+    command = [sys.executable, "-m", "ending"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "")

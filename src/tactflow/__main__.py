@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import gc
-import signal
 import sys
 from collections.abc import Sequence
 
-from tactflow.signals import leave, on_ending
+from tactflow.signals import give_up, leave, on_ending
 
-RUNS = ("run", "record")
+ENDLESS = ("run", "record", "listen")
 """Commands that one signal ends well."""
 
 
@@ -17,7 +16,7 @@ def entry() -> None:
     """Entry point of the console script."""
     # Before all else is imported, which takes a while. To be ended by a service, by a terminal that is closed
     # or by Ctrl-C is the same.
-    on_ending(leave if wanted(sys.argv[1:]) in RUNS else signal.default_int_handler)
+    on_ending(leave if wanted(sys.argv[1:]) in ENDLESS else give_up)
     # Nothing that is imported becomes garbage: to look for it there takes a twelfth of the start.
     gc.disable()
     from tactflow.cli import main

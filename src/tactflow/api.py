@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from contextlib import suppress
+import signal
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import cv2
@@ -20,7 +22,9 @@ from tactflow.config.yamlmap import Problems, wrap
 from tactflow.engine.conformance import build
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Mark, Pipeline
-from tactflow.engine.run import INTERRUPTED, Runner, RunResult
+from tactflow.engine.run import Runner, RunResult
+from tactflow.signals import INTERRUPTED, Interrupted, ending_handled
+from tactflow.vision import compiled
 
 Settings = Mapping[str, Any]
 """Values of the pipeline file to replace, as in `{"stages.preprocess.rotate": 0, "sinks.zmq": None}`."""
@@ -135,6 +139,29 @@ def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
     if pipeline.opencv_threads is not None:
         cv2.setNumThreads(pipeline.opencv_threads)
     return Runner(_calibrated(pipeline), **options)
+
+
+@contextmanager
+def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
+    """One Ctrl-C, SIGTERM or SIGHUP drains the pipeline; a second one ends it at once; a third is not caught.
+
+    While kernels are compiled there is nothing to drain, and the first one ends it. Gives those that came.
+    """
+    caught: list[int] = []
+
+    def handle(number: int, _: FrameType | None) -> None:
+        caught.append(number)
+        if len(caught) == 1:
+            # In any case: Python drops what is raised while it frees an object or imports a module.
+            runner.stop("signal")
+            if not compiled.is_loading():
+                return
+        if len(caught) > 1:
+            signal.signal(number, signal.SIG_DFL)
+        raise Interrupted
+
+    with ending_handled(handle):
+        yield caught
 
 
 def _calibrated(pipeline: Pipeline) -> Pipeline:

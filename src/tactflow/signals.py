@@ -6,13 +6,16 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 """Ctrl-C, a service manager, a terminal that is closed."""
 
-Handler = Callable[[int, FrameType | None], None]
+INTERRUPTED = 130
+"""Exit code of a program that was not allowed to finish what was under way."""
+
+Handler = Callable[[int, FrameType | None], object]
 
 
 class Interrupted(KeyboardInterrupt):
@@ -31,7 +34,28 @@ def leave(_number: int, _frame: FrameType | None) -> None:
     os._exit(0)
 
 
-def on_ending(handler: Handler) -> dict[int, object]:
+def give_up(_number: int, _frame: FrameType | None) -> None:
+    """Handler while any other command starts, which has given nothing yet: it ends at once, too."""
+    os._exit(INTERRUPTED)
+
+
+def interrupt(_number: int, _frame: FrameType | None) -> None:
+    """Handler that ends what is under way; a second signal does not keep it from tidying up.
+
+    A third is not caught.
+    """
+    on_ending(lambda _number, _frame: on_ending(signal.SIG_DFL))
+    raise Interrupted
+
+
+def interrupt_from_now_on() -> None:
+    """Have each of them interrupt, if so far it would have made the program give up."""
+    for number in ENDING:
+        if signal.getsignal(number) is give_up:
+            signal.signal(number, interrupt)
+
+
+def on_ending(handler: Handler | signal.Handlers) -> dict[int, object]:
     """Have a handler called for each of them; returns what was called before.
 
     One that is ignored stays so: who started the program with nohup wants it to go on.
@@ -69,5 +93,7 @@ def ending_held_back() -> Iterator[None]:
     finally:
         for number, earlier in zip(handled, before, strict=True):
             signal.signal(number, earlier)
-    for number in came:
-        signal.raise_signal(number)
+    # Each of them, whatever the handler raises for the first.
+    with ExitStack() as stack:
+        for number in reversed(came):
+            stack.callback(signal.raise_signal, number)

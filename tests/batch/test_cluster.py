@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +29,13 @@ def toy(task: Task) -> Outcome:
     return Outcome(task.recording.source, task.recording.name, "done")
 
 
+def blocked(task: Task) -> Outcome:
+    """Tells the signals that do not arrive in this process."""
+    numbers = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    names = " ".join(sorted(signal.Signals(number).name for number in numbers))
+    return Outcome(task.recording.source, task.recording.name, "failed", error=names)
+
+
 @pytest.fixture
 def scheduler() -> Iterator[Any]:
     """A cluster in this process."""
@@ -44,6 +53,14 @@ def test_every_task_comes_back_also_one_whose_work_raises(scheduler: Any, tmp_pa
         **{"a": "done", "b": "done", "broken": "failed"}
     }
     assert outcomes["broken"].error == "on a worker: ValueError: no such thing"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signal reaches another process there")
+def test_what_a_terminal_sends_to_all_its_processes_does_not_arrive_in_workers_that_are_started_here(
+    tmp_path: Path,
+) -> None:
+    outcomes = outcomes_of(DaskCluster("local", work=blocked), tasks(tmp_path, "a"))
+    assert outcomes["a"].error == "SIGHUP SIGINT"
 
 
 def test_nobody_who_answers_is_a_mistake_of_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:

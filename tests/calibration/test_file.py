@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -157,6 +158,23 @@ def test_a_calibration_that_cannot_be_written_leaves_the_one_before(
         replace(CALIBRATION, sensor="right").save(path)
     assert Calibration.load(path).sensor == "left"
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_ctrl_c_leaves_the_calibration_before_or_the_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "left.yaml"
+    CALIBRATION.save(path)
+    move = os.replace
+
+    def interrupted(here: str, there: str) -> None:
+        move(here, there)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("os.replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        replace(CALIBRATION, sensor="right").save(path)
+    assert Calibration.load(path).sensor == "right"
 
 
 def test_the_password_of_a_camera_is_not_kept(tmp_path: Path) -> None:

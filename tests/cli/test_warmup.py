@@ -15,16 +15,28 @@ from tests.clock import PATIENCE
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
-def test_one_ctrl_c_ends_compiling_and_the_processes_that_help(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", ["Ctrl-C", "end of input"])
+def test_compiling_and_the_processes_that_help_are_ended(by: str, tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
     sinks = "sinks={jsonl: {path: out.jsonl}}"
     command = [sys.executable, "-m", "tactflow", "run", "--source", "sim:press?frames=60", "--set", sinks]
-    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as run:
+    with subprocess.Popen(
+        [*command, "--end-with-stdin"],
+        cwd=tmp_path,
+        env=environment,
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as run:
+        assert run.stdin is not None
         assert run.stderr is not None
         line = run.stderr.readline()
         while line and "compiling" not in line:
             line = run.stderr.readline()
-        run.send_signal(signal.SIGINT)
+        if by == "Ctrl-C":
+            run.send_signal(signal.SIGINT)
+        else:
+            run.stdin.close()
         assert run.wait(PATIENCE) == 0
     # Each process may finish the loop at which it is; the default pipeline has some twenty.
     assert len(list((tmp_path / "kept").rglob("*.nbi"))) < 10

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from tactflow.cli.main import main
 from tactflow.doctor import examine, observe
+from tactflow.signals import ending_handled, interrupt
 from tactflow.sim import open_scene
 from tactflow.sources.devices import Camera
 
@@ -164,3 +166,18 @@ def test_what_cannot_be_looked_at_is_said(
 ) -> None:
     assert main(["doctor", *arguments]) == code
     assert says in capsys.readouterr().err
+
+
+def test_one_ctrl_c_ends_the_look_at_the_source_and_the_next_one_ends_the_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def signalled(_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("tactflow.cli.doctor._progress", lambda frames: signalled(0) if frames == 5 else None)
+    words = ["doctor", "--source", "sim:idle?frames=20"]
+    with ending_handled(interrupt):
+        assert main(words) == 0
+        assert ": 5 frames looked at" in capsys.readouterr().out
+        monkeypatch.setattr("tactflow.doctor.examine", signalled)
+        assert main(words) == 130

@@ -13,6 +13,7 @@ import pytest
 
 from tactflow.engine import run
 from tactflow.engine.run import MOST_STEPS, Runner, RunResult
+from tactflow.signals import INTERRUPTED
 from tests.clock import PATIENCE, until
 
 MakeRunner = Callable[..., Runner]
@@ -696,7 +697,7 @@ def test_nothing_is_closed_while_a_thread_is_in_it(
 ) -> None:
     monkeypatch.setattr("tactflow.engine.run.LEAVE_SECONDS", 0.1)
     runner = toy_runner({"join": {"seconds": PATIENCE}, "capture": {"frames": 3}})
-    assert interrupt_in_join(runner).exit_code == run.INTERRUPTED
+    assert interrupt_in_join(runner).exit_code == INTERRUPTED
     closed = {name: node.instance.closed for name, node in runner.nodes.items()}
     assert closed.pop("join") == 0
     assert set(closed.values()) == {1}
@@ -710,7 +711,7 @@ def test_an_interrupted_run_lets_its_threads_end_before_it_closes(
 ) -> None:
     monkeypatch.setattr("tactflow.engine.run.LEAVE_SECONDS", PATIENCE)
     runner = toy_runner({"join": {"seconds": 0.2}, "capture": {"frames": 3}})
-    assert interrupt_in_join(runner).exit_code == run.INTERRUPTED
+    assert interrupt_in_join(runner).exit_code == INTERRUPTED
     assert not any(thread.is_alive() for thread in runner._threads.values())
     assert runner.nodes["join"].instance.closed == 1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -11,8 +12,11 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zmq
+import zmq.auth
 from pydantic import ValidationError
 
 from tactflow.cli.main import main
@@ -22,7 +26,7 @@ from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import clash_problems
 from tactflow.network import bound_socket, connection
 from tactflow.network.connection import GREETING, asked_for
-from tactflow.network.keys import WrongKeysError, make_keys
+from tactflow.network.keys import WrongKeysError, make_keys, subscribers_folder
 from tactflow.network.publisher import Publisher
 from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import Subscriber
@@ -210,6 +214,20 @@ def test_who_may_read_is_not_for_others_to_say(folders: tuple[Path, Path], place
     os.chmod(folders[0] / place, 0o770)
     with pytest.raises(StageError, match=r"others may write to it; chmod go-w"):
         Publisher("tcp://127.0.0.1:*", 1, 32768, str(folders[0]))
+
+
+def test_a_ctrl_c_leaves_no_half_of_the_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    create = zmq.auth.create_certificates
+
+    def interrupted(*args: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return create(*args)
+
+    monkeypatch.setattr(zmq.auth, "create_certificates", interrupted)
+    assert main(["keys", "new", "laptop", "--folder", str(tmp_path)]) == 130
+    subscribers_folder(tmp_path / "publisher")
+    with Subscriber(keys=tmp_path / "laptop"):
+        pass
 
 
 def test_keys_that_are_missing_or_damaged_are_refused_with_a_hint(folders: tuple[Path, Path]) -> None:

@@ -218,6 +218,25 @@ def test_to_ask_for_values_ahead_is_an_instruction_of_the_compiled_loop() -> Non
     assert "call void @llvm.prefetch" in code
 
 
+def test_a_ctrl_c_waits_until_the_compiler_is_through_with_the_kernel(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    through: list[bool] = []
+    compile_or_read = compiled.Kernel._compile_or_read
+
+    def interrupted(*args: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        found = compile_or_read(*args)
+        through.append(True)
+        return found
+
+    monkeypatch.setattr(compiled.Kernel, "_compile_or_read", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        kernel("int64(int64)")(lambda n: n + 7).load()
+    assert through == [True]
+    assert not compiled.is_loading()
+
+
 @pytest.mark.parametrize("passed_over", [True, False])
 def test_garbage_is_looked_for_in_loaded_kernels_only_where_it_is_looked_for_in_imports(
     passed_over: bool, warm: Warm

@@ -10,8 +10,9 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
@@ -46,7 +47,7 @@ class _Worker:
         self.total: int | None = None
         self.connection, theirs = _CONTEXT.Pipe()
         self.process: BaseProcess = _CONTEXT.Process(target=_serve, args=(theirs, work), daemon=True)
-        with _signals_held():
+        with signals_held(ENDING):
             self.process.start()
         theirs.close()
 
@@ -149,16 +150,19 @@ class LocalProcesses:
 
 
 @contextmanager
-def _signals_held() -> Iterator[None]:
-    """Let a process start in which no signal that asks to end arrives.
+def signals_held(numbers: Collection[int]) -> Iterator[None]:
+    """Let processes, and threads that start some, begin in which these signals do not arrive.
 
     Ctrl-C on a terminal reaches every process there; the one of the command line decides.
     """
     if sys.platform == "win32":
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
+        # Python starts it with the first process, and then lets Ctrl-C and SIGTERM arrive again.
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from tactflow.api import make_runner
+from tactflow.api import ended_by_signals, make_runner
 from tactflow.engine.conformance import own_sink
 from tactflow.engine.contract import Sink
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.signals import ending_handled
+from tactflow.signals import INTERRUPTED, Interrupted
 
 _COLLECT: Final = "tactflow.calibrate"
 """Id of the sink that collects; no id of a file has a point in it."""
@@ -28,7 +28,8 @@ def collect(
 ) -> Any:
     """Run a pipeline with a sink of ours in place of its own, nothing skipped; returns the sink.
 
-    A signal such as Ctrl-C ends it; what was collected until then counts.
+    A signal such as Ctrl-C ends it; what was collected until then counts. A second one, or one while kernels
+    are compiled, raises KeyboardInterrupt.
 
     Parameters
     ----------
@@ -53,8 +54,10 @@ def collect(
     kept.update(watchers or {})
     kept[_COLLECT] = replace(node, inputs=inputs)
     runner = make_runner(replace(pipeline, nodes=kept, skipping=False, calibration=calibration))
-    with ending_handled(lambda _number, _frame: runner.stop()):
-        failure = runner.run().failure
-    if failure is not None:
-        raise failure
+    with ended_by_signals(runner):
+        result = runner.run()
+    if result.exit_code == INTERRUPTED:
+        raise Interrupted
+    if result.failure is not None:
+        raise result.failure
     return runner.nodes[_COLLECT].instance

@@ -24,6 +24,7 @@ from tactflow import __version__
 from tactflow.engine.errors import ConfigError
 from tactflow.files import completed, is_device
 from tactflow.redaction import public_address
+from tactflow.signals import ending_held_back
 from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import SurfaceErrors
 from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, ForceModel, LinearForce
@@ -208,8 +209,12 @@ class Calibration:
         if self.slopes is not None:
             arrays["slopes"] = self.slopes.coefficients
         try:
-            # Both are whole before one takes the place of an earlier calibration.
-            with completed(path) as unfinished, completed(path.with_suffix(".npz")) as unfinished_arrays:
+            # Both are whole before one takes the place of an earlier calibration, and then both do.
+            with (
+                ending_held_back(),
+                completed(path) as unfinished,
+                completed(path.with_suffix(".npz")) as unfinished_arrays,
+            ):
                 np.savez(unfinished_arrays, **arrays)
                 unfinished.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
         except OSError as error:

@@ -31,8 +31,7 @@ from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.run import INTERRUPTED
-from tactflow.signals import ending_handled
+from tactflow.signals import INTERRUPTED, ending_handled
 from tactflow.vision.compiled import processors
 
 _FAILED_SHOWN = 20

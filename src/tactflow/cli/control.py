@@ -61,8 +61,6 @@ def run(args: argparse.Namespace) -> int:
             raise SourceError(f"control: {error}") from None
         except RuntimeError as error:
             raise StageError(f"control: {error}") from None
-        except KeyboardInterrupt:
-            return 130
     if args.json:
         print(json.dumps(answer))
     elif "stats" in answer:

@@ -14,6 +14,7 @@ import orjson
 from tactflow.cli.options import seconds
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import StageError
+from tactflow.signals import ending_handled, interrupt
 from tactflow.sources import KINDS
 
 if TYPE_CHECKING:
@@ -54,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
     from tactflow.doctor import examine, observe
     from tactflow.doctor.checks import worst
 
-    seen = observe(args.source, args.seconds, _progress)
+    # The first ends only the look at the source.
+    with ending_handled(interrupt):
+        seen = observe(args.source, args.seconds, _progress)
     _progress(0)
     findings = examine(seen)
     verdict = worst(findings)

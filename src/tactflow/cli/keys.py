@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.network.keys import WrongKeysError, make_keys
+from tactflow.signals import ending_held_back
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make them, and print what goes where."""
     try:
-        publisher, subscriber = make_keys(args.folder, args.name)
+        # Of some of the keys, neither they nor the next ones could be used.
+        with ending_held_back():
+            publisher, subscriber = make_keys(args.folder, args.name)
     except WrongKeysError as error:
         raise ConfigError(f"keys: {error}") from None
     except OSError as error:

@@ -13,6 +13,7 @@ from tactflow.cli.options import positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.network.subscriber import DEFAULT_ENDPOINT, Subscriber
+from tactflow.signals import ending_handled, interrupt
 
 Message = dict[str, Any]
 
@@ -58,16 +59,16 @@ def run(args: argparse.Namespace) -> int:
     if sys.stderr.isatty():
         print(f"listening to {args.endpoint}; Ctrl-C ends", file=sys.stderr)
     show = _table if args.table else _json_lines if args.json else _lines
-    with subscriber:
-        try:
+    try:
+        with ending_handled(interrupt), subscriber:
             show(subscriber, math.inf if args.count is None else args.count)
-        except TimeoutError as error:
-            if subscriber.received == 0:
-                raise SourceError(f"listen: {error}") from None
-        except PermissionError as error:
+    except TimeoutError as error:
+        if subscriber.received == 0:
             raise SourceError(f"listen: {error}") from None
-        except KeyboardInterrupt:
-            pass
+    except PermissionError as error:
+        raise SourceError(f"listen: {error}") from None
+    except KeyboardInterrupt:
+        pass
     return 0
 
 

@@ -11,6 +11,7 @@ import os
 import re
 import signal
 import sys
+import threading
 from collections.abc import Collection, Sequence
 from typing import NoReturn
 
@@ -19,7 +20,7 @@ from tactflow.__main__ import wanted
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.files import Unheard, lead_nowhere
-from tactflow.signals import ENDING
+from tactflow.signals import ENDING, INTERRUPTED, interrupt_from_now_on
 
 COMMANDS = {
     "run": "run a pipeline",
@@ -75,9 +76,18 @@ def entry() -> None:
             unnamed = "the current folder" if isinstance(error, FileNotFoundError) else "standard output"
             print(f"tactflow: {error.filename or unnamed}: {error.strerror or error}", file=sys.stderr)
             code = StageError.exit_code
+    except KeyboardInterrupt:
+        # Whoever shall read our output does not.
+        lead_nowhere(sys.stdout)
+        code = INTERRUPTED
     # The code is known; what comes now shall not change it.
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
+    if threading.active_count() > 1:
+        # A thread of a run that was not allowed to finish: one that comes out of OpenCV while Python ends
+        # would abort the process.
+        sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)
 
 
@@ -86,6 +96,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         args = _parse(argv)
         _collect_garbage()
+        interrupt_from_now_on()
         return int(args.run(args))
     except TactflowError as error:
         # Imported here: it reads YAML, which not every command does.
@@ -94,7 +105,7 @@ def main(argv: Sequence[str]) -> int:
         print(printable(public_address(f"tactflow: {error}")), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else 0
 

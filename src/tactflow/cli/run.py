@@ -9,15 +9,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from rich.console import Console
 
-from tactflow.api import make_runner
+from tactflow.api import ended_by_signals, make_runner
 from tactflow.cli.notes import notes_on
 from tactflow.cli.opencv import warn_of_conflict
 from tactflow.cli.options import add_pipeline, positive, seconds
@@ -28,13 +27,13 @@ from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.run import INTERRUPTED, Runner, RunResult
+from tactflow.engine.run import Runner, RunResult
 from tactflow.engine.trace import TRACE_BEGINS, Trace
 from tactflow.files import is_device
 from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
-from tactflow.signals import Interrupted, ending_handled
+from tactflow.signals import INTERRUPTED
 from tactflow.vision import compiled
 
 STATISTICS_BEGIN = '{\n "frames":'
@@ -195,7 +194,7 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
         threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
     if args.sign_of_life is not None:
         start_beating(args.sign_of_life, Headway(runner.calls))
-    with notes_on(console), _signals(runner) as caught:
+    with notes_on(console), ended_by_signals(runner) as caught:
         _refuse_unwritable("--stats", args.stats, begins=STATISTICS_BEGIN)
         _refuse_unwritable("--trace", args.trace, begins=TRACE_BEGINS)
         logger = logging.getLogger("tactflow")
@@ -243,6 +242,9 @@ def _stop_at_end_of_input(runner: Runner) -> None:
         while os.read(sys.stdin.fileno(), 4096):
             pass
     runner.stop("signal")
+    if compiled.is_loading():
+        # This is not waited for after a signal.
+        signal.raise_signal(signal.SIGTERM)
 
 
 def _seconds(text: str) -> float:
@@ -289,23 +291,3 @@ def _refuse_shared(reports: Mapping[str, str | None], pipeline: Pipeline) -> Non
         if place in writers:
             raise ConfigError(f"{option} {path}: {writers[place]} writes it already; choose another file")
         writers[place] = option
-
-
-@contextmanager
-def _signals(runner: Runner) -> Iterator[Sequence[int]]:
-    """One Ctrl-C, SIGTERM or SIGHUP drains the pipeline; a second one ends it at once; a third is not caught.
-
-    While kernels are compiled there is nothing to drain, and the first one ends it. Gives those that came.
-    """
-    caught: list[int] = []
-
-    def handle(number: int, _: FrameType | None) -> None:
-        caught.append(number)
-        if len(caught) == 1 and not compiled.is_loading():
-            runner.stop("signal")
-            return
-        signal.signal(number, signal.SIG_DFL)
-        raise Interrupted
-
-    with ending_handled(handle):
-        yield caught

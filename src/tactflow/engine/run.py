@@ -23,11 +23,9 @@ from tactflow.engine.schedule import make_schedule
 from tactflow.engine.segment import NewReferences, NodeFailedError, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.engine.trace import Trace
+from tactflow.signals import INTERRUPTED
 
 logger = logging.getLogger("tactflow")
-
-INTERRUPTED = 130
-"""Exit code of a run that was not allowed to finish the frames under way."""
 
 CLOSE_SECONDS = 10.0
 """How long, s, no stage and no link may get on after the run was stopped or has failed, before the one that

@@ -180,7 +180,9 @@ class Kernel(Generic[P, R]):
         with claimed(found.stats.cache_path, self.name, wait) as mine:
             if not mine:
                 return None
-            found, self.kept = self._compile_or_read(found, function)
+            # An exception within the compiler would leave its objects half made, which then complain.
+            with ending_held_back():
+                found, self.kept = self._compile_or_read(found, function)
             self.compiled_here = bool(found.stats.cache_misses) or not self.kept
             if self.compiled_here:
                 for tell in _listeners:
