@@ -61,9 +61,9 @@ part in so many of its length's: of three equal channels it is one in three. Cho
 
 TWO_SIDED: Final = 0.4
 """How far apart what has brightened and what has darkened are (`_sidedness`), from which on they are two
-flanks of one contact: half of the 0.83 of a ball lit from one side. A dark contact with a bright halo has 0.02
-(9dtact_1), other contacts that change as a whole have 0.23 at most (sts_640). In grey pictures of mini_ball it
-is 0.74 to 0.83, of digit_fots 0.53 in the median."""
+flanks of one contact: half of the 0.83 of a ball lit from one side. A dark contact with a bright halo has
+0.02 (9dtact_1), other contacts that change as a whole have 0.23 at most (sts_640). In grey pictures of
+mini_ball it is 0.74 to 0.83, of digit_fots 0.53 in the median."""
 
 PLATEAU_REACH: Final = 0.7
 """Part of the contact's radius within which the largest change of a contact that has changed as a whole is

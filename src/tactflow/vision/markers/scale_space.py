@@ -51,9 +51,9 @@ OVERLAP: Final = 1.3
 """Distance of neighbouring marks at least, in radii: spots closer than that are ridges of a pattern."""
 
 LONGEST: Final = 10.0
-"""Ratio of the response's curvatures across and along a place, above which it is part of a line: a dead column
-of the camera, an edge. Lowe's value. No mark of 18 recordings is lost or gained; of 32 spots on a dead column
-across wrs_cam1 that continued the lattice of its marks none is left."""
+"""Ratio of the response's curvatures across and along a place, above which it is part of a line: a dead
+column of the camera, an edge. Lowe's value. No mark of 18 recordings is lost or gained; of 32 spots on a dead
+column across wrs_cam1 that continued the lattice of its marks none is left."""
 
 BORDER_MARGIN: Final = 0.8
 """Distance of a mark from the border of the image at least, in radii: others are cut by it."""
