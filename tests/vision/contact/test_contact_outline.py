@@ -129,6 +129,12 @@ def test_a_marker_alone_is_no_contact() -> None:
     assert not found(change, spot)[spot > 0].any()
 
 
+def test_a_change_that_lies_below_a_marker_alone_is_no_contact() -> None:
+    change = (disc(6) < 0)[..., None] * np.array([1, -1, 0], np.float32)
+    hidden = (distance_from(49.5, 49.5) <= DOT).astype(np.uint8)
+    assert not found(change, hidden).any()
+
+
 def test_brightened_contacts_end_below_markers_as_well() -> None:
     level = np.clip(0.5 - disc() / 4, 0, 1).astype(np.float32) * np.float32(0.5)
     clean = np.repeat(level[..., None], 3, axis=2)

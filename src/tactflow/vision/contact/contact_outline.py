@@ -229,6 +229,9 @@ def _level_of_slopes(strength: Float, bridge: float, hidden: Hidden | None) -> t
     region, solid, specks = _sloping_region(local, strength, bridge, hidden)
     if cv2.countNonZero(region.filled) == region.filled.size:
         return np.ones_like(strength), None
+    if not region.outlines:
+        # All that has changed lies below markers, where it is not seen.
+        return np.full_like(strength, -1), None
     inner, pixels = depth_of(region), None if hidden is None else hidden.pixels
     if specks is None:
         level = inside_border(inner, inner.depth, local, pixels)

@@ -75,7 +75,8 @@ class Spots(NamedTuple):
 
     def at(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> Spots:
         """Some of the spots, by their numbers or by (N,) bool."""
-        return Spots(*(values[which] for values in self))
+        clear, rounded = self.clear[which], self.round[which]
+        return Spots(self.points[which], self.radius[which], self.strength[which], clear, rounded)
 
 
 def joined(*parts: Spots) -> Spots:
@@ -174,7 +175,7 @@ def _is_round(response: NDArray[np.float32], peaks: FloatArray) -> NDArray[np.bo
     columns, rows = np.clip(np.rint(peaks).astype(np.int64), 1, limits).T
 
     def at(down: int, right: int) -> FloatArray:
-        return response[rows + down, columns + right].astype(np.float64)
+        return np.asarray(response[rows + down, columns + right], np.float64)
 
     peak = 2 * at(0, 0)
     across, down = at(0, -1) + at(0, 1) - peak, at(-1, 0) + at(1, 0) - peak
