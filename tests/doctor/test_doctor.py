@@ -18,6 +18,7 @@ from tactflow.doctor import examine, observe
 from tactflow.signals import ending_handled, interrupt
 from tactflow.sim import open_scene
 from tactflow.sources.devices import Camera
+from tests.vision.dots import grid, render
 
 Image = NDArray[np.uint8]
 FRAMES = 24
@@ -89,6 +90,17 @@ def test_each_fault_is_named_and_no_other(
     assert [finding.name for finding in bad] == ([] if name is None else [name])
     assert all(finding.effect and finding.advice for finding in bad)
     assert not [f.name for f in findings if f.verdict == "unknown" and f.name != "latency"]
+
+
+@pytest.mark.parametrize(("shown", "found"), [(1, False), (FRAMES, True)])
+def test_spots_in_no_regular_grid_are_dots_only_where_the_next_frame_shows_them(
+    tmp_path: Path, shown: int, found: bool
+) -> None:
+    # What compression makes of a gel without dots may look like an irregular grid, for a frame.
+    marked = render((400, 300), grid(8, 10, 34.0, corner=(30, 25), jitter=4.0), 4.6)
+    plain = render((400, 300), np.zeros((0, 2)), 4.6)
+    path = written(tmp_path / "r.avi", [marked] * shown + [plain] * (FRAMES - shown), 60.0)
+    assert (observe(str(path), 10.0).dots is not None) == found
 
 
 def test_a_single_clipped_pixel_is_no_share_to_speak_of(clean: list[Image], tmp_path: Path) -> None:

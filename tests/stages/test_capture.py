@@ -135,6 +135,21 @@ def test_a_recording_is_compared_with_the_first_frame_in_steady_light_and_keeps_
     ]
 
 
+def test_a_gel_of_which_two_states_may_be_the_untouched_one_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    images = np.stack(warming_up(tmp_path / "r.npy", [1.0] * 30))
+    images[:6, 16:32, 8:24] //= 2
+    images[6:, 16:32, 40:56] //= 2
+    np.save(tmp_path / "r.npy", images)
+    with caplog.at_level("INFO", "tactflow"):
+        frames = list(capture("r.npy", tmp_path).frames())
+    assert [frame.seq for frame in frames if frame.reference] == [0]
+    assert (
+        "the reference is frame 0, although the gel came to rest in another state at frame 6" in caplog.text
+    )
+
+
 @pytest.mark.parametrize(("settle", "reference"), [(0, 0), (3, -1)])
 def test_settling_can_be_switched_off(tmp_path: Path, settle: float, reference: int) -> None:
     warming_up(tmp_path / "r.npy", [0.6, 0.8] + [1.0] * 18)

@@ -24,6 +24,9 @@ KEPT: Final = 24
 FEW: Final = 20
 """Spots below which an irregular grid is none. Chosen on wedge_grasp, a gel without dots, where compression
 makes 6 and 16 of them."""
+SEEN_AGAIN: Final = 0.5
+"""Share of the dots of an irregular grid that the next frame shows again, at least: what compression makes is
+different in each frame. Chosen by hand."""
 LEAST_FRAMES: Final = 3
 """Frames without which nothing can be told of time."""
 
@@ -75,16 +78,32 @@ class Observation:
 
     @cached_property
     def dots(self) -> Detection | None:
-        """The dots of the first frame, or of the second that is kept."""
+        """The dots of the first frame, or of the second that is kept; an irregular grid is seen twice."""
         for pair in self.pairs[:2]:
-            try:
-                found = detect_markers(pair.image, valid=valid_area(pair.image))
-            except NoMarkersError:
+            found = _dots_of(pair.image)
+            if found is None:
                 continue
             closed = 0.0 if found.chosen is None else found.chosen.lattice
-            if len(found.centers) >= FEW or closed >= REGULAR:
+            if closed >= REGULAR:
+                return found
+            if len(found.centers) >= FEW and (pair.after is None or _same(found, _dots_of(pair.after))):
                 return found
         return None
+
+
+def _dots_of(image: Image) -> Detection | None:
+    try:
+        return detect_markers(image, valid=valid_area(image))
+    except NoMarkersError:
+        return None
+
+
+def _same(dots: Detection, others: Detection | None) -> bool:
+    """Whether most of the dots are at the places of others, to half a pitch."""
+    if others is None:
+        return False
+    away = np.hypot(*(dots.centers[:, None] - others.centers).transpose(2, 0, 1)).min(axis=1)
+    return bool(np.mean(away < dots.pitch / 2) >= SEEN_AGAIN)
 
 
 def observe(source: str, seconds: float, report: Callable[[int], None] = lambda _: None) -> Observation:

@@ -82,6 +82,14 @@ class FirstFrames:
             self._tell(best)
         elif settling.changing:
             self._warn(best)
+        if settling.undecided:
+            log.info(
+                "%s: the reference is frame %d, although the gel came to rest in another state at frame %d; "
+                "if it was touched until then, name a picture of the untouched gel: stages.capture.reference",
+                self._name,
+                best,
+                settling.begins,
+            )
         return alike[begin : begin + self._count]
 
     def _tell(self, best: int) -> None:

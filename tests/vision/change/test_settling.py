@@ -16,9 +16,11 @@ GEL = np.stack([90 + 0.3 * X, 120 - 0.2 * Y, 80 + 0.2 * Y + 0.1 * X], axis=-1)
 """A gel lit from the sides, grey levels."""
 
 
-def picture(gain: float | tuple[float, float, float] = 1.0, pressed: float = 0.0) -> Image:
-    """The gel under another light, with noise; `pressed` in the middle, relative."""
-    bump = pressed * np.exp(-((X - 70) ** 2 + (Y - 60) ** 2) / 2 / 12**2)
+def picture(
+    gain: float | tuple[float, float, float] = 1.0, pressed: float = 0.0, place: float = 70.0
+) -> Image:
+    """The gel under another light, with noise; `pressed` in the middle or at another x, relative."""
+    bump = pressed * np.exp(-((X - place) ** 2 + (Y - 60) ** 2) / 2 / 12**2)
     colours = np.stack([bump, -bump, 0 * bump], axis=-1)
     light = GEL * np.asarray(gain) * (1 + colours) + RNG.normal(0, 1.5, GEL.shape)
     return np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
@@ -69,6 +71,14 @@ def test_a_finger_that_comes_early_is_not_taken_for_the_gel() -> None:
     assert settling.steady
     assert settling.best() == 0
     assert settling.alike() == list(range(6))
+
+
+def test_two_states_that_are_as_even_are_said_to_be_undecided() -> None:
+    first = [picture(1, 0.3, 110) for _ in range(6)]
+    settling = settled(first + [picture(1, 0.3) for _ in range(20)])
+    assert (settling.undecided, settling.best(), settling.begins) == (True, 0, 6)
+    assert not settled([picture() for _ in range(20)]).undecided
+    assert not settled(first + [picture() for _ in range(20)]).undecided
 
 
 def test_a_finger_that_comes_slowly_ends_the_frames_that_are_alike() -> None:

@@ -129,6 +129,12 @@ def test_a_marker_alone_is_no_contact() -> None:
     assert not found(change, spot)[spot > 0].any()
 
 
+def test_a_change_that_lies_below_a_marker_alone_is_no_contact() -> None:
+    change = (disc(6) < 0)[..., None] * np.array([1, -1, 0], np.float32)
+    hidden = (distance_from(49.5, 49.5) <= DOT).astype(np.uint8)
+    assert not found(change, hidden).any()
+
+
 def test_brightened_contacts_end_below_markers_as_well() -> None:
     level = np.clip(0.5 - disc() / 4, 0, 1).astype(np.float32) * np.float32(0.5)
     clean = np.repeat(level[..., None], 3, axis=2)
@@ -299,3 +305,17 @@ def test_a_brightened_contact_ends_at_half_of_the_plateau_beside_its_border() ->
     mask = found(np.repeat(uneven[..., None], 3, axis=2).astype(np.float32))
     # Measured: 28.5 px on the dim side; 26.5 px if its height were sought a whole radius around.
     assert 49.5 - np.flatnonzero(mask[50])[0] > 28
+
+
+@pytest.mark.parametrize("turn", [0, 30, 90, 135])
+def test_both_flanks_of_a_ball_lit_from_one_side_are_one_contact(turn: int) -> None:
+    rows, columns = np.mgrid[:SIZE, :SIZE].astype(np.float32) - np.float32(49.5)
+    toward = columns * math.cos(math.radians(turn)) + rows * math.sin(math.radians(turn))
+    slope = np.where(disc(24) < 0, toward / 24, np.float32(0)).astype(np.float32)
+    mask = found(np.repeat(cv2.GaussianBlur(slope, (0, 0), 0.8)[..., None], 3, axis=2))
+    # One of the flanks alone has its centroid 14 px off.
+    assert math.hypot(*(float(places[mask].mean()) for places in (rows, columns))) < 0.5
+    hull = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32))
+    whole = cv2.fillConvexPoly(np.zeros((SIZE, SIZE), np.uint8), hull, 1) > 0
+    # The slope vanishes where the light comes along the border, so that the outline is drawn in there.
+    assert overlap(whole, disc(24) < 0) > 0.7

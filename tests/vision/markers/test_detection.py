@@ -49,6 +49,15 @@ def test_marks_in_no_regular_grid_are_found() -> None:
     assert away.max() < 0.15
 
 
+@pytest.mark.parametrize("column", [105, 110, 115])
+def test_a_dead_column_of_the_camera_holds_no_marks(column: int) -> None:
+    truth = grid(14, 10, 20.0, corner=(17.3, 21.6), jitter=0.3)
+    image = render((300, 400), truth, 2.6, noise=4.0)
+    image[:, column] = 0
+    which, _ = match(detect_markers(image).centers, truth)
+    assert sorted(which) == list(range(len(truth)))
+
+
 def painted(sizes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """A grid of 8 x 10 dots, each of its own size."""
     truth = grid(8, 10, 36.0, corner=(35, 30), jitter=1.5)

@@ -182,6 +182,19 @@ class Settling:
         return bool(spread < STEADY) and unevenness(self._looks[-1]) > AS_EVEN * self._unevenness(first)
 
     @property
+    def undecided(self) -> bool:
+        """Whether the gel came to rest in another state than the first, which is taken all the same.
+
+        Its evenness does not tell which of the two is the untouched gel.
+        """
+        return len(self._states) > 1 and self.steady and not self.touched and self.best() in self._states[0]
+
+    @property
+    def begins(self) -> int:
+        """Index of the frame with which the last state of the gel began."""
+        return self._states[-1][0]
+
+    @property
     def unrelated(self) -> bool:
         """Whether these are separate pictures rather than a video."""
         return len(self) >= 2 * CALM and 2 * len(self._states) > len(self)

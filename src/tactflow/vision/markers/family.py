@@ -289,7 +289,7 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     usual = np.median(marks.radius[around], axis=1)
     radius = wanted.radius / usual
     strength = wanted.strength / np.median(marks.strength[around], axis=1)
-    fits = (radius > NEAR_RADIUS[0]) & (radius < NEAR_RADIUS[1])
+    fits = wanted.round & (radius > NEAR_RADIUS[0]) & (radius < NEAR_RADIUS[1])
     fits &= (strength > NEAR_STRENGTH[0]) & (strength < NEAR_STRENGTH[1])
     sure = (wanted.clear > CLEAR) & (strength > ALIKE_STRENGTH[0]) & (strength < ALIKE_STRENGTH[1])
     chosen = (wanted.clear > RING_CONTRAST) & ((support >= LEAST_SUPPORT) | sure)
