@@ -173,11 +173,11 @@ def test_the_loops_draw_a_level_set_as_the_plain_version(
     top, left = data.draw(st.integers(0, frame[0] - 1)), data.draw(st.integers(0, frame[1] - 1))
     fast = rng.choice([0, 255], frame, p=[0.9, 0.1]).astype(np.uint8)
     slow = fast.copy()
-    resolution.draw_level(level, top, left, fast)
-    plain_raise_mask(level, top, left, slow)
+    any_inside = plain_raise_mask(level, top, left, slow)
+    assert resolution.draw_level(level, top, left, fast) == any_inside
     assert np.array_equal(fast, slow)
     drawn, shown = np.zeros(frame, np.uint8), level[: frame[0] - top, : frame[1] - left] > 0
-    resolution.draw_level(level, top, left, drawn, side=1)
+    assert resolution.draw_level(level, top, left, drawn, side=1) == shown.any()
     assert np.array_equal(drawn[top:, left:][: shown.shape[0], : shown.shape[1]] == 255, shown)
     assert cv2.countNonZero(drawn) == np.count_nonzero(shown)
 
