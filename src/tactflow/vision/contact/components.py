@@ -97,9 +97,8 @@ def contact_components(
     >>> [(found.rows, found.columns) for found in contact_components(squared, 5, 20, 10, 10, None)]
     [(slice(1, 7, None), slice(1, 7, None))]
     """
-    changed, box = np.empty(squared.shape, np.uint8), np.zeros(5, np.int64)
-    close_changes(squared, weak, changed, box)
-    *bounds, cells = box.tolist()
+    changed = np.empty(squared.shape, np.uint8)
+    *bounds, cells = close_changes(squared, weak, changed)
     least = min(MIN_CELLS, squared.size // 4)
     if cells:
         window = _window(bounds, squared.shape)
@@ -154,12 +153,12 @@ def _strongest(components: list[Component], squared: Float) -> list[Component]:
     return [components[index] for index in order[:MAX_COMPONENTS] if sums[index] >= STRAY * sums[order[0]]]
 
 
-@kernel("void(float32[:, ::1], float32, uint8[:, ::1], int64[::1])")
-def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int64]) -> None:
+@kernel("UniTuple(int64, 5)(float32[:, ::1], float32, uint8[:, ::1])")
+def close_changes(squared: Float, weak: float, closed: Mask) -> tuple[int, int, int, int, int]:
     """1 where `squared` is above `weak`, after closing by 3 x 3, else 0; `closed` is filled.
 
-    box : (5,), 0, filled with the left and upper end, width, height and number of these cells if they are one
-    piece without a gap in any row, as most contacts are.
+    Returns the left and upper end, width, height and number of these cells if they are one piece without a
+    gap in any row, as most contacts are; else 0.
     """
     high, wide = squared.shape
     # A border of one cell for each step: what is outside neither grows nor erodes.
@@ -182,12 +181,12 @@ def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int
             line[x] = upper[x] & here[x] & lower[x]
         for x in range(wide):
             row[x] = line[x] & line[x + 1] & line[x + 2]
-    _bound_one_piece(closed, box)
+    return _bound_one_piece(closed)
 
 
 @helper
-def _bound_one_piece(closed: Mask, box: NDArray[np.int64]) -> None:
-    """Fill `box` as `close_changes` does."""
+def _bound_one_piece(closed: Mask) -> tuple[int, int, int, int, int]:
+    """What `close_changes` returns."""
     high, wide = closed.shape
     top, left = high, wide
     bottom = right = cells = before = before_end = 0
@@ -204,10 +203,8 @@ def _bound_one_piece(closed: Mask, box: NDArray[np.int64]) -> None:
             count -= row[x]
         # Also cells that touch at a corner are connected.
         if count or (bottom and (bottom < y or first > before_end or end < before)):
-            return
+            return 0, 0, 0, 0, 0
         top, bottom, cells = min(top, y), y + 1, cells + end - first
         before, before_end = first, end
         left, right = min(left, first), max(right, end)
-    if cells:
-        box[0], box[1] = left, top
-        box[2], box[3], box[4] = right - left, bottom - top, cells
+    return (left, top, right - left, bottom - top, cells) if cells else (0, 0, 0, 0, 0)
