@@ -6,7 +6,7 @@ A module here holds the oracles of one module of the package: plain functions of
     from tactflow.vision.geometry.moments import measure_region
     from tests.oracles.gains import Gain
 
-    def plain_measure_region(mask, found): ...    # takes what the kernel takes, fills what it fills
+    def plain_measure_region(mask, ends): ...    # takes, fills and returns what the kernel does
 
     GAINS = [Gain(measure_region, plain_measure_region)]
 

@@ -49,17 +49,16 @@ def plain_weigh_change(
     squared: Float,
     colour: Float,
     evidence: Float,
-    summary: NDArray[np.float64],
-) -> None:
+) -> tuple[float, ...]:
     """Squared length of the weighted change; of its colour, without the part along the brightness."""
     change = _change(smooth, mean, coefficients, across, down)
     squared[:] = ((change * weight) ** 2).sum(axis=0)
     along = (change * weight**2 * mean).sum(axis=0)
     colour[:] = (squared - along**2 * brightness) * colour_factor
     np.maximum(squared, colour, out=evidence)
-    summary[:2] = squared.max(), colour.max()
     inside = before > 0
-    summary[2:] = (evidence[inside].sum(), evidence_before[inside].sum()) if before.size else (0, 0)
+    sums = (evidence[inside].sum(), evidence_before[inside].sum()) if before.size else (0.0, 0.0)
+    return float(squared.max()), float(colour.max()), *sums
 
 
 def plain_scaled_change(

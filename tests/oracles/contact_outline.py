@@ -19,15 +19,15 @@ SQUARE = np.ones((3, 3), np.uint8)
 
 
 def plain_cut_gloss(
-    strength: Float, brightness: Float, hidden: Mask, beside: Mask, cut: Float, sums: NDArray[np.float64]
-) -> None:
+    strength: Float, brightness: Float, hidden: Mask, beside: Mask, cut: Float
+) -> tuple[float, float, float]:
     """The mean of what is seen, weighted by itself, by OpenCV's norms."""
     beside[:] = cv2.dilate(hidden, SQUARE)
     seen = 1 - beside
     squares, total = cv2.norm(strength, cv2.NORM_L2SQR, seen), cv2.norm(strength, cv2.NORM_L1, seen)
     cap = GLOSS * max(squares / max(total, 1e-9), 1e-9)
     cut[:] = cv2.threshold(strength, cap, 0.0, cv2.THRESH_TRUNC)[1]
-    sums[:] = cap, cv2.norm(cut, cv2.NORM_L2SQR), cv2.norm(brightness, cv2.NORM_L2SQR)
+    return cap, cv2.norm(cut, cv2.NORM_L2SQR), cv2.norm(brightness, cv2.NORM_L2SQR)
 
 
 def plain_halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, float]:

@@ -12,12 +12,12 @@ from tactflow.vision.geometry.moments import measure_region, wrap_rows
 from tests.oracles.gains import Gain
 
 
-def plain_measure_region(mask: NDArray[np.uint8], found: NDArray[np.int64], ends: NDArray[np.int32]) -> None:
+def plain_measure_region(mask: NDArray[np.uint8], ends: NDArray[np.int32]) -> tuple[float, ...]:
     """Bounding box, number, and sums of x, y, x^2, x y, y^2 of the pixels of a mask; its regions counted."""
     left, top, width, height = cv2.boundingRect(mask)
-    found[:], ends[:] = 0, (mask.shape[1], -1)
+    ends[:] = mask.shape[1], -1
     if width == 0:
-        return
+        return (0,) * 11
     window = mask[top : top + height, left : left + width]
     sums = cv2.moments(window, binaryImage=True)
     raw = [sums[name] for name in ("m00", "m10", "m01", "m20", "m11", "m02")]
@@ -26,7 +26,7 @@ def plain_measure_region(mask: NDArray[np.uint8], found: NDArray[np.int64], ends
         if len(row):
             ends[top + y] = left + row[0], left + row[-1]
     runs = all(len(row) and len(row) == row[-1] + 1 - row[0] for row in rows)
-    found[:] = [left, top, width, height, *raw, runs and cv2.connectedComponents(window)[0] == 2]
+    return left, top, width, height, *raw, runs and cv2.connectedComponents(window)[0] == 2
 
 
 def plain_wrap_rows(

@@ -12,12 +12,14 @@ from tests.oracles.gains import Gain
 Mask = NDArray[np.uint8]
 
 
-def plain_raise_mask(level: NDArray[np.float32], top: int, left: int, mask: Mask) -> None:
-    """255 where the level, enlarged by OpenCV, is positive."""
+def plain_raise_mask(level: NDArray[np.float32], top: int, left: int, mask: Mask) -> bool:
+    """255 where the level, enlarged by OpenCV, is positive; whether it is anywhere."""
     window = mask[top : top + 2 * level.shape[0], left : left + 2 * level.shape[1]]
     large = cv2.resize(level, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     large = large.reshape(2 * level.shape[0], 2 * level.shape[1])
-    window[large[: window.shape[0], : window.shape[1]] > 0] = 255
+    positive = large[: window.shape[0], : window.shape[1]] > 0
+    window[positive] = 255
+    return bool(positive.any())
 
 
 def plain_halve_window(mask: Mask, top: int, left: int, inside: Mask, halved: Mask) -> None:

@@ -516,11 +516,11 @@ def test_looking_closely_only_around_a_contact_gives_what_looking_everywhere_giv
     def whole(square: NDArray[np.float32], *thresholds: Any) -> list[Any]:
         rows, columns = slice(0, square.shape[0]), slice(0, square.shape[1])
         found = []
-        for part_rows, part_columns, inside in windows(square, *thresholds):
-            shares.append(inside.size / square.size)
+        for part in windows(square, *thresholds):
+            shares.append(part.inside.size / square.size)
             belongs = np.zeros(square.shape, np.bool_)
-            belongs[part_rows, part_columns] = inside
-            found.append((rows, columns, belongs))
+            belongs[part.rows, part.columns] = part.inside
+            found.append(part._replace(rows=rows, columns=columns, inside=belongs))
         return found
 
     shares: list[float] = []

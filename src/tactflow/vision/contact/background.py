@@ -179,10 +179,9 @@ class BackgroundModel:
         smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
         squared, colour, evidence = np.empty((3, high, wide), np.float32)
-        summary = np.empty(4)
         if before is None or evidence_before is None:
             before, evidence_before = _NO_CELLS, _NO_EVIDENCE
-        weigh_change(
+        largest, largest_colour, now, was = weigh_change(
             smooth,
             coefficients,
             positions(wide),
@@ -196,9 +195,7 @@ class BackgroundModel:
             squared,
             colour,
             evidence,
-            summary,
         )
-        largest, largest_colour, now, was = summary.tolist()
         remaining = math.sqrt(now / was) if was > 0 else 1.0
         return Change(
             whole, half, coefficients, squared, colour, evidence, largest, largest_colour, remaining

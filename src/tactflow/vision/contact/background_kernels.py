@@ -16,7 +16,6 @@ from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.contact.illumination import WHITE
 
 Float = NDArray[np.float32]
-Double = NDArray[np.float64]
 Byte = NDArray[np.uint8]
 Index = NDArray[np.int64]
 
@@ -66,9 +65,9 @@ def smooth_cells(half: Byte, smooth: Float) -> None:
 
 
 @kernel(
-    "void(float32[:, :, ::1], float32[:, ::1], float32[::1], float32[::1], float32[:, :, ::1],"
-    " float32[:, :, ::1], float32[:, ::1], float32[:, ::1], uint8[:, ::1],"
-    " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float64[::1])",
+    "UniTuple(float64, 4)(float32[:, :, ::1], float32[:, ::1], float32[::1], float32[::1],"
+    " float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1], float32[:, ::1], uint8[:, ::1],"
+    " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
     reorder=True,
 )
 def weigh_change(
@@ -85,15 +84,14 @@ def weigh_change(
     squared: Float,
     colour: Float,
     evidence: Float,
-    summary: Double,
-) -> None:
+) -> tuple[float, float, float, float]:
     """Squared deviations of each cell from the background under this frame's illumination.
+
+    Returns the largest of squared and of colour, and the sums of the evidence over `before`, now and then.
 
     smooth, mean, weight : (3, h, w). brightness, colour_factor : (h, w). coefficients : (3, 4). across,
     down : positions, (w,) and (h,). before : (h, w), cells in contact in the previous frame, and
     evidence_before : the evidence there; both (0, 0) if none. squared, colour, evidence : (h, w), filled.
-    summary : filled with the largest of squared and of colour, and the sums of the evidence over `before`,
-    now and then.
     """
     high, wide = squared.shape
     along = np.empty(wide, np.float32)
@@ -126,11 +124,10 @@ def weigh_change(
                 if before[y, x]:
                     now += both[x]
                     was += evidence_before[y, x]
-    summary[0] = summary[1] = -np.inf
+    most = most_colour = np.float32(-np.inf)
     for x in range(wide):
-        summary[0] = max(summary[0], largest[x])
-        summary[1] = max(summary[1], largest_colour[x])
-    summary[2], summary[3] = now, was
+        most, most_colour = max(most, largest[x]), max(most_colour, largest_colour[x])
+    return float(most), float(most_colour), now, was
 
 
 @kernel(

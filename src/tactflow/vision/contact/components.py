@@ -36,23 +36,26 @@ WIDE_DEVIATION: Final = 12.0
 class Component(NamedTuple):
     """A connected change.
 
-    rows, columns : its window, cells. inside : (h, w) bool, which cells of the window belong.
+    rows, columns : its window, cells. inside : (h, w) bool, which cells of the window belong. cells : how
+    many do. peak : the largest squared deviation.
     """
 
     rows: slice
     columns: slice
     inside: Cells
+    cells: int
+    peak: float
 
 
 def union(components: list[Component], shape: tuple[int, ...]) -> Cells:
     """(h, w) bool: cells of all components.
 
     >>> import numpy as np
-    >>> union([Component(slice(0, 1), slice(1, 3), np.array([[True, True]]))], (2, 3)).sum()
+    >>> union([Component(slice(0, 1), slice(1, 3), np.array([[True, True]]), 2, 9.0)], (2, 3)).sum()
     np.int64(2)
     """
     cells = np.zeros(shape, np.bool_)
-    for rows, columns, inside in components:
+    for rows, columns, inside, *_ in components:
         window = cells[rows, columns]
         # Windows of several may overlap.
         window[:] = inside if len(components) == 1 else window | inside
@@ -94,25 +97,21 @@ def contact_components(
     >>> [(found.rows, found.columns) for found in contact_components(squared, 5, 20, 10, 10, None)]
     [(slice(1, 7, None), slice(1, 7, None))]
     """
-    changed, box = np.empty(squared.shape, np.uint8), np.zeros(5, np.int64)
-    close_changes(squared, weak, changed, box)
-    *bounds, cells = box.tolist()
+    changed = np.empty(squared.shape, np.uint8)
+    *bounds, cells = close_changes(squared, weak, changed)
     least = min(MIN_CELLS, squared.size // 4)
     if cells:
         window = _window(bounds, squared.shape)
-        parts = [(Component(*window, changed[window].copy().view(np.bool_)), cells, largest)]
+        parts = [Component(*window, changed[window].copy().view(np.bool_), cells, largest)]
     else:
         parts = _several_parts(changed, squared, least)
-    found = []
-    for component, cells, peak in parts:
-        kept = before is not None and peak >= stay and _overlaps(component, before)
-        if cells >= least and (peak >= start or kept):
-            found.append(component)
+    large = [part for part in parts if part.cells >= least]
+    found = [part for part in large if part.peak >= start or (part.peak >= stay and _overlaps(part, before))]
     return _strongest(found, squared)
 
 
-def _several_parts(changed: Mask, squared: Float, least: int) -> list[tuple[Component, int, float]]:
-    """Each connected part of what has changed, how many cells it has, and its peak.
+def _several_parts(changed: Mask, squared: Float, least: int) -> list[Component]:
+    """Each connected part of what has changed.
 
     least : cells of a part's bounding box, below which it is left out.
     """
@@ -129,7 +128,7 @@ def _several_parts(changed: Mask, squared: Float, least: int) -> list[tuple[Comp
             cv2.drawContours(own, outlines, index, 1, cv2.FILLED, offset=(-columns.start, -rows.start))
             filled &= own
         peak = cv2.minMaxLoc(squared[window], filled)[1]
-        parts.append((Component(*window, filled.view(np.bool_)), cv2.countNonZero(filled), peak))
+        parts.append(Component(*window, filled.view(np.bool_), cv2.countNonZero(filled), peak))
     return parts
 
 
@@ -140,27 +139,26 @@ def _window(bounds: Sequence[int], shape: tuple[int, ...]) -> tuple[slice, slice
     return rows, slice(max(left - 1, 0), min(left + wide + 1, shape[1]))
 
 
-def _overlaps(component: Component, cells: Cells) -> bool:
+def _overlaps(component: Component, cells: Cells | None) -> bool:
     """Whether a component has any of these cells, (h, w)."""
-    rows, columns, inside = component
-    return bool((cells[rows, columns] & inside).any())
+    return cells is not None and bool((cells[component.rows, component.columns] & component.inside).any())
 
 
 def _strongest(components: list[Component], squared: Float) -> list[Component]:
     """The components without stray ones, by their summed squared deviation."""
     if len(components) < 2:
         return components
-    sums = [float(squared[rows, columns][inside].sum()) for rows, columns, inside in components]
+    sums = [float(squared[part.rows, part.columns][part.inside].sum()) for part in components]
     order = sorted(range(len(components)), key=lambda index: -sums[index])
     return [components[index] for index in order[:MAX_COMPONENTS] if sums[index] >= STRAY * sums[order[0]]]
 
 
-@kernel("void(float32[:, ::1], float32, uint8[:, ::1], int64[::1])")
-def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int64]) -> None:
+@kernel("UniTuple(int64, 5)(float32[:, ::1], float32, uint8[:, ::1])")
+def close_changes(squared: Float, weak: float, closed: Mask) -> tuple[int, int, int, int, int]:
     """1 where `squared` is above `weak`, after closing by 3 x 3, else 0; `closed` is filled.
 
-    box : (5,), 0, filled with the left and upper end, width, height and number of these cells if they are one
-    piece without a gap in any row, as most contacts are.
+    Returns the left and upper end, width, height and number of these cells if they are one piece without a
+    gap in any row, as most contacts are; else 0.
     """
     high, wide = squared.shape
     # A border of one cell for each step: what is outside neither grows nor erodes.
@@ -183,12 +181,12 @@ def close_changes(squared: Float, weak: float, closed: Mask, box: NDArray[np.int
             line[x] = upper[x] & here[x] & lower[x]
         for x in range(wide):
             row[x] = line[x] & line[x + 1] & line[x + 2]
-    _bound_one_piece(closed, box)
+    return _bound_one_piece(closed)
 
 
 @helper
-def _bound_one_piece(closed: Mask, box: NDArray[np.int64]) -> None:
-    """Fill `box` as `close_changes` does."""
+def _bound_one_piece(closed: Mask) -> tuple[int, int, int, int, int]:
+    """What `close_changes` returns."""
     high, wide = closed.shape
     top, left = high, wide
     bottom = right = cells = before = before_end = 0
@@ -205,10 +203,8 @@ def _bound_one_piece(closed: Mask, box: NDArray[np.int64]) -> None:
             count -= row[x]
         # Also cells that touch at a corner are connected.
         if count or (bottom and (bottom < y or first > before_end or end < before)):
-            return
+            return 0, 0, 0, 0, 0
         top, bottom, cells = min(top, y), y + 1, cells + end - first
         before, before_end = first, end
         left, right = min(left, first), max(right, end)
-    if cells:
-        box[0], box[1] = left, top
-        box[2], box[3], box[4] = right - left, bottom - top, cells
+    return (left, top, right - left, bottom - top, cells) if cells else (0, 0, 0, 0, 0)

@@ -129,10 +129,9 @@ def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Fl
     pixels : of a `Hidden`; None where nothing is hidden.
     """
     shape = change.strength.shape
-    strength, beside, sums = np.empty(shape, np.float32), np.empty(shape, np.uint8), np.empty(3)
+    strength, beside = np.empty(shape, np.float32), np.empty(shape, np.uint8)
     none = np.zeros(shape, np.uint8) if pixels is None else pixels
-    cut_gloss(change.strength, change.brightness, none, beside, strength, sums)
-    cap, squares, common = sums.tolist()
+    cap, squares, common = cut_gloss(change.strength, change.brightness, none, beside, strength)
     hidden, even = None if pixels is None else Hidden(pixels, beside), squares / COLOURED
     # What is cut is no larger than before: where it is too little then, there is no need to cut it.
     if common > even:
@@ -144,17 +143,17 @@ def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Fl
 
 
 @kernel(
-    "void(float32[:, ::1], float32[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, ::1], float64[::1])",
+    "UniTuple(float64, 3)(float32[:, ::1], float32[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, ::1])",
     reorder=True,
 )
 def cut_gloss(
-    strength: Float, brightness: Float, hidden: Mask, beside: Mask, cut: Float, sums: NDArray[np.float64]
-) -> None:
-    """Cut what is a mirror image of a lamp.
+    strength: Float, brightness: Float, hidden: Mask, beside: Mask, cut: Float
+) -> tuple[float, float, float]:
+    """Cut what is a mirror image of a lamp; returns the cap, and sums of squares of `cut` and `brightness`.
 
     strength, brightness : of a `WindowChange`. hidden : (h, w), 1 where a marker was removed. beside : as of
     `Hidden`, filled; what is typical is told by the others. cut : (h, w), filled with the strength, but no
-    more than a cap. sums : (3,), filled with that, and the sums of the squares of `cut` and of `brightness`.
+    more than the cap.
     """
     high, wide = strength.shape
     near = np.empty(wide + 2, np.uint8)
@@ -170,13 +169,13 @@ def cut_gloss(
             value = np.float64(strength[y, x] if row[x] == 0 else np.float32(0))
             tone = np.float64(brightness[y, x])
             total, squares, common = total + value, squares + value * value, common + tone * tone
-    sums[0], sums[2] = GLOSS * max(squares / max(total, 1e-9), 1e-9), common
-    cap, squares = np.float32(sums[0]), 0.0
+    most = GLOSS * max(squares / max(total, 1e-9), 1e-9)
+    cap, squares = np.float32(most), 0.0
     for y in range(high):
         for x in range(wide):
             cut[y, x] = strength[y, x] if strength[y, x] < cap else cap
             squares += np.float64(cut[y, x]) * np.float64(cut[y, x])
-    sums[1] = squares
+    return most, squares, common
 
 
 def _sidedness(brightness: Float) -> float:

@@ -294,22 +294,23 @@ class ContactDetector:
         if faint and change.remaining < 1 - self._creep and self._mask is not None:
             return ContactResult(self._mask.copy(), True, strength)
         mask = np.zeros(image.shape[:2], np.uint8)
+        touching = False
         for component in found:
-            self._draw(change, component, hidden, mask)
-        self._mask = mask if cv2.countNonZero(mask) else None
-        return ContactResult(mask, self._mask is not None, strength)
+            touching |= self._draw(change, component, hidden, mask)
+        self._mask = mask if touching else None
+        return ContactResult(mask, touching, strength)
 
     def _draw(
         self, change: Change, component: Component, hidden: NDArray[np.uint8] | None, mask: NDArray[np.uint8]
-    ) -> None:
-        """Set a component's contact to 255 in the mask."""
+    ) -> bool:
+        """Set a component's contact to 255 in the mask; returns whether there is any."""
         assert self._background is not None
-        rows, columns, inside = component
+        rows, columns, inside, cells, _ = component
         top, left = CELL * rows.start, CELL * columns.start
-        side = 1 if self._crowded or cv2.countNonZero(inside.view(np.uint8)) < FEW_CELLS else 2
+        side = 1 if self._crowded or cells < FEW_CELLS else 2
         window = self._background.window_change(change, rows, columns, inside, side)
         removed = None if hidden is None else window_mask(hidden, top, left, inside, side)
-        draw_level(contact_level(window, 2 * BRIDGE / side, removed), top, left, mask, side)
+        return draw_level(contact_level(window, 2 * BRIDGE / side, removed), top, left, mask, side)
 
     def _clear(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
         """Contact by the size of the change, so that its outline can be seen.

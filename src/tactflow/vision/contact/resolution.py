@@ -36,8 +36,10 @@ def window_mask(mask: Mask, top: int, left: int, inside: NDArray[np.bool_], side
     return halved
 
 
-def draw_level(level: Float, top: int, left: int, mask: Mask, side: int = 2) -> None:
+def draw_level(level: Float, top: int, left: int, mask: Mask, side: int = 2) -> bool:
     """Set to 255 the pixels of a mask where a level set, interpolated to their resolution, is positive.
+
+    Returns whether there are any.
 
     level : (h, w) float32. top, left : its place in the mask, px, over whose border it may reach. mask :
     (H, W) uint8, changed in place. side : of the level's pixels, px, 1 or 2.
@@ -45,24 +47,26 @@ def draw_level(level: Float, top: int, left: int, mask: Mask, side: int = 2) -> 
     >>> import numpy as np
     >>> mask = np.zeros((2, 4), np.uint8)
     >>> draw_level(np.array([[1, -1]], np.float32), 0, 0, mask)
+    True
     >>> mask
     array([[255, 255,   0,   0],
            [255, 255,   0,   0]], dtype=uint8)
     """
-    if side == 1:
-        part = mask[top:, left:][: level.shape[0], : level.shape[1]]
-        part[level[: part.shape[0], : part.shape[1]] > 0] = 255
-    else:
-        raise_mask(level, top, left, mask)
+    if side == 2:
+        return raise_mask(level, top, left, mask)
+    part = mask[top:, left:][: level.shape[0], : level.shape[1]]
+    positive = level[: part.shape[0], : part.shape[1]] > 0
+    part[positive] = 255
+    return bool(positive.any())
 
 
-@kernel("void(float32[:, ::1], int64, int64, uint8[:, ::1])")
-def raise_mask(level: Float, top: int, left: int, mask: Mask) -> None:
+@kernel("boolean(float32[:, ::1], int64, int64, uint8[:, ::1])")
+def raise_mask(level: Float, top: int, left: int, mask: Mask) -> bool:
     """What `draw_level` does from half resolution."""
     high, wide = level.shape
     near, far = np.float32(0.75), np.float32(0.25)
     # With a pixel more on both sides, as its neighbour.
-    mixed, line = np.empty(wide + 2, np.float32), np.empty(2 * wide, np.uint8)
+    mixed, line, any_bits = np.empty(wide + 2, np.float32), np.empty(2 * wide, np.uint8), np.uint8(0)
     for y in range(min(2 * high, mask.shape[0] - top)):
         here, other = level[y // 2], level[min(max(y // 2 + 2 * (y & 1) - 1, 0), high - 1)]
         for x in range(wide):
@@ -74,6 +78,8 @@ def raise_mask(level: Float, top: int, left: int, mask: Mask) -> None:
         row = mask[top + y, left:]
         for x in range(min(2 * wide, row.size)):
             row[x] |= line[x]
+            any_bits = np.uint8(any_bits | line[x])
+    return bool(any_bits)
 
 
 @kernel("void(uint8[:, ::1], int64, int64, uint8[:, ::1], uint8[:, ::1])")

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from tactflow.vision.compiled import helper, kernel
 
-Whole = NDArray[np.int64]
 Ends = NDArray[np.int32]
 
 
@@ -77,9 +76,7 @@ class RegionProperties:
     ) -> None:
         self.mask, self.corner = mask, corner
         self._ends = np.empty((len(mask), 2), np.int32)
-        found = np.empty(11, np.int64)
-        measure_region(np.ascontiguousarray(mask), found, self._ends)
-        left, top, width, height, *sums, connected = found.tolist()
+        left, top, width, height, *sums, connected = measure_region(np.ascontiguousarray(mask), self._ends)
         self.box = Box(left + corner[0], top + corner[1], width, height)
         self.moments = Moments(*sums)
         self.connected = connected == 1
@@ -112,14 +109,15 @@ class RegionProperties:
         return (corners[1:count] if count > 1 else corners[:1]), pixels
 
 
-@kernel("void(uint8[:, ::1], int64[::1], int32[:, ::1])")
-def measure_region(mask: NDArray[np.uint8], found: Whole, ends: Ends) -> None:
+@kernel("UniTuple(int64, 11)(uint8[:, ::1], int32[:, ::1])")
+def measure_region(mask: NDArray[np.uint8], ends: Ends) -> tuple[int, ...]:
     """Bounding box of the pixels that are set, their moments, and where the rows begin and end.
 
-    mask : (H, W) uint8, H and W >= 1. found : (11,), filled: the box; the moments relative to its corner, as
-    `Box` and `Moments` list them; 1 if each row of the box is one run of pixels that touches that of the row
-    above, else 0. All 0 where no pixel is set. ends : (H, 2), filled: first and last column of the pixels of
-    each row; W and -1 in a row without any.
+    Returns the box; the moments relative to its corner, as `Box` and `Moments` list them; 1 if each row of
+    the box is one run of pixels that touches that of the row above, else 0. All 0 where no pixel is set.
+
+    mask : (H, W) uint8, H and W >= 1. ends : (H, 2), filled: first and last column of the pixels of each row;
+    W and -1 in a row without any.
     """
     height, width = mask.shape
     left, right, top, bottom = width, -1, -1, -1
@@ -157,15 +155,14 @@ def measure_region(mask: NDArray[np.uint8], found: Whole, ends: Ends) -> None:
         ends[y, 0], ends[y, 1] = first, last
         count, sx, sxx = count + number, sx + ones, sxx + twos
         sy, sxy, syy = sy + number * y, sxy + ones * y, syy + number * y * y
-    found[:] = 0
     if count == 0:
-        return
-    found[0], found[1], found[2], found[3] = left, top, right + 1 - left, bottom + 1 - top
-    found[4], found[5], found[6] = count, sx - left * count, sy - top * count
-    found[7] = sxx - 2 * left * sx + left * left * count
-    found[8] = sxy - left * sy - top * sx + left * top * count
-    found[9] = syy - 2 * top * sy + top * top * count
-    found[10] = 1 if connected else 0
+        left, top, connected = 0, 0, False
+    pixels, along, down = int(count), int(sx - left * count), int(sy - top * count)
+    xx = sxx - 2 * left * sx + left * left * count
+    xy = sxy - left * sy - top * sx + left * top * count
+    yy = int(syy - 2 * top * sy + top * top * count)
+    width, height = right + 1 - left, bottom + 1 - top
+    return left, top, width, height, pixels, along, down, xx, xy, yy, 1 if connected else 0
 
 
 @helper
