@@ -397,18 +397,3 @@ def test_blotches_wider_than_a_cell_are_no_noise_to_an_outline() -> None:
         strengths.append(float(window.strength[34:46, 34:46].mean()))
     # Measured: 18.4 and 17.5; 7.8 on blotches with the noise by which it is told whether anything touches.
     assert strengths[1] > 0.8 * strengths[0]
-
-
-def test_the_noise_of_a_gel_is_the_same_however_its_camera_is_mounted() -> None:
-    # Cells of 4 px that alternate from row to row: a pattern across, even along.
-    rows = np.where(np.arange(120) // 4 % 2, 100.0, 112.0)[:, None, None]
-    noise = np.random.default_rng(0).normal(0, 2, (120, 160, 3))
-    gel = np.clip(np.rint(rows + noise), 0, 255).astype(np.uint8)
-    pressed = gel.copy()
-    pressed[48:72, 64:88] += 8
-    largest = []
-    for turn in range(2):
-        untouched, touched = (np.ascontiguousarray(np.rot90(image, turn)) for image in (gel, pressed))
-        model = BackgroundModel(untouched, repeatability=0.025, tint=0.01, shift=0.0)
-        largest.append(model.compare(touched, None, None).largest)
-    assert largest[1] == pytest.approx(largest[0], rel=0.02)

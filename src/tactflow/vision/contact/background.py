@@ -374,27 +374,12 @@ def _spatial_noise(picture: NDArray[np.uint8]) -> Float:
     """Standard deviation of smoothed cells guessed from one frame, as a function of brightness: (3, h, w).
 
     Second differences of neighbouring cells see the noise and hardly the shading; their median is not moved
-    by markers. Grain of the gel counts as noise here, which errs on the side of silence; lines and rows of
-    dots have a direction, and noise has none, so the lesser of the differences along x and along y tells.
+    by markers. Grain of the gel counts as noise here, which errs on the side of silence.
     """
     cells = _planes(picture)
-    noise = [QUANTISATION**2 + np.square(_noise_along(cells))] if cells.shape[2] >= 3 else []
-    if cells.shape[1] >= 3:
-        turned = _noise_along(cells.transpose(0, 2, 1)).transpose(0, 2, 1)
-        noise.append(QUANTISATION**2 + np.square(turned))
-    if not noise:
-        return np.full_like(cells, QUANTISATION)
-    # Smoothing 3 x 3 would divide by three were the cells independent; demosaicing and compression see to
-    # it that they are not quite.
-    return np.asarray(np.sqrt(np.minimum.reduce(noise)) * (NOISE_CORRELATION / 3), np.float32)
-
-
-def _noise_along(cells: Float) -> Float:
-    """Standard deviation of cells, without that of rounding, by their second differences along x.
-
-    cells : (3, h, w), w of at least 3. Returns (3, h, w), a function of brightness for each channel.
-    """
-    noise = np.empty_like(cells)
+    noise = np.full_like(cells, QUANTISATION)
+    if cells.shape[2] < 3:
+        return noise
     # The difference of white noise has six times its variance.
     scale = np.float32(MAD_TO_SIGMA / math.sqrt(6))
     second = np.abs(cells[..., :-2] - 2 * cells[..., 1:-1] + cells[..., 2:]) * scale
@@ -405,7 +390,9 @@ def _noise_along(cells: Float) -> Float:
         center = [float(level[part].mean()) for part in bins]
         spread = [float(np.median(second[channel].ravel()[part])) for part in bins]
         noise[channel] = np.interp(cells[channel], center, spread)
-    return noise
+    # Smoothing 3 x 3 would divide by three were the cells independent; demosaicing and compression see to
+    # it that they are not quite.
+    return np.asarray(np.hypot(noise, QUANTISATION) * (NOISE_CORRELATION / 3), np.float32)
 
 
 def _fine_noise(planes: Float) -> Float:
