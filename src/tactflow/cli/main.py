@@ -141,7 +141,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         parser.error(f"there is no command {command}; {hint}")
     args, unknown = parser.parse_known_args(argv)
     if unknown:
-        _refuse(args.parser, unknown)
+        _refuse(args, unknown)
     return args
 
 
@@ -152,12 +152,13 @@ def _collect_garbage() -> None:
         gc.enable()
 
 
-def _refuse(command: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:
-    """End with the usage of a command that was given words it does not know."""
+def _refuse(args: argparse.Namespace, unknown: Sequence[str]) -> NoReturn:
+    """End with the usage of a command that was given words it does not know, besides those in `args`."""
+    command: argparse.ArgumentParser = args.parser
     options = re.findall(r"--[a-z][a-z-]*", command.format_usage())
     option = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)
     guess = difflib.get_close_matches(option, options, n=1) if option else []
     hint = f"; did you mean {guess[0]}?" if guess else ""
-    if "--source" in options and os.path.isfile(unknown[0]):
+    if getattr(args, "source", None) is not None and os.path.isfile(unknown[0]):
         hint = "; to give many files as one source, quote the pattern: --source 'FOLDER/*.png'"
     command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
