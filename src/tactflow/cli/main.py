@@ -83,9 +83,10 @@ def entry() -> None:
     # The code is known; what comes now shall not change it.
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
-    if threading.active_count() > 1:
+    if code != 0 and threading.active_count() > 1:
         # A thread of a run that was not allowed to finish: one that comes out of OpenCV while Python ends
-        # would abort the process.
+        # would abort the process. After a run that ended well, what sinks of one's own leave to the end of
+        # Python, such as a pool in which one writes, is done.
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
