@@ -23,7 +23,7 @@ from tactflow.engine.conformance import build
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Mark, Pipeline
 from tactflow.engine.run import Runner, RunResult
-from tactflow.signals import INTERRUPTED, Interrupted, ending_handled
+from tactflow.signals import INTERRUPTED, Interrupted, ending_handled, on_ending
 from tactflow.vision import compiled
 
 Settings = Mapping[str, Any]
@@ -156,8 +156,8 @@ def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
             runner.stop("signal")
             if not compiled.is_loading():
                 return
-        if len(caught) > 1:
-            signal.signal(number, signal.SIG_DFL)
+        else:
+            on_ending(signal.SIG_DFL)
         raise Interrupted
 
     with ending_handled(handle):

@@ -53,6 +53,7 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["run", "--max-fames=6"], "unrecognized arguments: --max-fames=6; did you mean --max-frames?"),
         (["check", "a.yaml", "b.yaml"], "unrecognized arguments: b.yaml"),
         (["run", "x.yaml", "--source", "1.png", __file__, "3.png"], "quote the pattern: --source 'FOLDER"),
+        (["run", "x.yaml", __file__], f"unrecognized arguments: {__file__}\n"),
         (["check", "--set"], "expected one argument"),
         (["schema", "sensor"], "invalid choice"),
         (["stages", "hul"], "there is no stage or sink 'hul'; did you mean hull?"),

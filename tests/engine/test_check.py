@@ -35,8 +35,22 @@ class Hidden:
     cost: Decimal
 
 
+@dataclass(frozen=True)
+class Loose:
+    """Arrays of no certain dtype."""
+
+    anything: NDArray[Any]
+    numbers: NDArray[np.floating]
+    words: NDArray[np.str_]
+    least: np.ndarray[Any, Any]
+
+
 class Tracks(Sink):
     def write(self, track: Track) -> None: ...
+
+
+class Looses(Sink):
+    def write(self, loose: Loose) -> None: ...
 
 
 class Costs(Sink):
@@ -70,3 +84,5 @@ def test_an_array_of_another_type_in_a_record_is_named(
 def test_a_record_that_is_right_or_cannot_be_read_is_not_blamed() -> None:
     assert said_of(Track(np.zeros((3, 2)), np.zeros(3, np.uint8)), Tracks) is None
     assert said_of(Hidden(None), Costs) is None  # type: ignore[arg-type]
+    numbers = np.zeros(3, np.float32)
+    assert said_of(Loose(numbers, numbers, np.array(["left"]), numbers), Looses) is None

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make them, and print what goes where."""
     try:
-        # Of some of the keys, neither they nor the next ones could be used.
+        # With only some of the files there, no key works, and none can be made anew.
         with ending_held_back():
             publisher, subscriber = make_keys(args.folder, args.name)
     except WrongKeysError as error:

@@ -83,9 +83,10 @@ def entry() -> None:
     # The code is known; what comes now shall not change it.
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
-    if threading.active_count() > 1:
+    if code != 0 and threading.active_count() > 1:
         # A thread of a run that was not allowed to finish: one that comes out of OpenCV while Python ends
-        # would abort the process.
+        # would abort the process. After a run that ended well, what sinks of one's own leave to the end of
+        # Python, such as a pool in which one writes, is done.
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
@@ -141,7 +142,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         parser.error(f"there is no command {command}; {hint}")
     args, unknown = parser.parse_known_args(argv)
     if unknown:
-        _refuse(args.parser, unknown)
+        _refuse(args, unknown)
     return args
 
 
@@ -152,12 +153,13 @@ def _collect_garbage() -> None:
         gc.enable()
 
 
-def _refuse(command: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:
-    """End with the usage of a command that was given words it does not know."""
+def _refuse(args: argparse.Namespace, unknown: Sequence[str]) -> NoReturn:
+    """End with the usage of a command that was given words it does not know, besides those in `args`."""
+    command: argparse.ArgumentParser = args.parser
     options = re.findall(r"--[a-z][a-z-]*", command.format_usage())
     option = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)
     guess = difflib.get_close_matches(option, options, n=1) if option else []
     hint = f"; did you mean {guess[0]}?" if guess else ""
-    if "--source" in options and os.path.isfile(unknown[0]):
+    if getattr(args, "source", None) is not None and os.path.isfile(unknown[0]):
         hint = "; to give many files as one source, quote the pattern: --source 'FOLDER/*.png'"
     command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")

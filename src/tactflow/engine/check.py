@@ -12,6 +12,9 @@ from tactflow.engine.frame import Absent
 from tactflow.engine.graph import Node
 from tactflow.engine.ports import ArrayPort, Port, SignalPort, port_type
 
+NUMBERS = frozenset(scalar for scalar in np.sctypeDict.values() if issubclass(scalar, np.number | np.bool_))
+"""Types of elements that stand for one dtype each; np.floating, np.str_ and Any stand for several."""
+
 
 class ArrayCheck:
     """Checks one node's values. Named dimensions must agree among all its inputs and outputs of a tick."""
@@ -89,16 +92,16 @@ def _check_value(port: Port, value: Any, sizes: dict[str, int]) -> None:
 
 
 def _array_fields(record: type) -> Iterator[tuple[str, str]]:
-    """Name and dtype of each field that is annotated as an array, such as NDArray[np.uint8]."""
+    """Name and dtype of each field that is annotated as an array of one dtype, such as NDArray[np.uint8]."""
     try:
         hints = get_type_hints(record)
     except NameError:  # a name that only type checkers see
         return
     for name, hint in hints.items():
         if get_origin(hint) is np.ndarray:
-            scalar = get_args(get_args(hint)[1])[0]
-            if isinstance(scalar, type):
-                yield name, np.dtype(scalar).name
+            for scalar in get_args(get_args(hint)[-1]):
+                if scalar in NUMBERS:
+                    yield name, np.dtype(scalar).name
 
 
 def _text(shape: Sequence[int | str]) -> str:

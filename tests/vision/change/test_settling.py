@@ -78,6 +78,8 @@ def test_two_states_that_are_as_even_are_said_to_be_undecided() -> None:
     settling = settled(first + [picture(1, 0.3) for _ in range(20)])
     assert (settling.undecided, settling.best(), settling.begins) == (True, 0, 6)
     assert not settled([picture() for _ in range(20)]).undecided
+    passing = [picture(1, 0.3) for _ in range(3)]
+    assert not settled([picture() for _ in range(3)] + passing + [picture() for _ in range(20)]).undecided
     assert not settled(first + [picture() for _ in range(20)]).undecided
 
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.contact import ContactDetector
-from tactflow.vision.contact.contact_outline import contact_level
+from tactflow.vision.contact.contact_outline import WindowChange, contact_level
 from tactflow.vision.contact.filling import Hidden, enclosed, outlined, trace_outlines, traced
 from tactflow.vision.contact.nearby import FAINT, largest_nearby
 from tests.oracles.border import change_of
@@ -305,6 +305,13 @@ def test_a_brightened_contact_ends_at_half_of_the_plateau_beside_its_border() ->
     mask = found(np.repeat(uneven[..., None], 3, axis=2).astype(np.float32))
     # Measured: 28.5 px on the dim side; 26.5 px if its height were sought a whole radius around.
     assert 49.5 - np.flatnonzero(mask[50])[0] > 28
+
+
+def test_one_pixel_that_outshines_all_others_is_a_contact_of_its_own() -> None:
+    brightness = np.zeros((200, 200), np.float32)
+    brightness[199, 199], brightness[198, 199] = 1, -1e-6
+    level = contact_level(WindowChange(np.abs(brightness) * np.float32(3**0.5), brightness))
+    assert np.argwhere(level > 0).tolist() == [[199, 199]]
 
 
 @pytest.mark.parametrize("turn", [0, 30, 90, 135])

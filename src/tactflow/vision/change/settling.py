@@ -187,7 +187,9 @@ class Settling:
 
         Its evenness does not tell which of the two is the untouched gel.
         """
-        return len(self._states) > 1 and self.steady and not self.touched and self.best() in self._states[0]
+        if not self.steady or self.touched or self.best() not in self._states[0]:
+            return False
+        return change_between(self._looks[self.best()], self._looks[-1])[1]
 
     @property
     def begins(self) -> int:

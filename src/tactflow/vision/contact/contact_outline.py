@@ -191,10 +191,11 @@ def _sidedness(brightness: Float) -> float:
     share = brighter["m00"] / max(whole["m00"], 1e-9)
     if not 0 < share < 1:
         return 0.0
-    # The centroid of the darker part from those of the whole and of the brighter part.
+    # The brighter part is as far from the whole as from the darker part, times the darker part's share.
     apart = [brighter[key] / brighter["m00"] - whole[key] / whole["m00"] for key in ("m10", "m01")]
-    gyration = math.sqrt((whole["mu20"] + whole["mu02"]) / whole["m00"])
-    return 2 * share * math.hypot(*apart) / max(gyration, 1e-9)
+    # Of a single pixel it is 0, or by rounding less.
+    gyration = math.sqrt(max((whole["mu20"] + whole["mu02"]) / whole["m00"], 1e-18))
+    return 2 * share * math.hypot(*apart) / gyration
 
 
 def _typical(values: Float) -> float:
