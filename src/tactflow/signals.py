@@ -58,8 +58,8 @@ def interrupt_from_now_on() -> None:
 def on_ending(handler: Handler | signal.Handlers) -> dict[int, object]:
     """Have a handler called for each of them; returns what was called before.
 
-    One that is ignored stays so: who started the program with nohup wants it to go on. So does one that a host
-    written in C handles, which Python could not give back.
+    One that is ignored stays so: who started the program with nohup wants it to go on. So does
+    one that a host written in C handles, which Python could not give back.
     """
     listened = [number for number in ENDING if signal.getsignal(number) not in (signal.SIG_IGN, None)]
     return {number: signal.signal(number, handler) for number in listened}
