@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -37,36 +36,3 @@ def test_a_killed_worker_is_replaced_and_what_kills_two_is_set_aside(tmp_path: P
         **{"a": "done", "b": "done", "unlucky": "done", "deadly": "set aside"}
     }
     assert not list(tmp_path.iterdir())
-
-
-def test_no_signal_arrives_in_a_worker_that_starts() -> None:
-    # What Python starts with the first process lets them arrive again.
-    program = """
-import signal
-from multiprocessing import resource_tracker
-from tactflow.batch.local import signals_held
-from tactflow.signals import ENDING
-with signals_held(ENDING):
-    resource_tracker.ensure_running()
-    print(set(ENDING) <= signal.pthread_sigmask(signal.SIG_BLOCK, []))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "True\n"
-
-
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
-def test_a_terminal_that_is_closed_does_not_end_what_python_starts_with_the_first_process() -> None:
-    program = """
-import re, signal
-from multiprocessing import resource_tracker
-from pathlib import Path
-from tactflow.batch.local import signals_held
-from tactflow.signals import ENDING
-with signals_held(ENDING):
-    resource_tracker.ensure_running()
-status = Path(f"/proc/{resource_tracker._resource_tracker._pid}/status").read_text()
-blocked = int(re.search("SigBlk:\\t(.*)", status)[1], 16)
-print(bool(blocked >> (signal.SIGHUP - 1) & 1))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "True\n"

@@ -12,12 +12,11 @@ from importlib import import_module
 from typing import Any
 
 from tactflow.batch.executor import Headway, died
-from tactflow.batch.local import signals_held
 from tactflow.batch.task import Outcome, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.extras import missing
-from tactflow.signals import ENDING
+from tactflow.signals import ENDING, blocked_in_children
 
 CONNECT_SECONDS = 10.0
 """How long a scheduler may take to answer, s. Chosen by hand."""
@@ -135,7 +134,7 @@ def _distributed() -> Any:
 def _local_cluster(workers: int) -> Any:
     package = _distributed()
     # Dask itself ends its processes with SIGTERM.
-    with signals_held([number for number in ENDING if number != signal.SIGTERM]):
+    with blocked_in_children([number for number in ENDING if number != signal.SIGTERM]):
         return package.LocalCluster(
             n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.ERROR
         )

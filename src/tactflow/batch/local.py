@@ -6,13 +6,10 @@ import multiprocessing
 import os
 import signal
 import socket
-import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
@@ -20,7 +17,7 @@ from tactflow.batch.executor import Headway
 from tactflow.batch.task import Outcome, Report, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import StageError
-from tactflow.signals import ENDING
+from tactflow.signals import ENDING, blocked_in_children
 
 Work = Callable[[Task, Report], Outcome]
 
@@ -47,7 +44,7 @@ class _Worker:
         self.total: int | None = None
         self.connection, theirs = _CONTEXT.Pipe()
         self.process: BaseProcess = _CONTEXT.Process(target=_serve, args=(theirs, work), daemon=True)
-        with signals_held(ENDING):
+        with blocked_in_children(ENDING):
             self.process.start()
         theirs.close()
 
@@ -147,25 +144,6 @@ class LocalProcesses:
         for worker in self._workers:
             worker.end(kill=kill or worker.task is not None)
         self._workers.clear()
-
-
-@contextmanager
-def signals_held(numbers: Collection[int]) -> Iterator[None]:
-    """Let processes, and threads that start some, begin in which these signals do not arrive.
-
-    Ctrl-C on a terminal reaches every process there; the one of the command line decides.
-    """
-    if sys.platform == "win32":
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
-        # Python starts it with the first process, and then lets Ctrl-C and SIGTERM arrive again.
-        resource_tracker.ensure_running()
-        signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(connection: Connection, work: Work) -> None:
