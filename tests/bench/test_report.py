@@ -79,6 +79,53 @@ def test_a_faster_method_is_no_better_while_another_of_its_errors_is_larger(resu
     assert "use this: the fastest and the most accurate" in html(result)
 
 
+def verdicts(result: Result, *methods: tuple[str, float, dict[str, float]]) -> dict[str, str]:
+    """What the report says of methods, each a name, a cost and errors in two scenes.
+
+    One whose name begins with `partial` has no `center_error` in the second.
+    """
+    result.measurements = [
+        replace(measurement(method, scene, cost, **errors), group="pipeline")
+        for method, cost, errors in methods
+        for scene in ("press", "cable")
+    ]
+    for one in result.measurements:
+        if one.method.startswith("partial") and one.scene == "cable":
+            del one.errors["center_error"]
+    answer = html(result).partition("Run time against error")[0]
+    return dict(re.findall(r"</span> <b>([\w ]+)</b></td><td>(.*?)</td>", answer))
+
+
+def test_a_slower_method_with_nothing_to_show_in_some_scenes_says_so(result: Result) -> None:
+    said = verdicts(
+        result,
+        ("fast", 5, {"displacement_rms": 0.2, "center_error": 0.5}),
+        ("partial", 10, {"displacement_rms": 0.1, "center_error": 0.5}),
+    )
+    assert said["partial"] == (
+        "a compromise on the Pareto front; nothing to show in some scenes: contact centre error, mean"
+    )
+
+
+def test_nothing_to_show_counts_more_than_any_error_where_the_best_has_none(result: Result) -> None:
+    said = verdicts(
+        result,
+        ("partial", 5, {"displacement_rms": 0.2, "center_error": 0.5}),
+        ("exact", 10, {"displacement_rms": 0.0, "center_error": 0.5}),
+    )
+    assert said["partial"] == "the fastest; nothing to show in some scenes: contact centre error, mean"
+
+
+def test_errors_and_times_that_are_about_the_same_are_not_called_1_times_as_large(result: Result) -> None:
+    said = verdicts(
+        result, ("fast", 5, {"displacement_rms": 0.1001}), ("exact", 5.001, {"displacement_rms": 0.1})
+    )
+    assert said == {
+        "fast": "the fastest; about the error of the best: marker displacement error, RMS",
+        "exact": "the most accurate; about the time of the fastest",
+    }
+
+
 class _Collector(HTMLParser):
     def __init__(self) -> None:
         super().__init__()

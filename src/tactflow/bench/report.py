@@ -69,32 +69,27 @@ def _front(everyone: Sequence[Point], errors: Mapping[str, Mapping[str, float]])
 
 
 def _verdict(
-    point: Point, everyone: Sequence[Point], errors: Mapping[str, Mapping[str, float]], quantity: Quantity
+    point: Point, front: Sequence[Point], errors: Mapping[str, Mapping[str, float]], quantity: Quantity
 ) -> str:
-    if len(everyone) == 1:
-        return "the only method"
+    """One of several methods in a few words; front, errors : as `_front` and `_errors` give them."""
     if point.missing:
         return f"fails: nothing to show in {point.missing} of {point.missing + point.scenes} scenes"
     if quantity.best == 1 and point.error > 0.95:
         return "fails in most scenes"
-    front = _front(everyone, errors)
     if point not in front:
         better = next(p for p in front if _beats(p, point, errors))
         return f"no reason to use it here: {better.method} is faster and at least as accurate"
     least = min(p.cost for p in front)
+    fastest = point.cost == least
     title, error, best = _weakness(point, front, errors)
     if error == best:
-        fastest = point.cost == least
-        return (
-            "use this: the fastest and the most accurate"
-            if fastest
-            else f"the most accurate; {_times(point.cost / least)} the time of the fastest"
-        )
-    if point.cost > least:
-        return "a compromise on the Pareto front"
+        if fastest:
+            return "use this: the fastest and the most accurate"
+        return f"the most accurate; {_times(point.cost / least)} the time of the fastest"
+    said = "the fastest" if fastest else "a compromise on the Pareto front"
     if math.isinf(error):
-        return f"the fastest; nothing to show in some scenes: {title}"
-    return f"the fastest; {_factor(error, best)} the error of the best: {title}"
+        return f"{said}; nothing to show in some scenes: {title}"
+    return f"{said}; {_factor(error, best)} the error of the best: {title}" if fastest else said
 
 
 def _weakness(
@@ -106,15 +101,17 @@ def _weakness(
         error, best = by[point.method], min(by[p.method] for p in front)
         ratio = 1.0 if error == best else math.inf if best == 0 else error / best
         found.append((ratio, title, error, best))
-    return max(found, key=lambda one: one[0])[1:]
+    # Nothing to show at all is worse than any error where the best has none.
+    return max(found, key=lambda one: (one[0], one[2]))[1:]
 
 
 def _times(ratio: float) -> str:
-    return f"{format_number(ratio)} times"
+    text = format_number(ratio)
+    return "about" if text == "1" else f"{text} times"
 
 
 def _factor(error: float, best: float) -> str:
-    return f"{format_number(error / best)} times" if best > 0 else f"{format_number(error)} more than"
+    return _times(error / best) if best > 0 else f"{format_number(error)} more than"
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]], numeric_from: int = 1) -> str:
@@ -131,36 +128,29 @@ def _align(column: int, numeric_from: int) -> str:
     return ' class="n"' if column >= numeric_from else ""
 
 
-def _answers(result: Result) -> str:
-    parts = []
-    for group in result.groups():
-        for name in PRIMARY.get(group, ()):
-            quantity = QUANTITIES[name]
-            candidates = points(result, group, quantity)
-            if not candidates:
-                continue
-            errors = _errors(result, group)
-            front = _front(candidates, errors)
-            others = [QUANTITIES[q] for q in PRIMARY[group] if q != name]
-            rows = []
-            for point in sorted(candidates, key=lambda p: p.cost):
-                mark = "●" if point in front else "○"
-                row = [
-                    f'<span class="{"on" if point in front else "off"}">{mark}</span> '
-                    f"<b>{escape(point.method)}</b>",
-                    escape(_verdict(point, candidates, errors, quantity)),
-                    format_number(point.cost),
-                    f"{point.cost * result.copy_ms:.2f}",
-                    _value_with_worst(result, group, point.method, quantity),
-                ]
-                row += [_value_with_worst(result, group, point.method, other) for other in others]
-                rows.append(row)
-            header = ["method", "", "copies", "ms"]
-            header += [_heading(q, limit_of(result, group, q)) for q in (quantity, *others)]
-            heading = escape(TITLES.get(group, group))
-            parts.append(f"<h3>{heading}</h3>" + _table(header, rows, numeric_from=2))
-            break
-    return "".join(parts)
+def _answer(result: Result, group: str) -> str:
+    """The methods of a group, fastest first; empty without any error that says which is better."""
+    quantities = [QUANTITIES[name] for name in PRIMARY.get(group, ())]
+    quantity = next((q for q in quantities if points(result, group, q)), None)
+    if quantity is None:
+        return ""
+    candidates = points(result, group, quantity)
+    errors = _errors(result, group)
+    front = _front(candidates, errors)
+    columns = [quantity, *(q for q in quantities if q != quantity)]
+    rows = []
+    for point in sorted(candidates, key=lambda p: p.cost):
+        kind, mark = ("on", "●") if point in front else ("off", "○")
+        alone = len(candidates) == 1
+        row = [
+            f'<span class="{kind}">{mark}</span> <b>{escape(point.method)}</b>',
+            escape("the only method" if alone else _verdict(point, front, errors, quantity)),
+            format_number(point.cost),
+            f"{point.cost * result.copy_ms:.2f}",
+        ]
+        rows.append(row + [_value_with_worst(result, group, point.method, column) for column in columns])
+    header = ["method", "", "copies", "ms"] + [_heading(q, limit_of(result, group, q)) for q in columns]
+    return f"<h3>{escape(TITLES.get(group, group))}</h3>" + _table(header, rows, numeric_from=2)
 
 
 def _heading(quantity: Quantity, limit: float | None = None) -> str:
@@ -343,7 +333,7 @@ def html(result: Result) -> str:
         '<p><span class="on">●</span> is on the Pareto front: nothing else is faster and, in every column, '
         'as accurate. <span class="off">○</span> is beaten. Errors are the median over the scenes; in '
         "brackets the worst scene.</p>",
-        _answers(result),
+        *(_answer(result, group) for group in result.groups()),
     ]
     times = _where_time_goes(result)
     if times:
