@@ -112,7 +112,8 @@ def run(
     ------
     ConfigError : the pipeline file is wrong; nothing was started.
     TactflowError : a stage, a sink or the source failed.
-    KeyboardInterrupt : Ctrl-C; the run has ended, without what was under way.
+    KeyboardInterrupt : Ctrl-C; the run has ended, without what was under way. A second one leaves the part
+        that is being closed as it is; the others are closed.
 
     Examples
     --------

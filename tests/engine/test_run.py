@@ -716,6 +716,22 @@ def test_an_interrupted_run_lets_its_threads_end_before_it_closes(
     assert runner.nodes["join"].instance.closed == 1
 
 
+def test_an_interrupt_while_one_part_is_closed_reaches_the_caller_when_the_others_are_closed(
+    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    runner = toy_runner()
+    monkeypatch.setattr(runner.pipeline.nodes["join"].component.cls, "close", interrupted, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        runner.run()
+    closed = {name: node.instance.closed for name, node in runner.nodes.items() if name != "join"}
+    assert set(closed.values()) == {1}
+    assert runner.source is not None
+    assert runner.source.closed == 1  # type: ignore[attr-defined]
+
+
 # -- the graph --------------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -117,7 +118,8 @@ class Runner:
         """Open everything, run to the end of the source, close everything.
 
         on_progress : called in this thread about every `interval_s` seconds. Never raises a TactflowError;
-        it is in the result. A KeyboardInterrupt raised in this thread ends the run at once.
+        it is in the result. A KeyboardInterrupt raised in this thread ends the run at once; one while the
+        run is being closed is raised after that.
         """
         self._began = time.perf_counter()
         try:
@@ -364,14 +366,18 @@ class Runner:
         """
         alive = [name for name, thread in self._threads.items() if thread.is_alive()]
         in_use = {self._segments[name].current for name in alive}
-        for node_id, instance in reversed(self._opened):
-            if node_id in in_use:
-                continue
-            try:
-                instance.close()
-            except (Exception, SystemExit) as error:
-                self.fail(StageError(f"{node_id}: closing failed: {error}"), error)
-        self._opened.clear()
+        opened, self._opened = self._opened, []
+        # An interrupt ends what one of them does, and is raised when the others are closed.
+        with ExitStack() as stack:
+            for node_id, instance in opened:
+                if node_id not in in_use:
+                    stack.callback(self._close_part, node_id, instance)
+
+    def _close_part(self, node_id: str, instance: Part) -> None:
+        try:
+            instance.close()
+        except (Exception, SystemExit) as error:
+            self.fail(StageError(f"{node_id}: closing failed: {error}"), error)
 
     # -- the source's thread ------------------------------------------------------------------------------
 
