@@ -150,6 +150,21 @@ def test_a_gel_of_which_two_states_may_be_the_untouched_one_is_told(
     )
 
 
+def test_the_reference_is_told_in_one_line_also_where_the_light_was_not_steady_before(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    images = np.stack(warming_up(tmp_path / "r.npy", [0.6, 0.8] + [1.0] * 28))
+    images[:8, 16:32, 8:24] //= 2
+    images[8:, 16:32, 40:56] //= 4
+    np.save(tmp_path / "r.npy", images)
+    with caplog.at_level("INFO", "tactflow"):
+        list(capture("r.npy", tmp_path).frames())
+    assert caplog.messages == [
+        "r.npy: the reference is frame 2, although the gel came to rest in another state at frame 8; if it was "
+        "touched until then, name a picture of the untouched gel: stages.capture.reference"
+    ]
+
+
 @pytest.mark.parametrize(("settle", "reference"), [(0, 0), (3, -1)])
 def test_settling_can_be_switched_off(tmp_path: Path, settle: float, reference: int) -> None:
     warming_up(tmp_path / "r.npy", [0.6, 0.8] + [1.0] * 18)

@@ -78,37 +78,30 @@ class FirstFrames:
         settling = self._settling
         best, alike = settling.best(), settling.alike()
         begin = max(0, min(alike.index(best) - self._count // 2, len(alike) - self._count))
-        if best > 0:
-            self._tell(best)
-        elif settling.changing:
-            self._warn(best)
-        if settling.undecided:
-            log.info(
-                "%s: the reference is frame %d, although the gel came to rest in another state at frame %d; "
-                "if it was touched until then, name a picture of the untouched gel: stages.capture.reference",
-                self._name,
-                best,
-                settling.begins,
-            )
+        self._tell(best)
         return alike[begin : begin + self._count]
 
     def _tell(self, best: int) -> None:
-        if self._settling.changing:
-            self._warn(best)
-        elif self._settling.touched_before(best):
-            log.info("%s: the reference is frame %d; the gel was touched or moved before", self._name, best)
-        else:
-            log.info(
-                "%s: the reference is frame %d; the camera was setting exposure and white balance until then",
+        """Say in one line which frame is the reference and why, unless it is plainly the very first."""
+        settling = self._settling
+        if settling.changing:
+            log.warning(
+                "%s: the light is not steady, it changed by %.0f %% within the last frames looked at; "
+                "the reference is frame %d. Fix exposure and white balance of the camera, or raise settle",
                 self._name,
+                100 * settling.drift,
                 best,
             )
-
-    def _warn(self, best: int) -> None:
-        log.warning(
-            "%s: the light is not steady, it changed by %.0f %% within the last frames looked at; "
-            "the reference is frame %d. Fix exposure and white balance of the camera, or raise settle",
-            self._name,
-            100 * self._settling.drift,
-            best,
-        )
+            return
+        if settling.undecided:
+            why = (
+                f", although the gel came to rest in another state at frame {settling.begins}; if it was "
+                "touched until then, name a picture of the untouched gel: stages.capture.reference"
+            )
+        elif settling.touched_before(best):
+            why = "; the gel was touched or moved before"
+        elif best > 0:
+            why = "; the camera was setting exposure and white balance until then"
+        else:
+            return
+        log.info("%s: the reference is frame %d%s", self._name, best, why)
