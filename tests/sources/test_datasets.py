@@ -60,6 +60,12 @@ def test_an_array_gives_its_frames_and_its_times(name: str, tmp_path: Path) -> N
         assert [t for _, t in found] == times
 
 
+@pytest.mark.parametrize("name", KINDS)
+def test_16_bit_pixels_are_read_in_either_order_of_their_bytes(name: str, tmp_path: Path) -> None:
+    path = KINDS[name](tmp_path / name, frames=(IMAGES.astype(int) * 257).astype(">u2"))
+    assert np.array_equal([image for image, _ in played(f"{path}?dataset=gel/frames")], IMAGES)
+
+
 def test_pictures_kept_as_files_are_decoded(tmp_path: Path) -> None:
     files = [cv2.imencode(".png", image)[1].ravel() for image in IMAGES]
     padded = np.zeros((5, max(map(len, files)) + 3), np.uint8)

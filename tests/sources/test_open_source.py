@@ -213,6 +213,13 @@ def test_other_kinds_of_pixels_are_converted_with_one_note(
     assert sum(note in record.message for record in caplog.records) == 1
 
 
+def test_16_bit_pixels_are_read_in_either_order_of_their_bytes(tmp_path: Path) -> None:
+    levels = np.arange(4 * 6).reshape(4, 6)
+    np.save(tmp_path / "a.npy", (257 * levels[None]).astype(">u2"))
+    ((image, _),) = read_all(open_source(str(tmp_path / "a.npy")))
+    np.testing.assert_array_equal(image[..., 0], levels)
+
+
 def test_few_bits_in_a_16_bit_file_are_pointed_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), np.full((4, 6), 4000, np.uint16))
     with caplog.at_level(logging.WARNING, "tactflow"):

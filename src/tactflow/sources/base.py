@@ -173,7 +173,9 @@ class Normaliser:
                 f"{self.size[0]} x {self.size[1]}; a source must keep its size. "
                 "Remove the odd frame, or run the two recordings one after the other"
             )
-        if image.dtype == np.uint16:
+        # A file may have 16-bit pixels in another machine's order of bytes.
+        if image.dtype.newbyteorder("=") == np.uint16:
+            image = image.astype(np.uint16, copy=False)
             if self._note("16 bit", "16-bit values are scaled to 8 bit (divided by 257)") and image.size:
                 peak = int(image.max())
                 if 0 < peak < SPARSE_PEAK:

@@ -176,7 +176,7 @@ def _checked(array: Any, name: str) -> int:
     """The number of frames of an array, if it holds frames of a size that can be."""
     shape, dtype = array.shape, array.dtype
     got = f"got {dtype} of shape {' x '.join(map(str, shape)) or '()'}"
-    pixels = dtype in (np.uint8, np.uint16) and (
+    pixels = dtype.newbyteorder("=") in (np.uint8, np.uint16) and (
         len(shape) == 3 or (len(shape) == 4 and shape[3] in (1, 3, 4))
     )
     files = (len(shape) == 1 and dtype.kind == "O") or (len(shape) == 2 and dtype == np.uint8)

@@ -340,7 +340,7 @@ def _map_array(path: Path) -> np.memmap[Any, Any]:
             ) from error
         raise SourceError(f"{path}: not a .npy file, or a damaged one; {wanted}") from error
     got = f"got {array.dtype} of shape {' x '.join(map(str, array.shape)) or '()'}"
-    if array.dtype not in (np.uint8, np.uint16):
+    if array.dtype.newbyteorder("=") not in (np.uint8, np.uint16):
         raise SourceError(f"{path}: {wanted}, {got}")
     if array.ndim == 3 and array.shape[2] in (3, 4):
         raise SourceError(f"{path}: {wanted}, {got}; a single image? Save it as array[None]")
