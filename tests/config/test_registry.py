@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tactflow.config.load import load_pipeline
-from tactflow.config.registry import available, catalogue, closest, did_you_mean, names, resolve
+from tactflow.config.registry import available, catalogue, names, resolve
 from tactflow.engine.errors import ConfigError
 
 STAGE = """
@@ -232,12 +232,3 @@ def test_a_stage_in_a_loose_file_replaces_a_built_in_one(tmp_path: Path) -> None
     pipeline = load_pipeline(tmp_path / "pipeline.yaml")
     assert pipeline.nodes["hull"].component.cls.__name__ == "Edges"
     assert str(pipeline.nodes["jsonl"].inputs["contact"]) == "hull.contact"
-
-
-def test_a_misspelled_word_gets_a_suggestion_only_if_one_is_near() -> None:
-    assert closest("min_aera", ["min_area", "method"]) == "min_area"
-    assert closest("HULL", ["hull"]) == "hull"
-    assert closest("teleport", ["min_area", "method"]) is None
-    assert did_you_mean("hul", ["hull", "capture"]) == "; did you mean hull?"
-    assert did_you_mean("zzz", ["hull", "capture"]) == "; known: hull, capture"
-    assert did_you_mean("zzz", []) == ""

@@ -160,8 +160,8 @@ def test_the_reference_is_told_in_one_line_also_where_the_light_was_not_steady_b
     with caplog.at_level("INFO", "tactflow"):
         list(capture("r.npy", tmp_path).frames())
     assert caplog.messages == [
-        "r.npy: the reference is frame 2, although the gel came to rest in another state at frame 8; if it was "
-        "touched until then, name a picture of the untouched gel: stages.capture.reference"
+        "r.npy: the reference is frame 2, although the gel came to rest in another state at frame 8; if it "
+        "was touched until then, name a picture of the untouched gel: stages.capture.reference"
     ]
 
 

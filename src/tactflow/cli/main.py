@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import gc
 import importlib
 import io
@@ -21,6 +20,7 @@ from tactflow.cli.printable import printable
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.files import Unheard, lead_nowhere
 from tactflow.signals import ENDING, INTERRUPTED, interrupt_from_now_on
+from tactflow.spelling import closest, did_you_mean
 
 COMMANDS = {
     "run": "run a pipeline",
@@ -137,9 +137,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     command = wanted(argv)
     parser = make_parser([command] if command in COMMANDS else [])
     if command is not None and command not in COMMANDS:
-        guess = difflib.get_close_matches(command, COMMANDS, n=1)
-        hint = f"did you mean {guess[0]}?" if guess else f"there are {', '.join(COMMANDS)}"
-        parser.error(f"there is no command {command}; {hint}")
+        parser.error(f"there is no command {command}{did_you_mean(command, COMMANDS, 'there are ')}")
     args, unknown = parser.parse_known_args(argv)
     if unknown:
         _refuse(args, unknown)
@@ -158,8 +156,8 @@ def _refuse(args: argparse.Namespace, unknown: Sequence[str]) -> NoReturn:
     command: argparse.ArgumentParser = args.parser
     options = re.findall(r"--[a-z][a-z-]*", command.format_usage())
     option = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)
-    guess = difflib.get_close_matches(option, options, n=1) if option else []
-    hint = f"; did you mean {guess[0]}?" if guess else ""
+    guess = closest(option, options) if option else None
+    hint = f"; did you mean {guess}?" if guess else ""
     if getattr(args, "source", None) is not None and os.path.isfile(unknown[0]):
         hint = "; to give many files as one source, quote the pattern: --source 'FOLDER/*.png'"
     command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")

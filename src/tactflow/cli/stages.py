@@ -16,11 +16,12 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from tactflow.config.models import is_word
-from tactflow.config.registry import Section, catalogue, did_you_mean, names, resolve
+from tactflow.config.registry import Section, catalogue, names, resolve
 from tactflow.config.yamlmap import shown
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 from tactflow.engine.ports import Port, describe_type
+from tactflow.spelling import did_you_mean
 
 _LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 

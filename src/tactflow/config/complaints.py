@@ -11,9 +11,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from tactflow.config.registry import closest, did_you_mean
 from tactflow.config.yamlmap import Item, Problems, shown
 from tactflow.engine.graph import Mark
+from tactflow.spelling import closest, did_you_mean
 
 _EXPECTED = {
     "int_type": "a whole number",

@@ -15,7 +15,7 @@ from tactflow.config.complaints import complain
 from tactflow.config.files_used import FileId, file_id, files_read, files_written
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import add_sinks, apply, replaced
-from tactflow.config.registry import Section, code_place, did_you_mean, resolve
+from tactflow.config.registry import Section, code_place, resolve
 from tactflow.config.shipped import is_packaged
 from tactflow.config.wiring import Draft
 from tactflow.config.yamlmap import Item, Problems, read_yaml, wrap
@@ -25,6 +25,7 @@ from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
 from tactflow.files import expanded
 from tactflow.redaction import public_address
+from tactflow.spelling import did_you_mean
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 

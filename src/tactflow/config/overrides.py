@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from tactflow.config.registry import did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems, read_value, wrap
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Mark
 from tactflow.redaction import public_setting
+from tactflow.spelling import did_you_mean
 
 
 def as_yaml(value: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import hashlib
 import importlib
@@ -11,7 +10,7 @@ import pkgutil
 import re
 import sys
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType, TracebackType
@@ -21,6 +20,7 @@ from tactflow.config.models import RESERVED
 from tactflow.engine.conformance import component, kind_of
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
+from tactflow.spelling import closest, did_you_mean
 
 Section = Literal["stages", "sinks"]
 
@@ -74,22 +74,6 @@ def catalogue() -> tuple[list[Component], list[str]]:
 def names(section: Section) -> list[str]:
     """Names of the built-ins and plug-ins of a section; nothing is imported for it."""
     return sorted({*_builtins(section), *(entry.name for entry in _entry_points(section))})
-
-
-def closest(word: str, candidates: Iterable[str]) -> str | None:
-    """The candidate a misspelled word most likely means, or None."""
-    lowered = {candidate.lower(): candidate for candidate in candidates}
-    found = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=0.6)
-    return lowered[found[0]] if found else None
-
-
-def did_you_mean(word: str, candidates: Iterable[str], otherwise: str = "known: ") -> str:
-    """`; did you mean X?` for a misspelled word, else a list of what there is."""
-    candidates = list(candidates)
-    guess = closest(word, candidates)
-    if guess is not None:
-        return f"; did you mean {guess}?"
-    return f"; {otherwise}{', '.join(candidates)}" if candidates else ""
 
 
 def _is_file(text: str) -> bool:

@@ -11,8 +11,8 @@ parameter. `{sensor}` in any text of a sink stands for the sensor's name.
 from __future__ import annotations
 
 from tactflow.config.models import Changes, is_word
-from tactflow.config.registry import did_you_mean
 from tactflow.config.yamlmap import Entry, Item, Problems
+from tactflow.spelling import did_you_mean
 
 PLACEHOLDER = "{sensor}"
 

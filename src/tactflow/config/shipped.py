@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from difflib import get_close_matches
 from importlib.resources import as_file, files
 from itertools import takewhile
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError
+from tactflow.spelling import closest
 
 
 def packaged_pipelines() -> list[str]:
@@ -44,8 +44,8 @@ def find_pipeline(name: str | None) -> Path:
         return _packaged(stem)
     if not path.exists() and name == stem and path.parent == Path():
         known = packaged_pipelines()
-        close = get_close_matches(name, known, 1)
-        advice = f"; did you mean {close[0]}?" if close else "."
+        close = closest(name, known)
+        advice = f"; did you mean {close}?" if close else "."
         raise ConfigError(
             f"there is no file {name}, and no pipeline of that name comes with tactflow{advice} "
             f"Those that do: {', '.join(known)} (tactflow pipelines)"

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from tactflow.config.registry import Section, catalogue, did_you_mean
+from tactflow.config.registry import Section, catalogue
 from tactflow.config.yamlmap import Entry, Item, Problems
 from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Component, Mark, Ref
 from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
+from tactflow.spelling import did_you_mean
 
 
 @dataclass(slots=True)

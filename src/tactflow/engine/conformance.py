@@ -39,7 +39,8 @@ _VALUES: dict[str, tuple[str, Callable[[Any], bool]]] = {
 }
 """Attribute of the contract -> what is required of its value, in words and in code."""
 _MISSPELT = 0.85
-"""Similarity (`difflib`, 0 to 1) from which a name is taken for a misspelt one; one letter in eight: 0.87."""
+"""Similarity (`difflib`, 0 to 1) from which a name is taken for a misspelt one; one letter in eight: 0.87.
+Stricter than for what users type: a class is refused for it."""
 
 
 def kind_of(cls: type[Any]) -> Kind | None:

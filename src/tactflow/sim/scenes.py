@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from tactflow.sim import camera as optics
 from tactflow.sim import gel, light, markers, motion
 from tactflow.sim.recipes import SCENES
-from tactflow.sim.settings import Settings, parse_query, suggestion
+from tactflow.sim.settings import Settings, parse_query
 from tactflow.sim.truth import Truth, measure
+from tactflow.spelling import did_you_mean
 
 SIZE = (800, 600)
 """Width and height of every scene's frames, px."""
@@ -63,7 +64,7 @@ def open_scene(spec: str) -> Scene:
     """
     name, _, query = spec.partition("?")
     if name not in SCENES:
-        raise ValueError(f"simulated sensor: unknown scene {name!r}{suggestion(name, SCENES)}")
+        raise ValueError(f"simulated sensor: unknown scene {name!r}{did_you_mean(name, sorted(SCENES))}")
     recipe = SCENES[name]
     return Scene(name, recipe.programme, parse_query(query, recipe.settings))
 

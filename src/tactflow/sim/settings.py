@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 from tactflow.sim.gel import RIM, SINK_IN
 from tactflow.sim.light import LIGHTS
 from tactflow.sim.markers import SHAPES
+from tactflow.spelling import did_you_mean
 
 
 @dataclass(frozen=True)
@@ -128,13 +128,6 @@ KEYS: dict[str, Key] = {
 }
 
 
-def suggestion(word: str, known: Iterable[str]) -> str:
-    """`; did you mean X?` where something known is close, else the list of what is known."""
-    names = list(known)
-    close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]}?" if close else f"; known are: {', '.join(sorted(names))}"
-
-
 def parse_query(query: str, defaults: Mapping[str, Any]) -> Settings:
     """Settings from `key=value&key=value`.
 
@@ -149,7 +142,7 @@ def parse_query(query: str, defaults: Mapping[str, Any]) -> Settings:
     for part in query.split("&") if query else []:
         key, equals, value = part.partition("=")
         if key not in KEYS:
-            raise ValueError(f"simulated sensor: unknown key {key!r}{suggestion(key, KEYS)}")
+            raise ValueError(f"simulated sensor: unknown key {key!r}{did_you_mean(key, sorted(KEYS))}")
         if key in seen:
             raise ValueError(f"simulated sensor: {key} is given twice")
         if not equals or not value:
@@ -163,7 +156,7 @@ def _value(key: str, value: str) -> Any:
     rule = KEYS[key]
     if rule.choices:
         if value not in rule.choices:
-            hint = suggestion(value, rule.choices)
+            hint = did_you_mean(value, rule.choices)
             raise ValueError(
                 f"simulated sensor: required {key} from {list(rule.choices)}, got {value!r}{hint}"
             )

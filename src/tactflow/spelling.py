@@ -1,0 +1,34 @@
+"""What a misspelled word was meant to be."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Final
+
+MISSPELLED: Final = 0.75
+"""Similarity (`difflib`, 0 to 1) from which one word is taken for another one misspelled: one wrong letter of
+four, or two in the wrong order. Below are other words: threads and radius (0.62), depth and path (0.67)."""
+
+
+def closest(word: str, candidates: Iterable[str]) -> str | None:
+    """The candidate a misspelled word most likely means, or None; upper case does not matter.
+
+    >>> closest("min_aera", ["min_area", "method"])
+    'min_area'
+    """
+    lowered = {candidate.lower(): candidate for candidate in candidates}
+    found = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=MISSPELLED)
+    return lowered[found[0]] if found else None
+
+
+def did_you_mean(word: str, candidates: Iterable[str], otherwise: str = "known: ") -> str:
+    """`; did you mean X?` for a misspelled word, else a list of what there is, if there is anything.
+
+    otherwise : what the list begins with.
+    """
+    candidates = list(candidates)
+    guess = closest(word, candidates)
+    if guess is not None:
+        return f"; did you mean {guess}?"
+    return f"; {otherwise}{', '.join(candidates)}" if candidates else ""
