@@ -42,20 +42,6 @@ def test_results_are_seen_outside_the_timed_part() -> None:
     assert seen == [("a", 3)]
 
 
-def test_a_method_that_uses_up_its_time_is_left_out() -> None:
-    calls: list[int] = []
-    seen: list[int] = []
-    timing.interleaved(
-        {"slow": calls.append, "fast": lambda _: None},
-        [("k", 1), ("k", 2), ("k", 3)],
-        block=2,
-        give_up_after=0.0,
-        see=lambda name, _kind, value, _result: seen.append(value) if name == "slow" else None,
-    )
-    assert calls == [1]
-    assert seen == [1]
-
-
 def test_measuring_uses_one_opencv_thread_and_restores_the_setting() -> None:
     before = cv2.getNumThreads()
     during: list[int] = []

@@ -314,16 +314,6 @@ class TestOptionsOfTheCommandLine:
         ):
             load(BODY, source_values={"frame_rate": 3})
 
-    def test_values_for_any_stage_replace_those_of_the_file(self, load: Load) -> None:
-        nodes = load(BODY, extra_stage_values={"prepare": {"gamma": 4}}).nodes
-        assert nodes["prepare"].params.model_dump()["gamma"] == 4
-
-    def test_a_value_for_a_stage_that_is_not_there_is_an_error(self, load: Load) -> None:
-        with pytest.raises(
-            ConfigError, match=r"^--gamma: there is no stage 'prepar'; did you mean prepare\?"
-        ):
-            load(BODY, extra_stage_values={"prepar": {"gamma": 4}})
-
     def test_an_added_sink_gets_an_id_that_is_free(self, load: Load) -> None:
         text = BODY.replace("  out:", "  jsonl:")
         nodes = load(text, extra_sinks={"--jsonl": {"path": "-"}}).nodes

@@ -124,12 +124,12 @@ class _Inputs:
         return "contact" if self.touching else "idle"
 
 
-def frames_of(rendered: Rendered, references: int = 1) -> Iterator[Frame]:
-    """The frames as the capture stage would hand them over."""
+def frames_of(rendered: Rendered) -> Iterator[Frame]:
+    """The frames as the capture stage would hand them over; the first is the reference."""
     for index in range(len(rendered)):
         image = np.array(rendered.frames[index])
         image.flags.writeable = False
-        yield Frame("bench", index, index / rendered.scene.fps, image, reference=index < references)
+        yield Frame("bench", index, index / rendered.scene.fps, image, reference=index == 0)
 
 
 def _chain(pipeline: Pipeline, rendered: Rendered) -> tuple[list[_Inputs], PixelMapping]:

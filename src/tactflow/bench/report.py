@@ -8,7 +8,7 @@ then everything that was measured.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from statistics import median
 
@@ -274,8 +274,8 @@ def _where_time_goes(result: Result) -> str:
     return f'<div class="figures">{"".join(parts)}</div>' if parts else ""
 
 
-def _maybe(value: float | None, show: Callable[[float], str] = format_number) -> str:
-    return "" if value is None else show(value)
+def _maybe(value: float | None) -> str:
+    return "" if value is None else format_number(value)
 
 
 _STYLE = """

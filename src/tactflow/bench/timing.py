@@ -89,7 +89,6 @@ def interleaved(
     inputs: Iterable[tuple[Hashable, Any]],
     *,
     block: int = BLOCK,
-    give_up_after: float = float("inf"),
     see: Callable[[str, Hashable, Any, Any], None] | None = None,
 ) -> dict[str, dict[Hashable, Samples]]:
     """Give every input to every alternative, in turns of a few inputs, and time each call.
@@ -99,8 +98,6 @@ def interleaved(
     alternatives : name -> callable of one input.
     inputs : (kind, input) pairs; times are kept apart by kind (for instance with and without contact).
     block : inputs in a turn; their results are kept until it ends.
-    give_up_after : s. An alternative whose calls took longer than this in total is left out from then on, so
-        that one slow method cannot use up the time of all others.
     see : called after each turn, outside the timed part, with (name, kind, input, result).
 
     Returns
@@ -108,20 +105,16 @@ def interleaved(
     name -> kind -> samples.
     """
     times: dict[str, dict[Hashable, Samples]] = {name: {} for name in alternatives}
-    spent = dict.fromkeys(alternatives, 0.0)
     waiting = iter(inputs)
     with quiet():
         while turn := list(islice(waiting, block)):
             for name, call in alternatives.items():
                 results: list[Any] = []
                 for kind, value in turn:
-                    if spent[name] > give_up_after:
-                        break
                     samples = times[name].setdefault(kind, Samples())
                     results.append(timed(lambda call=call, value=value: call(value), samples))  # type: ignore[misc]
-                    spent[name] += samples.wall[-1]
                 if see is not None:
-                    for (kind, value), result in zip(turn, results, strict=False):
+                    for (kind, value), result in zip(turn, results, strict=True):
                         see(name, kind, value, result)
     return times
 

@@ -167,7 +167,7 @@ class Matcher:
 class GridTracker:
     """The original tracker on a grid that is read off the reference frame instead of being typed in.
 
-    reference : (H, W, 3) uint8, BGR. max_visits : see `MAX_VISITS`.
+    reference : (H, W, 3) uint8, BGR.
     least_area, most_area : see `marker_center`.
 
     Raises
@@ -180,7 +180,6 @@ class GridTracker:
         self,
         reference: NDArray[np.uint8],
         *,
-        max_visits: int = MAX_VISITS,
         least_area: float = MARKER_AREAS[0],
         most_area: float = MARKER_AREAS[1],
     ) -> None:
@@ -190,7 +189,7 @@ class GridTracker:
         centers = marker_center(reference, least_area=least_area, most_area=most_area)
         grid, spacing = grid_of(centers)
         self._present = np.isfinite(grid[..., 0])
-        self._matcher = Matcher(grid, spacing, max_visits=max_visits)
+        self._matcher = Matcher(grid, spacing)
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
         """Match one frame; markers without a centre are inferred. Standard errors are unknown (NaN)."""

@@ -25,7 +25,6 @@ from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
 from tactflow.files import expanded
 from tactflow.redaction import public_address
-from tactflow.spelling import did_you_mean
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 
@@ -40,7 +39,6 @@ def load_pipeline(
     path: Path,
     overrides: Sequence[str] = (),
     extra_sinks: Mapping[str, Mapping[str, Any]] | None = None,
-    extra_stage_values: Mapping[str, Mapping[str, Any]] | None = None,
     source_values: Mapping[str, Any] | None = None,
     sensor: str | None = None,
 ) -> Pipeline:
@@ -50,7 +48,6 @@ def load_pipeline(
     overrides : `a.b.c=VALUE` as given to `--set`; VALUE is YAML, null for a whole sink or stage removes it.
     extra_sinks : option of the command line, such as "--jsonl" -> settings of the sink it adds. The sink's id
         is the option's name, with a number if that is taken.
-    extra_stage_values : stage id -> parameters that replace those of the file.
     source_values : parameters of the source stage, as `--NAME` on the command line sets them.
     sensor : which sensor of a file with `sensors:`; None is the first.
 
@@ -64,10 +61,8 @@ def load_pipeline(
     file = _envelope(root, problems)
     drafts = _drafts(root, path.parent, problems)
     source = _source(root, drafts, problems)
-    values = {id_: dict(given) for id_, given in (extra_stage_values or {}).items()}
     if source is not None:
-        values.setdefault(source.id, {}).update(source_values or {})
-    _set_values(drafts, values, problems)
+        _set_values(source, source_values or {})
     for draft in drafts:
         draft.params = _params(draft, problems)
     drafts = _one_writer_each(drafts, extra_sinks or {}, problems)
@@ -179,17 +174,12 @@ def _source(root: Item, drafts: Sequence[Draft], problems: Problems) -> Draft | 
     return sources[0] if sources else None
 
 
-def _set_values(drafts: Sequence[Draft], values: Mapping[str, Mapping[str, Any]], problems: Problems) -> None:
-    by_id = {draft.id: draft for draft in drafts}
-    for id_, given in values.items():
-        for name, value in given.items():
-            shown = f" {public_address(value)}" if isinstance(value, str) and value.isprintable() else ""
-            mark = Mark(f"--{name.replace('_', '-')}{shown}", 0, 0)
-            if id_ not in by_id:
-                problems.add(mark, f"there is no stage {id_!r}{did_you_mean(id_, by_id)}")
-                continue
-            draft = by_id[id_]
-            draft.item = replaced(draft.item, [name], wrap(value, mark), mark)
+def _set_values(draft: Draft, values: Mapping[str, Any]) -> None:
+    """Replace parameters of a stage by those of options, whose names are their places."""
+    for name, value in values.items():
+        shown = f" {public_address(value)}" if isinstance(value, str) and value.isprintable() else ""
+        mark = Mark(f"--{name.replace('_', '-')}{shown}", 0, 0)
+        draft.item = replaced(draft.item, [name], wrap(value, mark), mark)
 
 
 def _params(draft: Draft, problems: Problems) -> StageParams | None:

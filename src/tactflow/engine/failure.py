@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import traceback
 from collections.abc import Sequence
 from typing import Any
@@ -56,4 +57,4 @@ def _own_method(node: Node) -> str:
 
 
 def _of_the_engine(file: str) -> bool:
-    return file.rpartition("/")[0] == __file__.rpartition("/")[0]
+    return os.path.dirname(file) == os.path.dirname(__file__)

@@ -24,7 +24,7 @@ _number = count()
 class Durations:
     """A histogram of durations with bins of equal ratio; quantiles are good to 1 %.
 
-    Covers 0.1 us to about 3 h; shorter and longer ones count in the outermost bins. Any thread may
+    Covers 0.1 us to about 5 h; shorter and longer ones count in the outermost bins. Any thread may
     add and ask.
     """
 

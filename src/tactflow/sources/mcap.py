@@ -6,11 +6,11 @@ from collections.abc import Generator, Iterator
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import parse_qsl
 
 from tactflow.engine.errors import SourceError
 from tactflow.recording import missing_packages
 from tactflow.sources.base import BgrImage, Stamp, find_path, log
+from tactflow.sources.query import in_words, split_query
 
 if TYPE_CHECKING:
     from mcap.records import Message
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tactflow.recording.frames import StoredFrame
     from tactflow.recording.reader import Contents
 
-OPTIONS = "start=SECONDS (from the beginning), loop=N (play N times; 0 is for ever)"
+SETTINGS = {"start": "SECONDS (from the beginning)", "loop": "N (play N times; 0 is for ever)"}
 
 LATEST_START = 1e9
 """A beginning beyond this, s, is behind the end of every recording: 30 years. Chosen by hand."""
@@ -180,20 +180,13 @@ def _in_force(references: list[StoredFrame]) -> list[StoredFrame]:
 
 def _parse(spec: str, directory: Path | None) -> tuple[str, float, int]:
     """Path, start in s, and number of laps."""
-    name, mark, query = spec.rpartition("?")
-    if not mark or any((base / spec).exists() for base in (Path(), directory or Path())):
-        return spec, 0.0, 1
-    start, laps = 0.0, 1
-    for key, value in parse_qsl(query, keep_blank_values=True):
-        try:
-            if key == "start" and 0 <= float(value) <= LATEST_START:
-                start = float(value)
-            elif key == "loop" and int(value) >= 0:
-                laps = int(value)
-            else:
-                raise ValueError
-        except ValueError:
-            raise SourceError(f"{spec}: {key}={value}: required {OPTIONS}") from None
+    name, settings = split_query(spec, directory, SETTINGS)
+    try:
+        start, laps = float(settings.get("start", 0)), int(settings.get("loop", 1))
+    except ValueError:
+        start, laps = -1.0, 1
+    if not 0 <= start <= LATEST_START or laps < 0:
+        raise SourceError(f"{spec}: required {in_words(SETTINGS)}")
     return name, start, laps
 
 

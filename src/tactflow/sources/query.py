@@ -34,7 +34,11 @@ def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> 
     settings: dict[str, str] = {}
     for key, value in parse_qsl(query.replace("+", "%2B"), keep_blank_values=True):
         if key not in known or key in settings or not value:
-            offered = ", ".join(f"{setting}={what}" for setting, what in known.items())
-            raise SourceError(f"{spec}: {key}={value}: required {offered}")
+            raise SourceError(f"{spec}: {key}={value}: required {in_words(known)}")
         settings[key] = value
     return name, settings
+
+
+def in_words(known: Mapping[str, str]) -> str:
+    """The settings that there are, as `name=what it is`."""
+    return ", ".join(f"{setting}={what}" for setting, what in known.items())
