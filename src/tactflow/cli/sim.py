@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         if path is None:
             continue
         try:
-            with _progress(f"{path.name}", len(scene), args.quiet) as report:
+            with _progress(path.name, len(scene), args.quiet) as report:
                 write(scene, path, report)
         except (OSError, NotLosslessError) as error:
             raise StageError(f"{option} {path}: {error}") from error

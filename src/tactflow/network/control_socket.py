@@ -67,10 +67,10 @@ class ControlSocket:
 
     def __init__(self, endpoint: str, keys: str | None, sensor: str, commands: Commands) -> None:
         self._sensor = sensor
-        self._run = commands
-        self._commands: Mapping[str, Callable[[], Answer]] = {
+        self._commands = commands
+        self._by_name: Mapping[str, Callable[[], Answer]] = {
             "ping": lambda: {"message": "here"},
-            "stats": lambda: {"message": "statistics so far", "stats": self._run.snapshot()},
+            "stats": lambda: {"message": "statistics so far", "stats": self._commands.snapshot()},
             "take_reference": self._take_reference,
             "pause": lambda: self._pause(True),
             "resume": lambda: self._pause(False),
@@ -126,7 +126,7 @@ class ControlSocket:
         except Exception as error:
             log.warning("zmq: a command failed: %s: %s", type(error).__name__, error)
             answer = {"ok": False, "message": f"{type(error).__name__}: {error}"}
-        answer["state"] = {"sensor": self._sensor, **self._run.state()}
+        answer["state"] = {"sensor": self._sensor, **self._commands.state()}
         return orjson.dumps(answer, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY)
 
     def _done(self, request: list[bytes]) -> Answer:
@@ -136,31 +136,31 @@ class ControlSocket:
             name = wish["do"]
         except (ValueError, TypeError, KeyError):
             raise RefusedError('required one JSON object such as {"do": "ping"}') from None
-        if not isinstance(name, str) or name not in self._commands:
-            there = ", ".join(self._commands)
+        if not isinstance(name, str) or name not in self._by_name:
+            there = ", ".join(self._by_name)
             raise RefusedError(f"there is no command {str(name)[:LONGEST_QUOTE]!r}; there are {there}")
-        return self._commands[name]()
+        return self._by_name[name]()
 
     def _take_reference(self) -> Answer:
-        self._run.take_reference()
+        self._commands.take_reference()
         return {"message": "the next frame is taken as the reference"}
 
     def _pause(self, paused: bool) -> Answer:
-        self._run.pause(paused)
+        self._commands.pause(paused)
         return {"message": "paused" if paused else "running"}
 
     def _record_start(self) -> Answer:
-        refusal = self._run.refusal("record")
+        refusal = self._commands.refusal("record")
         if refusal is not None:
             raise RefusedError(f"{refusal}; --set 'sinks.record={{trigger: button}}' adds one")
-        already = self._run.state()["recording"]
-        recorder = self._run.record(True)
+        already = self._commands.state()["recording"]
+        recorder = self._commands.record(True)
         verb = "is recording already" if already else "recording"
         return {"message": f"{verb} to {recorder.description}", "path": recorder.description}
 
     def _record_stop(self) -> Answer:
-        was = self._run.state()["recording"]
-        recorder = self._run.record(False)
+        was = self._commands.state()["recording"]
+        recorder = self._commands.record(False)
         if not was:
             return {"message": "nothing was being recorded"}
         return {"message": f"recorded to {recorder.description}", "path": recorder.description}
