@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,13 @@ from numpy.typing import NDArray
 from tactflow.api import make_runner
 from tactflow.bench.timing import BLOCK
 from tactflow.config.registry import resolve
+from tactflow.engine.conformance import own_sink
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
-from tactflow.engine.graph import Component, Mark, Node, OnError, Pipeline, Queue
-from tactflow.engine.ports import Parameter, Port, Ports
+from tactflow.engine.graph import Mark, Node, Pipeline, Queue
 from tactflow.engine.run import RunResult
+from tactflow.ports import ContactMask, Image
 from tactflow.sources import open_source
 from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.first import Ahead
@@ -61,16 +62,26 @@ class Outcome:
     wall: float
 
 
-class Collect(Sink):
-    """A sink that keeps the last values for the bench."""
+class _Found(NamedTuple):
+    """What is kept of a frame; each is None where it was not computed, or no stage makes it."""
+
+    contact: Contact | None = None
+    flow: Flow | None = None
+    markers: Markers | None = None
+    contact_mask: ContactMask | None = None
+    mapping: PixelMapping | None = None
+    image: Image | None = None
+
+
+class _Collect(Sink):
+    """Keeps the last frame's values for the bench."""
 
     def __init__(self, params: StageParams) -> None:
         super().__init__(params)
-        self.last: dict[str, Any] = {}
+        self.last = _Found()
 
-    def write(self, **values: Any) -> None:
-        """Remember this frame's values."""
-        self.last = values
+    def write(self, found: _Found) -> None:
+        self.last = found
 
 
 class _Turns:
@@ -165,20 +176,7 @@ class LockstepPipeline:
     def _keep(self, cpu: float, wall: float) -> None:
         collect: Any = self._runner.nodes[_COLLECT].instance
         source: Any = self._runner.source
-        last = collect.last
-        self._outcomes.append(
-            Outcome(
-                frame=source.last_frame,
-                contact=last.get("contact"),
-                flow=last.get("flow"),
-                markers=last.get("markers"),
-                contact_mask=last.get("contact_mask"),
-                mapping=last.get("mapping"),
-                image=last.get("image"),
-                cpu=cpu,
-                wall=wall,
-            )
-        )
+        self._outcomes.append(Outcome(source.last_frame, *collect.last, cpu=cpu, wall=wall))
 
     def block(self, frames: int) -> list[Outcome]:
         """Run the next frames without a pause between them.
@@ -300,33 +298,10 @@ def _rewired(pipeline: Pipeline, jsonl: Path | None, turns: _Turns) -> Pipeline:
                 node, component=replace(node.component, cls=_lockstep_source(node.component.cls, turns))
             )
         nodes[node.id] = node
-    mark = Mark("bench", 0, 0)
     if jsonl is not None:
         component = resolve("jsonl", "sinks", pipeline.directory)
         params = component.params.model_validate({"path": str(jsonl), "overwrite": True})
         inputs = {port.name: pipeline.last_output(port.name) for port in component.ports.inputs}
-        nodes["jsonl"] = Node("jsonl", component, params, inputs, mark, segment=segment)
-    wanted: Mapping[str, Any] = {
-        "contact": Contact,
-        "flow": Flow,
-        "markers": Markers,
-        "contact_mask": NDArray[np.uint8],
-        "mapping": PixelMapping,
-        "image": NDArray[np.uint8],
-    }
-    collect = Component(
-        name=_COLLECT,
-        kind="sink",
-        cls=Collect,
-        params=StageParams,
-        ports=Ports(
-            [Parameter(name, [Port(name, kind, optional=True)]) for name, kind in wanted.items()], []
-        ),
-        memory="pure",
-        origin="bench",
-    )
-    inputs = {name: pipeline.last_output(name) for name in wanted}
-    nodes[_COLLECT] = Node(
-        _COLLECT, collect, StageParams(), inputs, mark, segment=segment, on_error=OnError()
-    )
+        nodes["jsonl"] = Node("jsonl", component, params, inputs, Mark("bench", 0, 0), segment=segment)
+    nodes[_COLLECT] = replace(own_sink(pipeline, _Collect, _COLLECT, "bench"), segment=segment)
     return replace(pipeline, nodes=nodes, opencv_threads=1)

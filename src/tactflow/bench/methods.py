@@ -9,7 +9,7 @@ alternative; geometry and flow are given the true contact mask.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
@@ -169,10 +169,6 @@ class _Group:
     feed: Callable[[_Inputs], dict[str, Any] | None]
     score: Callable[[], Any]
     see: Callable[[Any, _Inputs, Any], None]
-    group: str = field(default="")
-
-    def __post_init__(self) -> None:
-        self.group = self.group or self.stage
 
 
 def _see_contact(score: ContactScore, inputs: _Inputs, result: Any) -> None:
@@ -212,20 +208,16 @@ def _flow_inputs(inputs: _Inputs) -> dict[str, Any] | None:
     return {"markers": inputs.markers, "contact_mask": inputs.true_mask, "field": field}
 
 
-_GROUPS = (
+GROUPS = (
     _Group("preprocess", lambda i: {"frame": i.frame}, DetectionScore, lambda *_: None),
     _Group("marker_mask", lambda i: {"image": i.image}, DetectionScore, _see_mask),
     _Group("inpaint", lambda i: {"image": i.image, "marker_mask": i.marker_mask}, RemovalScore, _see_removal),
     _Group("difference", lambda i: {"unmarked": i.unmarked, "frame": i.frame}, ContactScore, _see_contact),
     _Group("hull", lambda i: {"contact_mask": i.true_mask} if i.touching else None, ContactScore, _see_hull),
     _Group("tracker", lambda i: {"image": i.image, "frame": i.frame}, MarkerScore, _see_markers),
-    _Group(
-        "flow_in_mask",
-        _flow_inputs,
-        FlowScore,
-        _see_flow,
-    ),
+    _Group("flow_in_mask", _flow_inputs, FlowScore, _see_flow),
 )
+"""The stages whose methods are measured alone, in this order."""
 
 
 def measure_methods(
@@ -242,7 +234,7 @@ def measure_methods(
     inputs, mapping = _chain(default, rendered)
     limit = rendered.displacement_limit(mapping)
     measurements: list[Measurement] = []
-    for group in _GROUPS:
+    for group in GROUPS:
         ways = alternatives(pipelines, group.stage)
         if len(ways) > 1 or (ways and group.stage in ("hull", "tracker")):
             made = _measure_group(group, ways, inputs, rendered, unit)
@@ -297,7 +289,7 @@ def _measure_group(
     yardstick = next((name for name, way in ways.items() if way.yardstick), None)
     made = []
     for name in ways:
-        measurement = Measurement(group.group, name, rendered.case.label, frames=len(inputs))
+        measurement = Measurement(group.stage, name, rendered.case.label, frames=len(inputs))
         measurement.failure = failures.get(name)
         if measurement.failure is None:
             measurement.errors = scores[name].errors()

@@ -21,7 +21,7 @@ RECORDING = "data:"
 class Measurement:
     """One method on one scene.
 
-    group : what is compared ("pipeline", "marker_mask", "inpaint", "contact", "hull", "tracker", ...).
+    group : what is compared ("pipeline", "marker_mask", "inpaint", "difference", "hull", "tracker", ...).
     method : the alternative's name. scene : what it was run on. frames : how many.
     time : kind ("contact", "idle", or "all") -> percentiles in ms; see `timing.Samples.summary`.
     copies : kind -> median CPU time in copies of a raw frame.

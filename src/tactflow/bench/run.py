@@ -7,7 +7,7 @@ import platform
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from tactflow.bench import depth, gels, motion, recordings
-from tactflow.bench.methods import CLASSIC, measure_methods
+from tactflow.bench.methods import CLASSIC, GROUPS, measure_methods
 from tactflow.bench.pictures import draw
 from tactflow.bench.pipelines import (
     Worst,
@@ -53,9 +53,6 @@ GROWTH_FRAMES = 60
 MEMORY_FRAMES = 20
 """Frames that a process runs whose peak memory is taken; chosen by hand."""
 
-STAGES_COMPARED = 7
-"""Stages whose methods are measured alone, one step of the progress each."""
-
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -65,6 +62,7 @@ class Plan:
     quick : a short run. data : folder of real recordings, or None. scenes : only these, or None for all.
     memory : whether to start each pipeline once more in a process of its own for its peak memory.
     pictures : folder for a picture of each pipeline's worst frame in each scene, or None.
+    cases, stage_cases : scenes for whole pipelines, and for methods alone; empty: those of such a run.
     """
 
     files: Mapping[str, Path]
@@ -73,8 +71,8 @@ class Plan:
     scenes: frozenset[str] | None = None
     memory: bool = True
     pictures: Path | None = None
-    cases: tuple[Case, ...] = field(default=())
-    stage_cases: tuple[Case, ...] = field(default=())
+    cases: tuple[Case, ...] = ()
+    stage_cases: tuple[Case, ...] = ()
 
     def chosen(self) -> tuple[tuple[Case, ...], tuple[Case, ...]]:
         """The scenes for whole pipelines, and for methods alone.
@@ -182,7 +180,7 @@ class _Run:
 
     def _steps(self) -> int:
         """Steps of the whole run: about one for each frame of a whole pipeline."""
-        steps = sum(case.frames for case in self.whole) + STAGES_COMPARED * len(self.alone)
+        steps = sum(case.frames for case in self.whole) + len(GROUPS) * len(self.alone)
         steps += 1 if self.plan.quick else GROWTH_FRAMES
         if self.plan.memory:
             steps += MEMORY_FRAMES * len(self.general)
