@@ -150,7 +150,7 @@ def test_scenes_can_be_chosen() -> None:
     ("arguments", "message"),
     [
         (["--against", "nothing.json"], "cannot be read"),
-        (["--html", "no/such/folder/x.html"], "no folder"),
+        (["--html", "no/such/folder/x.html"], "--html: there is no folder"),
         (["nothing.yaml"], "no such pipeline"),
         (["--scene", "nowhere"], "nowhere"),
         (["--data", "."], "wedge_ball"),

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from tactflow.calibration.file import PhotometricEntry
 from tactflow.calibration.presses import Press, Session
+from tactflow.calibration.scale import MAD_TO_SIGMA
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel, colour_terms, place_terms
 from tactflow.vision.depth.surface import Rest, Surface, colour_change
@@ -69,8 +70,6 @@ rejected. Chosen by hand."""
 JUDGED: Final = 2
 """How often presses are judged: the second time by what was learned without the bad ones, beside which good
 ones look bad too."""
-MAD_TO_SIGMA: Final = 1.4826
-"""Standard deviation of a normal variable in units of its median absolute deviation."""
 FEWEST_PIXELS: Final = 12
 """Pixels at half resolution inside a contact that a sphere can be fitted to. Chosen by hand."""
 EDGE: Final = 0.1

@@ -18,6 +18,9 @@ LONGER: Final = 1.35
 """How much longer than the typical one a distance between neighbours may be: less than the diagonal of a
 square, 1.41."""
 
+MAD_TO_SIGMA: Final = 1.4826
+"""Standard deviation of a normal variable in units of its median absolute deviation."""
+
 
 def centre(size: tuple[int, int]) -> tuple[float, float]:
     """The middle of a picture of size (width, height), px: where its mm coordinates are 0.
@@ -70,7 +73,8 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
         )
     means = np.array([np.median(group, axis=0) for group in groups])
     x, y = _square(means, pitch)
-    spread = np.array([1.4826 * np.median(np.abs(g - m), axis=0) for g, m in zip(groups, means, strict=True)])
+    deviations = [np.median(np.abs(g - m), axis=0) for g, m in zip(groups, means, strict=True)]
+    spread = MAD_TO_SIGMA * np.array(deviations)
     error = spread / np.sqrt([[len(group)] for group in groups])
     # Along an axis the relative error of the scale is that of the links that run along it.
     along = np.argmax(np.abs(means), axis=0)

@@ -26,6 +26,7 @@ from tactflow.bench.table import print_result, terminal
 from tactflow.bench.timing import CopyUnit
 from tactflow.cli.notes import without_notes
 from tactflow.cli.options import positive
+from tactflow.cli.outputs import refuse_output
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -124,8 +125,9 @@ def run(args: argparse.Namespace) -> int:
         return _skipping(args.pipelines, args.skipping, args.data)
     if args.against is not None:
         load_comparable(args.against, args.quick)
-    for path in (args.json, args.html, args.write_baseline, args.markdown):
-        _refuse_unwritable(path)
+    for name in ("json", "html", "write_baseline", "markdown"):
+        if getattr(args, name) is not None:
+            refuse_output(f"--{name.replace('_', '-')}", getattr(args, name), overwrite=True)
     plan = Plan(
         files=_files(args.pipelines),
         quick=args.quick,
@@ -196,14 +198,6 @@ def _files(given: list[str]) -> dict[str, Path]:
         if path not in files.values():
             files[path.stem if path.stem not in files else str(path)] = path
     return files
-
-
-def _refuse_unwritable(path: Path | None) -> None:
-    """Find out before the run, not after a quarter of an hour, that a result cannot be written."""
-    if path is not None and not path.parent.is_dir():
-        raise ConfigError(f"{path}: there is no folder {path.parent}")
-    if path is not None and path.is_dir():
-        raise ConfigError(f"{path}: is a folder; required the name of a file")
 
 
 def _write(args: argparse.Namespace, result: Result) -> None:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.cli.outputs import refuse_output
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
@@ -54,7 +55,10 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.frame < 0:
         raise ConfigError(f"--frame: required 0 or more, got {args.frame}")
-    _check_picture(args.picture, args.overwrite)
+    if args.picture is not None:
+        if args.picture.suffix.lower() not in PICTURES:
+            raise ConfigError(f"--picture: required a name that ends in .png or .jpg, got {args.picture}")
+        refuse_output("--picture", args.picture, overwrite=args.overwrite)
     image = _frame(args.source, args.frame)
     image = Preprocessor(image.shape[1::-1], rotate=args.rotate, downsample=args.downsample)(image)
     valid = None if args.all else valid_area(image)
@@ -107,19 +111,6 @@ def _best(spots: Candidate | None, what: str = "best") -> Iterator[str]:
     if spots is not None:
         closed = f"{100 * spots.lattice:.0f} % of their parallelograms close"
         yield f"magenta: {what}, {spots}; {closed}; score {spots.score:.1f}"
-
-
-def _check_picture(path: Path | None, overwrite: bool) -> None:
-    if path is None:
-        return
-    if path.suffix.lower() not in PICTURES:
-        raise ConfigError(f"--picture: required a file whose name ends in .png or .jpg, got {path}")
-    if not path.absolute().parent.is_dir():
-        raise ConfigError(f"--picture: there is no folder {path.absolute().parent}")
-    if path.is_dir():
-        raise ConfigError(f"--picture: {path} is a folder; required a file")
-    if path.exists() and not overwrite:
-        raise ConfigError(f"--picture: {path} is already there; give --overwrite to replace it")
 
 
 def _frame(source: str, number: int) -> NDArray[np.uint8]:

@@ -12,6 +12,7 @@ import orjson
 
 from tactflow.cli.notes import say, without_notes
 from tactflow.cli.options import seconds
+from tactflow.cli.outputs import refuse_output
 from tactflow.cli.printable import printable
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
@@ -107,12 +108,7 @@ def _check_files(out: Path, page: Path, overwrite: bool) -> None:
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"--out: required a file whose name ends in .yaml, got {out}")
     for option, path in (("--out", out), ("--html", page)):
-        if not path.absolute().parent.is_dir():
-            raise ConfigError(f"{option}: there is no folder {path.absolute().parent}")
-        if path.is_dir():
-            raise ConfigError(f"{option}: {path} is a folder; required a file")
-        if path.exists() and not overwrite:
-            raise ConfigError(f"{option}: {path} is already there; give --overwrite to replace it")
+        refuse_output(option, path, overwrite=overwrite)
 
 
 def _write(path: Path, text: str) -> None:

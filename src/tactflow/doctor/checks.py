@@ -183,7 +183,7 @@ def _rate(seen: Observation) -> Finding:
         return Finding("rate", "unknown", f"{len(times)} frames are too few")
     rate = len(gaps) / float(gaps.sum())
     usual = float(np.median(gaps))
-    jitter = measures.NORMAL * float(np.median(np.abs(gaps - usual))) / usual if usual > 0 else 1.0
+    jitter = measures.MAD_TO_SIGMA * float(np.median(np.abs(gaps - usual))) / usual if usual > 0 else 1.0
     verdict = _worse(RATES.verdict(rate), JITTER.verdict(jitter))
     promised = ""
     if seen.live and seen.promised:
@@ -363,7 +363,7 @@ def _flicker(seen: Observation, typical: measures.Gray) -> float:
         if pair.after is not None and seen.times is not None:
             after = measures.grey(pair.after)
             ratios.append(float(np.median(after / typical) - np.median(gray / typical)))
-    return measures.NORMAL * float(np.median(np.abs(ratios))) / np.sqrt(2.0) if ratios else 0.0
+    return measures.MAD_TO_SIGMA * float(np.median(np.abs(ratios))) / np.sqrt(2.0) if ratios else 0.0
 
 
 def _jpeg(seen: Observation) -> Finding:

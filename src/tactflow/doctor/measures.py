@@ -65,8 +65,8 @@ SMOOTHING: Final = 1.5
 """Standard deviation of the blur under which points are followed, px. Chosen by hand, against noise."""
 CORNERS: Final = (0.05, 8.0)
 """Least quality of a point relative to the best one, and least distance of two, px. Chosen by hand."""
-NORMAL: Final = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+MAD_TO_SIGMA: Final = 1.4826
+"""Standard deviation of a normal variable in units of its median absolute deviation."""
 
 
 def temporal_noise(first: Image, second: Image) -> float:

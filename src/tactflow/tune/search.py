@@ -99,7 +99,7 @@ class Tuned:
     recording, look, goal : what was tuned for. found : everything of the last rounds, the best first, with
     the pipeline as given and the original script. front : names of those that no other beats in both time
     and error. chosen : the candidate, or None where none keeps the budgets. tried : how many candidates.
-    words : what was decided on the way. rounds : candidates, frames of each round. settings : of all tried.
+    words : what was decided on the way. rounds : candidates, frames of each round.
     timed_on_recording : whether times are of the recording, else of the simulated one.
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -57,7 +57,7 @@ class Candidate:
     """One pipeline to try: a name, and what it sets in the file that the user gave."""
 
     name: str
-    settings: tuple[tuple[str, Any], ...] = field(default=())
+    settings: tuple[tuple[str, Any], ...] = ()
 
     def load(self, file: Path, sensor: str | None = None) -> Pipeline:
         """The pipeline. Raises ConfigError as `load_pipeline` does."""

@@ -127,7 +127,7 @@ class Hub:
         session: Session | None = None,
     ) -> None:
         self.control = control
-        self._run = Commands(control)
+        self._commands = Commands(control)
         self.sensor = sensor
         self.neighbours = neighbours
         self._again = again
@@ -146,15 +146,15 @@ class Hub:
         self._sent = 0
         self._screen = Durations()
         self._end: str | None = None
-        self._commands: dict[str, Callable[[Any], Any]] = {
-            "pause": lambda value: self._run.pause(value is True),
+        self._by_name: dict[str, Callable[[Any], Any]] = {
+            "pause": lambda value: self._commands.pause(value is True),
             "step": lambda _: self._step(),
-            "reference": lambda _: self._run.take_reference(),
-            "record": lambda value: self._run.record(value is True),
-            "stop": lambda _: self._run.stop(),
+            "reference": lambda _: self._commands.take_reference(),
+            "record": lambda value: self._commands.record(value is True),
+            "stop": lambda _: self._commands.stop(),
         }
         if session is not None:
-            self._commands["undo"] = lambda _: session.undo()
+            self._by_name["undo"] = lambda _: session.undo()
 
     # -- from other threads -------------------------------------------------------------------------------
 
@@ -225,7 +225,7 @@ class Hub:
 
     def end(self) -> None:
         """The run is over: tell every page how it ended and let it go."""
-        snapshot = self._run.snapshot()
+        snapshot = self._commands.snapshot()
         self._end = str(snapshot.get("end", "eos"))
         for page in self.pages:
             page.post("stats", _text(type="stats", sensor=self.sensor, screen_ms=None, run=snapshot))
@@ -243,7 +243,7 @@ class Hub:
         listeners = [page for page in self.pages if not page.stuck]
         if not listeners:
             return
-        snapshot = self._run.snapshot()
+        snapshot = self._commands.snapshot()
         state = self.state()
         for page in listeners:
             delays = sorted(page.screen_s)
@@ -256,7 +256,7 @@ class Hub:
         """The message that says what the run is doing, and which buttons work (null) or why not."""
         control = self.control
         source = None if control is None else control.source
-        now = self._run.state()
+        now = self._commands.state()
         paused, condition = now["paused"], now["source"]
         return _text(
             type="state",
@@ -271,7 +271,7 @@ class Hub:
                 "total": None if source is None else source.total,
                 "state": "paused" if paused and condition == "running" else condition,
             },
-            refused={name: self._refusal(name) for name in self._commands},
+            refused={name: self._refusal(name) for name in self._by_name},
         )
 
     # -- inside the loop ----------------------------------------------------------------------------------
@@ -358,13 +358,13 @@ class Hub:
     async def _command(self, page: Page, message: Mapping[str, Any]) -> None:
         name = message.get("do")
         try:
-            if not isinstance(name, str) or name not in self._commands:
+            if not isinstance(name, str) or name not in self._by_name:
                 raise RefusedError(f"there is no command {name!r}")
             refusal = self._refusal(name)
             if refusal is not None:
                 raise RefusedError(refusal)
             # Starting or ending a recording may touch the disk; the other commands return at once.
-            await asyncio.to_thread(self._commands[name], message.get("value"))
+            await asyncio.to_thread(self._by_name[name], message.get("value"))
         except Exception as error:
             if not isinstance(error, RefusedError):
                 log.warning("view: %s failed: %s: %s", name, type(error).__name__, error)
@@ -373,11 +373,11 @@ class Hub:
 
     def _refusal(self, name: str) -> str | None:
         """Why a command is not possible now, or None."""
-        return "the run has ended" if self._end is not None else self._run.refusal(name)
+        return "the run has ended" if self._end is not None else self._commands.refusal(name)
 
     def _step(self) -> None:
         self.owed = True
-        self._run.step()
+        self._commands.step()
 
 
 def _text(**fields: Any) -> str:

@@ -1,0 +1,25 @@
+"""Files that a command writes at its end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tactflow.engine.errors import ConfigError
+
+
+def refuse_output(option: str, path: Path, *, overwrite: bool) -> None:
+    """Find out before the work, not after it, that a file cannot be written.
+
+    option : that names the file.
+
+    Raises
+    ------
+    ConfigError : there is no folder for it, it is a folder, or it is there already and not to be overwritten.
+    """
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise ConfigError(f"{option}: there is no folder {folder}")
+    if path.is_dir():
+        raise ConfigError(f"{option}: {path} is a folder; required a file")
+    if path.exists() and not overwrite:
+        raise ConfigError(f"{option}: {path} is already there; give --overwrite to replace it")
