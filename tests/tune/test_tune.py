@@ -185,6 +185,7 @@ def test_no_line_of_a_recordings_name_becomes_part_of_the_pipeline(
         (["--source", "nowhere.avi"], 4, "no such file"),
         (["--source", "still", "--budget", "soon"], 2, "required a time such as 90s"),
         (["--source", "still", "--max-error", "-1"], 2, "required a number above 0"),
+        (["--source", "still", "--seed", "-1"], 2, "--seed: required a whole number from 0"),
         (["--source", "still", "--out", "tuned.txt"], 2, "ends in .yaml"),
         (["--source", "still", "--out", "there.yaml"], 2, "already there"),
     ],

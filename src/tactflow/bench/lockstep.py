@@ -176,7 +176,8 @@ class LockstepPipeline:
     def _keep(self, cpu: float, wall: float) -> None:
         collect: Any = self._runner.nodes[_COLLECT].instance
         source: Any = self._runner.source
-        self._outcomes.append(Outcome(source.last_frame, *collect.last, cpu=cpu, wall=wall))
+        found = collect.last._asdict()
+        self._outcomes.append(Outcome(frame=source.last_frame, **found, cpu=cpu, wall=wall))
 
     def block(self, frames: int) -> list[Outcome]:
         """Run the next frames without a pause between them.

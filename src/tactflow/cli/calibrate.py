@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -20,6 +21,7 @@ from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_f
 from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.cli.notes import notes_on, say
+from tactflow.cli.options import positive
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
@@ -31,6 +33,9 @@ WORSE: Final = 1.5
 LOOSE: Final = 0.02
 """Relative error of a scale by pitch from which on it is told how to get a better one. Chosen by hand: grids
 of the simulator have less than 0.01, the rings of a TacTip 0.1 to 0.15."""
+SHORTEST: Final = 1e-3
+LONGEST: Final = 1e4
+"""Lengths that are taken, mm. Chosen by hand: gels and balls have 1 to 100."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,20 +69,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
     parser.add_argument(
         "--pitch",
-        type=float,
+        type=_millimetres,
         metavar="MM",
         help="distance of neighbouring dots of the gel, which stand in a square grid, or of the target",
     )
     parser.add_argument(
         "--area",
-        type=float,
+        type=_millimetres,
         nargs=2,
         metavar=("WIDTH", "HEIGHT"),
         help="what the whole processed picture shows, mm, where the gel has no dots of known pitch",
     )
-    parser.add_argument("--ball-radius", type=float, metavar="MM", help="of the ball; without it, scale only")
     parser.add_argument(
-        "--presses", type=int, default=30, metavar="N", help="of a live source: enough presses (30)"
+        "--ball-radius", type=_millimetres, metavar="MM", help="of the ball; without it, scale only"
+    )
+    parser.add_argument(
+        "--presses", type=positive, default=30, metavar="N", help="of a live source: enough presses (30)"
     )
     parser.add_argument(
         "--view", action="store_true", help="show the live page, which says where to press next"
@@ -268,6 +275,18 @@ def _scale_words(scale: Scale) -> str:
     return (
         f"{scale.x:.5f} +- {scale.stderr[0]:.5f} mm per px in x, {scale.y:.5f} +- {scale.stderr[1]:.5f} in y"
     )
+
+
+def _millimetres(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not SHORTEST <= value <= LONGEST:
+        raise argparse.ArgumentTypeError(
+            f"required millimetres from {SHORTEST:g} to {LONGEST:g}, got {text!r}"
+        )
+    return value
 
 
 def _photometric_words(errors: dict[str, float]) -> str:

@@ -7,6 +7,7 @@ import math
 import tempfile
 import time
 from pathlib import Path
+from typing import Final
 
 import orjson
 
@@ -17,6 +18,9 @@ from tactflow.cli.printable import printable
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.files import completed
+
+LARGEST_SEED: Final = 1_000_000
+"""The simulator takes seeds up to 2**31 - 1, and a search some hundreds from the given one on."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--budget", type=seconds, default=120.0, metavar="TIME", help="as 90s, 2min (default)"
     )
     parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="the same errors again; not the times"
+        "--seed", type=_seed, default=0, metavar="N", help="the same errors again; not the times"
     )
     parser.add_argument("--sensor", metavar="NAME", help="which one of several in the pipeline file")
     parser.add_argument(
@@ -117,6 +121,13 @@ def _write(path: Path, text: str) -> None:
             unfinished.write_text(text, encoding="utf-8")
     except OSError as error:
         raise StageError(f"{path}: {error.strerror or error}") from error
+
+
+def _seed(text: str) -> int:
+    value = int(text) if text.isdecimal() else -1
+    if not 0 <= value <= LARGEST_SEED:
+        raise argparse.ArgumentTypeError(f"required a whole number from 0 to {LARGEST_SEED}, got {text!r}")
+    return value
 
 
 def _positive(text: str) -> float:
