@@ -226,3 +226,9 @@ def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path
     path.write_text("[" * 5000)
     with pytest.raises(ConfigError, match="make it anew"):
         Calibration.load(path)
+    path.write_text("left: 3")
+    with pytest.raises(ConfigError, match=r"format: Field required; make it anew"):
+        Calibration.load(path)
+    path.write_text("precious")
+    with pytest.raises(ConfigError, match=r"left\.yaml: is no calibration file; make it anew"):
+        Calibration.load(path)

@@ -238,3 +238,8 @@ def test_repair_refuses_what_is_no_recording(
     assert main(["repair", str(path)]) == 4
     assert words in capsys.readouterr().err
     assert len(list(tmp_path.iterdir())) == (content is not None)
+
+
+def test_repair_of_no_name_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["repair", ""]) == 4
+    assert "no such file" in capsys.readouterr().err

@@ -235,8 +235,9 @@ class Calibration:
             raise ConfigError(f"calibration {path}: {error.filename}: {error.strerror}") from None
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(map(str, first["loc"])) or "the file"
-            raise ConfigError(f"calibration {path}: {where}: {first['msg']}; {_REMEDY}") from None
+            where = ".".join(map(str, first["loc"]))
+            told = f"{where}: {first['msg']}" if where else "is no calibration file"
+            raise ConfigError(f"calibration {path}: {told}; {_REMEDY}") from None
         except Exception as error:
             # What YAML, ZIP and numpy raise about damaged data is many things.
             raise ConfigError(f"calibration {path}: cannot be read: {error}; {_REMEDY}") from None

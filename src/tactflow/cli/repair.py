@@ -46,9 +46,9 @@ def run(args: argparse.Namespace) -> int:
     if problem is not None:
         raise ConfigError(problem)
     path: Path = args.file
-    out: Path = args.out or path.with_name(f"{path.stem}-repaired{path.suffix}")
     if not path.is_file():
         raise SourceError(f"{path}: no such file")
+    out: Path = args.out or path.with_name(f"{path.stem}-repaired{path.suffix}")
     if out.is_dir():
         raise ConfigError(f"--out: {out} is a folder; name a file in it, as in {out / path.name}")
     if out.exists() and out.samefile(path):
