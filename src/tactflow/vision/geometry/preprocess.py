@@ -86,7 +86,7 @@ class Preprocessor:
         matrix = rotation(rotate, size) @ matrix
         if rotate in (90, 270):
             size = (size[1], size[0])
-        self._levels = downsample.bit_length() - 1
+        self._levels = int(downsample).bit_length() - 1
         before_pyramid = PixelMapping(raw, size, matrix, lens)
         for _ in range(self._levels):
             matrix, size = _half(matrix, size, method)
