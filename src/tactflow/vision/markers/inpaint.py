@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import cv2
 import numpy as np
@@ -70,7 +70,7 @@ def remove_markers(
 
     Raises
     ------
-    ValueError : image and mask do not fit together, or the radius is not positive.
+    ValueError : image and mask do not fit together, there is no such method, or the radius is not positive.
 
     References
     ----------
@@ -95,6 +95,8 @@ def remove_markers(
         raise ValueError(
             f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
         )
+    if method not in get_args(InpaintMethod):
+        raise ValueError(f"method: required one of {get_args(InpaintMethod)}, got {method!r}")
     if not (radius > 0 and math.isfinite(radius)):
         raise ValueError(f"radius: required > 0 px, got {radius}")
     if method == "normalized":
