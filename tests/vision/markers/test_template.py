@@ -148,3 +148,11 @@ def test_templates_of_whole_numbers_find_marks_as_templates_of_float64_do(
     # Measured: 6e-6 px, 2e-6 for gain, 4e-6 for r_squared, 1.2e-5 px for standard errors.
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=2e-5)
+
+
+def test_marks_too_large_for_the_sums_of_a_patch_are_refused() -> None:
+    """Of black and white pixels, the sum of squares of a larger patch is beyond 32 bits."""
+    gel, middle = np.full((60, 60), 128, np.float32), np.array([[30.0, 30.0]])
+    with pytest.raises(ValueError, match="required marks of a radius up to 131 px, got 132"):
+        MarkerTemplates(gel, middle, 132.0)
+    assert len(MarkerTemplates(gel, middle, 131.0).align(gel.astype(np.uint8), middle).position) == 1

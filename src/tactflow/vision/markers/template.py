@@ -42,6 +42,10 @@ RIDGE: Final = 1e-6
 """Ridge of the normal equations, relative to their trace: keeps marks without contrast solvable. Such marks
 are never trusted. Chosen by hand."""
 
+LARGEST_RADIUS: Final = 131.0
+"""Largest radius of a mark, px: the sum of the squares of its patch, fewer than 2**17 of at most 2**14, fits
+in 32 bits. Derived."""
+
 ONE_TEMPLATE: Final = 1.5
 """Ratio of radii of marks whose templates have one size, at most. Chosen by hand."""
 
@@ -102,6 +106,10 @@ class MarkerTemplates:
     radius : of a mark, px.
     dark : whether marks are darker than the gel.
 
+    Raises
+    ------
+    ValueError : a radius above `LARGEST_RADIUS`.
+
     References
     ----------
     Lucas and Kanade (1981); Hager and Belhumeur, "Efficient region tracking with parametric models of
@@ -119,6 +127,8 @@ class MarkerTemplates:
     """
 
     def __init__(self, reference: Float32Array, origin: FloatArray, radius: float, dark: bool = True) -> None:
+        if radius > LARGEST_RADIUS:
+            raise ValueError(f"required marks of a radius up to {LARGEST_RADIUS:g} px, got {radius:g}")
         extent = PATCH_SCALE * radius + PATCH_MARGIN
         reach = int(np.ceil(extent))
         axis = np.arange(-reach, reach + 1)
