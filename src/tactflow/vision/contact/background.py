@@ -49,7 +49,7 @@ by hand, near the part at which `contact_outline` takes a change for the contact
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
-"""What a comparison gives that found no change: nothing."""
+"""What `weigh_change` takes where nothing was in contact in the previous frame."""
 
 
 class Change(NamedTuple):
