@@ -28,7 +28,7 @@ from tactflow.vision.flow.loops import (
     sum_region,
     weigh_markers,
 )
-from tactflow.vision.markers.family import pitch_of
+from tactflow.vision.markers.lattice import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]

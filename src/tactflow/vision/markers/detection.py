@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.markers import family
-from tactflow.vision.markers.family import LONGEST_LINK, Family, Sign
-from tactflow.vision.markers.lattice import nearest, neighbour_graph
+from tactflow.vision.markers.family import Family, Sign
+from tactflow.vision.markers.lattice import LONGEST_LINK, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
@@ -316,7 +316,7 @@ def _detection(gray: NDArray[np.float32], best: Family, marks: Spots, others: li
         centers[radii == size] = refine_centers(dark, centers[radii == size], size)
     order = _reading_order(centers, radius)
     centers, radii = centers[order], radii[order]
-    pitch = family.pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
+    pitch = pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
     edges = neighbour_graph(centers, LONGEST_LINK * pitch)
     rival = next((_candidate(other) for other in others if not _same(other, centers, radii)), None)
     sizes = radii if (radii != radius).any() else None
