@@ -153,7 +153,7 @@ class MarkerTemplates:
         self._weights = weights.reshape(PHASES * PHASES * count, 5, length)
         self._terms = terms.reshape(PHASES * PHASES * count, 16)
         self._reach = reach
-        self._real = np.array([radius, CONVERGED, SAMPLING_ERROR])
+        self._radius = float(radius)
 
     def align(self, image: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None) -> Alignment:
         """Find marks from starting points that are right to about a radius.
@@ -172,7 +172,7 @@ class MarkerTemplates:
             self._terms,
             self._disc,
             self._reach,
-            self._real,
+            self._radius,
             position,
             found,
         )
@@ -405,7 +405,7 @@ def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int)
 
 @kernel(
     "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int16[:, :, ::1],"
-    "float32[:, ::1], int64[:, ::1], int64, float64[::1], float64[:, ::1], float32[:, ::1])",
+    "float32[:, ::1], int64[:, ::1], int64, float64, float64[:, ::1], float32[:, ::1])",
     reorder=True,
 )
 def align_marks(
@@ -416,7 +416,7 @@ def align_marks(
     terms: Float32Array,
     disc: IntArray,
     reach: int,
-    real: FloatArray,
+    radius: float,
     position: FloatArray,
     found: Float32Array,
 ) -> None:
@@ -425,11 +425,10 @@ def align_marks(
     image : (H, W, 3) BGR or (H, W, 1) grey. start : (n, 2). marks : (n,), of those in `weights`.
     weights : (PHASES^2 N, 5, P), of `whole_numbers`. terms : (PHASES^2 N, 16), 9 of the Gram matrix, variance
     per pixel, 5 units of weights. disc : (2, p) dx and dy of the pixels, p <= P; other weights are zero.
-    reach : of a patch, px. real : radius, px, length of a step that calls for another, px, and the sampling
-    error, px.
+    reach : of a patch, px. radius : of a mark, px; no step is longer along an axis.
     """
     height, width, channels = image.shape
-    radius, converged, sampling = np.float32(real[0]), real[1] * real[1], np.float32(real[2] * real[2])
+    longest = np.float32(radius)
     count, flat = weights.shape[0] // (PHASES * PHASES), image.reshape(-1)
     offsets = np.empty(disc.shape[1], np.int64)
     for p in range(len(offsets)):
@@ -457,12 +456,14 @@ def align_marks(
             fitted = fit_template(weights[which], terms[which], patch, len(offsets))
             gain, shift_x, shift_y, r_squared, rest = fitted
             safe = max(gain, LEAST_DIVISOR)
-            now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -radius), radius)
-            now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -radius), radius)
-            far = (now_x - x) * (now_x - x) + (now_y - y) * (now_y - y) > converged
+            now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
+            now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
+            far = (now_x - x) * (now_x - x) + (now_y - y) * (now_y - y) > CONVERGED * CONVERGED
             x, y = now_x, now_y
             if number == ROUNDS or not (far and r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
                 break
         position[n, 0], position[n, 1] = x, y
         found[0, n], found[1, n] = gain, r_squared
-        found[2, n] = np.sqrt(rest * terms[which, 9] / (safe * safe) + sampling)
+        found[2, n] = np.sqrt(
+            rest * terms[which, 9] / (safe * safe) + np.float32(SAMPLING_ERROR * SAMPLING_ERROR)
+        )
