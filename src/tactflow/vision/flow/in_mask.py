@@ -99,8 +99,7 @@ def flow_of_field(
     >>> [round(value, 1) for value in flow.mean], flow.count
     ([1.5, -0.5], 1)
     """
-    found = inside_mask(markers.position, mask, dilate)
-    count = int(np.count_nonzero(found & (markers.status != _LOST)))
+    count = len(_inside(markers, mask, dilate))
     box = region.box if region is not None and region.mask is mask else None
     motion = field.motion(mask, box) if count else None
     if motion is None or motion.unknown > UNKNOWN:
