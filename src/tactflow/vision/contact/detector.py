@@ -11,8 +11,8 @@ alarms, and then *where*, by a rule that does not depend on the noise:
    fainter change of colour is contact if it is wide, which neither noise nor compressed blocks are.
 5. Contact ends at the noise, or at a part of the strongest recent change, since a released gel creeps back;
    but not while it fades faster than by creeping: then it is still being unloaded.
-6. Each connected change around such a place is examined again at half resolution, where `contact_outline`
-   finds its border.
+6. Each connected change around such a place is examined again at half resolution, or pixel by pixel if it is
+   small, where `contact_outline` finds its border.
 
 References
 ----------
