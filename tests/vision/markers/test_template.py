@@ -150,9 +150,14 @@ def test_templates_of_whole_numbers_find_marks_as_templates_of_float64_do(
         np.testing.assert_allclose(one, other, rtol=0, atol=2e-5)
 
 
-def test_marks_too_large_for_the_sums_of_a_patch_are_refused() -> None:
-    """Of black and white pixels, the sum of squares of a larger patch is beyond 32 bits."""
-    gel, middle = np.full((60, 60), 128, np.float32), np.array([[30.0, 30.0]])
-    with pytest.raises(ValueError, match="required marks of a radius up to 131 px, got 132"):
-        MarkerTemplates(gel, middle, 132.0)
-    assert len(MarkerTemplates(gel, middle, 131.0).align(gel.astype(np.uint8), middle).position) == 1
+def test_the_largest_marks_are_told_from_a_picture_without_them() -> None:
+    """The sum of the squares of such a patch takes more than 32 bits."""
+    radius, middle = 140.0, np.array([[260.0, 260.0]])
+    y, x = np.mgrid[:520, :520] - 260
+    mark = (5 + 245 * np.clip(np.hypot(x, y) - radius + 0.5, 0, 1)).astype(np.uint8)
+    under_test = MarkerTemplates(mark.astype(np.float32), middle, radius)
+    stripes = np.where((x // 40 + y // 40) % 2, 5, 250).astype(np.uint8)
+    for image, least, most in ((mark, 0.999, 1.0), (stripes, 0.0, 0.2)):
+        found = under_test.align(image, middle)
+        assert least <= found.r_squared[0] <= most
+        check_alignment(under_test, image, middle)

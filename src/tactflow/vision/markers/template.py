@@ -42,10 +42,6 @@ RIDGE: Final = 1e-6
 """Ridge of the normal equations, relative to their trace: keeps marks without contrast solvable. Such marks
 are never trusted. Chosen by hand."""
 
-LARGEST_RADIUS: Final = 131.0
-"""Largest radius of a mark, px: the sum of the squares of its patch, fewer than 2**17 of at most 2**14, fits
-in 32 bits. Derived."""
-
 ONE_TEMPLATE: Final = 1.5
 """Ratio of radii of marks whose templates have one size, at most. Chosen by hand."""
 
@@ -57,6 +53,9 @@ LARGEST_LEVEL: Final = 2**15 - 2
 
 LARGEST_SUM: Final = 2**23
 """Largest sum of the sizes of such weights: times grey levels less 128 it fits in 32 bits. Derived: 2**30."""
+
+LARGEST_BLOCK: Final = 2**16
+"""Pixels whose squares, less than 2**15 each, have a sum that fits in 32 bits. Derived."""
 
 CACHE_LINE: Final = 32
 """Whole numbers of 16 bits that memory gives at a time, on most processors."""
@@ -106,10 +105,6 @@ class MarkerTemplates:
     radius : of a mark, px.
     dark : whether marks are darker than the gel.
 
-    Raises
-    ------
-    ValueError : a radius above `LARGEST_RADIUS`.
-
     References
     ----------
     Lucas and Kanade (1981); Hager and Belhumeur, "Efficient region tracking with parametric models of
@@ -127,8 +122,6 @@ class MarkerTemplates:
     """
 
     def __init__(self, reference: Float32Array, origin: FloatArray, radius: float, dark: bool = True) -> None:
-        if radius > LARGEST_RADIUS:
-            raise ValueError(f"required marks of a radius up to {LARGEST_RADIUS:g} px, got {radius:g}")
         extent = PATCH_SCALE * radius + PATCH_MARGIN
         reach = int(np.ceil(extent))
         axis = np.arange(-reach, reach + 1)
@@ -378,9 +371,27 @@ def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Levels) -> N
 
 
 @helper
-def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int) -> Any:
-    """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained."""
-    first = second = third = fourth = fifth = total = squares = np.int32(0)
+def variation(patch: Levels, pixels: int) -> float:
+    """Sum of squares of a patch about its mean; what follows its `pixels` is 0."""
+    total = squares = np.int64(0)
+    for start in range(0, len(patch), LARGEST_BLOCK):
+        block = patch[start : start + LARGEST_BLOCK]
+        sum_of_block = squares_of_block = np.int32(0)
+        for p in range(len(block)):
+            value = np.int32(block[p])
+            sum_of_block = np.int32(sum_of_block + value)
+            squares_of_block = np.int32(squares_of_block + value * value)
+        total, squares = total + sum_of_block, squares + squares_of_block
+    return squares - float(total) * total / pixels
+
+
+@helper
+def fit_template(weight: Levels, term: Float32Array, patch: Levels, varies: float) -> Any:
+    """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained.
+
+    varies : the patch's `variation`.
+    """
+    first = second = third = fourth = fifth = np.int32(0)
     # Whole numbers below 2**31, exact in whatever order.
     for p in range(len(patch)):
         value = np.int32(patch[p])
@@ -389,14 +400,12 @@ def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int)
         third = np.int32(third + weight[2, p] * value)
         fourth = np.int32(fourth + weight[3, p] * value)
         fifth = np.int32(fifth + weight[4, p] * value)
-        total = np.int32(total + value)
-        squares = np.int32(squares + value * value)
     gain, shift_x, shift_y = term[10] * first, term[11] * second, term[12] * third
     explained = gain * (term[0] * gain + term[1] * shift_x + term[2] * shift_y)
     explained += shift_x * (term[3] * gain + term[4] * shift_x + term[5] * shift_y)
     explained += shift_y * (term[6] * gain + term[7] * shift_x + term[8] * shift_y)
     slope_x, slope_y = term[13] * fourth, term[14] * fifth
-    contrast = squares - float(total) * total / pixels - slope_x * slope_x - slope_y * slope_y
+    contrast = varies - slope_x * slope_x - slope_y * slope_y
     gain, shift_x, shift_y = np.float32(gain), np.float32(shift_x), np.float32(shift_y)
     explained, contrast = np.float32(explained), np.float32(contrast)
     rest = max(contrast - explained, LEAST_RESIDUAL)
@@ -443,7 +452,7 @@ def align_marks(
             ask_for_template(weights, terms, which)
             ask_for_patch(flat, image.shape, phase_x // PHASES, phase_y // PHASES, reach)
         x, y = start[n, 0], start[n, 1]
-        seen_left = seen_top = -1
+        seen_left, seen_top, varies = -1, -1, 0.0
         for number in range(ROUNDS + 1):
             phase_x, phase_y = nearest_phase(x, y, width, height)
             left, top = phase_x // PHASES, phase_y // PHASES
@@ -453,7 +462,8 @@ def align_marks(
                 seen_left, seen_top = left, top
                 read_patch(flat, image.shape, left, top, reach, disc, offsets, words)
                 to_centred_gray(words, channels, patch)
-            fitted = fit_template(weights[which], terms[which], patch, len(offsets))
+                varies = variation(patch, len(offsets))
+            fitted = fit_template(weights[which], terms[which], patch, varies)
             gain, shift_x, shift_y, r_squared, rest = fitted
             safe = max(gain, LEAST_DIVISOR)
             now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
