@@ -75,7 +75,8 @@ class Region(NamedTuple):
 
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
-    return Region(filled, *_outlines(filled, Hidden(filled, np.zeros(filled.shape, np.uint8))))
+    nothing = np.zeros(filled.shape, np.uint8)
+    return Region(filled, *_outlines(filled, Hidden(nothing, nothing)))
 
 
 def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:

@@ -132,7 +132,7 @@ class Preprocessor:
         return np.ascontiguousarray(block)
 
     def _turn(self, block: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture turned, one that was shrunk for a turn by 90 degrees from upside down."""
+        """The picture turned; for a turn by 90 degrees, one that was shrunk comes upside down."""
         height, width = block.shape[:2]
         if self._rotate == 180:
             return cv2.rotate(block, cv2.ROTATE_180)  # type: ignore[return-value]
