@@ -87,6 +87,19 @@ def remove_markers(
     >>> bool((remove_markers(gel, mask) == 120).all())
     True
     """
+    _check(image, mask, method, radius)
+    if method == "normalized":
+        return _normalized(image, mask, radius)
+    if method == "none" or not mask.any():
+        return image.copy()
+    flag = cv2.INPAINT_TELEA if method == "telea" else cv2.INPAINT_NS
+    return np.asarray(
+        cv2.inpaint(np.ascontiguousarray(image), np.ascontiguousarray(mask), radius, flag), np.uint8
+    )
+
+
+def _check(image: Bytes, mask: Bytes, method: str, radius: float) -> None:
+    """Raise what `remove_markers` raises."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise ValueError(
             f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
@@ -99,14 +112,6 @@ def remove_markers(
         raise ValueError(f"method: required one of {get_args(InpaintMethod)}, got {method!r}")
     if not (radius > 0 and math.isfinite(radius)):
         raise ValueError(f"radius: required > 0 px, got {radius}")
-    if method == "normalized":
-        return _normalized(image, mask, radius)
-    if method == "none" or not mask.any():
-        return image.copy()
-    flag = cv2.INPAINT_TELEA if method == "telea" else cv2.INPAINT_NS
-    return np.asarray(
-        cv2.inpaint(np.ascontiguousarray(image), np.ascontiguousarray(mask), radius, flag), np.uint8
-    )
 
 
 def _normalized(image: Bytes, mask: Bytes, radius: float) -> Bytes:
