@@ -19,6 +19,7 @@ Sums = NDArray[np.uint16]
 Places = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
+_METHODS: Final = get_args(InpaintMethod)
 
 RADIUS: Final = 7.0
 """Neighbourhood from which a marker is filled unless said otherwise, px: that of the original script."""
@@ -108,8 +109,8 @@ def _check(image: Bytes, mask: Bytes, method: str, radius: float) -> None:
         raise ValueError(
             f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
         )
-    if method not in get_args(InpaintMethod):
-        raise ValueError(f"method: required one of {get_args(InpaintMethod)}, got {method!r}")
+    if method not in _METHODS:
+        raise ValueError(f"method: required one of {_METHODS}, got {method!r}")
     if not (radius > 0 and math.isfinite(radius)):
         raise ValueError(f"radius: required > 0 px, got {radius}")
 
