@@ -7,10 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.markers.template import (
+    CONVERGED,
     LEAST_DIVISOR,
     LEAST_RESIDUAL,
     PHASES,
     ROUNDS,
+    SAMPLING_ERROR,
     STEP_GAIN,
     STEP_R_SQUARED,
     align_marks,
@@ -30,19 +32,19 @@ def plain_align_marks(
     terms: Float32Array,
     disc: IntArray,
     reach: int,
-    real: FloatArray,
+    radius: float,
     position: FloatArray,
     found: Float32Array,
 ) -> None:
     """Steps of all marks together, as products of matrices; those that are done take part no longer."""
     gray = image[:, :, 0] if image.shape[2] == 1 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     del reach
-    models = (weights, terms, disc, real)
+    models = (weights, terms, disc, radius)
     position[:], found[:] = _step(gray, start, marks, *models)
     active = np.arange(len(marks))
     start = start.copy()
     for _ in range(ROUNDS):
-        far = ((position[active] - start[active]) ** 2).sum(axis=1) > real[1] ** 2
+        far = ((position[active] - start[active]) ** 2).sum(axis=1) > CONVERGED**2
         active = active[far & (found[1, active] > STEP_R_SQUARED) & (found[0, active] > STEP_GAIN)]
         start[active] = position[active]
         position[active], found[:, active] = _step(gray, start[active], marks[active], *models)
@@ -55,10 +57,10 @@ def _step(
     weights: NDArray[np.int16],
     terms: Float32Array,
     disc: IntArray,
-    real: FloatArray,
+    radius: float,
 ) -> tuple[FloatArray, Float32Array]:
     """One least-squares step from the phase nearest to the starting points."""
-    phases, radius = PHASES, np.float32(real[0])
+    phases, longest = PHASES, np.float32(radius)
     count, pixels = len(weights) // phases**2, disc.shape[1]
     limits = np.array([gray.shape[1] - 1, gray.shape[0] - 1])
     phase = (np.clip(start, 0, limits) * phases + phases / 2).astype(np.int64)
@@ -71,10 +73,10 @@ def _step(
     theta, slope = sums[:, :3], sums[:, 3:]
     explained = np.vecdot(np.matmul(term[:, :9].reshape(-1, 3, 3), theta[:, :, None])[:, :, 0], theta)
     safe = np.maximum(theta[:, 0], LEAST_DIVISOR)
-    step = np.clip(theta[:, 1:] / safe[:, None], -radius, radius)
+    step = np.clip(theta[:, 1:] / safe[:, None], -longest, longest)
     contrast = np.vecdot(patch, patch) - patch.sum(axis=1) ** 2 / pixels - np.vecdot(slope, slope)
     rest = np.maximum(contrast - explained, LEAST_RESIDUAL)
-    stderr = np.sqrt(rest * term[:, 9] / (safe * safe) + np.float32(real[2] ** 2))
+    stderr = np.sqrt(rest * term[:, 9] / (safe * safe) + np.float32(SAMPLING_ERROR**2))
     found = np.stack([theta[:, 0], explained / (explained + rest), stderr]).astype(np.float32)
     return (phase + 0.5) / phases - 0.5 + step, found
 

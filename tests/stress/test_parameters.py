@@ -22,7 +22,7 @@ from tactflow.vision.contact import ContactDetector, chi_square_threshold
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
-from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry, contact_parts
 from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, find_dot
@@ -111,10 +111,10 @@ def test_a_function_refuses_what_is_no_number_and_says_what_it_required(name: st
 
 
 def test_any_gap_may_be_bridged_but_not_an_unknown_one() -> None:
-    assert contact_geometry(MASK, max_gap=math.inf) is not None
+    assert len(contact_parts(MASK, max_gap=math.inf)) == 1
     for gap in (math.nan, -1.0, -math.inf):
         with pytest.raises(ValueError, match="required max_gap"):
-            contact_geometry(MASK, max_gap=gap)
+            contact_parts(MASK, max_gap=gap)
 
 
 # -- pipeline files ---------------------------------------------------------------------------------------

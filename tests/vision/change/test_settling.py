@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.change.settling import CALM, Settling, change_between, look_at
+from tactflow.vision.change.settling import CALM, Settling, change_between, look_at, unevenness
 
 Image = NDArray[np.uint8]
 
@@ -71,6 +71,15 @@ def test_a_finger_that_comes_early_is_not_taken_for_the_gel() -> None:
     assert settling.steady
     assert settling.best() == 0
     assert settling.alike() == list(range(6))
+
+
+def test_a_picture_without_noise_is_the_evenest() -> None:
+    gel = np.full((120, 160, 3), 100, np.uint8)
+    settling = settled([gel] * 6 + [picture(1, 0.3)] * 20)
+    assert unevenness(look_at(gel)) == 0
+    assert settling.steady
+    assert settling.touched
+    assert settling.best() == 0
 
 
 def test_two_states_that_are_as_even_are_said_to_be_undecided() -> None:

@@ -216,6 +216,16 @@ def test_where_no_marker_is_near_the_mean_is_not_known() -> None:
     assert field.motion(np.zeros((400, 300), np.uint8)) is None
 
 
+def test_a_contact_that_fills_the_picture_has_no_outline_that_could_err() -> None:
+    """Every cell lies inside: what rounding makes of 1 is at no border."""
+    everywhere = np.full((400, 300), 255, np.uint8)
+    motion = field_of(markers(-0.05 * (GRID - (150, 200)))).motion(everywhere)
+    assert motion is not None
+    assert motion.gradient is not None
+    assert motion.gradient.growth[0] == pytest.approx(-0.05, abs=0.005)
+    assert max(motion.outline_stderr) < 1e-3
+
+
 @pytest.mark.parametrize("origin", [np.zeros((2, 2)), np.zeros((5, 3)), np.zeros(6)])
 def test_too_few_markers_for_a_field_are_refused(origin: np.ndarray) -> None:
     with pytest.raises(ValueError, match=r"required an origin of shape \(N, 2\) with N >= 3"):

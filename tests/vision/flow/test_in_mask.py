@@ -220,6 +220,13 @@ def test_inside_is_the_same_as_looking_up_the_distance(
     np.testing.assert_array_equal(inside_mask(points, mask, dilate), expected)
 
 
+@pytest.mark.parametrize("dilate", [1e9, 1e19, 1e200])
+def test_a_reach_beyond_all_numbers_takes_in_every_point(dilate: float) -> None:
+    mask = np.zeros((160, 200), np.uint8)
+    mask[5:10, 5:10] = 255
+    assert inside_mask(np.array([[7.0, 7.0], [-1e6, 3e6]]), mask, dilate).all()
+
+
 def test_the_inputs_stay_as_they_are() -> None:
     given = moved(2.0)
     mask = EVERYWHERE.copy()

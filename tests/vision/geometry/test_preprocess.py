@@ -314,6 +314,14 @@ def test_the_identity_leaves_points_where_they_are() -> None:
     assert mapping.size == mapping.raw_size == (30, 20)
 
 
+def test_numbers_may_be_those_of_numpy() -> None:
+    plain = Preprocessor((40, 30), rotate=90, downsample=2, crop=(4, 0, 20, 10)).mapping
+    rotate, factor, *crop = np.array([90, 2, 4, 0, 20, 10])
+    mapping = Preprocessor((40, 30), rotate=rotate, downsample=factor, crop=tuple(crop)).mapping
+    assert mapping.size == plain.size
+    np.testing.assert_array_equal(mapping.matrix, plain.matrix)
+
+
 LINE = [[0, 0], [10, 10], [20, 20], [0, 30]]
 SQUARE = [[0, 0], [30, 0], [0, 30], [30, 30]]
 

@@ -122,6 +122,8 @@ def test_misfits_are_refused_with_what_came() -> None:
         remove_markers(np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint8))
     with pytest.raises(ValueError, match="radius: required > 0"):
         remove_markers(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.uint8), radius=0)
+    with pytest.raises(ValueError, match="method: required one of"):
+        remove_markers(np.zeros((4, 5, 3), np.uint8), np.ones((4, 5), np.uint8), method="tela")  # type: ignore
 
 
 def test_any_mask_value_but_zero_means_a_marker() -> None:

@@ -148,3 +148,16 @@ def test_templates_of_whole_numbers_find_marks_as_templates_of_float64_do(
     # Measured: 6e-6 px, 2e-6 for gain, 4e-6 for r_squared, 1.2e-5 px for standard errors.
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=2e-5)
+
+
+def test_the_largest_marks_are_told_from_a_picture_without_them() -> None:
+    """The sum of the squares of such a patch takes more than 32 bits."""
+    radius, middle = 140.0, np.array([[260.0, 260.0]])
+    y, x = np.mgrid[:520, :520] - 260
+    mark = (5 + 245 * np.clip(np.hypot(x, y) - radius + 0.5, 0, 1)).astype(np.uint8)
+    under_test = MarkerTemplates(mark.astype(np.float32), middle, radius)
+    stripes = np.where((x // 40 + y // 40) % 2, 5, 250).astype(np.uint8)
+    for image, least, most in ((mark, 0.999, 1.0), (stripes, 0.0, 0.2)):
+        found = under_test.align(image, middle)
+        assert least <= found.r_squared[0] <= most
+        check_alignment(under_test, image, middle)

@@ -106,15 +106,15 @@ def unevenness(look: Look) -> float:
     channels; infinite if too little of the picture is seen.
     """
     basis = _polynomials(*look.light.shape[:2])
-    total = 0.0
+    residuals = []
     for channel in range(look.light.shape[2]):
         plane = cv2.medianBlur(np.ascontiguousarray(look.light[..., channel]), MEDIAN).ravel()
         seen = look.seen[..., channel].ravel()
         if np.count_nonzero(seen) < 2 * basis.shape[1]:
             continue
         fitted = basis @ np.linalg.lstsq(basis[seen], plane[seen], rcond=None)[0]
-        total += float(np.square(plane - fitted)[seen].mean())
-    return total or float("inf")
+        residuals.append(float(np.square(plane - fitted)[seen].mean()))
+    return sum(residuals) if residuals else float("inf")
 
 
 @lru_cache(maxsize=4)
@@ -239,13 +239,13 @@ class Settling:
 
     def _is_better(self, state: list[int], than: list[int]) -> bool:
         """Whether a later state is the untouched gel rather than the best one so far."""
-        ratio = self._unevenness(state) / self._unevenness(than)
+        here, there = self._unevenness(state), self._unevenness(than)
         calm = self._calm(than)
         passing = than is not self._states[0] and len(calm) < CALM / 2
         apart = np.abs(self._level(state)[0] - self._level(than)[0]).max()
         if passing or calm[0] != than[0] or apart > STEADY:
-            return ratio < (AS_EVEN if self._is_steady(state) else EVENER)
-        return ratio < MUCH_EVENER
+            return here < there * (AS_EVEN if self._is_steady(state) else EVENER)
+        return here < there * MUCH_EVENER
 
     def _unevenness(self, state: list[int]) -> float:
         calm = self._calm(state)

@@ -49,7 +49,7 @@ by hand, near the part at which `contact_outline` takes a change for the contact
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
-"""What a comparison gives that found no change: nothing."""
+"""What `weigh_change` takes where nothing was in contact in the previous frame."""
 
 
 class Change(NamedTuple):
@@ -139,8 +139,8 @@ class BackgroundModel:
         self._mean: Float = _smoothed(half)
         self._squares = np.zeros_like(self._mean)
         self._noise = _spatial_noise(halved(half))
-        self._counts = _counting(half, valid)
-        self._count = 1
+        self._gel = _gel_cells(half, valid)
+        self._frames = 1
         self._repeatability, self._tint, self._shift = repeatability, tint, shift
         self._known: _Derived | None = None
         self._untouched: dict[int, _Untouched] = {}
@@ -152,13 +152,13 @@ class BackgroundModel:
         smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
         change: Float = smooth - under_illumination(known.mean, coefficients)
-        count = self._count
+        count = self._frames
         self._squares = self._squares + change * change * np.float32(count / (count + 1))
         self._mean = self._mean + change / np.float32(count + 1)
         for side, picture in ((1, whole), (2, half)):
             mean = self._pictures[side]
             self._pictures[side] = mean + (_planes(picture) - mean) / np.float32(count + 1)
-        self._count += 1
+        self._frames += 1
         self._known = None
         self._untouched.clear()
 
@@ -241,17 +241,17 @@ class BackgroundModel:
     def _derived(self) -> _Derived:
         if self._known is not None:
             return self._known
-        mean, count = self._mean, self._count
+        mean, count = self._mean, self._frames
         noise = (PRIOR_FRAMES * self._noise**2 + self._squares) / (PRIOR_FRAMES + count - 1)
         steady = noise * (1 + 1 / count) + (self._shift / CELL * _steepness(mean)) ** 2
         variance = steady + (self._repeatability * mean) ** 2
-        illumination = IlluminationModel(mean, np.asarray(variance, np.float32), self._counts)
+        illumination = IlluminationModel(mean, np.asarray(variance, np.float32), self._gel)
         weight = 1 / np.sqrt(variance)
         # One factor for all channels, so that a change in proportion to the brightness is none of colour.
         factor = (variance / (steady + (self._tint * mean) ** 2)).min(axis=0)
         length = np.linalg.norm(mean * weight, axis=0) + np.float32(1e-6)
-        if self._counts is not None:
-            weight = weight * self._counts
+        if self._gel is not None:
+            weight = weight * self._gel
         self._known = _Derived(
             illumination=illumination,
             mean=np.ascontiguousarray(mean, np.float32),
@@ -279,8 +279,8 @@ class BackgroundModel:
         pattern = shift * together * scale
         square = (pattern * pattern).sum(axis=0)
         left_out = (1 - 1 / np.sqrt(1 + square)) / np.maximum(square, np.float32(1e-6))
-        if self._counts is not None:
-            scale = scale * self._counts.repeat(2, axis=0).repeat(2, axis=1)
+        if self._gel is not None:
+            scale = scale * self._gel.repeat(2, axis=0).repeat(2, axis=1)
         half = mean, scale, pattern * np.sqrt(left_out)
         whole = self._pictures[1], *(planes.repeat(2, axis=1).repeat(2, axis=2) for planes in half[1:])
         return {1: _Untouched(*map(_interleaved, whole)), 2: _Untouched(*map(_interleaved, half))}
@@ -327,15 +327,15 @@ def _halves(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uin
     return whole, halved(whole)
 
 
-def _counting(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
+def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
     """Cells (h, w) that show gel and have light; None where all do. half : the gel at half resolution."""
     if valid is None:
         return None
-    counts = lit_area(half)[::2, ::2]
+    gel = lit_area(half)[::2, ::2]
     if not valid.all():
         cells = halved(_halves(np.repeat(valid[:, :, None], 3, axis=2))[1])
-        counts = counts & (cells[:, :, 0] >= CELL_VALID)
-    return None if counts.all() else np.asarray(counts)
+        gel = gel & (cells[:, :, 0] >= CELL_VALID)
+    return None if gel.all() else np.asarray(gel)
 
 
 def _steepness(planes: Float) -> Float:

@@ -20,7 +20,7 @@ Byte = NDArray[np.uint8]
 Index = NDArray[np.int64]
 
 BLUR_SIGMA: Final = 0.8
-"""Standard deviation by which changes are smoothed, pixels at half resolution. Chosen by hand."""
+"""Standard deviation by which changes are smoothed, pixels of the window. Chosen by hand."""
 _AT_ONE: Final = math.exp(-1 / (2 * BLUR_SIGMA**2))
 MIDDLE: Final = np.float32(1 / (1 + 2 * _AT_ONE))
 BESIDE: Final = np.float32(_AT_ONE / (1 + 2 * _AT_ONE))

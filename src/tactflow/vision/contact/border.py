@@ -9,6 +9,8 @@ where the border lies on the whole is told by the profile of all of them togethe
 the border. An outline is divided into steps, several to an arc: a pixel outside gets the step that it lies
 beside (`_steps_beside`), a pixel inside that of the nearest pixel outside. So each step has a profile; those
 within an arc's length, together, tell how deep the border lies there (`_step_depths`).
+
+Lengths are in pixels of the contact's window, which has the frame's resolution or half of it.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ SHARP_SKIRT: Final = 0.11
 widths of the contact."""
 
 SKIRT_BLUR: Final = 0.9
-"""What smoothing adds to that distance, pixels at half resolution. Chosen by hand."""
+"""What smoothing adds to that distance, pixels of the window. Chosen by hand."""
 
 SOFTNESS: Final = 3.5
 """Where the distance is larger, the gel is coated or soft and the slope has no break: the peak of the profile
@@ -75,7 +77,7 @@ times as much that of a long contact may, in proportion to its arcs, since it ma
 the simulator, wedge_ball and mini_ball."""
 
 BIN: Final = 0.5
-"""Width of the profile's bins, pixels at half resolution. Chosen by hand."""
+"""Width of the profile's bins, pixels of the window. Chosen by hand."""
 
 MIN_BIN_PIXELS: Final = 8
 MIN_ARC_PIXELS: Final = 2
@@ -85,7 +87,7 @@ LEVELS: Final = (SKIRT, TOP, BORDER)
 """Fractions of its peak at which a profile is measured."""
 
 
-class Depth(NamedTuple):
+class RegionDepth(NamedTuple):
     """How deep inside a region each pixel is, and its outlines.
 
     depth : (h, w) float32, distance to what is outside, px; 0 there. nearest : (h, w) int32, label of the
@@ -101,7 +103,7 @@ class Depth(NamedTuple):
     outlines: Whole
 
 
-def depth_of(region: Region) -> Depth:
+def depth_of(region: Region) -> RegionDepth:
     """Of a region with something outside."""
     depth, nearest = cv2.distanceTransformWithLabels(
         region.filled, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
@@ -111,7 +113,7 @@ def depth_of(region: Region) -> Depth:
     for outline, length in zip(outlines, region.lengths, strict=True):
         arcs = min(max(round(length / max(middle, 1.0)), FEWEST_ARCS), MOST_ARCS)
         ends.append((ends[-1][0] + len(outline), ends[-1][1] + STEPS * arcs, length))
-    return Depth(
+    return RegionDepth(
         np.asarray(depth, np.float32),
         np.asarray(nearest, np.int32),
         middle,
@@ -120,8 +122,8 @@ def depth_of(region: Region) -> Depth:
     )
 
 
-def inside_border(inner: Depth, parts: Float, strength: Float, hidden: Mask | None) -> Float:
-    """Level set of a contact: how far inside its border each pixel is, pixels at half resolution.
+def inside_border(inner: RegionDepth, parts: Float, strength: Float, hidden: Mask | None) -> Float:
+    """Level set of a contact: how far inside its border each pixel is, pixels of the window.
 
     inner : of the changed region. parts : (h, w), its depth, but below 0 where it does not belong to the
     contact. strength : (h, w), relative to the largest nearby. hidden : (h, w), 1 where a marker was removed;
@@ -262,7 +264,7 @@ def border_level(
 ) -> None:
     """What `inside_border` finds; `level` is filled.
 
-    nearest, corners, outlines : of a `Depth`. hidden : not 0 where a pixel does not count.
+    nearest, corners, outlines : of a `RegionDepth`. hidden : not 0 where a pixel does not count.
     middle : the largest depth of the parts.
     """
     high, wide = parts.shape

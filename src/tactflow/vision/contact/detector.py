@@ -11,8 +11,8 @@ alarms, and then *where*, by a rule that does not depend on the noise:
    fainter change of colour is contact if it is wide, which neither noise nor compressed blocks are.
 5. Contact ends at the noise, or at a part of the strongest recent change, since a released gel creeps back;
    but not while it fades faster than by creeping: then it is still being unloaded.
-6. Each connected change around such a place is examined again at half resolution, where `contact_outline`
-   finds its border.
+6. Each connected change around such a place is examined again at half resolution, or pixel by pixel if it is
+   small, where `contact_outline` finds its border.
 
 References
 ----------
@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Literal
 
 import cv2
@@ -102,6 +103,7 @@ class ContactResult:
     strength: float = 0.0
 
 
+@lru_cache(maxsize=16)
 def chi_square_threshold(probability: float) -> float:
     """Value that a chi-square variable with three degrees of freedom exceeds with a probability in (0, 1).
 
@@ -214,7 +216,6 @@ class ContactDetector:
         self._last: NDArray[np.uint8] | None = None
         self._background: BackgroundModel | None = None
         self._before: NDArray[np.bool_] | None = None
-        self._limits: dict[int, float] = {}
         self._strongest = self._strongest_wide = 0.0
         self._evidence: Float | None = None
         self._suspected: NDArray[np.bool_] | None = None
@@ -357,9 +358,8 @@ class ContactDetector:
         return max(WIDE * cells, CLUSTER * math.log(cells / self._false_alarms))
 
     def _limit(self, cells: int) -> float:
-        if cells not in self._limits:
-            self._limits[cells] = chi_square_threshold(self._false_alarms / cells)
-        return self._limits[cells]
+        """Squared deviation that chance lets one of so many cells exceed in as many frames as is allowed."""
+        return chi_square_threshold(self._false_alarms / cells)
 
 
 def _check_mask(mask: NDArray[np.uint8] | None, image: NDArray[np.uint8]) -> None:

@@ -22,7 +22,7 @@ from tactflow.vision.compiled import helper, kernel
 Mask = NDArray[np.uint8]
 
 BAY: Final = 2.5
-"""A region with a bay that is deeper, px at half resolution, may be a ring with a gap. A gap that is
+"""A region with a bay that is deeper, pixels of the window, may be a ring with a gap. A gap that is
 narrower than the ring is thick, or than a marker, is closed. Chosen by hand."""
 
 POCKET: Final = 0.8
@@ -75,7 +75,8 @@ class Region(NamedTuple):
 
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
-    return Region(filled, *_outlines(filled, Hidden(filled, np.zeros(filled.shape, np.uint8))))
+    nothing = np.zeros(filled.shape, np.uint8)
+    return Region(filled, *_outlines(filled, Hidden(nothing, nothing)))
 
 
 def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:

@@ -86,7 +86,7 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
     if not region.moments.pixels:
         if not motion.clearly:
             return FusedContact(light, None)
-        return FusedContact(_region(test.stretched(markers), test.pitch, light), "dots")
+        return FusedContact(_hull_of(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
         mask = _without_strays(region, markers, motion, test.pitch)
         return FusedContact(mask, "both", region=region if mask is light else None)
@@ -187,7 +187,7 @@ def _without_rims(light: Mask, box: Box, markers: Markers) -> Mask:
     return left_over
 
 
-def _region(points: NDArray[np.float64], pitch: float, like: Mask) -> Mask:
+def _hull_of(points: NDArray[np.float64], pitch: float, like: Mask) -> Mask:
     """The convex hull of markers, a little wider, so that markers in a line have one, too."""
     region = np.zeros_like(like)
     hull = cv2.convexHull(np.rint(points).astype(np.int32))

@@ -54,7 +54,7 @@ class IlluminationModel:
     Parameters
     ----------
     reference, variance : (3, h, w) float32, mean (grey levels) and variance of the untouched gel's cells.
-    counts : (h, w) bool, cells that show gel and are fitted; None: all.
+    gel : (h, w) bool, cells that show gel and are fitted; None: all.
 
     References
     ----------
@@ -70,7 +70,7 @@ class IlluminationModel:
     True
     """
 
-    def __init__(self, reference: Float, variance: Float, counts: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, reference: Float, variance: Float, gel: NDArray[np.bool_] | None = None) -> None:
         height, width = reference.shape[1:]
         self._row_weights = _block_weights(max(1, height // BLOCK), height)
         self._column_weights = _block_weights(max(1, width // BLOCK), width)
@@ -79,7 +79,7 @@ class IlluminationModel:
         slopes = np.stack([relative * positions(width), relative * positions(height)[:, None]], axis=1)
         terms = np.concatenate([relative[:, None], slopes, np.ones_like(relative)[:, None]], axis=1)
         basis = np.stack([self._block_means(channel) for channel in terms])
-        self._fitted = self._fitted_blocks(counts)
+        self._fitted = self._fitted_blocks(gel)
         weight = 1 / self._block_means(variance)[:, None]
         if self._fitted is not None:
             weight = weight * self._fitted
@@ -118,11 +118,11 @@ class IlluminationModel:
         fit_robustly(excess, self._basis, self._step, self._shrink, limit, self._center, coefficients)
         return coefficients
 
-    def _fitted_blocks(self, counts: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-        """Blocks (n,) of which at least half counts; None for all, also where there is none of them."""
-        if counts is None:
+    def _fitted_blocks(self, gel: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        """Blocks (n,) of which at least half is gel; None for all, also where there is none of them."""
+        if gel is None:
             return None
-        fitted = self._block_means(counts[None].astype(np.float32))[0] >= np.float32(0.5)
+        fitted = self._block_means(gel[None].astype(np.float32))[0] >= np.float32(0.5)
         return fitted if fitted.any() else None
 
     def _block_means(self, planes: Float) -> Float:

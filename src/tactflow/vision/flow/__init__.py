@@ -1,4 +1,10 @@
-"""Flow of the gel and its markers: whether they move, how the gel moves between them and in the contact."""
+"""Flow of the gel and its markers: whether they move, how the gel moves between them and in the contact.
+
+`motion` tests whether markers move as something that touches the gel moves them. `displacement_field` tells
+how the gel moves between them; `in_mask` sums that up for the contact, or else the motions of the markers
+that are `inside` of it, by a `similarity`; `slip` tells whether the contact slides. `loops` holds what they
+compile.
+"""
 
 from tactflow.vision.flow.displacement_field import DisplacementField, FieldModel
 from tactflow.vision.flow.in_mask import flow_in_mask, flow_of_field

@@ -28,7 +28,7 @@ from tactflow.vision.flow.loops import (
     sum_region,
     weigh_markers,
 )
-from tactflow.vision.markers.family import pitch_of
+from tactflow.vision.markers.lattice import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]
@@ -371,7 +371,8 @@ def _motion(sums: list[float], spacing: float) -> GelMotion:
     # An outline that is d too far out at s adds (m(s) - mean) d ds / area. Across it, the share of a cell
     # falls from 1 to 0 within its width: share (1 - share) is 1 / 6 for a whole side.
     unit = OUTLINE * 6 * spacing / (cells * spacing * spacing) ** 2
-    outline = math.sqrt(unit * at_x), math.sqrt(unit * at_y)
+    # Where no cell is at the outline, rounding leaves 0 or less.
+    outline = math.sqrt(max(unit * at_x, 0.0)), math.sqrt(max(unit * at_y, 0.0))
     stderr, spread = math.sqrt(scale * left + noise[0]), math.sqrt(squares / 2)
     determinant = xx * yy - xy * xy
     # A single cell has the second moment spacing^2 / 12 along each axis: too small to have slopes.

@@ -54,7 +54,7 @@ def flow_in_mask(markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0
     >>> flow.mean, flow.count
     ((1.5, -0.5), 3)
     """
-    chosen = _inside(markers, mask, dilate)
+    chosen = np.flatnonzero(_inside(markers, mask, dilate))
     tracked = chosen[markers.status[chosen] == _TRACKED]
     if len(tracked) == 1:
         chosen = tracked
@@ -99,8 +99,7 @@ def flow_of_field(
     >>> [round(value, 1) for value in flow.mean], flow.count
     ([1.5, -0.5], 1)
     """
-    found = inside_mask(markers.position, mask, dilate)
-    count = int(np.count_nonzero(found & (markers.status != _LOST)))
+    count = int(np.count_nonzero(_inside(markers, mask, dilate)))
     box = region.box if region is not None and region.mask is mask else None
     motion = field.motion(mask, box) if count else None
     if motion is None or motion.unknown > UNKNOWN:
@@ -108,9 +107,10 @@ def flow_of_field(
     return _field_summary(motion, count, coarse)
 
 
-def _inside(markers: Markers, mask: NDArray[np.uint8], dilate: float) -> NDArray[np.intp]:
-    """Which markers that are not lost lie inside the mask, or at most `dilate` px outside."""
-    return np.flatnonzero(inside_mask(markers.position, mask, dilate) & (markers.status != _LOST))
+def _inside(markers: Markers, mask: NDArray[np.uint8], dilate: float) -> NDArray[np.bool_]:
+    """Which markers (N,), lost ones left out, lie inside the mask, or at most `dilate` px outside."""
+    known: NDArray[np.bool_] = markers.status != _LOST
+    return inside_mask(markers.position, mask, dilate) & known
 
 
 def _field_summary(motion: GelMotion, count: int, coarse: bool) -> Flow:

@@ -14,6 +14,8 @@ from tactflow.vision.flow.loops import look_up
 _ROUNDING: Final = 1e-9
 """Added to a disc's radius, and to half the width of its rows, px, before they are cut to whole pixels: a
 whole number keeps its value where it was rounded down. Chosen by hand."""
+_FARTHEST: Final = 1e9
+"""Reach, px, that takes in all points; computing with a larger one may overflow. Chosen by hand."""
 
 
 def check_mask(mask: NDArray[np.uint8], dilate: float) -> None:
@@ -40,7 +42,7 @@ def inside_mask(points: NDArray[Any], mask: NDArray[np.uint8], dilate: float = 0
     array([ True,  True, False])
     """
     check_mask(mask, dilate)
-    inside = np.zeros(len(points), np.bool_)
+    inside, dilate = np.zeros(len(points), np.bool_), min(dilate, _FARTHEST)
     reach = math.floor(dilate + _ROUNDING)
     if reach == 0:
         look_up(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(mask), inside)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.flow.loops import rate_motion
-from tactflow.vision.markers.family import LONGEST_LINK, pitch_of
-from tactflow.vision.markers.lattice import neighbour_graph
+from tactflow.vision.markers.lattice import LONGEST_LINK, neighbour_graph, pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
 FloatArray = NDArray[np.float64]
@@ -58,10 +57,10 @@ class Motion(NamedTuple):
     bound: FloatArray
 
     def still(self, dragged: float = 0.0) -> NDArray[np.bool_]:
-        """Tracked markers (N,) bool that are at rest: not even half of what `moving` asks for.
+        """Markers (N,) bool that are at rest: their motion is not even half of what `moving` asks for.
 
         dragged : part of the largest motion up to which a marker rests as well. One whose standard error is
-        unknown does not rest.
+        unknown, as of those that are not tracked, does not rest.
         """
         return np.asarray(self.left <= np.maximum(STILL * self.bound, dragged * self.largest))
 

@@ -24,7 +24,7 @@ when it has slid by 0.16 r."""
 GOES_ON: Final = 0.03
 """Share exchanged within `RECENT` frames while which a slip goes on. Chosen by hand."""
 RECENT: Final = 3
-"""Frames; 0.05 s at 60 frames a second."""
+"""Frames over which it is told whether a slip goes on: 0.05 s at 60 frames a second. Chosen by hand."""
 GROWN: Final = 0.08
 """Change of the contact's area, relative, after which slip is measured from this frame on: what presses
 harder or lets go moves the gel without slipping. Chosen by hand."""

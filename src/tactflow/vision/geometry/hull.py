@@ -27,17 +27,13 @@ def contact_geometry(
     mask: NDArray[np.uint8] | RegionProperties,
     *,
     min_area: float = 1.0,
-    max_gap: float | None = None,
     min_confidence: float = 0.0,
 ) -> Contact | None:
-    """Describe the contact region of a mask; None where there is none.
+    """Describe the contact region of a mask, all its components as one contact; None where there is none.
 
     mask : (H, W) uint8, non-zero inside the contact; or its properties, where they are known.
     min_area : px^2; components (8-connected, holes filled) with fewer pixels are ignored. Larger is safer
         against specks and misses small contacts.
-    max_gap : px; components whose nearest pixels are at most this far apart (to within 1 px and 2 %) belong
-        together, also by way of others; the group with the most pixels is the contact. None: all components
-        are one contact.
     min_confidence : 0 to 1; a region whose confidence is not above it gets no direction. For errors that the
         mask makes in one direction (light from one side), which no statistics of its outline can tell from
         shape; 0.3 is an axis ratio of 1.36. Higher withholds the direction of stubby shapes.
@@ -61,13 +57,8 @@ def contact_geometry(
     >>> contact.center, contact.area, contact.angle
     ((29.5, 24.5), 400.0, 0.0)
     """
-    seen = _large_enough(_region(mask, min_area, max_gap, min_confidence), min_area)
-    if seen is None:
-        return None
-    if max_gap is not None and not seen.connected:
-        groups = _groups(seen.contours, seen.box, max_gap)
-        seen = _only(seen, max(groups, key=_pixels))
-    return _describe(seen, min_confidence)
+    seen = _region(mask, min_area, min_confidence)
+    return None if seen is None else _describe(seen, min_confidence)
 
 
 def contact_parts(
@@ -80,15 +71,19 @@ def contact_parts(
 ) -> list[Contact]:
     """Describe each separate contact region of a mask, the one with the most pixels first.
 
+    max_gap : px; components whose nearest pixels are at most this far apart (to within 1 px and 2 %) belong
+        together, also by way of others.
     evidence : what shows them. The other parameters and what is raised are those of `contact_geometry`, which
-    describes one of these contacts, or all of them as one.
+    describes all of them as one.
 
     >>> mask = np.zeros((60, 80), np.uint8)
     >>> mask[20:30, 10:50] = mask[50:55, 10:20] = 255
     >>> [contact.region_area for contact in contact_parts(mask)]
     [400.0, 50.0]
     """
-    seen = _large_enough(_region(mask, min_area, max_gap, min_confidence), min_area)
+    if not max_gap >= 0:
+        raise ValueError(f"required max_gap >= 0 px, got {max_gap}")
+    seen = _region(mask, min_area, min_confidence)
     if seen is None:
         return []
     if seen.connected:
@@ -97,8 +92,23 @@ def contact_parts(
     return [_describe(_only(seen, group), min_confidence, evidence) for group in groups]
 
 
-def _large_enough(region: RegionProperties, min_area: float) -> RegionProperties | None:
-    """The regions of a mask that are large enough; None where there is none."""
+def _region(
+    mask: NDArray[np.uint8] | RegionProperties, min_area: float, min_confidence: float
+) -> RegionProperties | None:
+    """The regions of a mask that are large enough; None where there is none.
+
+    Raises ValueError if anything is out of its range.
+    """
+    if not (min_area >= 0 and math.isfinite(min_area)):
+        raise ValueError(f"required min_area >= 0 px^2, got {min_area}")
+    if not 0 <= min_confidence <= 1:
+        raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
+    if isinstance(mask, RegionProperties):
+        region = mask
+    elif mask.ndim != 2 or mask.dtype != np.uint8:
+        raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
+    else:
+        region = RegionProperties(mask)
     if region.connected and region.moments.pixels >= min_area:
         return region
     kept = [contour for contour in region.contours if _filled_area(contour) >= min_area]
@@ -115,23 +125,6 @@ def _only(region: RegionProperties, contours: Contours) -> RegionProperties:
     x, y = left - region.corner[0], top - region.corner[1]
     seen = cv2.bitwise_and(region.mask[y : y + height, x : x + width], filled)
     return RegionProperties(np.asarray(seen, np.uint8), (left, top), contours)
-
-
-def _region(
-    mask: NDArray[np.uint8] | RegionProperties, min_area: float, max_gap: float | None, min_confidence: float
-) -> RegionProperties:
-    """The properties of a mask; ValueError if anything is out of its range."""
-    if not (min_area >= 0 and math.isfinite(min_area)):
-        raise ValueError(f"required min_area >= 0 px^2, got {min_area}")
-    if max_gap is not None and not max_gap >= 0:
-        raise ValueError(f"required max_gap >= 0 px or None, got {max_gap}")
-    if not 0 <= min_confidence <= 1:
-        raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
-    if isinstance(mask, RegionProperties):
-        return mask
-    if mask.ndim != 2 or mask.dtype != np.uint8:
-        raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
-    return RegionProperties(mask)
 
 
 def _describe(seen: RegionProperties, min_confidence: float, evidence: Evidence = "light") -> Contact:

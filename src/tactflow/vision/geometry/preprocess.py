@@ -86,7 +86,7 @@ class Preprocessor:
         matrix = rotation(rotate, size) @ matrix
         if rotate in (90, 270):
             size = (size[1], size[0])
-        self._levels = downsample.bit_length() - 1
+        self._levels = int(downsample).bit_length() - 1
         before_pyramid = PixelMapping(raw, size, matrix, lens)
         for _ in range(self._levels):
             matrix, size = _half(matrix, size, method)
@@ -132,7 +132,7 @@ class Preprocessor:
         return np.ascontiguousarray(block)
 
     def _turn(self, block: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture turned, one that was shrunk for a turn by 90 degrees from upside down."""
+        """The picture turned; for a turn by 90 degrees, one that was shrunk comes upside down."""
         height, width = block.shape[:2]
         if self._rotate == 180:
             return cv2.rotate(block, cv2.ROTATE_180)  # type: ignore[return-value]

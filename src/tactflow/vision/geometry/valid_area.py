@@ -38,7 +38,8 @@ picture. Smaller places are marks, or the gaps between bright ones. Chosen by ha
 development recordings have 0.04."""
 
 MOST: Final = 0.5
-"""Part of a place that is not black, at least, for the light to say something there: the larger one."""
+"""Part of the surroundings of a place that is not black, at least, for the light to say something there:
+marks cover less than half. Derived."""
 
 
 def valid_area(image: NDArray[np.uint8]) -> Mask:

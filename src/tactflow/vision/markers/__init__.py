@@ -1,4 +1,15 @@
-"""The printed markers of a gel: detection, mask, removal and tracking."""
+"""The printed markers of a gel: detection, mask, removal and tracking.
+
+Once for each reference, `detection` finds them: `scale_space` looks for spots of every size, `family` tells
+which of them are marks by the `lattice` that they form and by their `likeness`, and `picture` draws what was
+found.
+
+In each frame, `mask` tells where markers cover the gel, and `inpaint` fills these places. `tracking` follows
+the markers: `template` aligns each one from where it was last, and `graph` tells whether neighbours move
+alike. Where a marker is missing or neighbours do not, `spots` finds spots of the markers' size, `jump` a
+motion that all of them share, `matching` chooses a spot for each marker, and `interpolation` places those
+that are not seen.
+"""
 
 from tactflow.vision.markers.detection import Candidate, Detection, NoMarkersError, detect_markers
 from tactflow.vision.markers.inpaint import remove_markers

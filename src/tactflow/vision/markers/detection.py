@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.markers import family
-from tactflow.vision.markers.family import LONGEST_LINK, Family, Sign
-from tactflow.vision.markers.lattice import nearest, neighbour_graph
+from tactflow.vision.markers.family import Family, Sign
+from tactflow.vision.markers.lattice import LONGEST_LINK, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
@@ -207,41 +207,19 @@ def detect_markers(
     """
     gray = to_gray(image).astype(np.float32)
     _require_options(dot_radius, polarity, valid, gray.shape)
-    last = next(iter(_LAST), None)
-    if last is None or not last.is_of(image, dot_radius, polarity, valid):
+    asked = image.shape, image.tobytes(), dot_radius, polarity, None if valid is None else valid.tobytes()
+    found = _LAST.get(asked)
+    if found is None:
         found = _found_in(gray, dot_radius, polarity, valid)
-        last = _Answer(image.copy(), dot_radius, polarity, None if valid is None else valid.copy(), found)
-        _LAST[:] = [last]
+        _LAST.clear()
+        _LAST[asked] = found
     # Who gets it may write to it.
-    return deepcopy(last.found)
+    return deepcopy(found)
 
 
-class _Answer(NamedTuple):
-    """What was asked of `detect_markers`, and what it found."""
-
-    image: NDArray[np.uint8]
-    dot_radius: float | None
-    polarity: Polarity
-    valid: NDArray[np.uint8] | None
-    found: Detection
-
-    def is_of(
-        self,
-        image: NDArray[np.uint8],
-        dot_radius: float | None,
-        polarity: Polarity,
-        valid: NDArray[np.uint8] | None,
-    ) -> bool:
-        """Whether the same is asked again: to compare two pictures costs a thousandth of a search."""
-        if (dot_radius, polarity) != (self.dot_radius, self.polarity):
-            return False
-        if valid is None or self.valid is None:
-            return valid is self.valid and np.array_equal(image, self.image)
-        return np.array_equal(image, self.image) and np.array_equal(valid, self.valid)
-
-
-_LAST: Final[list[_Answer]] = []
-"""The last answer: two stages ask for the marks of each reference."""
+_LAST: Final[dict[tuple[object, ...], Detection]] = {}
+"""What was asked last, and the answer: two stages ask for the marks of each reference, and to compare two
+pictures costs a hundredth of a search."""
 
 
 def _found_in(
@@ -316,7 +294,7 @@ def _detection(gray: NDArray[np.float32], best: Family, marks: Spots, others: li
         centers[radii == size] = refine_centers(dark, centers[radii == size], size)
     order = _reading_order(centers, radius)
     centers, radii = centers[order], radii[order]
-    pitch = family.pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
+    pitch = pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
     edges = neighbour_graph(centers, LONGEST_LINK * pitch)
     rival = next((_candidate(other) for other in others if not _same(other, centers, radii)), None)
     sizes = radii if (radii != radius).any() else None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.markers import lattice
-from tactflow.vision.markers.lattice import Corners, nearest, neighbour_graph
+from tactflow.vision.markers.lattice import LONGEST_LINK, Corners, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.likeness import likeness
 from tactflow.vision.markers.scale_space import OVERLAP, RADIUS_PER_SIGMA, Spots, joined
 
@@ -26,9 +26,6 @@ BETWEEN: Final = 0.55
 
 LONELY: Final = 2.3
 """Distance of the second nearest mark, pitches, beyond which a spot is lonely. Chosen by hand."""
-
-LONGEST_LINK: Final = 2.6
-"""Distance of neighbours at most, pitches. Chosen by hand."""
 
 RANDOM_SHARE: Final = 0.3
 """Share of parallelograms that close among spots in no lattice: 0.1 to 0.25 on rendered textures, 0.31 where
@@ -160,11 +157,6 @@ def _median_of_links(edges: NDArray[np.int64], values: FloatArray, count: int) -
     degree = np.bincount(mark, minlength=count)
     middle = np.cumsum(degree) - degree + (degree - 1) // 2
     return np.where(degree > 0, np.append(value[order], np.inf)[np.where(degree > 0, middle, -1)], np.inf)
-
-
-def pitch_of(points: FloatArray) -> float:
-    """Median distance of marks (N, 2), N >= 2, to their nearest neighbours, px."""
-    return float(np.median(nearest(points, 1)[0]))
 
 
 def united(gray: NDArray[np.float32], family: Family, by_scale: Mapping[float, Spots]) -> Spots:

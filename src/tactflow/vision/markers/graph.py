@@ -20,7 +20,6 @@ BORDER_WEIGHT: Final = 3
 """Votes of a mark at the border of the grid, against 1 of others. Chosen by hand: marks at the border hardly
 move, so the component that holds them is the right one."""
 
-
 LEAST_GRID: Final = 6
 """Marks of a grid beside others, at least: fewer are a group whose neighbours are hidden. Chosen by hand."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ Sums = NDArray[np.uint16]
 Places = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
+_METHODS: Final = get_args(InpaintMethod)
 
 RADIUS: Final = 7.0
 """Neighbourhood from which a marker is filled unless said otherwise, px: that of the original script."""
@@ -70,7 +71,7 @@ def remove_markers(
 
     Raises
     ------
-    ValueError : image and mask do not fit together, or the radius is not positive.
+    ValueError : image and mask do not fit together, there is no such method, or the radius is not positive.
 
     References
     ----------
@@ -87,16 +88,7 @@ def remove_markers(
     >>> bool((remove_markers(gel, mask) == 120).all())
     True
     """
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-        raise ValueError(
-            f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
-        )
-    if mask.shape != image.shape[:2] or mask.dtype != np.uint8:
-        raise ValueError(
-            f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
-        )
-    if not (radius > 0 and math.isfinite(radius)):
-        raise ValueError(f"radius: required > 0 px, got {radius}")
+    _check(image, mask, method, radius)
     if method == "normalized":
         return _normalized(image, mask, radius)
     if method == "none" or not mask.any():
@@ -105,6 +97,22 @@ def remove_markers(
     return np.asarray(
         cv2.inpaint(np.ascontiguousarray(image), np.ascontiguousarray(mask), radius, flag), np.uint8
     )
+
+
+def _check(image: Bytes, mask: Bytes, method: str, radius: float) -> None:
+    """Raise what `remove_markers` raises."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+        raise ValueError(
+            f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
+        )
+    if mask.shape != image.shape[:2] or mask.dtype != np.uint8:
+        raise ValueError(
+            f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
+        )
+    if method not in _METHODS:
+        raise ValueError(f"method: required one of {_METHODS}, got {method!r}")
+    if not (radius > 0 and math.isfinite(radius)):
+        raise ValueError(f"radius: required > 0 px, got {radius}")
 
 
 def _normalized(image: Bytes, mask: Bytes, radius: float) -> Bytes:

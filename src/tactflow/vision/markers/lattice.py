@@ -16,6 +16,9 @@ BLOCKING: Final = 1.1
 """Sum of squares, over the squared distance of two marks, below which a third one between them blocks their
 link. A right angle has 1; a tenth more keeps a skewed square free of diagonals. Chosen by hand."""
 
+LONGEST_LINK: Final = 2.6
+"""Distance of neighbours at most, pitches. Chosen by hand."""
+
 GRAPH_CANDIDATES: Final = 12
 """Nearest marks among which neighbours are looked for. Chosen by hand."""
 
@@ -94,6 +97,11 @@ def nearest(points: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
     distances, near = cv2.batchDistance(flat, flat, cv2.CV_32F, None, None, cv2.NORM_L2, count + 1)
     # The nearest is the point itself.
     return np.asarray(distances[:, 1:], np.float64), np.asarray(near[:, 1:], np.int64)
+
+
+def pitch_of(points: FloatArray) -> float:
+    """Median distance of marks (N, 2), N >= 2, to their nearest neighbours, px."""
+    return float(np.median(nearest(points, 1)[0]))
 
 
 def corners(centers: FloatArray, edges: IntArray) -> Corners:

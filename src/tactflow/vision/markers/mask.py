@@ -43,8 +43,8 @@ LEAST_CONTRAST: Final = 6.0
 class Dot:
     """What the markers of a gel look like.
 
-    radius : px, > 0. polarity : darker or brighter than the gel. contrast : least difference to the gel that
-    counts as a marker, grey levels, > 0. others : radii of those of other sizes, px, each > 0.
+    radius : px, > 0. polarity : darker or brighter than the gel. contrast : difference to the gel above which
+    a spot is a marker, grey levels, > 0. others : radii of those of other sizes, px, each > 0.
     """
 
     radius: float
@@ -112,8 +112,8 @@ def _other_sizes(found: Detection) -> tuple[float, ...]:
 def marker_mask(image: Bytes, dot: Dot) -> Bytes:
     """Mask of spots of a given size and their soft borders.
 
-    A spot differs by `dot.contrast` from every point on a circle around it, in at least two of the three
-    channels. A difference of Gaussians compares with the mean of the surroundings instead; the least
+    A spot differs by more than `dot.contrast` from every point on a circle around it, in at least two of the
+    three channels. A difference of Gaussians compares with the mean of the surroundings instead; the least
     difference keeps the edge of a contact, dark on one side or along a line, out of the mask.
 
     Parameters

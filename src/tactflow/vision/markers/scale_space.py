@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -115,7 +115,7 @@ def find_spots(
     while sigma >= factor * FULL_SIZE_SIGMA:
         factor *= 2
     fine, radius = sigma / factor, sigma * RADIUS_PER_SIGMA
-    narrow, wide = _blurred(_shrunk(gray, factor), fine)
+    narrow, wide = blurred(shrunk(gray, factor), fine)
     dark = polarity == "dark"
     response = np.asarray(wide - narrow if dark else narrow - wide, np.float32)
     peaks, strength = _peaks(response, fine)
@@ -128,16 +128,16 @@ def find_spots(
     return spots if valid is None else spots.at(_on_gel(valid, spots.points, radius))
 
 
-def _shrunk(gray: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """The image, its sides divided by a factor."""
-    height, width = gray.shape[0] // factor, gray.shape[1] // factor
-    if factor == 1 or min(height, width) < 1:
+def shrunk(gray: NDArray[Any], factor: int) -> NDArray[Any]:
+    """The image, its sides divided by a factor that they are no smaller than; of the same dtype."""
+    if factor == 1:
         return gray
+    height, width = gray.shape[0] // factor, gray.shape[1] // factor
     cut = gray[: height * factor, : width * factor]
-    return np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def _blurred(gray: NDArray[np.float32], sigma: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def blurred(gray: NDArray[np.float32], sigma: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The image at a scale and at the next coarser one; their difference answers to spots of the scale."""
     narrow = cv2.GaussianBlur(gray, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     step = sigma * float(np.sqrt(SCALE_RATIO**2 - 1.0))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.markers.detection import Detection
-from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SCALE_RATIO
+from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, blurred, shrunk
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -48,9 +48,8 @@ class SpotFinder:
         while detection.dot_radius / self._factor >= LARGEST_RADIUS:
             self._factor *= 2
         radius = detection.dot_radius / self._factor
-        self._narrow = max(radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
-        self._wide = float(np.sqrt(SCALE_RATIO**2 - 1.0) * self._narrow)
-        self._sign = 1.0 if detection.polarity == "dark" else -1.0
+        self._sigma = max(radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
+        self._dark = detection.polarity == "dark"
         self._reach = max(1, round(PEAK_REACH * radius))
         self._margin = MARGIN * detection.dot_radius + 2 * self._factor
         response = self._response(reference)
@@ -81,17 +80,8 @@ class SpotFinder:
 
     def _response(self, gray: NDArray[np.uint8]) -> Float32Array:
         """Difference of Gaussians at low resolution, positive on marks."""
-        factor = self._factor
-        if factor > 1:
-            height, width = gray.shape[0] // factor, gray.shape[1] // factor
-            cut = gray[: height * factor, : width * factor]
-            gray = np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-        narrow = cv2.GaussianBlur(
-            gray.astype(np.float32), (0, 0), self._narrow, borderType=cv2.BORDER_REPLICATE
-        )
-        wide = cv2.GaussianBlur(narrow, (0, 0), self._wide, borderType=cv2.BORDER_REPLICATE)
-        response = cv2.subtract(wide, narrow) if self._sign > 0 else cv2.subtract(narrow, wide)
-        return np.asarray(response, np.float32)
+        narrow, wide = blurred(shrunk(gray, self._factor).astype(np.float32), self._sigma)
+        return np.asarray(wide - narrow if self._dark else narrow - wide, np.float32)
 
 
 def find_peaks(response: Float32Array, least: float, reach: int) -> tuple[FloatArray, Float32Array]:

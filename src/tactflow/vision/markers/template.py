@@ -54,6 +54,9 @@ LARGEST_LEVEL: Final = 2**15 - 2
 LARGEST_SUM: Final = 2**23
 """Largest sum of the sizes of such weights: times grey levels less 128 it fits in 32 bits. Derived: 2**30."""
 
+LARGEST_BLOCK: Final = 2**16
+"""Pixels whose squares, less than 2**15 each, have a sum that fits in 32 bits. Derived."""
+
 CACHE_LINE: Final = 32
 """Whole numbers of 16 bits that memory gives at a time, on most processors."""
 
@@ -143,7 +146,7 @@ class MarkerTemplates:
         self._weights = weights.reshape(PHASES * PHASES * count, 5, length)
         self._terms = terms.reshape(PHASES * PHASES * count, 16)
         self._reach = reach
-        self._real = np.array([radius, CONVERGED, SAMPLING_ERROR])
+        self._radius = float(radius)
 
     def align(self, image: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None) -> Alignment:
         """Find marks from starting points that are right to about a radius.
@@ -162,7 +165,7 @@ class MarkerTemplates:
             self._terms,
             self._disc,
             self._reach,
-            self._real,
+            self._radius,
             position,
             found,
         )
@@ -368,9 +371,27 @@ def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Levels) -> N
 
 
 @helper
-def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int) -> Any:
-    """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained."""
-    first = second = third = fourth = fifth = total = squares = np.int32(0)
+def variation(patch: Levels, pixels: int) -> float:
+    """Sum of squares of a patch about its mean; what follows its `pixels` is 0."""
+    total = squares = np.int64(0)
+    for start in range(0, len(patch), LARGEST_BLOCK):
+        block = patch[start : start + LARGEST_BLOCK]
+        sum_of_block = squares_of_block = np.int32(0)
+        for p in range(len(block)):
+            value = np.int32(block[p])
+            sum_of_block = np.int32(sum_of_block + value)
+            squares_of_block = np.int32(squares_of_block + value * value)
+        total, squares = total + sum_of_block, squares + squares_of_block
+    return squares - float(total) * total / pixels
+
+
+@helper
+def fit_template(weight: Levels, term: Float32Array, patch: Levels, varies: float) -> Any:
+    """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained.
+
+    varies : the patch's `variation`.
+    """
+    first = second = third = fourth = fifth = np.int32(0)
     # Whole numbers below 2**31, exact in whatever order.
     for p in range(len(patch)):
         value = np.int32(patch[p])
@@ -379,14 +400,12 @@ def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int)
         third = np.int32(third + weight[2, p] * value)
         fourth = np.int32(fourth + weight[3, p] * value)
         fifth = np.int32(fifth + weight[4, p] * value)
-        total = np.int32(total + value)
-        squares = np.int32(squares + value * value)
     gain, shift_x, shift_y = term[10] * first, term[11] * second, term[12] * third
     explained = gain * (term[0] * gain + term[1] * shift_x + term[2] * shift_y)
     explained += shift_x * (term[3] * gain + term[4] * shift_x + term[5] * shift_y)
     explained += shift_y * (term[6] * gain + term[7] * shift_x + term[8] * shift_y)
     slope_x, slope_y = term[13] * fourth, term[14] * fifth
-    contrast = squares - float(total) * total / pixels - slope_x * slope_x - slope_y * slope_y
+    contrast = varies - slope_x * slope_x - slope_y * slope_y
     gain, shift_x, shift_y = np.float32(gain), np.float32(shift_x), np.float32(shift_y)
     explained, contrast = np.float32(explained), np.float32(contrast)
     rest = max(contrast - explained, LEAST_RESIDUAL)
@@ -395,7 +414,7 @@ def fit_template(weight: Levels, term: Float32Array, patch: Levels, pixels: int)
 
 @kernel(
     "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int16[:, :, ::1],"
-    "float32[:, ::1], int64[:, ::1], int64, float64[::1], float64[:, ::1], float32[:, ::1])",
+    "float32[:, ::1], int64[:, ::1], int64, float64, float64[:, ::1], float32[:, ::1])",
     reorder=True,
 )
 def align_marks(
@@ -406,7 +425,7 @@ def align_marks(
     terms: Float32Array,
     disc: IntArray,
     reach: int,
-    real: FloatArray,
+    radius: float,
     position: FloatArray,
     found: Float32Array,
 ) -> None:
@@ -415,11 +434,10 @@ def align_marks(
     image : (H, W, 3) BGR or (H, W, 1) grey. start : (n, 2). marks : (n,), of those in `weights`.
     weights : (PHASES^2 N, 5, P), of `whole_numbers`. terms : (PHASES^2 N, 16), 9 of the Gram matrix, variance
     per pixel, 5 units of weights. disc : (2, p) dx and dy of the pixels, p <= P; other weights are zero.
-    reach : of a patch, px. real : radius, px, length of a step that calls for another, px, and the sampling
-    error, px.
+    reach : of a patch, px. radius : of a mark, px; no step is longer along an axis.
     """
     height, width, channels = image.shape
-    radius, converged, sampling = np.float32(real[0]), real[1] * real[1], np.float32(real[2] * real[2])
+    longest = np.float32(radius)
     count, flat = weights.shape[0] // (PHASES * PHASES), image.reshape(-1)
     offsets = np.empty(disc.shape[1], np.int64)
     for p in range(len(offsets)):
@@ -434,7 +452,7 @@ def align_marks(
             ask_for_template(weights, terms, which)
             ask_for_patch(flat, image.shape, phase_x // PHASES, phase_y // PHASES, reach)
         x, y = start[n, 0], start[n, 1]
-        seen_left = seen_top = -1
+        seen_left, seen_top, varies = -1, -1, 0.0
         for number in range(ROUNDS + 1):
             phase_x, phase_y = nearest_phase(x, y, width, height)
             left, top = phase_x // PHASES, phase_y // PHASES
@@ -444,15 +462,18 @@ def align_marks(
                 seen_left, seen_top = left, top
                 read_patch(flat, image.shape, left, top, reach, disc, offsets, words)
                 to_centred_gray(words, channels, patch)
-            fitted = fit_template(weights[which], terms[which], patch, len(offsets))
+                varies = variation(patch, len(offsets))
+            fitted = fit_template(weights[which], terms[which], patch, varies)
             gain, shift_x, shift_y, r_squared, rest = fitted
             safe = max(gain, LEAST_DIVISOR)
-            now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -radius), radius)
-            now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -radius), radius)
-            far = (now_x - x) * (now_x - x) + (now_y - y) * (now_y - y) > converged
+            now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
+            now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
+            far = (now_x - x) * (now_x - x) + (now_y - y) * (now_y - y) > CONVERGED * CONVERGED
             x, y = now_x, now_y
             if number == ROUNDS or not (far and r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
                 break
         position[n, 0], position[n, 1] = x, y
         found[0, n], found[1, n] = gain, r_squared
-        found[2, n] = np.sqrt(rest * terms[which, 9] / (safe * safe) + sampling)
+        found[2, n] = np.sqrt(
+            rest * terms[which, 9] / (safe * safe) + np.float32(SAMPLING_ERROR * SAMPLING_ERROR)
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,9 +249,8 @@ class MarkerTracker:
 
     def _search(
         self, image: NDArray[np.uint8], found: Alignment, seen: BoolArray, strain: FloatArray
-    ) -> tuple[FloatArray, BoolArray, NDArray[Any]]:
-        """Joint choice among the spots, for marks outside the largest smooth component: positions, which
-        marks are found, standard errors."""
+    ) -> _Result:
+        """Joint choice among the spots, for marks outside the largest smooth component."""
         jumped = self._jumps(image, seen)
         if jumped is not None:
             found = self._templates.align(image, jumped)
@@ -261,7 +260,7 @@ class MarkerTracker:
         inliers = self._graph.largest_component(seen, strain)
         free = np.flatnonzero(~inliers)
         if len(free) == 0:
-            return found.position, seen, found.stderr
+            return _Result(found.position, seen, found.stderr)
         moved = found.position - self._origin
         expected = np.stack([self._position[free], self._origin[free] + _median(moved[inliers])])
         spots, strength = self._candidates(image, found.position, inliers, free[seen[free]], expected)
@@ -276,7 +275,7 @@ class MarkerTracker:
         unused[chosen[given]] = False
         if not result.found.all() and unused.any():
             self._take_left_over(image, spots[unused], result)
-        return result.position, result.found, result.stderr
+        return result
 
     def _jumps(self, image: NDArray[np.uint8], seen: BoolArray) -> FloatArray | None:
         """Where the marks (N, 2) are, px, if a whole grid jumped or is a pitch off; None if none.
@@ -363,11 +362,12 @@ class MarkerTracker:
         return self._interpolator.place(position, found)
 
 
-class _Result:
-    """What a search finds of each mark: (N, 2) position, (N,) found, (N,) stderr; changed as it goes on."""
+class _Result(NamedTuple):
+    """What a search finds of each mark: (N, 2) position, (N,) found, (N,) stderr; filled as it goes on."""
 
-    def __init__(self, position: FloatArray, found: BoolArray, stderr: NDArray[Any]) -> None:
-        self.position, self.found, self.stderr = position, found, stderr
+    position: FloatArray
+    found: BoolArray
+    stderr: NDArray[Any]
 
 
 def _median(vectors: FloatArray) -> FloatArray:
