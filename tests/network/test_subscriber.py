@@ -215,6 +215,21 @@ def test_a_port_that_there_is_not_is_not_taken_for_another(connect: type) -> Non
         connect("tcp://127.0.0.1:70000")
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"timeout": -1.0}, "timeout: required None or a number of seconds from 0, got -1"),
+        ({"timeout": float("nan")}, "timeout: required"),
+        ({"backlog": -1}, "backlog: required 1 to 2147483647 messages, got -1"),
+        ({"backlog": 0}, "backlog: required"),
+        ({"backlog": 2**40}, "backlog: required"),
+    ],
+)
+def test_wrong_numbers_are_refused_with_what_is_required(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Subscriber(**wrong)
+
+
 def test_a_subscriber_needs_no_opencv() -> None:
     program = (
         "import sys, tactflow.network.subscriber; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"

@@ -38,6 +38,9 @@ LONGEST_MESSAGE = 16 << 20
 """Bytes of a message at most; one with 140 dots has about 14,000. Whoever sends longer ones is no tactflow,
 and is heard no more, before memory is taken for it. Chosen by hand."""
 
+LARGEST_BACKLOG = 2**31 - 1
+"""ZeroMQ takes it as an `int` of C; 0 would be no limit to it."""
+
 MOST_SENSORS = 1000
 """Sensors whose gaps are counted, so that invented names take no memory. Chosen by hand."""
 
@@ -77,7 +80,7 @@ class Subscriber(Connection):
     Raises
     ------
     ValueError
-        If the endpoint is no address, or the folder has no keys.
+        If the endpoint is no address, the folder has no keys, or timeout or backlog is no such number.
 
     Examples
     --------
@@ -96,6 +99,10 @@ class Subscriber(Connection):
         backlog: int = 10_000,
         keys: str | Path | None = None,
     ) -> None:
+        if timeout is not None and not timeout >= 0:
+            raise ValueError(f"timeout: required None or a number of seconds from 0, got {timeout}")
+        if not 1 <= backlog <= LARGEST_BACKLOG:
+            raise ValueError(f"backlog: required 1 to {LARGEST_BACKLOG} messages, got {backlog}")
         self._clock = clock
         self.timeout = timeout
         self.lost = 0
