@@ -14,7 +14,7 @@ from tactflow.vision.change import ChangeProbe
 from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import inside_mask
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.geometry.hull import contact_geometry, contact_parts
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, marker_mask
 from tactflow.vision.types import Contact, Flow, Markers
@@ -85,7 +85,7 @@ PICTURES: dict[str, Callable[[Array, Array], Any]] = {
 
 MASKS: dict[str, Callable[[Array], Any]] = {
     **{f"hull-{name}": lambda mask, name=name: HULLS[name](mask) for name in HULLS},
-    "hull-groups": lambda mask: contact_geometry(mask, min_area=5, max_gap=2),
+    "hull-groups": lambda mask: contact_parts(mask, min_area=5, max_gap=2)[0],
     **{f"flow-{name}": lambda mask, name=name: FLOWS[name](MARKERS, mask, dilate=3) for name in FLOWS},
     "inside": lambda mask: inside_mask(PLAIN.position, mask, 2.5),
     **{
