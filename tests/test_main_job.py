@@ -60,7 +60,7 @@ def test_the_main_job_gives_one_valid_message_a_frame_and_nothing_else_on_standa
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=PATIENCE,
         check=False,
     )
     assert done.returncode == 0, done.stderr

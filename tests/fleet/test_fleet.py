@@ -42,7 +42,7 @@ def run(*arguments: str, cwd: Path, command: str = "run") -> subprocess.Complete
         cwd=cwd,
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=PATIENCE,
         check=False,
     )
 
@@ -102,7 +102,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
         [sys.executable, "-P", "-m", "tactflow", "run", "--stats", "stats.json", "--jsonl", "-"],
         cwd=folder,
         capture_output=True,
-        timeout=100,
+        timeout=PATIENCE,
         check=False,
     )
     assert done.returncode == 0, done.stderr
@@ -406,7 +406,7 @@ def test_a_full_disk_behind_standard_output_ends_the_run_with_an_error(folder: P
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=60,
+            timeout=PATIENCE,
             check=False,
         )
     assert done.returncode == 3

@@ -219,7 +219,7 @@ def test_a_subscriber_needs_no_opencv() -> None:
     program = (
         "import sys, tactflow.network.subscriber; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", program], check=False, timeout=60).returncode == 0
+    assert subprocess.run([sys.executable, "-c", program], check=False, timeout=PATIENCE).returncode == 0
 
 
 # -- tactflow listen --------------------------------------------------------------------------------------
