@@ -109,7 +109,8 @@ def test_a_subscriber_in_another_process_gets_every_message_of_a_run(
                 "--set",
                 f"sinks.zmq.wait_for_subscriber={PATIENCE}",
             ),
-            *("--set", "sinks.zmq.backlog=50", "--source", "sim:press?frames=50", "--stats", str(stats)),
+            *("--set", "sinks.zmq.backlog=50", "--set", "sinks.zmq.linger=60"),
+            *("--source", "sim:press?frames=50", "--stats", str(stats)),
         ],
         cwd=REPOSITORY,
     ) as process:

@@ -159,7 +159,7 @@ def test_all_sensors_publish_at_one_address(folder: Path, monkeypatch: pytest.Mo
                     "--set",
                     f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}', wait_for_subscriber: {PATIENCE}}}",
                 ),
-                *("--set", "sinks.zmq.backlog=100"),
+                *("--set", "sinks.zmq.backlog=100", "--set", "sinks.zmq.linger=60"),
             ],
             cwd=folder,
             stderr=subprocess.DEVNULL,

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +117,7 @@ def test_the_relay_of_several_sensors_asks_for_keys_and_their_own_processes_need
     finder.close(0)
     try:
         with (
-            relay(finder.endpoint, [sensor.endpoint], 10, str(folders[0])),
+            relay(finder.endpoint, [sensor.endpoint], 10, 0.0, str(folders[0])),
             Subscriber(finder.endpoint, timeout=PATIENCE, keys=folders[1]) as messages,
         ):
             assert sensor.socket.recv() == b"\x01tactflow."
@@ -261,13 +261,39 @@ def test_the_command_keeps_keys_that_are_there(tmp_path: Path, capsys: pytest.Ca
     assert sorted(path.name for path in folder.iterdir()) == ["laptop", "phone", "publisher"]
 
 
+def test_the_relay_delivers_the_last_messages_to_a_slow_subscriber_as_long_as_it_is_told_to() -> None:
+    sensor = Publisher("tcp://127.0.0.1:*", 100, 1 << 20)
+    finder = Publisher("tcp://127.0.0.1:*", 1, 32768)
+    finder.close(0)
+    closing = ExitStack()
+    closing.enter_context(relay(finder.endpoint, [sensor.endpoint], 100, 60.0))
+    with zmq.Context() as context, context.socket(zmq.SUB) as slow:
+        slow.linger, slow.rcvtimeo, slow.rcvhwm, slow.rcvbuf = 0, round(PATIENCE * 1000), 1, 4096
+        slow.subscribe("tactflow.")
+        slow.connect(finder.endpoint)
+        assert sensor.socket.recv() == b"\x01tactflow."
+        # More than all buffers on the way hold.
+        for number in range(50):
+            sensor.socket.send(b"tactflow.main %d " % number + bytes(200_000))
+
+        def end() -> None:
+            sensor.close(60.0)
+            closing.close()
+
+        ended = threading.Thread(target=end)
+        ended.start()
+        ended.join(1.0)
+        assert [int(slow.recv().split(b" ")[1]) for _ in range(50)] == list(range(50))
+        ended.join()
+
+
 def test_the_relay_ends_a_flood_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     sensor = Publisher("tcp://127.0.0.1:*", 10, 32768)
     finder = Publisher("tcp://127.0.0.1:*", 10, 32768)
     finder.close(0)
     try:
         with (
-            relay(finder.endpoint, [sensor.endpoint], 10),
+            relay(finder.endpoint, [sensor.endpoint], 10, 0.0),
             Subscriber(finder.endpoint, timeout=PATIENCE) as messages,
         ):
             assert sensor.socket.recv() == b"\x01tactflow."
