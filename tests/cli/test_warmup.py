@@ -13,7 +13,6 @@ import pytest
 from tactflow.cli.main import main
 from tests.clock import PATIENCE
 
-
 HELD = r"""
 import time
 from pathlib import Path

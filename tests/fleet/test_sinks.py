@@ -70,9 +70,8 @@ def test_a_file_that_was_begun_is_continued_and_one_from_before_is_replaced(tmp_
 
 def test_the_last_messages_get_the_longest_time_that_one_of_the_sensors_gives_them(tmp_path: Path) -> None:
     file = tmp_path / "pipeline.yaml"
-    file.write_text(
-        f"sensors: {{left: , right: {{sinks: {{zmq: {{linger: 7}}}}}}}}\n{STAGES}sinks: {{zmq: {{linger: 3}}}}\n"
-    )
+    sensors = "sensors: {left: , right: {sinks: {zmq: {linger: 7}}}}"
+    file.write_text(f"{sensors}\n{STAGES}sinks: {{zmq: {{linger: 3}}}}\n")
     pipelines = {name: load_pipeline(file, sensor=name) for name in ("left", "right")}
     (shared,) = shared_addresses(pipelines)
     assert (shared.linger, shared.backlog) == (7, 64)
