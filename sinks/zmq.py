@@ -192,7 +192,7 @@ class Zmq(Sink):
     @classmethod
     def publishes(cls, params: Zmq.Params) -> Publication:
         """At its endpoint."""
-        return Publication(params.endpoint, params.backlog, params.keys)
+        return Publication(params.endpoint, params.backlog, params.keys, params.linger)
 
     @classmethod
     def publish_at(cls, params: Zmq.Params, address: str) -> Zmq.Params:

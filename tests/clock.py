@@ -6,8 +6,9 @@ import threading
 import time
 from collections.abc import Callable
 
-PATIENCE = 60.0
-"""How long a test waits for what must happen, s. Nothing depends on its length."""
+PATIENCE = 300.0
+"""How long a test waits for what must happen, s. Nothing depends on its length, which is below `timeout` of
+pytest."""
 LOOK_SECONDS = 0.005
 """Time between two looks, s."""
 

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.clock import PATIENCE
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONTRIBUTING = (REPOSITORY / "CONTRIBUTING.md").read_text()
 PAGES = ["CONTRIBUTING.md", "docs/architecture.md", "docs/glossary.md"]
@@ -135,6 +137,8 @@ def test_the_stage_and_the_sink_for_contributors_run(tmp_path: Path) -> None:
         "sinks:\n  count: {use: ./count.py}\n"
     )
     command = [sys.executable, "-m", "tactflow", "run", "--quiet", "--check", "pipeline.yaml"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert int((tmp_path / "contacts.txt").read_text()) > 0

@@ -48,7 +48,7 @@ def modules() -> set[str]:
     }
 
 
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(3600)
 def test_the_wheel_runs_in_a_fresh_environment_and_compiles_nothing_after_warmup(tmp_path: Path) -> None:
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input", "--quiet")
     command(*pip, "wheel", "--no-deps", "--wheel-dir", tmp_path, REPOSITORY, cwd=tmp_path)

@@ -59,7 +59,7 @@ def test_the_main_job_gives_one_valid_message_a_frame_and_nothing_else_on_standa
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=PATIENCE,
         check=False,
     )
     assert done.returncode == 0, done.stderr
@@ -109,7 +109,8 @@ def test_a_subscriber_in_another_process_gets_every_message_of_a_run(
                 "--set",
                 f"sinks.zmq.wait_for_subscriber={PATIENCE}",
             ),
-            *("--set", "sinks.zmq.backlog=50", "--source", "sim:press?frames=50", "--stats", str(stats)),
+            *("--set", "sinks.zmq.backlog=50", "--set", "sinks.zmq.linger=60"),
+            *("--source", "sim:press?frames=50", "--stats", str(stats)),
         ],
         cwd=REPOSITORY,
     ) as process:
@@ -187,7 +188,7 @@ def test_one_signal_drains_and_finalises(number: int, tmp_path: Path) -> None:
     assert [row["seq"] for row in rows] == list(range(stats["frames"]))
 
 
-SLOW = """
+SLOW = f"""
 import time
 from pathlib import Path
 from tactflow.engine.contract import Stage, StageParams
@@ -204,9 +205,10 @@ class Slow(Stage):
         while not self.run.hurried:
             time.sleep(0.001)
         Path("told").touch()
-        time.sleep(60)
+        time.sleep({PATIENCE})
         return image
 """
+"""A stage that works on, also when the run is told to end."""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -236,6 +238,7 @@ def test_a_second_signal_ends_at_once_with_130(tmp_path: Path) -> None:
     until(lambda: process.poll() is not None or (tmp_path / "began").exists())
     assert process.poll() is None, process.communicate()[1]
     process.send_signal(signal.SIGINT)
+    # Two at once may arrive as one.
     until(lambda: process.poll() is not None or (tmp_path / "told").exists())
     assert process.poll() is None, "one signal waits for the frame under way"
     process.send_signal(signal.SIGINT)

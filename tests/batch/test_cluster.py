@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +16,7 @@ from tactflow.batch.cluster import DaskCluster
 from tactflow.batch.task import Outcome, Task
 from tactflow.engine.errors import ConfigError, StageError
 from tests.batch.doubles import outcomes_of, tasks
+from tests.clock import PATIENCE, until
 
 distributed = pytest.importorskip("distributed", reason="needs Dask: pip install 'tactflow[dask]'")
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -34,6 +34,14 @@ def blocked(task: Task) -> Outcome:
     numbers = signal.pthread_sigmask(signal.SIG_BLOCK, [])
     names = " ".join(sorted(signal.Signals(number).name for number in numbers))
     return Outcome(task.recording.source, task.recording.name, "failed", error=names)
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever answers, starts or ends may take its time."""
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", PATIENCE)
+    # Dask gives its own threads 10 s to end.
+    monkeypatch.setattr(distributed.utils.LoopRunner.stop, "__defaults__", (PATIENCE,))
 
 
 @pytest.fixture
@@ -90,18 +98,29 @@ def test_a_cluster_of_other_versions_is_refused_before_anything_is_begun(
         DaskCluster("tcp://127.0.0.1:8786")
 
 
-def test_a_scheduler_that_goes_is_said(
+def test_a_goodbye_that_takes_too_long_is_no_failure(
     scheduler: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
     executor = DaskCluster(scheduler.scheduler_address, work=toy)
+    close = executor._client.close
+
+    def slow(timeout: float) -> None:
+        close(timeout)
+        raise TimeoutError(f"timed out after {timeout} s.")
+
+    monkeypatch.setattr(executor._client, "close", slow)
+    assert outcomes_of(executor, tasks(tmp_path, "a"))["a"].status == "done"
+
+
+def test_a_scheduler_that_goes_is_said(scheduler: Any, tmp_path: Path) -> None:
+    executor = DaskCluster(scheduler.scheduler_address, work=toy)
+    # How long it is sought once it has gone, s.
+    executor._client._timeout = 0.5
 
     def until_it_is_noticed() -> None:
         for task in tasks(tmp_path, "a"):
             executor.submit(task)
-        deadline = time.monotonic() + 100
-        while time.monotonic() < deadline:
-            executor.finished(0.5)
+        until(lambda: executor.finished(0.5) and None)
 
     try:
         scheduler.close()

@@ -22,7 +22,7 @@ FILES = {name: find_pipeline(name) for name in ("default", "classic")}
 
 
 # The run takes a minute on a quiet machine, twenty on one with a lot of other work.
-pytestmark = pytest.mark.timeout(1200)
+pytestmark = pytest.mark.timeout(3600)
 
 BASELINE = Path(__file__).with_name("baseline_quick.json")
 

@@ -26,6 +26,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests import clock
+
 sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: playwright is not installed")
 
 from websockets.http11 import Request, Response  # noqa: E402
@@ -35,8 +37,8 @@ from websockets.sync.server import serve as websockets_serve  # noqa: E402
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGE = REPOSITORY / "src" / "tactflow" / "view" / "page"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-PATIENCE = 60_000
-"""ms; how long a test waits for what must happen. Nothing is asserted about the time it takes."""
+PATIENCE = round(clock.PATIENCE * 1000)
+"""How long a test waits for what must happen, ms. Nothing is asserted about the time it takes."""
 
 FLAGS = [
     "--disable-gpu",
@@ -109,7 +111,7 @@ def browser() -> Iterator[Any]:
     if CHROMIUM is None:
         pytest.skip("NO BROWSER TESTS: there is no chromium here; `make system-deps` installs it")
     with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE)
         yield chromium
         chromium.close()
 
@@ -140,7 +142,7 @@ def watched() -> Iterator[Run]:
 def browser_without_webgl(browser: Any) -> Iterator[Any]:
     """One that cannot draw in three dimensions."""
     flat = browser.browser_type.launch(
-        executable_path=CHROMIUM, args=[*FLAGS, "--disable-software-rasterizer"]
+        executable_path=CHROMIUM, args=[*FLAGS, "--disable-software-rasterizer"], timeout=PATIENCE
     )
     yield flat
     flat.close()
@@ -801,7 +803,8 @@ def test_a_live_source_cannot_be_stepped_and_says_so(watched: Run, open_page: Ca
     assert page.is_disabled("#step")
     assert page.get_attribute("#step", "title") == "a live source cannot be stepped"
     page.keyboard.press("s")
-    assert "a live source cannot be stepped" in page.inner_text("#note")
+    # A note is hidden after some seconds.
+    assert "a live source cannot be stepped" in page.text_content("#note")
 
 
 def test_without_a_record_sink_the_button_says_so(watched: Run, open_page: Callable[..., Any]) -> None:

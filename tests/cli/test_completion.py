@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tactflow.cli.main import main
+from tests.clock import PATIENCE
 
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash here")
 
@@ -53,7 +54,7 @@ def test_bash_completes_commands_options_and_pipeline_files(
         cwd=here,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=True,
     )
     assert set(done.stdout.split()) == expected

@@ -13,13 +13,14 @@ import pytest
 from tactflow import __version__
 from tactflow.cli.main import COMMANDS, main
 from tactflow.engine.errors import SourceError, StageError
+from tests.clock import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def program(*args: str, **options: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "tactflow", *args]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)  # type: ignore[call-overload, no-any-return]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, **options)  # type: ignore[call-overload, no-any-return]
 
 
 def test_help_lists_every_command_and_what_it_does(capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,7 +92,7 @@ def test_help_imports_neither_opencv_nor_numpy() -> None:
         "print({'cv2', 'numpy', 'pydantic'} & set(sys.modules))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=True
     )
     assert done.stdout.splitlines()[-1] == "set()"
 
@@ -117,7 +118,7 @@ def test_a_reader_that_leaves_early_causes_no_complaint() -> None:
             stdout=out,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=60,
+            timeout=PATIENCE,
             check=False,
         )
     assert (done.returncode, done.stderr) == (0, "")
@@ -163,7 +164,7 @@ def test_a_program_without_standard_output_does_its_work() -> None:
         ["sh", "-c", f"'{sys.executable}' -m tactflow.cli.main stages >&-"],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
@@ -176,7 +177,7 @@ def test_a_program_without_standard_error_says_what_letters_its_output_has(tmp_p
         ["sh", "-c", f"'{sys.executable}' -m tactflow check ü.yaml 2>&-"],
         stdout=subprocess.PIPE,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
         cwd=tmp_path,
         env=os.environ | {"PYTHONIOENCODING": "ascii"},
@@ -194,7 +195,7 @@ def test_a_full_disk_behind_standard_output_is_an_error_and_no_traceback(words: 
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=60,
+            timeout=PATIENCE,
             check=False,
             cwd=ROOT,
         )

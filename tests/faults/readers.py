@@ -93,7 +93,7 @@ def zeromq(subscriber_does: str, folder: Path) -> Seen:
             else:
                 _send_noise(address, 20)
 
-        settings = {"endpoint": address, "wait_for_subscriber": PATIENCE, "backlog": 1000}
+        settings = {"endpoint": address, "wait_for_subscriber": PATIENCE, "backlog": 1000, "linger": 60}
         _, seen = run(folder, {"zmq": settings}, fault, source=str(array(folder)))
     return Seen(seen.exit, seen.said, f"the good one got {len(received)} messages")
 

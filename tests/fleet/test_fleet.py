@@ -42,7 +42,7 @@ def run(*arguments: str, cwd: Path, command: str = "run") -> subprocess.Complete
         cwd=cwd,
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=PATIENCE,
         check=False,
     )
 
@@ -102,7 +102,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
         [sys.executable, "-P", "-m", "tactflow", "run", "--stats", "stats.json", "--jsonl", "-"],
         cwd=folder,
         capture_output=True,
-        timeout=100,
+        timeout=PATIENCE,
         check=False,
     )
     assert done.returncode == 0, done.stderr
@@ -159,7 +159,7 @@ def test_all_sensors_publish_at_one_address(folder: Path, monkeypatch: pytest.Mo
                     "--set",
                     f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}', wait_for_subscriber: {PATIENCE}}}",
                 ),
-                *("--set", "sinks.zmq.backlog=100"),
+                *("--set", "sinks.zmq.backlog=100", "--set", "sinks.zmq.linger=60"),
             ],
             cwd=folder,
             stderr=subprocess.DEVNULL,
@@ -406,7 +406,7 @@ def test_a_full_disk_behind_standard_output_ends_the_run_with_an_error(folder: P
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=60,
+            timeout=PATIENCE,
             check=False,
         )
     assert done.returncode == 3

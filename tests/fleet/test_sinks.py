@@ -9,7 +9,7 @@ import pytest
 
 from tactflow.config.load import load_pipeline
 from tactflow.engine.graph import Node
-from tactflow.fleet.sinks import WatchedSink
+from tactflow.fleet.sinks import WatchedSink, shared_addresses
 
 STAGES = "stages: {capture: , preprocess: }\n"
 
@@ -66,3 +66,12 @@ def test_a_file_that_was_begun_is_continued_and_one_from_before_is_replaced(tmp_
     assert (watched.overrides, watched.refused) == ([], None)
     file.write_text("{}\n{}\n")
     assert watched.overrides == ["sinks.out.overwrite=false", "sinks.out.append=true"]
+
+
+def test_the_last_messages_get_the_longest_time_that_one_of_the_sensors_gives_them(tmp_path: Path) -> None:
+    file = tmp_path / "pipeline.yaml"
+    sensors = "sensors: {left: , right: {sinks: {zmq: {linger: 7}}}}"
+    file.write_text(f"{sensors}\n{STAGES}sinks: {{zmq: {{linger: 3}}}}\n")
+    pipelines = {name: load_pipeline(file, sensor=name) for name in ("left", "right")}
+    (shared,) = shared_addresses(pipelines)
+    assert (shared.linger, shared.backlog) == (7, 64)

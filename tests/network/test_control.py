@@ -231,17 +231,31 @@ def test_a_late_answer_to_an_earlier_command_is_none_to_the_next() -> None:
     with zmq.Context() as context, context.socket(zmq.ROUTER) as run:
         run.linger = 0
         port = run.bind_to_random_port("tcp://127.0.0.1")
-        with RemoteControl(f"tcp://127.0.0.1:{port}", timeout=0.2) as control:
-            with pytest.raises(TimeoutError):
-                control.ping()
-            asked = run.recv_multipart()
-            late = threading.Timer(
-                0.1, run.send_multipart, [[*asked[:-1], b'{"ok": true, "message": "late"}']]
-            )
-            late.start()
-            with pytest.raises(TimeoutError):
-                control.ping()
-            late.join()
+        asked: dict[str, list[bytes]] = {}
+
+        def answer() -> None:
+            """Answer the second command, after the first one has been answered late, on the same way."""
+            while "stats" not in asked:
+                parts = run.recv_multipart()
+                asked[json.loads(parts[-1])["do"]] = parts
+            (way, second, *rest), first = asked["stats"][:-1], asked["ping"][1]
+            for number, message in ((first, "late"), (second, "in time")):
+                answered = {"ok": True, "message": message, "state": {"sensor": "main"}}
+                run.send_multipart([way, number, *rest, json.dumps(answered).encode()])
+
+        with RemoteControl(f"tcp://127.0.0.1:{port}", timeout=0.05) as control:
+
+            def ping_arrives() -> int:
+                with pytest.raises(TimeoutError):
+                    control.ping()
+                return run.poll(0)
+
+            until(ping_arrives)
+            thread = threading.Thread(target=answer)
+            thread.start()
+            control.timeout = PATIENCE
+            assert control.stats()["message"] == "in time"
+            thread.join()
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -164,10 +165,12 @@ def test_a_wait_may_be_longer_than_zeromq_can_count(timeout: float, publisher: P
 
 
 class Ticking(ManualClock):
-    """A clock that goes on by a little whenever somebody looks at it."""
+    """A clock that goes on by a little whenever somebody looks at it, unless it is stopped."""
+
+    stopped = False
 
     def now(self) -> float:
-        self.advance(0.02)
+        self.advance(0.0 if self.stopped else 0.02)
         return super().now()
 
 
@@ -187,7 +190,7 @@ def test_a_subscriber_may_start_before_the_publisher_and_survives_its_restart() 
     first.sink.close()
 
     def run(seqs: list[int]) -> None:
-        sink = Zmq(Zmq.Params(endpoint=endpoint, wait_for_subscriber=LONG))
+        sink = Zmq(Zmq.Params(endpoint=endpoint, wait_for_subscriber=LONG, linger=60))
         sink.open()
         for seq in seqs:
             sink.write(Tick(Frame("main", seq, 0.0, IMAGE)), Results(IMAGE))
@@ -234,7 +237,7 @@ def test_a_subscriber_needs_no_opencv() -> None:
     program = (
         "import sys, tactflow.network.subscriber; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", program], check=False, timeout=60).returncode == 0
+    assert subprocess.run([sys.executable, "-c", program], check=False, timeout=PATIENCE).returncode == 0
 
 
 # -- tactflow listen --------------------------------------------------------------------------------------
@@ -290,7 +293,15 @@ def test_listen_prints_the_messages_as_they_are(
     assert [json.loads(line)["seq"] for line in lines] == [0, 1]
 
 
-def test_listen_ends_well_when_messages_stop_coming(publisher: Publisher) -> None:
+def test_listen_ends_well_when_messages_stop_coming(
+    publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(subscriber, "LONGEST_WAIT", 0.001)
+    # Time passes from the first message on.
+    clock = Ticking()
+    clock.stopped = True
+    monkeypatch.setattr(listen, "Subscriber", partial(Subscriber, clock=clock))
+    monkeypatch.setattr(listen, "describe", lambda _: setattr(clock, "stopped", False))
     assert run_listen(publisher, "--timeout", "1.5", send=lambda: publisher.send(0)) == 0
 
 

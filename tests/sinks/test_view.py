@@ -105,7 +105,8 @@ class Page:
 
     def __init__(self, url: str, stack: ExitStack, **options: Any) -> None:
         host = url.removeprefix("http://").partition("/")[0]
-        options = {"origin": f"http://{host}"} | options
+        # A machine may be as slow as it likes.
+        options = {"origin": f"http://{host}", "open_timeout": PATIENCE, "ping_timeout": None} | options
         path = options.pop("path", "live")
         self.socket: ClientConnection = stack.enter_context(
             connect(f"ws://{host}/{path}", compression=None, **options)
@@ -148,6 +149,13 @@ def stack() -> Iterator[ExitStack]:
     """Closes what a test opened, last first."""
     with ExitStack() as opened:
         yield opened
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server gets as long as it takes to start and to end."""
+    monkeypatch.setattr(server, "START_SECONDS", PATIENCE)
+    monkeypatch.setattr(server, "CLOSE_SECONDS", PATIENCE)
 
 
 @pytest.fixture
@@ -274,12 +282,12 @@ def test_a_page_that_reads_nothing_holds_up_neither_writing_nor_closing(
 
 
 def test_max_fps_bounds_what_is_encoded(view: Callable[..., View], page: Callable[..., Page]) -> None:
-    sink = view(max_fps=0.01)
+    sink = view(max_fps=1e-6)
     browser = page(sink)
     write(sink, 0)
     browser.say(ack=browser.next("frame")[0]["number"])
     until(lambda: "screen_p50_ms" in sink.counters())
-    # The page is ready, but the next frame is due in 50 s.
+    # The page is ready, but the next frame is due in six days.
     assert not sink.wants()
     sink.write(tick(1), Results(picture(), None, None, None))
     assert sink.counters()["encoded"] == 1
@@ -336,7 +344,7 @@ def test_field_and_heights_are_sent_only_while_a_page_shows_them(
     )
     run = FakeRun()
     sink = view(run)
-    browser, other = page(sink), page(sink)
+    browser, _ = page(sink), page(sink)
 
     def shown(seq: int) -> tuple[Any, bytes]:
         until(sink.wants)
@@ -370,7 +378,8 @@ def test_field_and_heights_are_sent_only_while_a_page_shows_them(
     assert np.ptp(np.subtract(header["field"]["position"], header["field"]["origin"])[::2]) <= 10
     browser.say(show="field")
     until(lambda: sink._hub is not None and not sink._hub.shown)
-    other.next("stats")
+    # A page that has shown what it was sent is told more.
+    browser.next("stats")
 
 
 # -- what pages may ask for ---------------------------------------------------------------------------------
@@ -510,6 +519,8 @@ def test_a_page_on_a_full_machine_rests_before_its_next_frame(
     view: Callable[..., View], page: Callable[..., Page], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tactflow.view.hub.REST_MS", 3_600_000)
+    # The frame is shown to the other page, however late it comes.
+    monkeypatch.setattr("tactflow.view.hub.STALE_SECONDS", PATIENCE)
     sink = view()
     browser = page(sink)
     write(sink, 0)
@@ -660,6 +671,8 @@ def test_connections_that_ask_for_nothing_keep_nobody_out(
     for connection in silent:
         with suppress(ConnectionError):
             assert connection.recv(1) == b"", "closed by the server"
+    # From now on, silent ones may stay.
+    monkeypatch.setattr(server, "SILENT_SECONDS", PATIENCE)
     assert get(sink).status == 200
 
 
@@ -669,12 +682,19 @@ def test_a_connection_that_begins_a_second_request_and_waits_is_closed(
     monkeypatch.setattr(server, "SILENT_SECONDS", 0.2)
     where = urlsplit(str(view().description))
     request = b"HEAD / HTTP/1.1\r\nHost: localhost\r\n\r\n"
-    with socket.create_connection((str(where.hostname), where.port or 0), PATIENCE) as connection:
-        connection.sendall(request)
-        assert connection.recv(65536).startswith(b"HTTP/1.1")
-        connection.sendall(request[:10])
-        with suppress(ConnectionError):
-            assert connection.recv(65536) == b""
+
+    def closed_after_an_answer() -> bool:
+        """Whether an answer came; who has asked too late is sent off without one."""
+        with socket.create_connection((str(where.hostname), where.port or 0), PATIENCE) as connection:
+            answered = False
+            with suppress(ConnectionError):
+                connection.sendall(request)
+                answered = connection.recv(65536).startswith(b"HTTP/1.1")
+                connection.sendall(request[:10])
+                assert connection.recv(65536) == b""
+            return answered
+
+    until(closed_after_an_answer)
 
 
 def test_a_request_whose_body_is_none_is_refused_without_a_traceback(
@@ -883,10 +903,19 @@ sinks:
 """
 
 
-def test_a_page_pauses_steps_and_ends_a_run(tmp_path: Path, stack: ExitStack) -> None:
+def test_a_page_pauses_steps_and_ends_a_run(
+    tmp_path: Path, stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "pipeline.yaml"
     file.write_text(PIPELINE)
     runner = Runner(load_pipeline(file))
+    held, may_go_on = threading.Event(), runner._may_go_on
+
+    def hold() -> bool:
+        held.set()
+        return may_go_on()
+
+    monkeypatch.setattr(runner, "_may_go_on", hold)
     results: list[Any] = []
     thread = threading.Thread(target=lambda: results.append(runner.run()))
     thread.start()
@@ -900,12 +929,10 @@ def test_a_page_pauses_steps_and_ends_a_run(tmp_path: Path, stack: ExitStack) ->
     browser.say(ack=header["number"])
 
     def settle() -> int:
-        """The number of frames captured once the run stands still."""
-        before = -1
-        while before != (now := runner.progress().frames):
-            before = now
-            time.sleep(0.2)
-        return now
+        """The number of frames that were let through once the next one is held."""
+        assert held.wait(PATIENCE)
+        held.clear()
+        return runner.progress().frames
 
     still = settle()
     browser.say(do="step")

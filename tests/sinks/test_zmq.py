@@ -205,7 +205,7 @@ def test_a_conflating_subscriber_that_pauses_gets_the_newest(subscribe: Subscrib
 
 def test_closing_delivers_the_last_messages(subscribe: Subscribing) -> None:
     for _ in range(5):
-        sink = opened()
+        sink = opened(linger=60)
         socket = subscribe(sink.endpoint)
         wait_until_wanted(sink)
         write(sink, range(5))

@@ -10,9 +10,16 @@ import subprocess
 FFMPEG = shutil.which("ffmpeg")
 
 MOVING = "testsrc2=size=320x240:rate=30"
+TURNS = 40
+"""How often a picture stands still: who is late for one time sees the next."""
 FREEZES = (
-    "testsrc2=size=320x240:rate=30:duration=3[a];color=gray:size=320x240:rate=30:duration=4[b];"
-    "testsrc2=size=320x240:rate=30:duration=60[c];[a][b][c]concat=n=3"
+    "".join(
+        f"testsrc2=size=320x240:rate=30:duration=3[moves{n}];"
+        f"color=gray:size=320x240:rate=30:duration=4[stands{n}];"
+        for n in range(TURNS)
+    )
+    + "".join(f"[moves{n}][stands{n}]" for n in range(TURNS))
+    + f"concat=n={2 * TURNS}"
 )
 DARKENS = FREEZES.replace("color=gray", "color=black")
 

@@ -4,42 +4,51 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
+from tactflow.sources import Watch, Watched, open_source
+from tactflow.sources.base import FrameReader
 from tactflow.stages.capture import Capture
+from tests.clock import LOOK_SECONDS, PATIENCE, ManualClock, until
 from tests.sources.ffmpeg import DARKENS, FFMPEG, FREEZES, Server
 
 pytestmark = pytest.mark.skipif(
     FFMPEG is None, reason="NO STREAM TESTS: ffmpeg is not installed (make system-deps installs it)"
 )
 
-PATIENCE = 40.0
-"""s; how long a test waits for what must happen. Nothing is asserted about the time it takes."""
+
+def watched_by_hand(address: str, *, watch: Watch, **options: Any) -> Watched:
+    """A stream that is watched by a clock on which time passes between two attempts to open it alone."""
+    clock = ManualClock(pause=LOOK_SECONDS)
+    return Watched(lambda: open_source(address, **options), watch, address, clock)
 
 
 class Reading:
     """A capture of a stream, read in a thread of its own."""
 
-    def __init__(self, server: Server, **params: object) -> None:
-        self.stage = Capture(Capture.Params.model_validate({"source": server.address, **params}))
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            try:
-                self.stage.open()
-                break
-            except SourceError:
-                # The server needs a moment until it listens.
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
+    def __init__(
+        self, server: Server, opener: Callable[..., FrameReader] = open_source, **params: object
+    ) -> None:
+        given = Capture.Params.model_validate({"source": server.address, **params})
+        self.stage = Capture(given, opener=opener)
+        until(self._opens, lambda: f"{server.address} cannot be opened")
         self.frames: list[Frame] = []
         self.error: SourceError | None = None
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
+
+    def _opens(self) -> bool:
+        """Try it; the server needs a moment until it listens."""
+        try:
+            self.stage.open()
+        except SourceError:
+            return False
+        return True
 
     def _run(self) -> None:
         try:
@@ -52,12 +61,8 @@ class Reading:
         wanted = len(self.frames) + count
         self.until(lambda: len(self.frames) >= wanted)
 
-    def until(self, condition: object) -> None:
-        assert callable(condition)
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, f"{len(self.frames)} frames, {self.stage.state}, {self.error}"
-            time.sleep(0.01)
+    def until(self, condition: Callable[[], object]) -> None:
+        until(condition, lambda: f"{len(self.frames)} frames, {self.stage.state}, {self.error}")
 
     def ended(self) -> bool:
         return not self._thread.is_alive()
@@ -143,7 +148,7 @@ def test_a_picture_that_freezes_or_turns_black_is_reported_and_not_handed_over(
 
 def test_a_server_that_stays_away_ends_the_run_with_what_to_try(servers: list[Server]) -> None:
     server = serve(servers, "http")
-    reading = Reading(server, no_frame_timeout=4.0)
+    reading = Reading(server, watched_by_hand, no_frame_timeout=4.0)
     try:
         reading.more()
         server.kill()
@@ -159,7 +164,6 @@ def test_without_reconnection_a_server_that_goes_away_is_the_end(servers: list[S
     server = serve(servers, "http")
     reading = Reading(server, reconnect=False)
     try:
-        reading.more()
         server.kill()
         reading.until(reading.ended)
     finally:

@@ -8,6 +8,7 @@ import signal
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from importlib import import_module
 from typing import Any
 
@@ -118,9 +119,12 @@ class DaskCluster:
         """Let go of the cluster; end it if it was started here."""
         if kill and self._is_there:
             self._client.cancel([future for future, _ in self._tasks.values()], force=True)
-        self._client.close(timeout=CONNECT_SECONDS)
+        # A goodbye that takes too long takes nothing from what is done.
+        with suppress(TimeoutError):
+            self._client.close(timeout=CONNECT_SECONDS)
         if self._cluster is not None:
-            self._cluster.close()
+            with suppress(TimeoutError):
+                self._cluster.close()
 
 
 def _distributed() -> Any:

@@ -164,12 +164,13 @@ class Publication:
     """An address at which a sink publishes.
 
     backlog : messages that may wait there for each subscriber. keys : folder that says who may read; None:
-    everybody who can reach the address.
+    everybody who can reach the address. linger : time to deliver the last messages at the end, s.
     """
 
     address: str
     backlog: int
     keys: str | None = None
+    linger: float = 1.0
 
 
 class Sink(Part):

@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from tactflow.engine.errors import StageError
 from tactflow.network.bound_socket import FloodError
 from tactflow.network.publisher import SEND_BUFFER, Publisher
 
-LINGER = 0.5
-"""Time to deliver the last messages at the end, s. Chosen by hand."""
 POLL_MS = 100
 """How often the thread looks whether it shall end, ms. Chosen by hand."""
+LONGEST_END = 5.0
+"""Time that the thread gets to end, once it need not linger, s. Chosen by hand."""
+COMES_OR_GOES = zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED
+"""What is told about the connections to the publishers."""
 
 
 @contextmanager
-def relay(address: str, upstream: Sequence[str], backlog: int, keys: str | None = None) -> Iterator[None]:
+def relay(
+    address: str, upstream: Sequence[str], backlog: int, linger: float, keys: str | None = None
+) -> Iterator[None]:
     """Bind `address` and pass on what the upstream publishers send, while the block lasts.
 
     upstream : addresses of the publishers. backlog : messages that may wait for each subscriber.
-    keys : as of `Publisher`.
+    linger : time to deliver the last ones at the end, s. keys : as of `Publisher`.
 
     Raises
     ------
@@ -32,7 +39,7 @@ def relay(address: str, upstream: Sequence[str], backlog: int, keys: str | None 
     """
     publisher = Publisher(address, backlog, SEND_BUFFER, keys)
     stop = threading.Event()
-    work = _Relay(publisher, upstream, backlog, stop)
+    work = _Relay(publisher, upstream, backlog, linger, stop)
     thread = threading.Thread(target=work.run, name="tactflow-relay", daemon=True)
     thread.start()
 
@@ -41,19 +48,28 @@ def relay(address: str, upstream: Sequence[str], backlog: int, keys: str | None 
         yield
     finally:
         stop.set()
-        thread.join(5)
-        publisher.close(LINGER)
+        thread.join(linger + LONGEST_END)
+        publisher.close(linger)
 
 
 class _Relay:
-    """Messages to the front, subscriptions to the back, until told to stop; all of it in one thread."""
+    """Messages to the front, subscriptions to the back, until told to stop; all of it in one thread.
+
+    After that until the publishers are gone, whose last messages may be on the way, for at most `linger`.
+    """
 
     def __init__(
-        self, publisher: Publisher, upstream: Sequence[str], backlog: int, stop: threading.Event
+        self,
+        publisher: Publisher,
+        upstream: Sequence[str],
+        backlog: int,
+        linger: float,
+        stop: threading.Event,
     ) -> None:
         self._publisher = publisher
         self._upstream = upstream
         self._backlog = backlog
+        self._linger = linger
         self._stop = stop
 
     def run(self) -> None:
@@ -66,17 +82,26 @@ class _Relay:
                     back.linger = 0
                     # As in the sink: a slow reader shall not be seconds behind.
                     back.rcvhwm = self._backlog
-                    for source in self._upstream:
-                        back.connect(source)
-                    flooded = self._pass_on(back)
+                    with back.get_monitor_socket(COMES_OR_GOES) as connections:
+                        for source in self._upstream:
+                            back.connect(source)
+                        flooded = self._pass_on(back, connections)
+                        back.disable_monitor()
 
-    def _pass_on(self, back: zmq.Socket[bytes]) -> bool:
+    def _pass_on(self, back: zmq.Socket[bytes], connections: zmq.Socket[bytes]) -> bool:
         """Until told to stop; True: until subscribers took too much and were disconnected."""
         front = self._publisher.socket
         poller = zmq.Poller()
         poller.register(front, zmq.POLLIN)
         poller.register(back, zmq.POLLIN)
+        connected, end = 0, math.inf
         while True:
+            if self._stop.is_set():
+                end = min(end, time.monotonic() + self._linger)
+            # Before the messages: what a publisher that has gone has sent is there by then.
+            while connections.poll(0):
+                is_new = recv_monitor_message(connections)["event"] == zmq.EVENT_CONNECTED
+                connected += 1 if is_new else -1
             events = dict(poller.poll(POLL_MS))
             try:
                 event = self._publisher.next_event()
@@ -92,5 +117,5 @@ class _Relay:
                 back.send(event)
             if back in events:
                 front.send(back.recv())
-            elif self._stop.is_set():
+            elif (end < math.inf and not connected) or time.monotonic() > end:
                 return False

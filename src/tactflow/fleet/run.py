@@ -71,7 +71,7 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
         scratch = Path(stack.enter_context(_scratch_folder(pipelines)))
         for one in shared:
             upstream = [_private(scratch, sensor, node) for sensor, node in one.sinks]
-            stack.enter_context(relay(one.address, upstream, one.backlog, one.keys))
+            stack.enter_context(relay(one.address, upstream, one.backlog, one.linger, one.keys))
         members = []
         for sensor, pipeline in pipelines.items():
             sign = SignOfLife(scratch / f"{sensor}.alive", request.hang_after)

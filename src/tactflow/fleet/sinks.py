@@ -125,13 +125,15 @@ def _taken(node: Node, sensor: str) -> Iterator[tuple[str, str, str]]:
 class Shared(NamedTuple):
     """An address at which several sinks would publish.
 
-    sinks : (sensor, its sink). backlog : messages. keys : as in `Publication`.
+    sinks : (sensor, its sink). backlog : messages. keys : as in `Publication`. linger : the longest of the
+    sinks', s.
     """
 
     address: str
     sinks: Sequence[tuple[str, Node]]
     backlog: int
     keys: str | None
+    linger: float
 
 
 def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
@@ -145,9 +147,11 @@ def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
             publication = sink_class(node).publishes(node.params)
             if publication is not None:
                 address = publication.address
-                before = found.get(address, Shared(address, (), 0, publication.keys))
+                before = found.get(address, Shared(address, (), 0, publication.keys, 0.0))
                 found[address] = before._replace(
-                    sinks=(*before.sinks, (sensor, node)), backlog=before.backlog + publication.backlog
+                    sinks=(*before.sinks, (sensor, node)),
+                    backlog=before.backlog + publication.backlog,
+                    linger=max(before.linger, publication.linger),
                 )
     return [shared for shared in found.values() if len(shared.sinks) > 1]
 
