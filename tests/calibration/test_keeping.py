@@ -13,7 +13,7 @@ import pytest
 from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.presses import Press, _Collect
 from tactflow.engine.contract import StageParams
-from tactflow.engine.errors import ConfigError
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact
@@ -61,6 +61,12 @@ def test_a_kept_press_that_is_damaged_is_named(tmp_path: Path) -> None:
     (tmp_path / "untouched.npz").write_bytes(b"PK\x03\x04 cut short")
     with pytest.raises(ConfigError, match=r"untouched\.npz: cannot be read"):
         kept.check(GEL, MAPPING)
+
+
+def test_presses_that_cannot_be_kept_are_told_in_words(tmp_path: Path) -> None:
+    (tmp_path / "main.presses").touch()
+    with pytest.raises(StageError, match=r"main\.presses, which cannot be written into: .* --out"):
+        KeptPresses(tmp_path / "main.presses").sync([PRESS])
 
 
 class LiveSink(_Collect):

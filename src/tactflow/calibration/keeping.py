@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.calibration.file import raw_corners
 from tactflow.calibration.presses import SAME, Press, difference
-from tactflow.engine.errors import ConfigError
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.files import completed
 from tactflow.vision.geometry import PixelMapping
 
@@ -92,8 +92,15 @@ class KeptPresses:
 
 
 def _save(path: Path, **arrays: Any) -> None:
-    with completed(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    """Raises StageError if it cannot be written."""
+    try:
+        with completed(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+    except OSError as error:
+        raise StageError(
+            f"presses are kept in {path.parent}, which cannot be written into: {error.strerror or error}; "
+            "make room, or name another folder with --out"
+        ) from error
 
 
 def _unreadable(path: Path, error: Exception) -> ConfigError:

@@ -197,7 +197,9 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     session = find_presses(_load(args, pipeline), report)
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
-        print(printable(f"does not fit: {misfit}"))
+        print(
+            printable(f"does not fit: {misfit}; name the pipeline that it was made with, or calibrate anew")
+        )
         return 3
     unlike = calibration.unlikeness(session.untouched)
     fits = unlike <= UNLIKE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import tempfile
 import time
 from pathlib import Path
@@ -109,6 +110,8 @@ def _check_files(out: Path, page: Path, overwrite: bool) -> None:
     for option, path in (("--out", out), ("--html", page)):
         if not path.absolute().parent.is_dir():
             raise ConfigError(f"{option}: there is no folder {path.absolute().parent}")
+        if not os.access(path.absolute().parent, os.W_OK):
+            raise ConfigError(f"{option}: {path.absolute().parent} cannot be written into")
         if path.is_dir():
             raise ConfigError(f"{option}: {path} is a folder; required a file")
         if path.exists() and not overwrite:
