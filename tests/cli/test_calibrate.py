@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import cv2
@@ -167,6 +168,15 @@ def test_what_gives_no_calibration_is_refused_in_words(
     assert calibrate(*words) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.yaml"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="its shell quotes otherwise")
+def test_what_is_said_to_be_typed_can_be_typed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert calibrate("--from", "sim:idle?frames=2", "--pitch", "1.724", "--out", "my gel/left.yaml") == 0
+    assert "--set 'calibration=my gel/left.yaml'" in capsys.readouterr().err
 
 
 def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(

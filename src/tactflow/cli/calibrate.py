@@ -20,7 +20,7 @@ from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_f
 from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.cli.notes import notes_on, say
-from tactflow.cli.printable import printable
+from tactflow.cli.printable import printable, typed
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.view.guided import Guiding
@@ -150,7 +150,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         say(f"to go on to {args.presses} presses, run the command again with --overwrite")
     say(
         f"{out} is written. To use it, write into the pipeline file: calibration: {out}\n"
-        f"or give it to a run: --set calibration={out}"
+        f"or give it to a run: {typed('--set', f'calibration={out}')}"
     )
     return 0
 
