@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,9 +26,11 @@ from tactflow.sources import (
     Watch,
     open_source,
 )
-from tactflow.sources.files import load_image
+from tactflow.sources.files import ImageFiles, load_image
 from tactflow.sources.first import Ahead, FirstFrames
 from tactflow.sources.pace import Pace
+
+logger = logging.getLogger("tactflow")
 
 
 class Capture(Source):
@@ -258,6 +261,13 @@ class Capture(Source):
             if first.look(*item):
                 break
         chosen = first.references() if pictures else []
+        if isinstance(self._source, ImageFiles) and first.separate and chosen[0] == 0:
+            logger.info(
+                "%s: separate pictures; %s, the first by name, is taken for the untouched gel. "
+                "If another one shows that, name it: stages.capture.reference",
+                self.params.source,
+                self._source.first,
+            )
         if chosen == list(range(len(chosen))):
             return [], len(chosen)
         return [pictures[index] for index in chosen], 0

@@ -1,4 +1,5 @@
-"""Writes LeRobot datasets (layout v3.0): pictures, contact and flow at a constant rate.
+"""Writes LeRobot datasets (layout v3.0): pictures, contact and flow at a constant rate; of a calibrated
+sensor also in mm and N.
 
 The layout is described at https://huggingface.co/docs/lerobot/lerobot-dataset-v3. Each recording is an
 episode, in files of its own.
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,15 +21,27 @@ from tactflow import __version__
 from tactflow.engine.errors import StageError
 from tactflow.extras import missing
 from tactflow.streaming import Result
+from tactflow.vision.types import Scale
 
 if TYPE_CHECKING:
     import av
 
 VERSION = "v3.0"
 """Of the layout, as LeRobot compares it."""
-CONTACT, FLOW = "observation.tactile.contact", "observation.tactile.flow"
-NAMES = {CONTACT: ["touching", "x", "y", "area", "angle"], FLOW: ["known", "dx", "dy"]}
-"""Features and the names of their numbers. All are 0 where the first is 0."""
+TACTILE = "observation.tactile"
+PIXELS = {
+    f"{TACTILE}.contact": ["touching", "x", "y", "area", "angle"],
+    f"{TACTILE}.flow": ["known", "dx", "dy"],
+}
+"""Features and the names of their numbers, px. All are 0 where the first is 0."""
+CALIBRATED = {
+    f"{TACTILE}.contact_mm": ["touching", "x_mm", "y_mm", "area_mm2"],
+    f"{TACTILE}.flow_mm": ["known", "dx_mm", "dy_mm"],
+    f"{TACTILE}.depth": ["known", "depth_mm", "volume_mm3"],
+    f"{TACTILE}.force": ["known", "z_N", "in_range"],
+    f"{TACTILE}.drag": ["known", "x_N", "y_N"],
+}
+"""The same of recordings that are worked on with a calibration, whatever it knows."""
 WHOLE = ("frame_index", "episode_index", "index", "task_index")
 """Columns of whole numbers that every dataset has, beside `timestamp`."""
 CHUNK = 1000
@@ -60,7 +73,8 @@ class DatasetWriter:
         self._frames = 0
         self._camera = ""
         self._shape: tuple[int, ...] = ()
-        self._numbers: dict[str, list[NDArray[np.float64]]] = {name: [] for name in NAMES}
+        self._features: dict[str, list[str]] = {}
+        self._numbers: dict[str, list[NDArray[np.float64]]] = {}
         self._pixels: list[NDArray[np.float64]] = []
 
     def add(self, results: Iterable[Result]) -> int:
@@ -70,8 +84,8 @@ class DatasetWriter:
 
         Raises
         ------
-        StageError : the sensor or the size of its pictures is not that of the episodes before, or there is no
-            picture. OSError : the files cannot be written.
+        StageError : the sensor or the size of its pictures is not that of the episodes before, one has a
+            calibration and the other none, or there is no picture. OSError : the files cannot be written.
         """
         episode = len(self._episodes)
         place = f"chunk-{episode // CHUNK:03d}/file-{episode % CHUNK:03d}"
@@ -121,12 +135,20 @@ class DatasetWriter:
         if image is None:
             raise StageError("the pipeline makes no picture: it needs a stage preprocess")
         camera = f"observation.images.{result.sensor}"
+        features = PIXELS if result.scale is None else PIXELS | CALIBRATED
         if not self._camera:
-            self._camera, self._shape = camera, image.shape
+            self._camera, self._shape, self._features = camera, image.shape, features
+            self._numbers = {name: [] for name in features}
         if (camera, image.shape) != (self._camera, self._shape):
             raise StageError(
                 f"{camera} with pictures of {image.shape[1]} x {image.shape[0]} pixels; those before are "
                 f"{self._camera}, {self._shape[1]} x {self._shape[0]}: make two datasets"
+            )
+        if features != self._features:
+            own, before = ("no", "one") if result.scale is None else ("a", "none")
+            raise StageError(
+                f"has {own} calibration, those before have {before}: name one in the pipeline file, or make "
+                "two datasets"
             )
         if self._film and (image.shape[0] % 2 or image.shape[1] % 2):
             raise StageError(
@@ -136,7 +158,9 @@ class DatasetWriter:
         return image
 
     def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
-        row: dict[str, Any] = dict(_numbers(result))
+        row: dict[str, Any] = {**_in_pixels(result)}
+        if result.scale is not None:
+            row |= _calibrated(result, result.scale)
         for name, values in self._numbers.items():
             values.append(np.array(row[name]))
         if index % SAMPLED == 0:
@@ -153,7 +177,9 @@ class DatasetWriter:
     def _write_rows(self, rows: list[dict[str, Any]], path: Path) -> None:
         import pyarrow as pa
 
-        fields = [pa.field(name, pa.list_(pa.float32(), len(names))) for name, names in NAMES.items()]
+        fields = [
+            pa.field(name, pa.list_(pa.float32(), len(names))) for name, names in self._features.items()
+        ]
         if not self._film:
             fields.append(pa.field(self._camera, pa.struct([("bytes", pa.binary()), ("path", pa.string())])))
         fields += [pa.field("timestamp", pa.float32()), *(pa.field(name, pa.int64()) for name in WHOLE)]
@@ -194,7 +220,7 @@ class DatasetWriter:
                 "has_audio": False,
             }
         features: dict[str, Any] = {self._camera: camera}
-        for name, names in NAMES.items():
+        for name, names in self._features.items():
             features[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in WHOLE}
@@ -260,14 +286,38 @@ def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
         yield before
 
 
-def _numbers(result: Result) -> Iterator[tuple[str, list[float]]]:
+def _in_pixels(result: Result) -> dict[str, list[float]]:
+    """The numbers of `PIXELS`."""
     contact, mean = result.contact, None if result.flow is None else result.flow.mean
-    if contact is None:
-        yield CONTACT, [0.0] * len(NAMES[CONTACT])
-    else:
-        angle = 0.0 if contact.angle is None else math.radians(contact.angle)
-        yield CONTACT, [1.0, *contact.center, contact.area, angle]
-    yield FLOW, [0.0, 0.0, 0.0] if mean is None else [1.0, *mean]
+    angle = 0.0 if contact is None or contact.angle is None else math.radians(contact.angle)
+    touched = None if contact is None else [*contact.center, contact.area, angle]
+    return _filled(PIXELS, [touched, mean])
+
+
+def _calibrated(result: Result, scale: Scale) -> dict[str, list[float]]:
+    """The numbers of `CALIBRATED`."""
+    contact, depth, force = result.contact, result.depth, result.force
+    mean = None if result.flow is None else result.flow.mean
+    drag = [] if force is None else [part for part in force.value[:2] if part is not None]
+    found = [
+        None if contact is None else [*scale.point(contact.center), scale.area(contact.area)],
+        None if mean is None else scale.vector(mean),
+        None if depth is None else [depth.greatest, depth.volume],
+        None if force is None else [force.value[2], force.in_range],
+        drag if len(drag) == 2 else None,
+    ]
+    return _filled(CALIBRATED, found)
+
+
+def _filled(
+    features: Mapping[str, Sequence[str]], found: Iterable[Sequence[float] | None]
+) -> dict[str, list[float]]:
+    """1 and what was found, or zeros, for each feature."""
+    pairs = zip(features.items(), found, strict=True)
+    return {
+        name: [0.0] * len(names) if numbers is None else [1.0, *map(float, numbers)]
+        for (name, names), numbers in pairs
+    }
 
 
 class _Film:

@@ -136,6 +136,13 @@ def test_a_file_that_is_no_calibration_is_refused(
         Calibration.load(path)
 
 
+@pytest.mark.parametrize("text", ["", "- 1\n", "press", PIPELINE])
+def test_a_file_of_another_kind_is_refused_in_words(text: str, tmp_path: Path) -> None:
+    (tmp_path / "left.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=r"left\.yaml: is empty, or no calibration; make it anew"):
+        Calibration.load(tmp_path / "left.yaml")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
 def test_nobody_waits_at_a_pipe_for_a_calibration(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "left.yaml")

@@ -13,7 +13,7 @@ import pytest
 from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.presses import Press, _Collect
 from tactflow.engine.contract import StageParams
-from tactflow.engine.errors import ConfigError
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact
@@ -63,10 +63,38 @@ def test_a_kept_press_that_is_damaged_is_named(tmp_path: Path) -> None:
         kept.check(GEL, MAPPING)
 
 
+def test_presses_that_cannot_be_kept_are_told_in_words(tmp_path: Path) -> None:
+    (tmp_path / "main.presses").touch()
+    with pytest.raises(StageError, match=r"main\.presses, which cannot be written into: .* --out"):
+        KeptPresses(tmp_path / "main.presses").sync([PRESS])
+
+
 class LiveSink(_Collect):
     """The sink of `find_presses`, at a live source, with nobody who guides."""
 
     report = staticmethod(lambda _frames, _presses, _lasts: False)
+
+
+@pytest.mark.parametrize(("brighter", "left"), [(2, 2), (20, 1)])
+def test_a_new_reference_replaces_the_one_before_and_presses_of_another_look_are_left_out(
+    brighter: int, left: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    live: Any = SimpleNamespace(source=SimpleNamespace(live=True))
+    kept = KeptPresses(tmp_path / "main.presses")
+    sink = LiveSink(StageParams(), live)
+    sink.keeper = lambda: kept
+    sink.open()
+    contact = Contact(100.0, (14.5, 14.5), None, None, np.zeros((0, 2)), None)
+    changed = np.asarray(GEL + brighter, np.uint8)
+    for seq, (gel, touched) in enumerate(
+        [(GEL, 0), (GEL, 1), (GEL, 0), (changed, 0), (changed, 0), (changed, 1)]
+    ):
+        tick = Tick(Frame("main", seq, seq / 60, gel, reference=seq in (0, 3), epoch=int(seq > 2)))
+        sink.write(tick, gel, contact if touched else None, MASK, None, None, MAPPING)
+    sink.write(Tick(Frame("main", 9, 1.0, changed, epoch=1)), changed, None, MASK, None, None, MAPPING)
+    assert np.array_equal(sink.untouched(), changed)
+    assert len(sink.presses) == len(KeptPresses(kept.folder).presses) == left
+    assert ("1, are left out" in caplog.text) == (left == 1)
 
 
 def test_a_live_session_begins_with_the_presses_of_the_one_before(tmp_path: Path) -> None:

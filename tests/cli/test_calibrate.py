@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import cv2
@@ -89,7 +90,16 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:ball?frames=60&seed=2") == 0
     assert "it still fits" in capsys.readouterr().out
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:round_gel?frames=3") == 3
-    assert "calibrate anew" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "with another sensor or light, or where something touches the gel at the start" in told
+    assert "calibrate anew" in told
+    # One press of another ball is no drift.
+    assert calibrate("check", "calibration/main.yaml", "--source", "sim:finger?frames=12") == 3
+    told = capsys.readouterr().out
+    assert "1 press today" in told
+    assert "with a ball whose radius is not 2.375 mm" in told
+    assert calibrate("check", "calibration/main.yaml", "--source", "sim:idle?frames=3") == 0
+    assert "no presses today, so depth is not looked at" in capsys.readouterr().out
 
 
 def test_a_printed_target_gives_the_scale(
@@ -164,6 +174,15 @@ def test_what_gives_no_calibration_is_refused_in_words(
     assert not list(tmp_path.rglob("*.yaml"))
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="its shell quotes otherwise")
+def test_what_is_said_to_be_typed_can_be_typed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert calibrate("--from", "sim:idle?frames=2", "--pitch", "1.724", "--out", "my gel/left.yaml") == 0
+    assert "--set 'calibration=my gel/left.yaml'" in capsys.readouterr().err
+
+
 def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,6 +193,9 @@ def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
     assert "--set calibration=film.yaml" in told
     assert calibrate("check", "film.yaml", "--from", "sim:ball?frames=2") == 0
     assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in capsys.readouterr().err
+    # As a camera, for ten minutes: a scale needs no presses to be checked either.
+    assert calibrate("check", "film.yaml", "--from", "sim:idle?frames=36000", "--realtime") == 0
+    assert "Leave the gel untouched." in capsys.readouterr().err
     # As a camera, for ten minutes, unless it ends when it knows what it needs.
     live = ["--from", "sim:idle?frames=36000", "--realtime", "--pitch", "1.724", "--out", "camera.yaml"]
     assert calibrate(*live) == 0

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,12 @@ import pytest
 
 import tactflow
 from tactflow.cli.main import main
+from tactflow.engine.errors import StageError
 from tactflow.files import claim_path
+from tactflow.lerobot import DatasetWriter
 from tactflow.sources import open_source
+from tactflow.streaming import Result
+from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
 
 pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
 pytest.importorskip("av", reason="the extra lerobot is not installed")
@@ -64,6 +69,71 @@ def test_statistics_are_those_of_the_numbers(dataset: Path) -> None:
     assert np.allclose(stats["observation.tactile.contact"]["mean"], np.mean(rows, 0), rtol=1e-5)
     assert np.allclose(stats["observation.tactile.contact"]["std"], np.std(rows, 0), rtol=1e-5)
     assert np.shape(stats[KEY]["mean"]) == (3, 1, 1)
+
+
+def touched(scale: Scale | None, depth: Depth | None = None, force: Force | None = None) -> Result:
+    """A frame with a contact whose centre is 10 px right of the middle, 5 px below it."""
+    contact = Contact(400.0, (41.5, 28.5), 90.0, None, np.zeros((0, 2)), None)
+    image = np.zeros((48, 64, 3), np.uint8)
+    flow = Flow((2.0, -1.0), 3)
+    return Result("main", 0, 0.0, contact, flow, None, None, {}, scale, depth, force, image=image)
+
+
+def test_a_calibrated_recording_has_millimetres_and_newtons(tmp_path: Path) -> None:
+    scale = Scale(0.1, 0.2, (0.001, 0.001), (31.5, 23.5))
+    depth = Depth(np.zeros((48, 64), np.float32), 0.75, None, 3.5, None)
+    results = [
+        touched(scale, depth, Force((0.5, -0.25, 2.5), (0.1, 0.1, 0.1), in_range=True)),
+        touched(scale, depth, Force((None, None, 4.5), (None, None, 0.1), in_range=False)),
+        touched(scale),
+        replace(touched(scale), contact=None, flow=None),
+    ]
+    frames = [replace(result, seq=index, t=index / 10) for index, result in enumerate(results)]
+    writer = DatasetWriter(tmp_path, 10, "press")
+    writer.add(frames)
+    writer.finish()
+    table = pq.read_table(tmp_path / "data").to_pydict()
+    info = json.loads((tmp_path / "meta" / "info.json").read_text())
+    stats = json.loads((tmp_path / "meta" / "stats.json").read_text())
+    place, nowhere = [1.0, 1.0, 1.0, 8.0], [0.0, 0.0, 0.0, 0.0]
+    for name, names, values in (
+        ("contact_mm", ["touching", "x_mm", "y_mm", "area_mm2"], [place, place, place, nowhere]),
+        ("flow_mm", ["known", "dx_mm", "dy_mm"], [[1, 0.2, -0.2]] * 3 + [[0, 0, 0]]),
+        ("depth", ["known", "depth_mm", "volume_mm3"], [[1, 0.75, 3.5]] * 2 + [[0, 0, 0]] * 2),
+        ("force", ["known", "z_N", "in_range"], [[1, 2.5, 1], [1, 4.5, 0], [0, 0, 0], [0, 0, 0]]),
+        ("drag", ["known", "x_N", "y_N"], [[1, 0.5, -0.25]] + [[0, 0, 0]] * 3),
+    ):
+        feature = f"observation.tactile.{name}"
+        assert np.allclose(table[feature], values), name
+        assert info["features"][feature] == {"dtype": "float32", "shape": [len(names)], "names": names}
+        assert np.allclose(stats[feature]["mean"], np.mean(values, 0))
+
+
+@pytest.mark.parametrize(("first", "said"), [(True, "has no calibration"), (False, "has a calibration")])
+def test_a_dataset_is_not_calibrated_in_part(tmp_path: Path, first: bool, said: str) -> None:
+    scale = Scale(0.1, 0.1, (0.001, 0.001), (31.5, 23.5))
+    writer = DatasetWriter(tmp_path, 10, "press")
+    writer.add([touched(scale if first else None)])
+    with pytest.raises(StageError, match=said):
+        writer.add([touched(None if first else scale)])
+
+
+def test_a_recording_brings_its_calibration_into_the_dataset(tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="the extra record is not installed")
+    source, recording = "sim:press?frames=20", tmp_path / "press.mcap"
+    calibrate = ["calibrate", "--from", source, "--pitch", "1.724", "--out", str(tmp_path / "main.yaml")]
+    assert main(calibrate) == 0
+    settings = {"calibration": str(tmp_path / "main.yaml"), "sinks": {"record": {"path": str(recording)}}}
+    assert tactflow.run(source=source, settings=settings).exit_code == 0
+    assert main(["export", "lerobot", str(recording), "--out", str(tmp_path / "press")]) == 0
+    rows = pq.read_table(tmp_path / "press" / "data").to_pylist()
+    results = list(tactflow.stream(source=str(recording), settings={"sinks": {}}))
+    for row, result in zip(rows, results, strict=True):
+        known, x, _, _ = row["observation.tactile.contact_mm"]
+        assert known == (result.contact is not None)
+        if result.contact is not None and result.scale is not None:
+            assert x == pytest.approx(result.scale.point(result.contact.center)[0])
+    assert any(row["observation.tactile.contact_mm"][0] for row in rows)
 
 
 OPENED = """

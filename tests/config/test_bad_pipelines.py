@@ -69,6 +69,10 @@ CASES: dict[str, tuple[str, list[str]]] = {
         "§stagse: {}\n" + HEAD + SINK,
         ["stagse: unknown key", "did you mean stages?"],
     ),
+    "stage that stands beside stages": (
+        HEAD + SINK + "§capture: {source: '0'}\n",
+        ["capture: unknown key; did you mean stages.capture?"],
+    ),
     "unknown top-level key": (HEAD + SINK + "§colour: red\n", ["colour: unknown key", "sensor, sensors"]),
     "no stages": ("§sensor: main\n", ["stages: required, but not given", "id -> stage"]),
     "stages that are a list": (

@@ -165,6 +165,30 @@ def test_the_reference_is_told_in_one_line_also_where_the_light_was_not_steady_b
     ]
 
 
+def test_the_reference_of_a_folder_of_separate_pictures_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    images = warming_up(tmp_path / "r.npy", [1.0] * 12)
+    (tmp_path / "alike").mkdir()
+    (tmp_path / "separate").mkdir()
+    for index, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / "alike" / f"{index}.png"), image)
+        touched = image.copy()
+        touched[16:32, 4 * index : 4 * index + 16] //= 2
+        name = f"press-{index}.png" if index < 11 else "untouched.png"
+        cv2.imwrite(str(tmp_path / "separate" / name), touched if index < 11 else image)
+    with caplog.at_level("INFO", "tactflow"):
+        list(capture("alike", tmp_path).frames())
+        assert not caplog.messages
+        frames = list(capture("separate", tmp_path).frames())
+        assert [frame.seq for frame in frames if frame.reference] == [0]
+        assert "separate pictures; press-0.png, the first by name, is taken" in caplog.messages[0]
+        caplog.clear()
+        frames = list(capture("separate", tmp_path, reference="separate/untouched.png").frames())
+        assert np.array_equal(frames[0].image, images[0])
+        assert not caplog.messages
+
+
 @pytest.mark.parametrize(("settle", "reference"), [(0, 0), (3, -1)])
 def test_settling_can_be_switched_off(tmp_path: Path, settle: float, reference: int) -> None:
     warming_up(tmp_path / "r.npy", [0.6, 0.8] + [1.0] * 18)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -188,6 +189,7 @@ def test_no_line_of_a_recordings_name_becomes_part_of_the_pipeline(
         (["--source", "still", "--seed", "-1"], 2, "--seed: required a whole number from 0"),
         (["--source", "still", "--out", "tuned.txt"], 2, "ends in .yaml"),
         (["--source", "still", "--out", "there.yaml"], 2, "already there"),
+        (["--source", "still", "--out", "readonly/tuned.yaml"], 2, "readonly cannot be written into"),
     ],
 )
 def test_what_cannot_be_tuned_is_said(
@@ -200,6 +202,9 @@ def test_what_cannot_be_tuned_is_said(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.yaml").touch()
+    # Of a user who may do everything too.
+    monkeypatch.setattr(os, "access", lambda path, _mode: Path(path).name != "readonly")
+    (tmp_path / "readonly").mkdir()
     for name, count in (("still", 24), ("short", 5)):
         (tmp_path / name).mkdir()
         for index in range(count):

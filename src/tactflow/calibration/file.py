@@ -227,10 +227,15 @@ class Calibration:
         Raises ConfigError if it or its arrays are not there, or are no calibration.
         """
         try:
-            said = _File.model_validate(yaml.safe_load(stored_text(path).decode("utf-8")))
+            mapping = yaml.safe_load(stored_text(path).decode("utf-8"))
+            if not isinstance(mapping, dict) or "format" not in mapping:
+                raise ConfigError(f"calibration {path}: is empty, or no calibration; {_REMEDY}")
+            said = _File.model_validate(mapping)
             arrays = _arrays(stored_arrays(path))
             look = np.asarray(arrays["look"], np.float32)
             slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
+        except ConfigError:
+            raise
         except OSError as error:
             raise ConfigError(f"calibration {path}: {error.filename}: {error.strerror}") from None
         except ValidationError as error:

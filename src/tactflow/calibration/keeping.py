@@ -5,20 +5,16 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.calibration.file import raw_corners
-from tactflow.calibration.presses import Press
-from tactflow.engine.errors import ConfigError
+from tactflow.calibration.presses import SAME, Press, difference
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.files import completed
 from tactflow.vision.geometry import PixelMapping
-
-SAME: Final = 0.03
-"""RMS difference of the untouched gel, relative to its brightness, up to which a session may go on. Chosen by
-hand, between what presses of one session differ by (0.01) and what a calibration bears (0.1)."""
 
 
 class KeptPresses:
@@ -60,7 +56,7 @@ class KeptPresses:
         remedy = f"begin anew with --fresh, which forgets the {len(self._saved)} presses in {self.folder}"
         if then.shape != untouched.shape or np.abs(where - corners).max() > 1:
             raise ConfigError(f"calibrate: the session of before had another preprocess; {remedy}")
-        differs = float(np.sqrt(np.mean((untouched.astype(float) - then) ** 2)) / max(then.mean(), 1))
+        differs = difference(untouched, then)
         if differs > SAME:
             raise ConfigError(
                 f"calibrate: the untouched gel differs by {100 * differs:.0f} % of its brightness from the "
@@ -96,8 +92,15 @@ class KeptPresses:
 
 
 def _save(path: Path, **arrays: Any) -> None:
-    with completed(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    """Raises StageError if it cannot be written."""
+    try:
+        with completed(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+    except OSError as error:
+        raise StageError(
+            f"presses are kept in {path.parent}, which cannot be written into: {error.strerror or error}; "
+            "make room, or name another folder with --out"
+        ) from error
 
 
 def _unreadable(path: Path, error: Exception) -> ConfigError:

@@ -170,9 +170,11 @@ def check_presses(session: Session, scale: Scale, ball_radius: float) -> None:
         )
     span = np.ptp([press.center for press in presses], axis=0) / session.mapping.size
     if span.min() < SPREAD:
+        # Rounded down, so as not to read as enough.
+        wide, high = np.floor(1000 * span) / 10
         raise ConfigError(
-            f"calibrate: the presses span {100 * span[0]:.0f} % of the picture's width and "
-            f"{100 * span[1]:.0f} % of its height, required {100 * SPREAD:.0f} %; press all over the gel"
+            f"calibrate: the presses span {wide:g} % of the picture's width and "
+            f"{high:g} % of its height, required {100 * SPREAD:.0f} %; press all over the gel"
         )
     radius = float(np.median([press.radius for press in presses])) * (scale.x * scale.y) ** 0.5
     if radius > TOO_LARGE * ball_radius:

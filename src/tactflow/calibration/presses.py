@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -19,6 +20,11 @@ from tactflow.ports import ContactMask, MarkerMask, Unmarked
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Markers
 
+logger = logging.getLogger("tactflow")
+
+SAME: Final = 0.03
+"""RMS difference of the untouched gel, relative to its brightness, up to which presses belong to one session.
+Chosen by hand, between what presses of one session differ by (0.01) and what a calibration bears (0.1)."""
 MOVED_ON: Final = 0.5
 """How far a contact lies from the one before, in its own radii, to be another press. Chosen by hand."""
 
@@ -44,7 +50,8 @@ class Press:
 class Session:
     """What a recording shows that a calibration needs.
 
-    untouched : (H, W, 3) uint8, mean of the reference frames without markers. mapping : of the pixels.
+    untouched : (H, W, 3) uint8, mean of the reference frames without markers; of those that were taken last,
+        where a new reference was taken meanwhile. mapping : of the pixels.
     presses : in order. dots : (N, 2) float64, markers of the untouched gel, px; empty without markers.
     frames : how many there were.
     """
@@ -74,6 +81,9 @@ class Keeper(Protocol):
 
     def sync(self, presses: Sequence[Press]) -> None:
         """Save those that are new, forget those that are no more."""
+
+    def clear(self) -> None:
+        """Forget all of them, and the untouched gel that they are compared with."""
 
 
 def find_presses(
@@ -119,6 +129,8 @@ class _Collect(Sink):
         self.mapping: PixelMapping | None = None
         self.dots = np.zeros((0, 2))
         self.frames = 0
+        self._epoch = 0
+        self._before: NDArray[np.uint8] | None = None
         self._open = False
         self._keeper: Keeper | None = None
         self._checked = False
@@ -143,8 +155,11 @@ class _Collect(Sink):
         """Look at one frame."""
         self.frames += tick.frame.seq >= 0
         if not self.rest or tick.frame.reference:
-            self.rest.append(unmarked.copy())
+            self._compare_with(unmarked, tick.frame.epoch)
             self.mapping = mapping
+        elif self._before is not None:
+            self._keep_what_belongs(self._before)
+            self._before = None
         if markers is not None:
             self.dots = markers.origin
         if contact is None or contact_mask is None or tick.frame.reference:
@@ -163,6 +178,30 @@ class _Collect(Sink):
         # All frames of the reference count, whenever it is said that there is enough.
         if self._enough and live and not tick.frame.reference:
             self._control.stop()
+
+    def _compare_with(self, unmarked: NDArray[np.uint8], epoch: int) -> None:
+        """Another frame of the reference, or the first of a new one, which replaces the one before."""
+        if self.rest and epoch != self._epoch:
+            self._before, self.rest = self.untouched(), []
+        self._epoch = epoch
+        self.rest.append(unmarked.copy())
+
+    def _keep_what_belongs(self, before: NDArray[np.uint8]) -> None:
+        """Leave out the presses so far, if the gel looked different `before` the new reference."""
+        differs = difference(self.untouched(), before)
+        if differs <= SAME:
+            return
+        logger.warning(
+            "calibrate: the new reference differs by %.0f %% of its brightness from the one before (%.0f %% "
+            "at most); the presses before it, %d, are left out: press there again",
+            100 * differs,
+            100 * SAME,
+            len(self.presses),
+        )
+        self.presses.clear()
+        self._checked = False
+        if self._keeper is not None:
+            self._keeper.clear()
 
     def untouched(self) -> NDArray[np.uint8]:
         """(H, W, 3): mean of the reference frames."""
@@ -183,6 +222,15 @@ class _Collect(Sink):
                 return
         self._open = True
         self.presses.append(press)
+
+
+def difference(untouched: NDArray[np.uint8], before: NDArray[np.uint8]) -> float:
+    """RMS difference of two pictures (H, W, 3) uint8 of a gel, relative to the brightness of the second.
+
+    >>> difference(np.full((2, 2, 3), 120, np.uint8), np.full((2, 2, 3), 100, np.uint8))
+    0.2
+    """
+    return float(np.sqrt(np.mean((untouched.astype(float) - before) ** 2)) / max(before.mean(), 1))
 
 
 def _session(collected: _Collect) -> Session:

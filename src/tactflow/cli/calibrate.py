@@ -12,17 +12,17 @@ from typing import Final
 from rich.console import Console
 
 from tactflow.api import Settings, load
-from tactflow.calibration.file import UNLIKE, Calibration, raw_corners, small_picture
+from tactflow.calibration.file import UNLIKE, Calibration, PhotometricEntry, raw_corners, small_picture
 from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
-from tactflow.calibration.presses import Session, find_presses
+from tactflow.calibration.presses import Press, Session, find_presses
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
 from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_force
 from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.cli.notes import notes_on, say
 from tactflow.cli.options import positive
-from tactflow.cli.printable import printable
+from tactflow.cli.printable import printable, typed
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.view.guided import Guiding
@@ -130,14 +130,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         raise ConfigError(f"--out: required a file whose name ends in .yaml, got {out}")
     if out.exists() and not args.overwrite:
         raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
-    if args.ball_radius is not None:
-        say(
-            "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
-            f"all over the gel and to several depths. {args.presses} presses will do. Type u and Enter to "
-            "undo the last one, q and Enter or Ctrl-C to end earlier; what was pressed is kept."
-        )
-    else:
-        say("Leave the gel untouched.")
+    _instruct(args, args.ball_radius, "; what was pressed is kept")
     kept = KeptPresses(out.with_suffix(".presses"))
     if args.fresh:
         kept.clear()
@@ -145,7 +138,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     page = _page(args, pipeline, guide) if args.view else None
     if args.ball_radius is None:
         # The untouched gel is enough for a scale.
-        session = find_presses(loaded, lambda _frames, _presses, _lasts: True, watchers=page)
+        session = find_presses(loaded, _at_once, watchers=page)
     else:
         session = find_presses(loaded, guide, kept, page)
     try:
@@ -164,7 +157,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         say(f"to go on to {args.presses} presses, run the command again with --overwrite")
     say(
         f"{out} is written. To use it, write into the pipeline file: calibration: {out}\n"
-        f"or give it to a run: --set calibration={out}"
+        f"or give it to a run: {typed('--set', f'calibration={out}')}"
     )
     return 0
 
@@ -204,26 +197,69 @@ def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Ca
 
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
-    session = find_presses(_load(args, pipeline), Guide(args.presses, say))
+    then = calibration.photometric
+    _instruct(args, None if then is None else then.ball_radius)
+    # The untouched gel is enough for a scale.
+    report = _at_once if then is None else Guide(args.presses, say, typed_lines())
+    session = find_presses(_load(args, pipeline), report)
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
-        print(printable(f"does not fit: {misfit}"))
+        print(
+            printable(f"does not fit: {misfit}; name the pipeline that it was made with, or calibrate anew")
+        )
         return 3
     unlike = calibration.unlikeness(session.untouched)
     fits = unlike <= UNLIKE
     print(
         f"untouched gel: differs by {100 * unlike:.1f} % of its brightness; up to {100 * UNLIKE:.0f} % fits"
     )
-    if calibration.slopes is not None and calibration.photometric is not None and session.presses:
-        then = calibration.photometric
-        now = try_photometry(session, calibration.slopes, calibration.scale, then.ball_radius)
-        print(f"{len(session.presses)} presses today: {_photometric_words(now)}")
-        print(f"when it was made: {_photometric_words(then.model_dump())}")
-        fits = fits and now["normal_error"] <= WORSE * then.normal_error
+    if not fits:
+        print("so it does too with another sensor or light, or where something touches the gel at the start")
+    if then is not None:
+        fits = _check_presses(calibration, then, session) and fits
     if args.csv is not None:
         fits = check_force(args, path, calibration.force, pipeline, WORSE) and fits
-    print("it still fits" if fits else "it has drifted; calibrate anew")
+    print("it still fits" if fits else "it does not fit; if none of this explains it, calibrate anew")
     return 0 if fits else 3
+
+
+def _check_presses(calibration: Calibration, then: PhotometricEntry, session: Session) -> bool:
+    """Whether a calibration fits the presses of today, which is told; True where there are none."""
+    count = len(session.presses)
+    if calibration.slopes is None or not count:
+        print(
+            "no presses today, so depth is not looked at: show the untouched gel, then a ball of radius "
+            f"{then.ball_radius:g} mm"
+        )
+        return True
+    now = try_photometry(session, calibration.slopes, calibration.scale, then.ball_radius)
+    print(f"{count} {'press' if count == 1 else 'presses'} today: {_photometric_words(now)}")
+    print(f"when it was made: {_photometric_words(then.model_dump())}")
+    if now["normal_error"] <= WORSE * then.normal_error:
+        return True
+    print(
+        f"normals up to {WORSE * then.normal_error:.1f} degrees off fit. They are more off too with few "
+        f"presses, with a ball whose radius is not {then.ball_radius:g} mm, or where the source does not "
+        "begin with the untouched gel"
+    )
+    return False
+
+
+def _instruct(args: argparse.Namespace, ball_radius: float | None, ended: str = "") -> None:
+    """Say what to do with the gel. ball_radius : mm; None without a ball. ended : what becomes of presses."""
+    if ball_radius is None:
+        say("Leave the gel untouched.")
+        return
+    say(
+        "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
+        f"all over the gel and to several depths. {args.presses} presses will do. Type u and Enter to "
+        f"undo the last one, q and Enter or Ctrl-C to end earlier{ended}."
+    )
+
+
+def _at_once(_frames: int, _presses: list[Press], _lasts: bool) -> bool:
+    """A `Report` for which the untouched gel is enough."""
+    return True
 
 
 def _load(

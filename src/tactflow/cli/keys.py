@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tactflow.cli.printable import typed
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.signals import ending_held_back
@@ -36,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"keys: {error}") from None
     except OSError as error:
         raise StageError(f"{args.folder}: keys cannot be written: {error.strerror or error}") from None
-    print(f"{publisher} stays here, for the run: --set sinks.zmq.keys={publisher}")
+    print(f"{publisher} stays here, for the run: {typed('--set', f'sinks.zmq.keys={publisher}')}")
     print(
         f"{subscriber} goes to the subscriber, over a safe way (scp), and to nobody else: "
         f"tactflow listen tcp://HOST:5556 --keys {subscriber.name}"

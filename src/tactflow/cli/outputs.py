@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError
@@ -14,11 +15,14 @@ def refuse_output(option: str, path: Path, *, overwrite: bool) -> None:
 
     Raises
     ------
-    ConfigError : there is no folder for it, it is a folder, or it is there already and not to be overwritten.
+    ConfigError : there is no folder for it, or one that cannot be written into; it is a folder; or it is there
+        already and not to be overwritten.
     """
     folder = path.absolute().parent
     if not folder.is_dir():
         raise ConfigError(f"{option}: there is no folder {folder}")
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(f"{option}: {folder} cannot be written into")
     if path.is_dir():
         raise ConfigError(f"{option}: {path} is a folder; required a file")
     if path.exists() and not overwrite:

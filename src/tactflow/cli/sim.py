@@ -75,7 +75,10 @@ def run(args: argparse.Namespace) -> int:
         try:
             with _progress(path.name, len(scene), args.quiet) as report:
                 write(scene, path, report)
-        except (OSError, NotLosslessError) as error:
+        except OSError as error:
+            # Its text names the unfinished file.
+            raise StageError(f"{option} {path}: cannot be written: {error.strerror or error}") from error
+        except NotLosslessError as error:
             raise StageError(f"{option} {path}: {error}") from error
         if not args.quiet:
             print(f"{path}: {len(scene)} frames of {scene.name}", file=sys.stderr)

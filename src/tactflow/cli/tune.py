@@ -14,7 +14,7 @@ import orjson
 from tactflow.cli.notes import say, without_notes
 from tactflow.cli.options import seconds
 from tactflow.cli.outputs import refuse_output
-from tactflow.cli.printable import printable
+from tactflow.cli.printable import printable, typed
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.files import completed
@@ -104,7 +104,8 @@ def run(args: argparse.Namespace) -> int:
         return StageError.exit_code
     # YAML takes no control characters, which a name in a comment may have.
     _write(args.out, printable(report.pipeline_text(tuned, file, args.out)))
-    say(f"{args.out} and {page} are written; try: tactflow run {args.out} --source {args.source}")
+    command = typed("tactflow", "run", str(args.out), "--source", args.source)
+    say(f"{args.out} and {page} are written; try: {command}")
     return 0
 
 

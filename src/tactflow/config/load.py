@@ -125,8 +125,19 @@ def _envelope(root: Item, problems: Problems) -> PipelineFile | None:
     try:
         return PipelineFile.model_validate(root.plain())
     except ValidationError as error:
-        complain(error, PipelineFile, root, "", problems, advice=_ADVICE)
+        complain(error, PipelineFile, root, "", problems, advice=_misplaced(root) | _ADVICE)
         return None
+
+
+def _misplaced(root: Item) -> dict[str, str]:
+    """For each stage and sink of the file, as if it stood beside `stages`: where it belongs."""
+    ids = {
+        id_: section
+        for section in _SECTIONS
+        if section in root.entries
+        for id_ in root.entries[section].item.entries
+    }
+    return {id_: f"; did you mean {section}.{id_}?" for id_, section in ids.items()}
 
 
 def _drafts(root: Item, directory: Path, problems: Problems) -> list[Draft]:

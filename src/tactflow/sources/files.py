@@ -135,6 +135,10 @@ class ImageFiles:
     files : in the order they are played.
     description : one line for people.
     fps : frames per second; the time of frame i is i / fps.
+
+    Attributes
+    ----------
+    first : name of the first file, without its folder.
     """
 
     live = False
@@ -149,6 +153,7 @@ class ImageFiles:
         self._first: BgrImage | None = self._load(0)
         self.size = self._normalise.size
         self.description = f"{description}, {len(files)} images"
+        self.first = files[0].name
         _warn_of_pages(files[0])
 
     def _load(self, index: int) -> BgrImage:

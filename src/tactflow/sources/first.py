@@ -73,6 +73,11 @@ class FirstFrames:
             return True
         return t - self._began >= self._seconds or self._bytes > MEMORY
 
+    @property
+    def separate(self) -> bool:
+        """Whether these are separate pictures, most unlike the one before, rather than a video."""
+        return self._settling.scattered
+
     def references(self) -> list[int]:
         """Indices of the frames that show the untouched gel, in order: `count` of them, or as many as do."""
         settling = self._settling

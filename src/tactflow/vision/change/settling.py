@@ -197,9 +197,14 @@ class Settling:
         return self._states[-1][0]
 
     @property
+    def scattered(self) -> bool:
+        """Whether most frames show the gel in another state than the one before."""
+        return len(self) > 1 and 2 * len(self._states) > len(self)
+
+    @property
     def unrelated(self) -> bool:
         """Whether these are separate pictures rather than a video."""
-        return len(self) >= 2 * CALM and 2 * len(self._states) > len(self)
+        return len(self) >= 2 * CALM and self.scattered
 
     @property
     def changing(self) -> bool:
