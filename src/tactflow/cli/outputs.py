@@ -15,7 +15,7 @@ def refuse_output(option: str, path: Path, *, overwrite: bool) -> None:
 
     Raises
     ------
-    ConfigError : there is no folder for it, or one that cannot be written into; it is a folder; or it is there
+    ConfigError : there is no folder for it, or it cannot be written into; it is a folder; or it is there
         already and not to be overwritten.
     """
     folder = path.absolute().parent

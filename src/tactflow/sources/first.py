@@ -68,7 +68,7 @@ class FirstFrames:
         self._began = t if self._began is None else self._began
         self._bytes += image.nbytes
         settling = self._settling
-        settling.add(image)
+        settling.add(image, t)
         if settling.touched or settling.unrelated or (settling.steady and len(settling) >= self._count):
             return True
         return t - self._began >= self._seconds or self._bytes > MEMORY

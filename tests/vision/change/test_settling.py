@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.change.settling import CALM, Settling, change_between, look_at, unevenness
+from tactflow.vision.change.settling import MOST, Settling, change_between, look_at, unevenness
 
 Image = NDArray[np.uint8]
 
@@ -26,11 +26,11 @@ def picture(
     return np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
 
 
-def settled(frames: list[Image]) -> Settling:
+def settled(frames: list[Image], rate: float = 25.0) -> Settling:
     """Look at frames until no more need to be."""
     settling = Settling()
-    for frame in frames:
-        settling.add(frame)
+    for index, frame in enumerate(frames):
+        settling.add(frame, index / rate)
         if settling.steady:
             break
     return settling
@@ -38,8 +38,8 @@ def settled(frames: list[Image]) -> Settling:
 
 def test_light_that_is_steady_from_the_start_leaves_the_first_frame_the_reference() -> None:
     settling = settled([picture() for _ in range(30)])
-    assert (len(settling), settling.best()) == (CALM, 0)
-    assert settling.alike() == list(range(CALM))
+    assert (len(settling), settling.best()) == (MOST, 0)
+    assert settling.alike() == list(range(MOST))
 
 
 @pytest.mark.parametrize("white_balance", [False, True])
@@ -64,6 +64,30 @@ def test_the_touch_of_before_is_not_taken_for_the_untouched_gel() -> None:
     assert settling.steady
     assert 6 <= settling.best() <= 12
     assert settling.touched_before(settling.best())
+
+
+@pytest.mark.parametrize(("rate", "looked_at"), [(100.0, 10), (25.0, 10), (15.0, 6), (12.5, 5), (2.0, 4)])
+def test_light_must_be_steady_for_a_time_but_never_for_fewer_frames_than_tell(
+    rate: float, looked_at: int
+) -> None:
+    assert len(settled([picture() for _ in range(30)], rate)) == looked_at
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_gel_at_rest_between_two_grasps_is_found_at_half_the_rate_too(every: int) -> None:
+    warming = [picture(0.7 + 0.05 * i, 0.3) for i in range(6)]
+    grasped = [picture(1, 0.2 * i, 100) for i in range(1, 4)] + [picture(1, 0.6, 100) for _ in range(60)]
+    frames = warming + [picture() for _ in range(6)] + grasped
+    settling = settled(frames[::every], 25 / every)
+    assert 6 <= every * settling.best() <= 11
+
+
+def test_a_touch_of_which_only_the_end_is_seen_is_not_the_gel_but_one_that_lasts_may_be() -> None:
+    untouched = [picture(1, 0.2, 110) for _ in range(20)]
+    brief = settled([picture(1, 0.25, 60) for _ in range(3)] + untouched)
+    assert (brief.best() >= 3, brief.undecided) == (True, False)
+    lasting = settled([picture(1, 0.25, 60) for _ in range(6)] + untouched)
+    assert (lasting.best(), lasting.undecided) == (0, True)
 
 
 def test_a_finger_that_comes_early_is_not_taken_for_the_gel() -> None:
@@ -108,15 +132,15 @@ def test_a_lamp_that_flickers_is_as_steady_as_it_gets() -> None:
 
 def test_separate_pictures_are_no_video_and_the_first_one_is_the_reference() -> None:
     settling = Settling()
-    for index in range(2 * CALM):
+    for index in range(2 * MOST):
         assert not settling.unrelated
-        settling.add(np.roll(picture(1, 0.6 if index else 0), 13 * index, axis=1))
+        settling.add(np.roll(picture(1, 0.6 if index else 0), 13 * index, axis=1), index / 25)
     assert settling.unrelated
     assert settling.best() == 0
 
 
 @pytest.mark.parametrize("shape", [(3, 4), (1, 1, 3), (48, 64, 1), (700, 30, 3), (1, 640), (2000, 2, 3)])
 def test_pictures_of_any_size_can_be_looked_at(shape: tuple[int, ...]) -> None:
-    settling = settled([np.full(shape, 100, np.uint8)] * CALM)
+    settling = settled([np.full(shape, 100, np.uint8)] * MOST)
     assert settling.steady
     assert settling.best() == 0

@@ -21,11 +21,15 @@ follow the exposure. Chosen by hand."""
 CLIPPED: Final = 0.1
 """Share of such samples from which a cell is left out. Chosen by hand."""
 
-CALM: Final = 10
-"""Frames in a row that must be alike before the light counts as steady. Chosen on franka_mini, whose first
-frames may still show the grasp before, for at most eight frames."""
-SHORT: Final = 4
-"""Frames that a state of the gel must last to be considered at all. Chosen by hand."""
+CALM: Final = 0.4
+"""For how long frames in a row must be alike before the light counts as steady, s. Chosen on franka_mini,
+whose first frames may still show the grasp before, for at most 0.32 s."""
+FEWEST, MOST = 4, 10
+"""How many frames these are at least, so that they tell a trend, and at most, for a camera sets its exposure
+from frame to frame. The least was chosen on every second recording of franka_mini, with two of three and
+three of four frames left out."""
+SHORT: Final = 0.4
+"""Part of these frames that a state of the gel must last to be considered at all. Chosen by hand."""
 STEADY: Final = 0.02
 """Relative change of a channel that is steady: less than what a contact must exceed (`repeatability`)."""
 SCATTER: Final = 2.5
@@ -45,8 +49,8 @@ MEDIAN: Final = 5
 """Side, cells, of the median filter that takes dots out. Chosen by hand."""
 EVENER: Final = 0.8
 """Ratio of two states' unevenness below which the evener one is the untouched gel, where the light was still
-changing. Chosen on franka_mini: a gel that is touched has 1.2 to 50 times the unevenness of the same gel at
-rest, and for faint contacts at least 0.9 times."""
+changing, or the first state so brief that it may be the end of a touch. Chosen on franka_mini: a gel that is
+touched has 1.2 to 50 times the unevenness of the same gel at rest, and for faint contacts at least 0.9."""
 MUCH_EVENER: Final = 0.5
 """The same where nothing but this speaks for the later state. Chosen by hand."""
 AS_EVEN: Final = 1.5
@@ -138,22 +142,23 @@ class Settling:
     --------
     >>> gel = np.full((48, 64, 3), 120, np.uint8)
     >>> settling = Settling()
-    >>> for exposure in (0.5, 0.8, *[1.0] * 10):
-    ...     settling.add(np.uint8(gel * exposure))
+    >>> for index, exposure in enumerate((0.5, 0.8, *[1.0] * 10)):
+    ...     settling.add(np.uint8(gel * exposure), index / 25)
     >>> settling.steady, settling.best()
     (True, 2)
     """
 
     def __init__(self) -> None:
         self._looks: list[Look] = []
+        self._times: list[float] = []
         self._gains: list[Float] = []
         self._states: list[list[int]] = []
 
     def __len__(self) -> int:
         return len(self._looks)
 
-    def add(self, frame: NDArray[np.uint8]) -> None:
-        """Look at the next frame: (H, W) or (H, W, channels) uint8, all of one size."""
+    def add(self, frame: NDArray[np.uint8], t: float) -> None:
+        """Look at the next frame, taken at t, s: (H, W) or (H, W, channels) uint8, all of one size."""
         now, index = look_at(frame), len(self._looks)
         if index == 0:
             gain, moved = np.zeros(now.light.shape[2], np.float32), True
@@ -165,7 +170,19 @@ class Settling:
             self._states.append([])
         self._states[-1].append(index)
         self._looks.append(now)
+        self._times.append(t)
         self._gains.append(gain)
+
+    @property
+    def _calm(self) -> int:
+        """How many frames in a row must be alike: those of the time `CALM`."""
+        step = float(np.median(np.diff(self._times))) if len(self) > 1 else 0.0
+        return int(np.clip(round(CALM / step), FEWEST, MOST)) if step > 0 else MOST
+
+    @property
+    def _short(self) -> int:
+        """How many frames a state must last to be considered."""
+        return round(SHORT * self._calm)
 
     @property
     def steady(self) -> bool:
@@ -176,7 +193,7 @@ class Settling:
     def touched(self) -> bool:
         """Whether the light was steady from the first frame on, until something touched the gel."""
         first, *later = self._states
-        if not later or len(first) < SHORT:
+        if not later or len(first) < self._short:
             return False
         spread = np.ptp([self._gains[i] for i in first], axis=0).max()
         return bool(spread < STEADY) and unevenness(self._looks[-1]) > AS_EVEN * self._unevenness(first)
@@ -204,17 +221,17 @@ class Settling:
     @property
     def unrelated(self) -> bool:
         """Whether these are separate pictures rather than a video."""
-        return len(self) >= 2 * CALM and self.scattered
+        return len(self) >= 2 * MOST and self.scattered
 
     @property
     def changing(self) -> bool:
         """Whether frames in a row show the same gel, but in a light that is not steady."""
-        return not self.steady and len(self._states[-1]) >= CALM
+        return not self.steady and len(self._states[-1]) >= self._calm
 
     @property
     def drift(self) -> float:
         """By how much the light of a channel changed over the last frames, relative."""
-        gains = np.array(self._gains[-CALM:])
+        gains = np.array(self._gains[-self._calm :])
         return float(np.expm1(np.ptp(gains, axis=0).max()))
 
     def touched_before(self, index: int) -> bool:
@@ -238,27 +255,27 @@ class Settling:
         first, *later = self._states
         best = first
         for state in later:
-            if len(self._calm(state)) >= SHORT and self._is_better(state, best):
+            if len(self._calm_frames(state)) >= self._short and self._is_better(state, best):
                 best = state
-        return self._calm(best)
+        return self._calm_frames(best)
 
     def _is_better(self, state: list[int], than: list[int]) -> bool:
         """Whether a later state is the untouched gel rather than the best one so far."""
         here, there = self._unevenness(state), self._unevenness(than)
-        calm = self._calm(than)
-        passing = than is not self._states[0] and len(calm) < CALM / 2
+        calm = self._calm_frames(than)
+        passing = len(calm) < self._calm / 2
         apart = np.abs(self._level(state)[0] - self._level(than)[0]).max()
-        if passing or calm[0] != than[0] or apart > STEADY:
+        if (passing and than is not self._states[0]) or calm[0] != than[0] or apart > STEADY:
             return here < there * (AS_EVEN if self._is_steady(state) else EVENER)
-        return here < there * MUCH_EVENER
+        return here < there * (EVENER if passing else MUCH_EVENER)
 
     def _unevenness(self, state: list[int]) -> float:
-        calm = self._calm(state)
+        calm = self._calm_frames(state)
         return unevenness(self._looks[calm[len(calm) // 2]])
 
     def _is_steady(self, state: list[int]) -> bool:
-        gains = np.array([self._gains[i] for i in state[-CALM:]])
-        if len(gains) < CALM:
+        gains = np.array([self._gains[i] for i in state[-self._calm :]])
+        if len(gains) < self._calm:
             return False
         scatter = np.square(gains - gains.mean(axis=0)).sum(axis=0)
         steps = np.square(np.diff(gains, axis=0)).sum(axis=0)
@@ -266,12 +283,12 @@ class Settling:
 
     def _level(self, state: list[int]) -> tuple[Float, Float]:
         """Where the light of a state ends, and how far from there it is still the same: (channels,) each."""
-        gains = np.array([self._gains[i] for i in state[-CALM:]])
+        gains = np.array([self._gains[i] for i in state[-self._calm :]])
         level = np.median(gains, axis=0)
         spread = 1.4826 * np.median(np.abs(gains - level), axis=0)
         return level, np.maximum(np.float32(STEADY), np.float32(SCATTER) * spread)
 
-    def _calm(self, state: list[int]) -> list[int]:
+    def _calm_frames(self, state: list[int]) -> list[int]:
         """The frames of a state that have the light of its end."""
         level, tolerance = self._level(state)
         return [i for i in state if np.all(np.abs(self._gains[i] - level) <= tolerance)]
