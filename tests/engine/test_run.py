@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -642,7 +643,13 @@ def test_a_slow_stage_may_finish_what_waits_after_a_stop(
 ) -> None:
     monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 1.0)
     queue = {"capacity": 8, "when_full": "block"}
-    runner = toy_runner({"join": {"seconds": 0.2, "segment": "slow", "queue": queue}})
+    runner = toy_runner({"join": {"seconds": 0.02, "segment": "slow", "queue": queue}})
+
+    def clock() -> float:
+        """As if the stage took 0.2 s for a frame, and nothing else any time."""
+        return 0.2 * runner.nodes["join"].stats.runs if "join" in runner.nodes else 0.0
+
+    monkeypatch.setattr("tactflow.engine.run.time", SimpleNamespace(perf_counter=clock))
 
     def stop_when_full(_: object) -> None:
         if any(link.stats().high_water == 8 for link in runner._links):

@@ -338,7 +338,9 @@ def condition(pair: Pair, parameters: dict[str, Any]) -> dict[str, Any]:
 
 @needs_rclpy
 def test_the_example_closes_until_something_touches_and_tightens_while_it_slips(pair: Pair) -> None:
-    example = Program(str(REPOSITORY / "examples" / "ros2" / "hold.py"), "--ros-args", "-p", "sensor:=left")
+    # So wide that it never closes altogether while nothing touches.
+    given = ("-p", "sensor:=left", "-p", "width:=100.0")
+    example = Program(str(REPOSITORY / "examples" / "ros2" / "hold.py"), "--ros-args", *given)
     try:
         pair.receive("touching", without_contact(RESULTS))
         until(lambda: closing(pair) == pytest.approx(0.0005))

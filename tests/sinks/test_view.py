@@ -329,6 +329,26 @@ def test_a_page_that_comes_late_to_a_paused_run_sees_the_last_picture(
     assert page(sink).next("frame")[0]["message"]["seq"] == 5
 
 
+def test_a_frame_that_was_under_way_is_not_taken_for_that_of_a_step(
+    view: Callable[..., View], page: Callable[..., Page]
+) -> None:
+    run = FakeRun()
+    run.paused = True
+    sink = view(run)
+    browser = page(sink)
+    browser.next("hello")
+    under_way = tick(0)
+    browser.say(do="step")
+    until(lambda: run.calls == ["step"])
+    sink.write(under_way, Results(picture()))
+    header, _ = browser.next("frame")
+    assert sink.wants()
+    sink.write(tick(1), Results(picture()))
+    assert not sink.wants()
+    browser.say(ack=header["number"])
+    assert browser.next("frame")[0]["message"]["seq"] == 1
+
+
 def test_field_and_heights_are_sent_only_while_a_page_shows_them(
     view: Callable[..., View], page: Callable[..., Page]
 ) -> None:

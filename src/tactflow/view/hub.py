@@ -136,6 +136,7 @@ class Hub:
         """Whether a page has credit."""
         self.owed = False
         """Whether somebody asked for one single frame: it is shown however soon it comes."""
+        self._owed_since = 0.0
         self.shown: frozenset[str] = frozenset()
         """Those of `SHOWN_IF_ASKED` that some page shows."""
         self.pages: set[Page] = set()
@@ -171,7 +172,9 @@ class Hub:
         pixels : heights of a surface, if the header describes one, then the picture as JPEG.
         captured : `time.perf_counter` at its capture, s.
         """
-        self.owed = False
+        # One that was under way when it was asked for is another one.
+        if captured >= self._owed_since:
+            self.owed = False
         self._number += 1
         header = header + b',"number":%d}' % self._number
         # A little-endian length, the JSON header, the heights and the picture.
@@ -376,6 +379,7 @@ class Hub:
         return "the run has ended" if self._end is not None else self._commands.refusal(name)
 
     def _step(self) -> None:
+        self._owed_since = time.perf_counter()
         self.owed = True
         self._commands.step()
 
