@@ -281,15 +281,16 @@ def test_a_recording_is_paused_stepped_and_resumed(
     first = seq(page)
     page.click("#step")
     until(page, "seq => Number(document.getElementById('picture').dataset.seq) > seq", first)
-    for way in ("button", "key") * 2:
-        before = seq(page)
-        if way == "button":
+    settled(page)
+    first = seq(page)
+    for step in range(1, 5):
+        if step % 2:
             page.click("#step")
         else:
             page.keyboard.press("s")
-        until(page, "seq => Number(document.getElementById('picture').dataset.seq) > seq", before)
-        settled(page)
-        assert seq(page) == before + 1
+        until(page, "seq => Number(document.getElementById('picture').dataset.seq) === seq", first + step)
+    settled(page)
+    assert seq(page) == first + 4
     page.keyboard.press("Escape")
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press(" ")

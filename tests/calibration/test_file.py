@@ -136,10 +136,10 @@ def test_a_file_that_is_no_calibration_is_refused(
         Calibration.load(path)
 
 
-@pytest.mark.parametrize("text", ["", "- 1\n", "press", PIPELINE])
+@pytest.mark.parametrize("text", ["", "- 1\n", "press", "left: 3", PIPELINE])
 def test_a_file_of_another_kind_is_refused_in_words(text: str, tmp_path: Path) -> None:
     (tmp_path / "left.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"left\.yaml: is empty, or no calibration; make it anew"):
+    with pytest.raises(ConfigError, match=r"left\.yaml: is no calibration file; make it anew"):
         Calibration.load(tmp_path / "left.yaml")
 
 
@@ -232,10 +232,4 @@ def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path
         Calibration.load(path)
     path.write_text("[" * 5000)
     with pytest.raises(ConfigError, match="make it anew"):
-        Calibration.load(path)
-    path.write_text("left: 3")
-    with pytest.raises(ConfigError, match=r"format: Field required; make it anew"):
-        Calibration.load(path)
-    path.write_text("precious")
-    with pytest.raises(ConfigError, match=r"left\.yaml: is no calibration file; make it anew"):
         Calibration.load(path)

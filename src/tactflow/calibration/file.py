@@ -227,21 +227,17 @@ class Calibration:
         Raises ConfigError if it or its arrays are not there, or are no calibration.
         """
         try:
-            mapping = yaml.safe_load(stored_text(path).decode("utf-8"))
-            if not isinstance(mapping, dict) or "format" not in mapping:
-                raise ConfigError(f"calibration {path}: is empty, or no calibration; {_REMEDY}")
-            said = _File.model_validate(mapping)
+            said = _File.model_validate(yaml.safe_load(stored_text(path).decode("utf-8")))
             arrays = _arrays(stored_arrays(path))
             look = np.asarray(arrays["look"], np.float32)
             slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
-        except ConfigError:
-            raise
         except OSError as error:
             raise ConfigError(f"calibration {path}: {error.filename}: {error.strerror}") from None
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
-            told = f"{where}: {first['msg']}" if where else "is no calibration file"
+            other = not where or (where, first["type"]) == ("format", "missing")
+            told = "is no calibration file" if other else f"{where}: {first['msg']}"
             raise ConfigError(f"calibration {path}: {told}; {_REMEDY}") from None
         except Exception as error:
             # What YAML, ZIP and numpy raise about damaged data is many things.
