@@ -86,11 +86,15 @@ def test_an_error_becomes_its_exit_code(
     assert capsys.readouterr().err == ("tactflow: no\n" if code != 130 else "")
 
 
-def test_help_imports_neither_opencv_nor_numpy() -> None:
-    code = (
-        "import sys; from tactflow.cli.main import main; main(['--help']); "
-        "print({'cv2', 'numpy', 'pydantic'} & set(sys.modules))"
-    )
+@pytest.mark.parametrize(
+    ("imports", "without"),
+    [
+        ("from tactflow.cli.main import main; main(['--help'])", {"cv2", "numpy", "pydantic"}),
+        ("import tactflow.cli.run", {"asyncio", "numba", "pyarrow", "ssl", "websockets"}),
+    ],
+)
+def test_what_a_command_does_not_need_at_its_start_is_not_imported(imports: str, without: set[str]) -> None:
+    code = f"import sys; {imports}; print({without} & set(sys.modules))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=True
     )

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import zmq
-from zmq.utils.monitor import recv_monitor_message
 
 from tactflow.engine.errors import StageError
 from tactflow.network.bound_socket import FloodError
@@ -90,6 +89,9 @@ class _Relay:
 
     def _pass_on(self, back: zmq.Socket[bytes], connections: zmq.Socket[bytes]) -> bool:
         """Until told to stop; True: until subscribers took too much and were disconnected."""
+        # Imported here: it imports asyncio, which the run of one sensor does without.
+        from zmq.utils.monitor import recv_monitor_message
+
         front = self._publisher.socket
         poller = zmq.Poller()
         poller.register(front, zmq.POLLIN)
