@@ -33,10 +33,10 @@ test: lint types
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
 soak: $(VENV)/.installed-test
 	$(PY) -m pytest -m slow
-	$(PY) -m tests.load.soak
+	$(PY) -m benchmarks.load.soak
 
 load: $(VENV)/.installed-test
-	$(PY) -m tests.load.knee
+	$(PY) -m benchmarks.load.knee
 
 fuzz: SECONDS := 300
 fuzz: $(VENV)/.installed-test

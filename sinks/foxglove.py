@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field, model_validator
 
+from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.extras import missing
-from tactflow.jpeg import encode_jpeg
-from tactflow.message import Results, encode_message
+from tactflow.message.encoding import Results, encode_message
 from tactflow.network.address import is_loopback
+from tactflow.system.extras import missing
 
 if TYPE_CHECKING:
     from foxglove import Channel, Context

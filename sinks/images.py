@@ -13,8 +13,8 @@ from pydantic import Field
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import claim_path, expanded, make_folder, next_name
 from tactflow.ports import Picture
+from tactflow.system.files import claim_path, expanded, make_folder, next_name
 
 UNFINISHED = ".unfinished"
 """Name of a picture until all of it is written: none is ever seen in half."""

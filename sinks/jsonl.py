@@ -15,9 +15,9 @@ from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import expanded, is_device, lead_nowhere, make_folder
-from tactflow.lines import LineFile, LineStream, open_pipe
-from tactflow.message import Results, encode_message
+from tactflow.message.encoding import Results, encode_message
+from tactflow.system.files import expanded, is_device, lead_nowhere, make_folder
+from tactflow.system.lines import LineFile, LineStream, open_pipe
 
 log = logging.getLogger("tactflow")
 

@@ -10,9 +10,9 @@ import orjson
 import zmq
 from pydantic import Field, model_validator
 
+from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.frame import Tick
-from tactflow.jpeg import encode_jpeg
 from tactflow.network.address import is_reachable, picks_a_port
 from tactflow.network.bound_socket import FloodError
 from tactflow.network.publisher import Publisher

@@ -17,15 +17,15 @@ from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.extras import missing
-from tactflow.files import claim_path, expanded, make_folder
-from tactflow.message import SCHEMA, Results, encode_message
-from tactflow.provenance import facts, texts
+from tactflow.message.encoding import SCHEMA, Results, encode_message
+from tactflow.system.extras import missing
+from tactflow.system.files import claim_path, expanded, make_folder
+from tactflow.system.provenance import facts, texts
 
 if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]
 
-    from tactflow.tables import Tables
+    from tactflow.adapters.tables import Tables
 
 log = logging.getLogger("tactflow")
 
@@ -112,7 +112,7 @@ class Parquet(Sink):
         # Now, and not in the middle of the run, when the first part is written.
         import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
 
-        from tactflow.tables import Tables
+        from tactflow.adapters.tables import Tables
 
         try:
             for name in TABLES:

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
 
+from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Output, Recorder, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.engine.rate import SLACK, RateLimit
-from tactflow.files import expanded, next_name
-from tactflow.jpeg import encode_jpeg
-from tactflow.message import Results, encode_message
-from tactflow.provenance import arrays, facts, texts
+from tactflow.message.encoding import Results, encode_message
 from tactflow.recording import missing_packages
+from tactflow.system.files import expanded, next_name
+from tactflow.system.provenance import arrays, facts, texts
 
 if TYPE_CHECKING:
     from tactflow.recording.frames import FrameCoder

@@ -19,8 +19,8 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.files import claim_path, expanded, is_device, make_folder, next_name, taken_away
 from tactflow.ports import Picture
+from tactflow.system.files import claim_path, expanded, is_device, make_folder, next_name, taken_away
 
 log = logging.getLogger("tactflow")
 

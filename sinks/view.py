@@ -17,17 +17,17 @@ import numpy as np
 import orjson
 from pydantic import Field, model_validator
 
+from tactflow.drawing.jpeg import encode_jpeg
+from tactflow.drawing.results import dimmed, field_arrows
 from tactflow.engine.contract import StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Tick
-from tactflow.jpeg import encode_jpeg
-from tactflow.message import Results, encode_message
+from tactflow.message.encoding import Results, encode_message
 from tactflow.network.address import is_loopback
 from tactflow.ports import Image, Valid
 from tactflow.view.address import Neighbours, address, bind
 from tactflow.view.compact import compact_markers, compact_surface
 from tactflow.view.guided import Guiding
-from tactflow.vision.draw import dimmed, field_arrows
 
 if TYPE_CHECKING:
     from tactflow.view.hub import Hub

@@ -11,13 +11,13 @@ import orjson
 import zmq
 from pydantic import Field, field_validator, model_validator
 
+from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.rate import RateLimit
-from tactflow.jpeg import encode_jpeg
-from tactflow.message import Results, encode_message
+from tactflow.message.encoding import Results, encode_message
 from tactflow.network.address import is_reachable, picks_a_port, refuse_high_port
 from tactflow.network.bound_socket import FloodError
 from tactflow.network.commands import Commands

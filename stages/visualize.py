@@ -7,9 +7,9 @@ from typing import Literal
 
 from pydantic import Field
 
+from tactflow.drawing.results import Annotator
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Image, Picture, Valid
-from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import DisplacementField
 from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 

@@ -7,7 +7,7 @@ from typing import Any
 import orjson
 
 from tactflow.engine.frame import Tick
-from tactflow.message import Results, encode_message
+from tactflow.message.encoding import Results, encode_message
 
 
 def build_message(tick: Tick, results: Results, *, detail: bool = False) -> dict[str, Any]:

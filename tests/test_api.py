@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import tactflow
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tests.messages import build_message
 
 PIPELINE = """

@@ -18,7 +18,7 @@ import yaml
 import zmq
 
 from tactflow.cli.main import main
-from tactflow.message_schema import message_schema
+from tactflow.message.schema import message_schema
 from tests.clock import PATIENCE, until
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Slip
 from tests.clock import LOOK_SECONDS

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tactflow.engine.frame import Absent as Absent
     from tactflow.engine.frame import Frame as Frame
     from tactflow.engine.frame import Tick as Tick
-    from tactflow.message import Results as Results
+    from tactflow.message.encoding import Results as Results
     from tactflow.network.remote_control import RemoteControl as RemoteControl
     from tactflow.network.subscriber import Subscriber as Subscriber
     from tactflow.sim.scenes import open_scene as open_scene
@@ -57,7 +57,7 @@ _HOMES = {
     "tactflow.vision.types": ("Contact", "Flow", "Markers", "MarkerStatus"),
     "tactflow.engine.contract": ("Stage", "Sink", "Source", "StageParams"),
     "tactflow.engine.frame": ("Frame", "Tick", "Absent"),
-    "tactflow.message": ("Results",),
+    "tactflow.message.encoding": ("Results",),
     "tactflow.engine.errors": ("TactflowError", "ConfigError"),
 }
 """Module -> the public names that live there."""

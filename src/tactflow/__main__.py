@@ -6,7 +6,7 @@ import gc
 import sys
 from collections.abc import Sequence
 
-from tactflow.signals import give_up, leave, on_ending
+from tactflow.system.signals import give_up, leave, on_ending
 
 ENDLESS = ("run", "record", "listen")
 """Commands that one signal ends well."""

@@ -23,7 +23,7 @@ from tactflow.engine.conformance import build
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Mark, Pipeline
 from tactflow.engine.run import Runner, RunResult
-from tactflow.signals import INTERRUPTED, Interrupted, ending_handled, on_ending
+from tactflow.system.signals import INTERRUPTED, Interrupted, ending_handled, on_ending
 from tactflow.vision import compiled
 
 Settings = Mapping[str, Any]

@@ -1,4 +1,4 @@
-"""A Dask cluster as an executor; `python -m tests.load.batch cluster` shows what happens to its processes."""
+"""A Dask cluster as an executor."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.sinks.record import Record
 
 

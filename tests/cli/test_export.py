@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 import tactflow
+from tactflow.adapters.lerobot import DatasetWriter
 from tactflow.cli.main import main
 from tactflow.engine.errors import StageError
-from tactflow.files import claim_path
-from tactflow.lerobot import DatasetWriter
 from tactflow.sources import open_source
 from tactflow.streaming import Result
+from tactflow.system.files import claim_path
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
 
 pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
@@ -150,7 +150,7 @@ FULL_DISK = """
 import sys
 import tactflow
 from pathlib import Path
-from tactflow.lerobot import DatasetWriter
+from tactflow.adapters.lerobot import DatasetWriter
 settings = {"sinks": {}}
 try:
     DatasetWriter(Path(sys.argv[1]), 60, "press").add(

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from tactflow.cli.main import main
 from tactflow.doctor import examine, observe
-from tactflow.signals import ending_handled, interrupt
 from tactflow.sim import open_scene
 from tactflow.sources.devices import Camera
+from tactflow.system.signals import ending_handled, interrupt
 from tests.vision.dots import grid, render
 
 Image = NDArray[np.uint8]

@@ -14,7 +14,7 @@ import pytest
 
 from tactflow.engine import run
 from tactflow.engine.run import MOST_STEPS, Runner, RunResult
-from tactflow.signals import INTERRUPTED
+from tactflow.system.signals import INTERRUPTED
 from tests.clock import PATIENCE, until
 
 MakeRunner = Callable[..., Runner]

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.load.workload import write_section
 from tests.faults.rig import Seen
 from tests.faults.table import CASES, SECTIONS, Case
-from tests.load.workload import write_section
 
 LONGEST = 150
 """Letters of what was said that the page shows."""

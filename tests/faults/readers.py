@@ -17,8 +17,8 @@ from urllib.request import urlopen
 import pytest
 import zmq
 
-from tactflow import lines
 from tactflow.engine.run import Runner
+from tactflow.system import lines
 from tests.clock import PATIENCE, until
 from tests.faults.rig import FRAMES, Seen, array, run
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from tactflow.signals import INTERRUPTED
+from tactflow.system.signals import INTERRUPTED
 from tests.clock import PATIENCE, until
 from tests.faults.rig import Seen, array, write_pipeline
 from tests.faults.sinks import KINDS, settings_of

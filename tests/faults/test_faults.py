@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.load.workload import PAGE
 from tests.faults.__main__ import row
 from tests.faults.table import CASES, Case
-from tests.load.workload import PAGE
 
 
 @pytest.mark.parametrize(

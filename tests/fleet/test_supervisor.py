@@ -15,7 +15,7 @@ import pytest
 
 from tactflow.fleet.heartbeat import HANG_AFTER, LONGEST_LOOK, Headway, SignOfLife
 from tactflow.fleet.supervisor import FIRST_PAUSE, GIVE_UP_AFTER, GOOD_RUN, LONGEST_PAUSE, Member, Supervisor
-from tactflow.signals import ending_handled
+from tactflow.system.signals import ending_handled
 
 
 class Clock:

@@ -24,7 +24,7 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.plan import make_plan
-from tactflow.message import Results, encode_message
+from tactflow.message.encoding import Results, encode_message
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
 from tactflow.network.subscriber import _parsed

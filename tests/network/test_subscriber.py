@@ -21,7 +21,7 @@ import zmq
 from tactflow.cli import listen
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results, encode_message
+from tactflow.message.encoding import Results, encode_message
 from tactflow.network import subscriber
 from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import LONGEST_MESSAGE, Subscriber

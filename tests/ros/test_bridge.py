@@ -15,7 +15,7 @@ import pytest
 
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.network.keys import make_keys
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Scale, Slip

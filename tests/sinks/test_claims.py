@@ -13,7 +13,7 @@ import pytest
 from tactflow.engine.contract import Sink
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.sinks.images import Images
 from tactflow.sinks.jsonl import Jsonl
 from tactflow.sinks.video import Video

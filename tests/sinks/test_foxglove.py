@@ -19,7 +19,7 @@ from websockets.sync.client import connect
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.sinks.foxglove import Foxglove
 from tests.clock import PATIENCE, until
 from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.sinks import jsonl as jsonl_module
 from tactflow.sinks.jsonl import Jsonl
 from tests.clock import PATIENCE
@@ -219,7 +219,7 @@ def test_a_reader_that_leaves_ends_the_output_quietly() -> None:
     program = """
 import numpy as np, sys
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.sinks.jsonl import Jsonl
 sink = Jsonl(Jsonl.Params(path="-"))
 sink.open()

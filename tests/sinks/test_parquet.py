@@ -19,8 +19,8 @@ import pytest
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
-from tactflow.message_schema import message_schema
+from tactflow.message.encoding import Results
+from tactflow.message.schema import message_schema
 from tactflow.sinks import parquet as parquet_module
 from tactflow.sinks.parquet import TABLES, Parquet
 from tactflow.vision.types import Depth, Force, Scale, Slip

@@ -17,7 +17,7 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.graph import Pipeline
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.recording.frames import StoredFrame
 from tactflow.sinks.record import Record
 from tactflow.sources import open_source

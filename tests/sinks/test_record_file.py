@@ -24,8 +24,8 @@ import tactflow
 from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
-from tactflow.message import Results
-from tactflow.message_schema import message_schema
+from tactflow.message.encoding import Results
+from tactflow.message.schema import message_schema
 from tactflow.recording.frames import FrameCoder, StoredFrame
 from tactflow.recording.layout import layout
 from tactflow.recording.protobuf import decode, encode, unzigzag, zigzag

@@ -30,7 +30,7 @@ from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.network.address import is_loopback
 from tactflow.sinks.view import View
 from tactflow.view import server

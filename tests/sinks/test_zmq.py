@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.network import bound_socket
 from tactflow.network.publisher import SEND_BUFFER
 from tactflow.sinks.zmq import MOST_OTHERS, Zmq

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.recording import records
 from tactflow.recording.frames import StoredFrame
 from tactflow.recording.protobuf import encode

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tactflow.drawing.results import Annotator
 from tactflow.vision.change import ChangeProbe
-from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import inside_mask
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts

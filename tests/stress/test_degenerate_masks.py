@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.draw import Annotator
+from tactflow.drawing.results import Annotator
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
 from tactflow.vision.types import Markers
 from tests.stress.builders import FLOWS, HULLS, Image, assert_defined

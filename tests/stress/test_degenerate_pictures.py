@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tactflow.drawing.results import Annotator
 from tactflow.vision.change import ChangeProbe
-from tactflow.vision.draw import Annotator
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers
 from tactflow.vision.markers.inpaint import remove_markers

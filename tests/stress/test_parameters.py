@@ -16,10 +16,10 @@ from pydantic import BaseModel
 from tactflow.classic.tracker import GridTracker
 from tactflow.config.load import load_pipeline
 from tactflow.config.registry import names, resolve
+from tactflow.drawing.results import Annotator
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.change import ChangeProbe
 from tactflow.vision.contact import ContactDetector, chi_square_threshold
-from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts

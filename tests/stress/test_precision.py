@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.classic import functions
+from tactflow.drawing.results import Annotator
 from tactflow.vision.change import ChangeProbe, noise, tiles
 from tactflow.vision.change import probe as change_probe
 from tactflow.vision.contact import (
@@ -25,7 +26,6 @@ from tactflow.vision.contact import (
     response,
 )
 from tactflow.vision.contact import detector as contact
-from tactflow.vision.draw import Annotator
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor
 from tactflow.vision.markers import detection as markers

@@ -16,8 +16,8 @@ from tactflow.batch.executor import Headway, died
 from tactflow.batch.task import Outcome, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.extras import missing
-from tactflow.signals import ENDING, blocked_in_children
+from tactflow.system.extras import missing
+from tactflow.system.signals import ENDING, blocked_in_children
 
 CONNECT_SECONDS = 10.0
 """How long a scheduler may take to answer, s. Chosen by hand."""

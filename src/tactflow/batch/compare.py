@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import orjson
 
+from tactflow.adapters.tables import Column, frame_columns
 from tactflow.batch.folder import Folder
 from tactflow.batch.recordings import Recording
 from tactflow.batch.task import Outcome
-from tactflow.tables import Column, frame_columns
 
 MOST_WORST = 8
 """Frames that are shown. Chosen by hand: they fit on two screens."""

@@ -16,7 +16,7 @@ from tactflow.batch.summary import Looker, picture_of, with_looker
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Tick
 from tactflow.engine.graph import Pipeline
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 
 SIDE = 420
 """Longer side of a picture, px. Chosen by hand."""

@@ -26,7 +26,7 @@ LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba")
 """Packages whose version may change a number."""
 COMPUTING = (
     *("calibration", "classic", "engine", "recording", "sim", "sinks", "sources", "stages", "vision"),
-    *("message", "message_schema", "tables"),
+    *("message", "adapters"),
 )
 """Rooms and modules whose code may change a number."""
 

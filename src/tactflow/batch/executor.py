@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from tactflow.batch.task import Outcome, Status, Task
-from tactflow.clock import SYSTEM
+from tactflow.system.clock import SYSTEM
 
 
 @dataclass(frozen=True, slots=True)

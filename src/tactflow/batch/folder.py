@@ -25,7 +25,7 @@ from pydantic import BaseModel, Field
 from tactflow.batch.digests import digest_of, fingerprint
 from tactflow.batch.task import Outcome, decoded
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.files import claim_path, make_folder
+from tactflow.system.files import claim_path, make_folder
 
 
 class _Picture(BaseModel):

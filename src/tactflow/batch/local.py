@@ -17,7 +17,7 @@ from tactflow.batch.executor import Headway
 from tactflow.batch.task import Outcome, Report, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import StageError
-from tactflow.signals import ENDING, blocked_in_children
+from tactflow.system.signals import ENDING, blocked_in_children
 
 Work = Callable[[Task, Report], Outcome]
 

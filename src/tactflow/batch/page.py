@@ -15,7 +15,7 @@ from tactflow.batch.folder import Folder
 from tactflow.batch.runs_table import Row
 from tactflow.batch.task import Outcome
 from tactflow.engine.errors import StageError
-from tactflow.files import completed
+from tactflow.system.files import completed
 
 MOST_ROWS = 1000
 """Recordings that the page shows, those that failed first: it has some 20 kB for each. Chosen by hand: a

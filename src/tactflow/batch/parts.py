@@ -10,7 +10,7 @@ from tactflow.batch.task import Part
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.graph import Pipeline
-from tactflow.message import Results
+from tactflow.message.encoding import Results
 from tactflow.sources import open_source
 
 OVERLAP = 30

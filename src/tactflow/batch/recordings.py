@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError, SourceError
-from tactflow.files import expanded, is_utf8
 from tactflow.sources.base import find_path
 from tactflow.sources.files import IMAGE_SUFFIXES, matching, natural_key
 from tactflow.sources.lerobot import SCHEME
+from tactflow.system.files import expanded, is_utf8
 
 FILE_SUFFIXES = frozenset(
     [

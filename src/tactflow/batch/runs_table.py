@@ -12,8 +12,8 @@ import orjson
 from tactflow.batch.recordings import Recording
 from tactflow.batch.task import Format, Outcome
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.extras import missing
-from tactflow.files import completed
+from tactflow.system.extras import missing
+from tactflow.system.files import completed
 
 _ROWS = 10_000
 """Rows that are written at once. Chosen by hand: some 10 MB."""

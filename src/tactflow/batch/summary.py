@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.drawing.jpeg import encode_jpeg
+from tactflow.drawing.results import Annotator
 from tactflow.engine.conformance import own_sink
 from tactflow.engine.contract import Sink
 from tactflow.engine.frame import Tick
 from tactflow.engine.graph import Pipeline
-from tactflow.jpeg import encode_jpeg
-from tactflow.message import Results
-from tactflow.vision.draw import Annotator
+from tactflow.message.encoding import Results
 
 MOST_POINTS = 240
 """Points of a curve, before neighbours are merged: one a pixel of a plot. Chosen by hand."""

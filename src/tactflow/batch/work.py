@@ -32,11 +32,11 @@ from tactflow.batch.parts import OVERLAP, of_part
 from tactflow.batch.recordings import Recording
 from tactflow.batch.summary import Summary, with_looker
 from tactflow.batch.task import Format, Outcome, PipelineRequest, Report, Task, result_name
-from tactflow.clock import SYSTEM
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
 from tactflow.engine.graph import Mark, Pipeline
 from tactflow.engine.run import Progress
+from tactflow.system.clock import SYSTEM
 
 DEADLY = 2
 """Workers that a recording may kill before it is set aside."""

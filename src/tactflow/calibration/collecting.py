@@ -12,7 +12,7 @@ from tactflow.engine.conformance import own_sink
 from tactflow.engine.contract import Sink
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.signals import INTERRUPTED, Interrupted
+from tactflow.system.signals import INTERRUPTED, Interrupted
 
 _COLLECT: Final = "tactflow.calibrate"
 """Id of the sink that collects; no id of a file has a point in it."""

@@ -22,9 +22,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from tactflow import __version__
 from tactflow.engine.errors import ConfigError
-from tactflow.files import completed, is_device
-from tactflow.redaction import public_address
-from tactflow.signals import ending_held_back
+from tactflow.system.files import completed, is_device
+from tactflow.system.redaction import public_address
+from tactflow.system.signals import ending_held_back
 from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import SurfaceErrors
 from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, ForceModel, LinearForce

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactflow.calibration.file import raw_corners
 from tactflow.calibration.presses import SAME, Press, difference
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.files import completed
+from tactflow.system.files import completed
 from tactflow.vision.geometry import PixelMapping
 
 

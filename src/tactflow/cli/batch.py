@@ -31,7 +31,7 @@ from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
-from tactflow.signals import INTERRUPTED, ending_handled
+from tactflow.system.signals import INTERRUPTED, ending_handled
 from tactflow.vision.compiled import processors
 
 _FAILED_SHOWN = 20

@@ -12,7 +12,7 @@ from tactflow.calibration.force import Fit, Watched, fit_force, try_force, watch
 from tactflow.calibration.reference import Reference, read_reference
 from tactflow.cli.notes import say
 from tactflow.engine.errors import ConfigError
-from tactflow.files import expanded
+from tactflow.system.files import expanded
 
 
 def add_force_arguments(parser: argparse.ArgumentParser) -> None:

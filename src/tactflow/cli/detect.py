@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from tactflow.cli.outputs import refuse_output
 from tactflow.cli.printable import printable
+from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers
-from tactflow.vision.markers.picture import draw_detection
 
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 """Endings of files that a picture can be written to."""

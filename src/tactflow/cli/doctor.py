@@ -14,8 +14,8 @@ import orjson
 from tactflow.cli.options import seconds
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import StageError
-from tactflow.signals import ending_handled, interrupt
 from tactflow.sources import KINDS
+from tactflow.system.signals import ending_handled, interrupt
 
 if TYPE_CHECKING:
     from tactflow.doctor import Finding

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from tactflow.cli.notes import notes_on, say
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.files import claim_path, make_folder
+from tactflow.system.files import claim_path, make_folder
 
 FASTEST = 1000
 """Frames per second of a dataset at most; cameras of gels are slower. Chosen by hand."""
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     ConfigError : the folder is there already, or the rate is none. Nothing was written.
     TactflowError : as `tactflow run`; nothing is left behind.
     """
-    from tactflow.lerobot import DatasetWriter
+    from tactflow.adapters.lerobot import DatasetWriter
     from tactflow.streaming import stream
 
     if args.out.exists():

@@ -8,7 +8,7 @@ from pathlib import Path
 from tactflow.cli.printable import typed
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.network.keys import WrongKeysError, make_keys
-from tactflow.signals import ending_held_back
+from tactflow.system.signals import ending_held_back
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from tactflow.cli.options import positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.network.subscriber import DEFAULT_ENDPOINT, Subscriber
-from tactflow.signals import ending_handled, interrupt
+from tactflow.system.signals import ending_handled, interrupt
 
 Message = dict[str, Any]
 

@@ -18,9 +18,9 @@ from tactflow import __version__
 from tactflow.__main__ import wanted
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import StageError, TactflowError
-from tactflow.files import Unheard, lead_nowhere
-from tactflow.signals import ENDING, INTERRUPTED, interrupt_from_now_on
-from tactflow.spelling import closest, did_you_mean
+from tactflow.system.files import Unheard, lead_nowhere
+from tactflow.system.signals import ENDING, INTERRUPTED, interrupt_from_now_on
+from tactflow.system.spelling import closest, did_you_mean
 
 COMMANDS = {
     "run": "run a pipeline",
@@ -101,7 +101,7 @@ def main(argv: Sequence[str]) -> int:
         return int(args.run(args))
     except TactflowError as error:
         # Imported here: it reads YAML, which not every command does.
-        from tactflow.redaction import public_address
+        from tactflow.system.redaction import public_address
 
         print(printable(public_address(f"tactflow: {error}")), file=sys.stderr)
         return error.exit_code

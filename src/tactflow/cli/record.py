@@ -7,9 +7,9 @@ from pathlib import Path
 
 from tactflow.cli import run as run_command
 from tactflow.engine.errors import ConfigError
-from tactflow.files import next_name
 from tactflow.fleet.names import with_name
 from tactflow.recording import missing_packages
+from tactflow.system.files import next_name
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,8 +12,8 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from tactflow.cli.notes import say
 from tactflow.engine.errors import ConfigError, SourceError, StageError
-from tactflow.files import claim
 from tactflow.recording import missing_packages
+from tactflow.system.files import claim
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -29,11 +29,11 @@ from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner, RunResult
 from tactflow.engine.trace import TRACE_BEGINS, Trace
-from tactflow.files import is_device
 from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
-from tactflow.signals import INTERRUPTED
+from tactflow.system.files import is_device
+from tactflow.system.signals import INTERRUPTED
 from tactflow.vision import compiled
 
 STATISTICS_BEGIN = '{\n "frames":'

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the schema, or the layout."""
     if args.what == "message":
-        from tactflow.message_schema import message_schema
+        from tactflow.message.schema import message_schema
 
         schema = message_schema()
     elif args.what == "foxglove-layout":

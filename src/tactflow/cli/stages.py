@@ -21,7 +21,7 @@ from tactflow.config.yamlmap import shown
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 from tactflow.engine.ports import Port, describe_type
-from tactflow.spelling import did_you_mean
+from tactflow.system.spelling import did_you_mean
 
 _LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 

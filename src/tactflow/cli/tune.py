@@ -17,7 +17,7 @@ from tactflow.cli.outputs import refuse_output
 from tactflow.cli.printable import printable, typed
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.files import completed
+from tactflow.system.files import completed
 
 LARGEST_SEED: Final = 1_000_000
 """The simulator takes seeds up to 2**31 - 1, and a search some hundreds from the given one on."""

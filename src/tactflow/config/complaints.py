@@ -13,7 +13,7 @@ from pydantic_core import ErrorDetails
 
 from tactflow.config.yamlmap import Item, Problems, shown
 from tactflow.engine.graph import Mark
-from tactflow.spelling import closest, did_you_mean
+from tactflow.system.spelling import closest, did_you_mean
 
 _EXPECTED = {
     "int_type": "a whole number",

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from tactflow.engine.contract import Sink, StageParams
-from tactflow.files import expanded, is_device
+from tactflow.system.files import expanded, is_device
 
 FileId = tuple[int, int]
 """Device and inode: the same for all names of a file, links too."""

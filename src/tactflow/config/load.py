@@ -23,8 +23,8 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
-from tactflow.files import expanded
-from tactflow.redaction import public_address
+from tactflow.system.files import expanded
+from tactflow.system.redaction import public_address
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 

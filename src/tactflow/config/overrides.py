@@ -11,8 +11,8 @@ import numpy as np
 from tactflow.config.yamlmap import Entry, Item, Problems, read_value, wrap
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Mark
-from tactflow.redaction import public_setting
-from tactflow.spelling import did_you_mean
+from tactflow.system.redaction import public_setting
+from tactflow.system.spelling import did_you_mean
 
 
 def as_yaml(value: Any) -> str:

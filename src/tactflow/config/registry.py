@@ -20,7 +20,7 @@ from tactflow.config.models import RESERVED
 from tactflow.engine.conformance import component, kind_of
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
-from tactflow.spelling import closest, did_you_mean
+from tactflow.system.spelling import closest, did_you_mean
 
 Section = Literal["stages", "sinks"]
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from tactflow.config.models import Changes, is_word
 from tactflow.config.yamlmap import Entry, Item, Problems
-from tactflow.spelling import did_you_mean
+from tactflow.system.spelling import did_you_mean
 
 PLACEHOLDER = "{sensor}"
 

@@ -8,7 +8,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError
-from tactflow.spelling import closest
+from tactflow.system.spelling import closest
 
 
 def packaged_pipelines() -> list[str]:

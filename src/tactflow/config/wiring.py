@@ -10,7 +10,7 @@ from tactflow.config.yamlmap import Entry, Item, Problems
 from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Component, Mark, Ref
 from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
-from tactflow.spelling import did_you_mean
+from tactflow.system.spelling import did_you_mean
 
 
 @dataclass(slots=True)

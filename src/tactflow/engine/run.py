@@ -24,7 +24,7 @@ from tactflow.engine.schedule import make_schedule
 from tactflow.engine.segment import NewReferences, NodeFailedError, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.engine.trace import Trace
-from tactflow.signals import INTERRUPTED
+from tactflow.system.signals import INTERRUPTED
 
 logger = logging.getLogger("tactflow")
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from tactflow.files import status
+from tactflow.system.files import status
 
 BEAT_EVERY = 1.0
 """Time between two signs of life, s. Chosen by hand."""

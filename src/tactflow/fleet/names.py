@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tactflow.config.sensors import PLACEHOLDER
 from tactflow.engine.errors import ConfigError
-from tactflow.files import expanded, is_device
+from tactflow.system.files import expanded, is_device
 
 STREAMS = ("/dev/stdout", "/dev/stderr")
 """They lead to the supervisor, even where what they stand for is a regular file just now."""

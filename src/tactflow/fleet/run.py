@@ -24,7 +24,7 @@ from tactflow.fleet.sinks import (
     sink_class,
 )
 from tactflow.fleet.supervisor import Member, Supervisor
-from tactflow.signals import ending_handled
+from tactflow.system.signals import ending_handled
 
 LONGEST_ADDRESS = 107
 """Bytes that the path of a local socket may have (Linux; elsewhere four less)."""

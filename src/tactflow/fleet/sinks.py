@@ -12,8 +12,8 @@ from tactflow.config.overrides import as_yaml
 from tactflow.config.sensors import PLACEHOLDER
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.files import is_device, status
 from tactflow.fleet.names import STREAMS
+from tactflow.system.files import is_device, status
 
 
 class _State(NamedTuple):

@@ -13,10 +13,10 @@ from types import FrameType
 from typing import IO, TextIO
 
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.files import lead_nowhere
 from tactflow.fleet.heartbeat import SignOfLife
 from tactflow.fleet.sinks import WatchedSink
-from tactflow.signals import INTERRUPTED
+from tactflow.system.files import lead_nowhere
+from tactflow.system.signals import INTERRUPTED
 
 FIRST_PAUSE = 1.0
 """Time before the first new start after a failure, s; it doubles with each further one. Chosen by hand."""

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import zmq
 
 from tactflow.engine.errors import StageError
-from tactflow.files import expanded, files_left
 from tactflow.network.address import is_ipv6
 from tactflow.network.keys import DOMAIN, WrongKeysError, secure_publisher, subscribers_folder
+from tactflow.system.files import expanded, files_left
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator

@@ -15,9 +15,9 @@ from typing import Any, Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from tactflow.files import expanded
 from tactflow.network.address import is_ipv6, refuse_high_port
 from tactflow.network.keys import WrongKeysError, secure_subscriber
+from tactflow.system.files import expanded
 
 REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
 """After these, ZeroMQ does not try again."""

@@ -18,8 +18,8 @@ from typing import Any
 import orjson
 import zmq
 
-from tactflow.clock import SYSTEM, Clock
 from tactflow.network.connection import Connection
+from tactflow.system.clock import SYSTEM, Clock
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Where tactflow publishes unless its pipeline says otherwise."""

@@ -18,7 +18,7 @@ adds it for programs that insist on one.
 
 from __future__ import annotations
 
-from tactflow.extras import missing
+from tactflow.system.extras import missing
 
 NEEDED = ("mcap", "zstandard", "mcap_protobuf", "foxglove_schemas_protobuf")
 

@@ -20,8 +20,8 @@ from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyp
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
-from tactflow.message import Results
-from tactflow.message_schema import message_schema
+from tactflow.message.encoding import Results
+from tactflow.message.schema import message_schema
 from tactflow.vision.types import Markers, MarkerStatus
 
 RESULT_TYPE = "tactflow.frame"

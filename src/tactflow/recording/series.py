@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from tactflow.engine.errors import StageError
-from tactflow.files import next_name
 from tactflow.recording.writer import About, Entry, RecordingWriter
+from tactflow.system.files import next_name
 
 log = logging.getLogger("tactflow")
 

@@ -12,10 +12,10 @@ from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
-from tactflow.files import claim, make_folder, taken_away
-from tactflow.message_schema import message_schema
+from tactflow.message.schema import message_schema
 from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
 from tactflow.recording.schemas import channel_types
+from tactflow.system.files import claim, make_folder, taken_away
 
 NEVER = 1 << 62
 """Size at which a chunk would end by itself, bytes: they are ended by hand."""

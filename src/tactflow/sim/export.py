@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.files import completed
 from tactflow.sim.scenes import Scene
+from tactflow.system.files import completed
 
 VIDEO_SUFFIXES = (".avi", ".mkv")
 TRUTH_SUFFIXES = (".jsonl", ".npz", ".csv")

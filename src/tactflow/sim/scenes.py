@@ -14,7 +14,7 @@ from tactflow.sim import gel, light, markers, motion
 from tactflow.sim.recipes import SCENES
 from tactflow.sim.settings import Settings, parse_query
 from tactflow.sim.truth import Truth, measure
-from tactflow.spelling import did_you_mean
+from tactflow.system.spelling import did_you_mean
 
 SIZE = (800, 600)
 """Width and height of every scene's frames, px."""

@@ -10,7 +10,7 @@ from typing import Any
 from tactflow.sim.gel import RIM, SINK_IN
 from tactflow.sim.light import LIGHTS
 from tactflow.sim.markers import SHAPES
-from tactflow.spelling import did_you_mean
+from tactflow.system.spelling import did_you_mean
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from functools import partial
 from pathlib import Path
 
 from tactflow.engine.errors import SourceError
-from tactflow.files import expanded, is_utf8
-from tactflow.redaction import public_address
 from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream
 from tactflow.sources.files import open_recording
 from tactflow.sources.health import Watch
 from tactflow.sources.watch import Arrival, LiveReader, Watched
+from tactflow.system.files import expanded, is_utf8
+from tactflow.system.redaction import public_address
 
 __all__ = [
     "KINDS",

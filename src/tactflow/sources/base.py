@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
-from tactflow.files import expanded, is_device
+from tactflow.system.files import expanded, is_device
 
 log = logging.getLogger("tactflow")
 

@@ -11,10 +11,10 @@ from urllib.parse import urlsplit
 
 import cv2
 
-from tactflow.clock import SYSTEM, Clock
 from tactflow.engine.errors import SourceError
-from tactflow.redaction import public_address
 from tactflow.sources.base import BgrImage, Normaliser, frame_size, log, quiet_opencv
+from tactflow.system.clock import SYSTEM, Clock
+from tactflow.system.redaction import public_address
 
 LARGEST_INDEX = 2**31 - 1
 """OpenCV takes the index of a camera as an `int` of C."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
-from tactflow.files import expanded
 from tactflow.sources.base import (
     BgrImage,
     Normaliser,
@@ -24,6 +23,7 @@ from tactflow.sources.base import (
     quiet_opencv,
     refuse_too_large,
 )
+from tactflow.system.files import expanded
 
 IMAGE_SUFFIXES = frozenset(
     [".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"]

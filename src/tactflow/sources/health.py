@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactflow.clock import SYSTEM, Clock
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import BgrImage
+from tactflow.system.clock import SYSTEM, Clock
 
 log = logging.getLogger("tactflow")
 

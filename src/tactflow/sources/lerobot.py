@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.extras import missing
 from tactflow.sources.base import BgrImage, Normaliser, find_path, refuse_devices, refuse_too_large
 from tactflow.sources.files import decode_image, refuse_playlist
 from tactflow.sources.query import split_query
 from tactflow.sources.stores import damaged
+from tactflow.system.extras import missing
 
 SCHEME = "lerobot:"
 SETTINGS = {"camera": "key of a camera", "episode": "number of an episode"}

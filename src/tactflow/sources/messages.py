@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.extras import missing
 from tactflow.sources.base import refuse_too_large
 from tactflow.sources.files import decode_image
+from tactflow.system.extras import missing
 
 if TYPE_CHECKING:
     import av

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 
-from tactflow.clock import SYSTEM, Clock
+from tactflow.system.clock import SYSTEM, Clock
 
 LEAD = 1.25
 """Times as long as reading a frame took of late is set aside for reading the next. Chosen by hand."""

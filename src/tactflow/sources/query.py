@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import parse_qsl
 
 from tactflow.engine.errors import SourceError
-from tactflow.files import expanded
+from tactflow.system.files import expanded
 
 
 def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> tuple[str, dict[str, str]]:

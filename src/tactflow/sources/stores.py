@@ -10,8 +10,8 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from tactflow.engine.errors import SourceError
-from tactflow.extras import missing
 from tactflow.recording import missing_packages
+from tactflow.system.extras import missing
 
 if TYPE_CHECKING:
     from mcap.records import Channel, Schema

@@ -12,10 +12,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from tactflow.clock import SYSTEM, Clock
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import BgrImage, FrameReader, log
 from tactflow.sources.health import HANG_INTERVALS, Health, Verdict, Watch
+from tactflow.system.clock import SYSTEM, Clock
 
 OPENING_SECONDS = 15.0
 """Opening that takes longer hangs, s; more than what drivers and streams themselves allow. Chosen by

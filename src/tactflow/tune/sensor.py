@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tactflow.bench.scenes import Case, Rendered
 from tactflow.doctor import measures
-from tactflow.jpeg import encode_jpeg
+from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.sim import Truth, open_scene
 from tactflow.sim.scenes import SIZE
 from tactflow.tune.recording import Recording, change_between

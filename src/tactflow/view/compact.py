@@ -14,7 +14,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from tactflow.message import STATUS_NAMES
+from tactflow.message.encoding import STATUS_NAMES
 from tactflow.vision.types import Depth, Markers
 
 STATUS_LETTERS: Final = np.array([ord(name[0]) for name in STATUS_NAMES], np.uint8)

@@ -49,7 +49,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.signals import ending_held_back
+from tactflow.system.signals import ending_held_back
 from tactflow.vision.kernel_cache import POLL_S, claimed, dispatcher_of
 
 logger = logging.getLogger("tactflow")

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from tactflow.cli.main import main
 from tactflow.cli.notes import notes_on
-from tactflow.redaction import public_address, without_secrets
+from tactflow.system.redaction import public_address, without_secrets
 
 SECRET = "a-secret-of-some-length"
 

@@ -1,8 +1,8 @@
 """Load until it is too much: results, drops, their age and memory against sensors, subscribers and pages.
 
-    python -m tests.load.knee                              writes the section "load" of docs/reliability.md
-    python -m tests.load.knee --sensors 1 --rate 60        prints one load: the latency of one sensor at 60 Hz
-    python -m tests.load.knee --sensors 4                  the same of four at 30 Hz
+  python -m benchmarks.load.knee                              writes the section "load" of docs/reliability.md
+  python -m benchmarks.load.knee --sensors 1 --rate 60   latency of one sensor at 60 Hz
+  python -m benchmarks.load.knee --sensors 4             the same of four at 30 Hz
 
 The subscribers and pages run on the same machine, in a process of their own.
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.load.workload import (
+from benchmarks.load.workload import (
     Subscribers,
     children,
     pages,

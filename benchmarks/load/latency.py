@@ -1,6 +1,6 @@
 """Where the age of a live result comes from: writes the section "age" of docs/tuning.md.
 
-    python -m tests.load.latency
+    python -m benchmarks.load.latency
 
 One sensor at 60 Hz and a subscriber in a process of its own, on a machine that is otherwise quiet.
 """
@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import zmq
 
+from benchmarks.load.workload import write_pipeline, write_section
 from tactflow.bench.lockstep import LockstepPipeline
 from tactflow.bench.pipelines import on_recording
 from tactflow.bench.timing import BLOCK
@@ -31,7 +32,6 @@ from tactflow.engine.run import Runner
 from tactflow.engine.trace import Trace
 from tactflow.sim import open_scene
 from tests.conftest import REPOSITORY
-from tests.load.workload import write_pipeline, write_section
 
 SIZE = (800, 600)
 """Of the pictures, px: the default pipeline halves them."""
@@ -76,7 +76,7 @@ def subscribe(endpoint: str, count: int) -> None:
 @contextmanager
 def subscriber(endpoint: str) -> Iterator[subprocess.Popen[str]]:
     """A process that subscribes; what it prints can be read when it has ended."""
-    command = [sys.executable, "-m", "tests.load.latency", "--subscribe", endpoint]
+    command = [sys.executable, "-m", "benchmarks.load.latency", "--subscribe", endpoint]
     process = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
     try:
         yield process

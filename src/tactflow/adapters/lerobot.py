@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError
-from tactflow.extras import missing
 from tactflow.streaming import Result
+from tactflow.system.extras import missing
 from tactflow.vision.types import Scale
 
 if TYPE_CHECKING:

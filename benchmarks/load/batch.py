@@ -1,10 +1,10 @@
 """What a batch costs, and what survives: processes, a Dask cluster, growing work, kill -9.
 
-    python -m tests.load.batch speed
-    python -m tests.load.batch speed --data ../shared/data    # real recordings instead
-    python -m tests.load.batch cluster
-    python -m tests.load.batch growth
-    python -m tests.load.batch resume
+    python -m benchmarks.load.batch speed
+    python -m benchmarks.load.batch speed --data ../shared/data    # real recordings instead
+    python -m benchmarks.load.batch cluster
+    python -m benchmarks.load.batch growth
+    python -m benchmarks.load.batch resume
 
 Each tells what it has done on stderr, and prints the table that stands in docs/batch.md. Everything is
 written below a temporary folder. `--recordings` makes it shorter.

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message import STATUS_NAMES, Results, encode_message
-from tactflow.message_schema import message_schema
+from tactflow.message.encoding import STATUS_NAMES, Results, encode_message
+from tactflow.message.schema import message_schema
 from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, MarkerStatus, Scale
 from tests.messages import build_message

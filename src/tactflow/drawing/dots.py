@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.draw import DARK, GRAY, GREEN, MAGENTA, WHITE, YELLOW, Colour
-from tactflow.vision.lettering import Lettering
+from tactflow.drawing.lettering import Lettering
+from tactflow.drawing.results import DARK, GRAY, GREEN, MAGENTA, WHITE, YELLOW, Colour
 from tactflow.vision.markers.detection import Candidate, Detection
 
 SHORTEST_SIDE: Final = 480

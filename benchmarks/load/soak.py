@@ -1,6 +1,6 @@
 """A million frames through all sinks as fast as possible: memory, open files and threads, to the end.
 
-    python -m tests.load.soak
+    python -m benchmarks.load.soak
 
 writes docs/soak.svg and the section "soak" of docs/reliability.md. Pictures are small, so that it takes an
 hour and not ten: what is lost with each frame shows all the same. Old files of the recording are deleted as
@@ -16,8 +16,16 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.load.workload import (
+    Sample,
+    Subscribers,
+    pages,
+    running,
+    sample,
+    write_pipeline,
+    write_section,
+)
 from tests.conftest import REPOSITORY
-from tests.load.workload import Sample, Subscribers, pages, running, sample, write_pipeline, write_section
 
 SIZE = (200, 150)
 """Of the pictures, px."""

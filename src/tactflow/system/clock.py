@@ -1,7 +1,7 @@
 """Time and pauses, as what waits is given them: the system's, or in tests a clock that is moved by hand.
 
 >>> from threading import Event
->>> from tactflow.clock import SYSTEM
+>>> from tactflow.system.clock import SYSTEM
 >>> began = SYSTEM.now()
 >>> SYSTEM.sleep(0.001, Event())
 False

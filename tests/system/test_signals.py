@@ -12,7 +12,7 @@ from threading import Thread
 import pytest
 
 from tactflow.api import ended_by_signals, load, make_runner
-from tactflow.signals import ENDING, ending_handled, ending_held_back, interrupt
+from tactflow.system.signals import ENDING, ending_handled, ending_held_back, interrupt
 from tests.clock import PATIENCE, until
 
 ENDS = [number for number in ENDING if sys.platform != "win32"]
@@ -90,7 +90,7 @@ def test_no_signal_arrives_in_a_child_that_starts() -> None:
     program = """
 import signal
 from multiprocessing import resource_tracker
-from tactflow.signals import ENDING, blocked_in_children
+from tactflow.system.signals import ENDING, blocked_in_children
 with blocked_in_children(ENDING):
     resource_tracker.ensure_running()
     print(set(ENDING) <= signal.pthread_sigmask(signal.SIG_BLOCK, []))
@@ -105,7 +105,7 @@ def test_a_terminal_that_is_closed_does_not_end_what_python_starts_with_the_firs
 import re, signal
 from multiprocessing import resource_tracker
 from pathlib import Path
-from tactflow.signals import ENDING, blocked_in_children
+from tactflow.system.signals import ENDING, blocked_in_children
 with blocked_in_children(ENDING):
     resource_tracker.ensure_running()
 status = Path(f"/proc/{resource_tracker._resource_tracker._pid}/status").read_text()
@@ -120,7 +120,7 @@ def test_the_exit_code_stands_wherever_the_signal_came(tmp_path: Path) -> None:
     # Seen to end by SIGINT in CPython 3.11 where a KeyboardInterrupt itself is raised.
     (tmp_path / "ending.py").write_text("""
 import sys
-from tactflow.signals import Interrupted
+from tactflow.system.signals import Interrupted
 try:
     exec("raise Interrupted")
 except KeyboardInterrupt:
@@ -223,7 +223,7 @@ def test_a_signal_while_nobody_takes_the_last_of_the_output(tmp_path: Path) -> N
     (tmp_path / "ending.py").write_text("""
 import sys
 from tactflow.cli import main
-from tactflow.signals import Interrupted
+from tactflow.system.signals import Interrupted
 
 def interrupted():
     sys.stdout.flush = lambda: None

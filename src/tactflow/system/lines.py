@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from tactflow.engine.errors import StageError
-from tactflow.files import claim, taken_away
+from tactflow.system.files import claim, taken_away
 
 log = logging.getLogger("tactflow")
 

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.drawing.lettering import Lettering
+from tactflow.drawing.relief import colour_bar, relief
 from tactflow.vision.flow import DisplacementField, inside_mask
-from tactflow.vision.lettering import Lettering
-from tactflow.vision.relief import colour_bar, relief
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
 
 View = Literal["frame", "contact", "depth"]

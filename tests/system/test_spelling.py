@@ -6,7 +6,7 @@ import pytest
 
 from tactflow.config.registry import available, resolve
 from tactflow.sim.settings import KEYS
-from tactflow.spelling import closest, did_you_mean
+from tactflow.system.spelling import closest, did_you_mean
 
 
 def test_a_misspelled_word_gets_a_suggestion_and_another_one_the_list() -> None:

@@ -13,7 +13,7 @@ import yaml
 from tactflow import __version__
 from tactflow.calibration.file import stored_arrays, stored_text
 from tactflow.engine.control import Control
-from tactflow.redaction import without_secrets
+from tactflow.system.redaction import without_secrets
 from tactflow.vision import compiled
 
 log = logging.getLogger("tactflow")

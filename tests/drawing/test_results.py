@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.draw import Annotator, draw_arrows, draw_ellipse, draw_polygon
+from tactflow.drawing.lettering import Lettering
+from tactflow.drawing.results import Annotator, draw_arrows, draw_ellipse, draw_polygon
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry.hull import contact_geometry
-from tactflow.vision.lettering import Lettering
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
 
 GRAY = np.full((240, 320, 3), 100, np.uint8)

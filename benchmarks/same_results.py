@@ -1,0 +1,161 @@
+"""Compare the results of two checkouts over simulated scenes and real recordings.
+
+    python benchmarks/same_results.py run OUT [--data ../shared/data]     # with the tactflow of this Python
+    python benchmarks/same_results.py compare BEFORE AFTER
+
+Exit code 1 if anything differs by more than the tolerances below.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+SCENES = (
+    *("press", "bright", "cable", "bent_cable", "edge", "ring", "screw"),
+    *("two", "slide", "jumps", "dense", "worn"),
+)
+PIPELINES = ("default", "wedge", "markerless", "classic")
+
+MARKER_TOLERANCE = 1e-3
+"""Markers may move by so much, px."""
+OUTLINE_TOLERANCE = 1.0
+"""Outlines may move by so much, px: every vertex lies within this distance of the other hull."""
+OTHER_TOLERANCE = 1e-2
+"""Centre (px), angle (degrees) and mean flow (px) may differ by so much."""
+
+
+def jobs(data: Path) -> Iterator[tuple[str, str, str, list[str]]]:
+    """Name, pipeline, source and settings of every run."""
+    for pipeline in PIPELINES:
+        for scene in SCENES:
+            yield f"{pipeline}-{scene}", pipeline, f"sim:{scene}?frames=60", []
+    gels = data / "gels"
+    for folder in sorted(path for path in gels.glob("*") if path.is_dir()):
+        videos = sorted(path for path in folder.iterdir() if path.suffix in (".avi", ".mp4", ".m4v"))
+        source = str(videos[len(videos) // 2]) if videos else str(folder)
+        for pipeline in ("default", "markerless"):
+            yield f"{pipeline}-{folder.name}", pipeline, source, ["stages.preprocess.rotate=0"]
+    for folder, pipeline in (
+        *(("wedge_roll", "wedge"), ("wedge_ball", "wedge"), ("wedge_ball", "classic")),
+        *(("mini_ball_9mm", "mini_plain"), ("letac/empty", "default")),
+    ):
+        yield f"{pipeline}-{folder.replace('/', '_')}", pipeline, str(data / folder), []
+
+
+def run(out: Path, data: Path, frames: int) -> None:
+    """Write the messages of every job to OUT/NAME.jsonl."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name, pipeline, source, settings in jobs(data):
+        target = out / f"{name}.jsonl"
+        if target.exists():
+            continue
+        command = [sys.executable, "-m", "tactflow", "run", pipeline, "--source", source, "--quiet"]
+        command += ["--max-frames", str(frames), "--jsonl", "-"]
+        for setting in (*settings, "sinks.zmq=null", "sinks.view=null", "sinks.jsonl=null"):
+            command += ["--set", setting]
+        done = subprocess.run(command, capture_output=True, cwd=out, check=False)
+        target.write_bytes(done.stdout)
+        print(f"{name}: {len(done.stdout.splitlines())} messages, exit {done.returncode}", flush=True)
+
+
+def hull_distance(one: list[Any], other: list[Any]) -> float:
+    """Largest distance of a vertex of one hull from the border of the other, px."""
+    first, second = (np.asarray(hull, np.float32).reshape(-1, 1, 2) for hull in (one, other))
+    return max(
+        max(abs(cv2.pointPolygonTest(border, (float(x), float(y)), True)) for x, y in points[:, 0])
+        for points, border in ((first, second), (second, first))
+    )
+
+
+def differences(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
+    """What differs between two messages of the same frame."""
+    if before["seq"] != after["seq"]:
+        yield f"seq {before['seq']} and {after['seq']}"
+        return
+    if (before["contact"] is None) != (after["contact"] is None):
+        yield "contact decision"
+    elif before["contact"] is not None:
+        if (
+            distance := hull_distance(before["contact"]["hull"], after["contact"]["hull"])
+        ) > OUTLINE_TOLERANCE:
+            yield f"hull by {distance:.2f} px"
+        moved = np.subtract(before["contact"]["center"], after["contact"]["center"])
+        if np.abs(moved).max() > OTHER_TOLERANCE:
+            yield f"centre by {np.abs(moved).max():.3g} px"
+        angles = before["contact"]["angle"], after["contact"]["angle"]
+        if (angles[0] is None) != (angles[1] is None):
+            yield "angle known or not"
+        elif angles[0] is not None and abs((angles[0] - angles[1] + 90) % 180 - 90) > OTHER_TOLERANCE:
+            yield f"angle {angles[0]:.3f} and {angles[1]:.3f}"
+    flows = [(message["flow"] or {}).get("mean") for message in (before, after)]
+    if (flows[0] is None) != (flows[1] is None):
+        yield "flow known or not"
+    elif flows[0] is not None and np.abs(np.subtract(*flows)).max() > OTHER_TOLERANCE:
+        yield f"mean flow by {np.abs(np.subtract(*flows)).max():.3g} px"
+    markers = before["markers"], after["markers"]
+    if (markers[0] is None) != (markers[1] is None):
+        yield "markers known or not"
+    elif markers[0] is not None:
+        if len(markers[0]["position"]) != len(markers[1]["position"]):
+            yield f"{len(markers[0]['position'])} and {len(markers[1]['position'])} markers"
+        elif markers[0]["position"]:
+            distance = np.abs(np.subtract(markers[0]["position"], markers[1]["position"])).max()
+            if distance > MARKER_TOLERANCE:
+                yield f"markers by {distance:.3g} px"
+            if markers[0]["status"] != markers[1]["status"]:
+                yield "marker status"
+
+
+def compare(before: Path, after: Path) -> int:
+    """Print what differs; returns how many runs do."""
+    bad = total = 0
+    for file in sorted(before.glob("*.jsonl")):
+        if not (after / file.name).exists():
+            print(f"{file.stem}: was not run")
+            bad += 1
+            continue
+        lines = [
+            [json.loads(line) for line in (f / file.name).read_text().splitlines()] for f in (before, after)
+        ]
+        found: dict[str, list[int]] = {}
+        for one, other in zip(*lines, strict=False):
+            total += 1
+            for text in differences(one, other):
+                found.setdefault(text, []).append(one["seq"])
+        if len(lines[0]) != len(lines[1]):
+            found[f"{len(lines[0])} and {len(lines[1])} messages"] = []
+        if found:
+            bad += 1
+            print(
+                f"{file.stem}: " + "; ".join(f"{text} ({seqs[:3]})" for text, seqs in list(found.items())[:6])
+            )
+    print(f"{total} messages compared; {bad} runs differ")
+    return bad
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    one = commands.add_parser("run")
+    one.add_argument("out", type=Path)
+    one.add_argument("--data", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "data")
+    one.add_argument("--frames", type=int, default=60)
+    two = commands.add_parser("compare")
+    two.add_argument("before", type=Path)
+    two.add_argument("after", type=Path)
+    given = parser.parse_args()
+    if given.command == "run":
+        run(given.out.resolve(), given.data.resolve(), given.frames)
+    else:
+        sys.exit(bool(compare(given.before, given.after)))

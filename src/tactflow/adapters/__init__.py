@@ -1,0 +1,1 @@
+"""Foreign formats and systems; each can be deleted without a trace elsewhere."""
