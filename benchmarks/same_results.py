@@ -24,6 +24,10 @@ SCENES = (
     *("two", "slide", "jumps", "dense", "worn"),
 )
 PIPELINES = ("default", "wedge", "markerless", "classic")
+UPRIGHT = {
+    "wedge": [f"stages.preprocess.{key}" for key in ("homography=null", "rotate=90", "downsample=2")]
+}
+"""Settings with which a pipeline made for another camera takes the simulator's pictures."""
 
 MARKER_TOLERANCE = 1e-3
 """Markers may move by so much, px."""
@@ -37,7 +41,7 @@ def jobs(data: Path) -> Iterator[tuple[str, str, str, list[str]]]:
     """Name, pipeline, source and settings of every run."""
     for pipeline in PIPELINES:
         for scene in SCENES:
-            yield f"{pipeline}-{scene}", pipeline, f"sim:{scene}?frames=60", []
+            yield f"{pipeline}-{scene}", pipeline, f"sim:{scene}?frames=60", UPRIGHT.get(pipeline, [])
     gels = data / "gels"
     for folder in sorted(path for path in gels.glob("*") if path.is_dir()):
         videos = sorted(path for path in folder.iterdir() if path.suffix in (".avi", ".mp4", ".m4v"))
