@@ -24,9 +24,7 @@ SCENES = (
     *("two", "slide", "jumps", "dense", "worn"),
 )
 PIPELINES = ("default", "wedge", "markerless", "classic")
-UPRIGHT = {
-    "wedge": [f"stages.preprocess.{key}" for key in ("homography=null", "rotate=90", "downsample=2")]
-}
+UPRIGHT = {"wedge": [f"stages.preprocess.{key}" for key in ("homography=null", "rotate=90", "downsample=2")]}
 """Settings with which a pipeline made for another camera takes the simulator's pictures."""
 
 MARKER_TOLERANCE = 1e-3

@@ -164,6 +164,9 @@ class Normaliser:
             If the pixels are of another kind, or the frame is not as large as the ones before it.
         """
         where = name or self.name
+        channels = image.shape[2] if image.ndim == 3 else 1
+        if image.ndim not in (2, 3) or channels not in (1, 3, 4):
+            raise SourceError(f"{where}: required 1, 3 or 4 channels, got an image of shape {image.shape}")
         height, width = image.shape[:2]
         if self.size is None:
             self.size = (width, height)
@@ -190,9 +193,6 @@ class Normaliser:
             image = cv2.convertScaleAbs(image, alpha=255.0 / 65535.0)
         elif image.dtype != np.uint8:
             raise SourceError(f"{where}: required 8- or 16-bit unsigned pixels, got {image.dtype}")
-        channels = 1 if image.ndim == 2 else image.shape[2]
-        if image.ndim not in (2, 3) or channels not in (1, 3, 4):
-            raise SourceError(f"{where}: required 1, 3 or 4 channels, got an image of shape {image.shape}")
         if channels == 3:
             return image if image.flags.c_contiguous else np.ascontiguousarray(image)
         if channels == 1:

@@ -1,0 +1,69 @@
+"""Frames that a program already has: an array, a list, or any iterator of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sized
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources.base import BgrImage, Normaliser
+from tactflow.sources.files import DEFAULT_FPS
+
+
+class MemoryFrames:
+    """Pictures in memory, as a recording; frame i is taken at i / fps.
+
+    `tactflow.stream(source=frames)` opens its pictures with this reader. Pictures of an iterator are asked
+    for one at a time, when the pipeline is ready for the next one.
+
+    Parameters
+    ----------
+    frames : (N, H, W, 3) BGR or (N, H, W) grey array of uint8 or uint16, or an iterable of pictures
+        (H, W, 3) or (H, W), all of one size. They are not copied: leave a picture as it is once it was given.
+    fps : frames per second; 30 by default.
+
+    Raises
+    ------
+    SourceError
+        From `read`, if a picture is not an array of such pixels or of another size than the first one.
+
+    Examples
+    --------
+    >>> reader = MemoryFrames(np.zeros((2, 48, 64), np.uint8), fps=10)
+    >>> reader.total, [(image.shape, t) for image, t in iter(reader.read, None)]
+    (2, [((48, 64, 3), 0.0), ((48, 64, 3), 0.1)])
+    """
+
+    live = False
+
+    def __init__(self, frames: Iterable[NDArray[Any]], fps: float | None = None) -> None:
+        if isinstance(frames, np.ndarray) and (frames.ndim < 3 or frames.shape[2:] in ((3,), (4,))):
+            raise SourceError(
+                f"an array of shape {frames.shape}: required N x H x W x 3 (BGR) or N x H x W (gray); "
+                "a single picture? Give array[None]"
+            )
+        self.fps: float | None = fps or DEFAULT_FPS
+        self.size: tuple[int, int] | None = None
+        self.total = len(frames) if isinstance(frames, Sized) else None
+        self.description = f"frames in memory, {'' if self.total is None else f'{self.total} '}pictures"
+        self._rate = fps or DEFAULT_FPS
+        self._normalise = Normaliser("frames in memory")
+        self._frames = enumerate(frames)
+
+    def read(self) -> tuple[BgrImage, float] | None:
+        """The next picture and its time; see `FrameReader.read`."""
+        index, image = next(self._frames, (0, None))
+        if image is None:
+            return None
+        if not isinstance(image, np.ndarray):
+            raise SourceError(f"frames in memory: picture {index}: required an array, got {type(image)}")
+        image = self._normalise(image, f"picture {index}")
+        self.size = self._normalise.size
+        return image, index / self._rate
+
+    def close(self) -> None:
+        """Ask for no more pictures."""
+        self._frames = enumerate(())
