@@ -11,18 +11,17 @@ from types import FrameType
 from typing import Any
 
 import cv2
-from pydantic import ValidationError
 
-from tactflow.config.complaints import complain
+from tactflow.config.complaints import validated
 from tactflow.config.load import load_pipeline
-from tactflow.config.overrides import as_yaml
+from tactflow.config.overrides import Override, from_settings
 from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
-from tactflow.config.yamlmap import Problems, wrap
 from tactflow.engine.conformance import build
 from tactflow.engine.errors import ConfigError, SourceError
-from tactflow.engine.graph import Mark, Pipeline
+from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner, RunResult
+from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED, Interrupted, ending_handled, on_ending
 from tactflow.vision import compiled
 
@@ -60,12 +59,13 @@ def load(
     >>> list(pipeline.nodes)[:3]
     ['capture', 'probe', 'preprocess']
     """
-    values: dict[str, Any] = {} if source is None else {"source": str(source)}
+    values = []
+    if source is not None:
+        values.append(Override("source", str(source), f"source {public_address(str(source))}"))
     if realtime:
-        values["realtime"] = True
-    overrides = [f"{key}={as_yaml(value)}" for key, value in (settings or {}).items()]
+        values.append(Override("realtime", value=True, origin="realtime"))
     file = find_pipeline(None if pipeline is None else str(pipeline))
-    return load_pipeline(file, overrides, source_values=values, sensor=sensor)
+    return load_pipeline(file, from_settings(settings or {}), source_values=values, sensor=sensor)
 
 
 def check(pipeline: str | Path | None = None, *, settings: Settings | None = None) -> list[str]:
@@ -79,7 +79,7 @@ def check(pipeline: str | Path | None = None, *, settings: Settings | None = Non
     >>> tactflow.check("markerless")
     []
     >>> print(tactflow.check("markerless", settings={"stages.hull.min_aera": 5})[0])
-    --set stages.hull.min_aera=5: stages.hull.min_aera: unknown parameter; did you mean min_area?
+    settings: stages.hull.min_aera: unknown parameter; did you mean min_area?
     """
     try:
         load(pipeline, settings=settings)
@@ -220,13 +220,7 @@ def stage(use: str, /, **params: Any) -> Any:
     ((29.5, 29.5), 0.0)
     """
     component = resolve(use, "stages", Path())
-    problems = Problems()
-    try:
-        checked = component.params.model_validate(params)
-    except ValidationError as error:
-        given = wrap(params, Mark(f'stage("{use}")', 0, 0))
-        complain(error, component.params, given, use, problems, noun="parameter")
-    problems.raise_if_any()
+    checked = validated(component.params, params, use, origin=f'stage("{use}")')
     offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None, "calibration": None}
     instance = build(component.cls, checked, offered)
     instance.open()

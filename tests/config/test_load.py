@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tactflow.config.load import load_pipeline
+from tactflow.config.overrides import Override, from_settings
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Mark, OnError, Pipeline, Queue, Ref
 
@@ -40,7 +41,7 @@ def load(tmp_path: Path) -> Load:
     """Load a pipeline text with parts beside it."""
     shutil.copy(PARTS, tmp_path / "parts.py")
 
-    def from_text(text: str = BODY, *overrides: str, **options: Any) -> Pipeline:
+    def from_text(text: str = BODY, *overrides: Override | str, **options: Any) -> Pipeline:
         (tmp_path / "p.yaml").write_text(text)
         return load_pipeline(tmp_path / "p.yaml", overrides, **options)
 
@@ -280,6 +281,16 @@ class TestSet:
         assert message.startswith(f"--set {override}: ")
         assert words in message
 
+    def test_a_program_gives_python_values_and_a_mistake_names_its_settings(self, load: Load) -> None:
+        corners = np.float32([[1, 2], [3, 4]])
+        given = from_settings({"stages.prepare.corners": corners, "sinks.out.path": Path("a"), "sinks.x": {}})
+        with pytest.raises(ConfigError, match=r"^settings: sinks\.x: there is no sink called x"):
+            load(BODY, *given)
+        nodes = load(BODY, *given[:2], *from_settings({"stages.outline": None})).nodes
+        assert nodes["prepare"].params.model_dump()["corners"] == [(1.0, 2.0), (3.0, 4.0)]
+        assert nodes["out"].params.model_dump()["path"] == "a"
+        assert "outline" not in nodes
+
     @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(
         st.lists(
@@ -305,14 +316,15 @@ class TestSet:
 
 class TestOptionsOfTheCommandLine:
     def test_values_for_the_source_replace_those_of_the_file(self, load: Load) -> None:
-        pipeline = load(BODY, source_values={"source": "film.mp4", "realtime": True})
+        values = [Override("source", "film.mp4", "--source"), Override("realtime", True, "--realtime")]
+        pipeline = load(BODY, source_values=values)
         assert pipeline.source.params.model_dump() == {"source": "film.mp4", "realtime": True}
 
     def test_a_value_the_source_does_not_have_names_the_option(self, load: Load) -> None:
         with pytest.raises(
             ConfigError, match=r"^--frame-rate: stages\.capture\.frame_rate: unknown parameter"
         ):
-            load(BODY, source_values={"frame_rate": 3})
+            load(BODY, source_values=[Override("frame_rate", 3, "--frame-rate")])
 
     def test_an_added_sink_gets_an_id_that_is_free(self, load: Load) -> None:
         text = BODY.replace("  out:", "  jsonl:")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tactflow.config.load import load_pipeline
+from tactflow.config.overrides import Override
 from tactflow.engine.run import Runner, RunResult
 from tests.stress.builders import (
     DOUBLED,
@@ -77,7 +78,7 @@ def ran(name: str, frames: Sequence[Image] | Path, folder: Path, *settings: str)
     pipeline = load_pipeline(
         file,
         [*sinks, "sinks.collect.use=./collect.py:Collect", *settings],
-        source_values={"source": str(source)},
+        source_values=[Override("source", str(source), "--source")],
     )
     runner = Runner(pipeline, check=True)
     result = runner.run()

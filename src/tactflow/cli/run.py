@@ -24,6 +24,7 @@ from tactflow.cli.printable import printable
 from tactflow.cli.progress import progress_display, summary, with_statistics
 from tactflow.config.files_used import files_written
 from tactflow.config.load import load_pipeline, sensor_names
+from tactflow.config.overrides import Override
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
@@ -33,6 +34,7 @@ from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 from tactflow.system.files import is_device
+from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.vision import compiled
 
@@ -174,11 +176,12 @@ def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
 
 
 def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks) -> Pipeline:
-    source_values: dict[str, Any] = {}
+    source_values = []
     if args.source is not None:
-        source_values["source"] = args.source
+        address = f" {public_address(args.source)}" if args.source.isprintable() else ""
+        source_values.append(Override("source", args.source, f"--source{address}"))
     if args.realtime:
-        source_values["realtime"] = True
+        source_values.append(Override("realtime", value=True, origin="--realtime"))
     return load_pipeline(
         file, overrides=args.overrides, extra_sinks=sinks, source_values=source_values, sensor=sensor
     )

@@ -11,7 +11,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from tactflow.config.yamlmap import Item, Problems, shown
+from tactflow.config.yamlmap import Item, Problems, shown, wrap
+from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Mark
 from tactflow.system.spelling import closest, did_you_mean
 
@@ -70,6 +71,24 @@ class _Spot:
     path: str
     union: tuple[str, str] | None = None
     inside: bool = False
+
+
+def validated(model: type[StageParams], values: Mapping[str, Any], name: str, *, origin: str) -> StageParams:
+    """The parameters that a program gives a stage or sink, as its own model.
+
+    name : what a message calls the stage. origin : what it begins with, in place of file, line and column.
+
+    Raises
+    ------
+    ConfigError : every mistake in the values.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        problems = Problems()
+        complain(error, model, wrap(values, Mark(origin, 0, 0)), name, problems, noun="parameter")
+        problems.raise_if_any()
+        raise
 
 
 def complain(

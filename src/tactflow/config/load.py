@@ -14,7 +14,7 @@ from tactflow.config import sensors, wiring
 from tactflow.config.complaints import complain
 from tactflow.config.files_used import FileId, file_id, files_read, files_written
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
-from tactflow.config.overrides import add_sinks, apply, replaced
+from tactflow.config.overrides import Override, add_sinks, apply, plain, replaced
 from tactflow.config.registry import Section, code_place, resolve
 from tactflow.config.shipped import is_packaged
 from tactflow.config.wiring import Draft
@@ -24,7 +24,6 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
 from tactflow.system.files import expanded
-from tactflow.system.redaction import public_address
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
 
@@ -37,18 +36,19 @@ _ADVICE = {key: _NO_MEMORY.format(key=key) for key in ("hold", "at_least_every")
 
 def load_pipeline(
     path: Path,
-    overrides: Sequence[str] = (),
+    overrides: Sequence[Override | str] = (),
     extra_sinks: Mapping[str, Mapping[str, Any]] | None = None,
-    source_values: Mapping[str, Any] | None = None,
+    source_values: Sequence[Override] = (),
     sensor: str | None = None,
 ) -> Pipeline:
     """Read and check a pipeline file.
 
     path : the file.
-    overrides : `a.b.c=VALUE` as given to `--set`; VALUE is YAML, null for a whole sink or stage removes it.
+    overrides : values to replace. A text is what `--set` takes: `a.b.c=VALUE`, with VALUE in YAML, null for a
+        whole sink or stage removes it.
     extra_sinks : option of the command line, such as "--jsonl" -> settings of the sink it adds. The sink's id
         is the option's name, with a number if that is taken.
-    source_values : parameters of the source stage, as `--NAME` on the command line sets them.
+    source_values : parameters of the source stage to replace; their keys are names of parameters.
     sensor : which sensor of a file with `sensors:`; None is the first.
 
     Raises
@@ -62,7 +62,7 @@ def load_pipeline(
     drafts = _drafts(root, path.parent, problems)
     source = _source(root, drafts, problems)
     if source is not None:
-        _set_values(source, source_values or {})
+        _set_values(source, source_values)
     for draft in drafts:
         draft.params = _params(draft, problems)
     drafts = _one_writer_each(drafts, extra_sinks or {}, problems)
@@ -93,7 +93,7 @@ def load_pipeline(
     return pipeline
 
 
-def sensor_names(path: Path, overrides: Sequence[str] = ()) -> list[str]:
+def sensor_names(path: Path, overrides: Sequence[Override | str] = ()) -> list[str]:
     """The sensors under `sensors:` of a pipeline file, in order; empty if it has no such key.
 
     Raises
@@ -106,7 +106,7 @@ def sensor_names(path: Path, overrides: Sequence[str] = ()) -> list[str]:
     return sensors.names(root)
 
 
-def _read(path: Path, overrides: Sequence[str], problems: Problems) -> Item:
+def _read(path: Path, overrides: Sequence[Override | str], problems: Problems) -> Item:
     """The document with its overrides."""
     root = read_yaml(path, problems)
     if root.content is None:
@@ -115,8 +115,8 @@ def _read(path: Path, overrides: Sequence[str], problems: Problems) -> Item:
         problems.add(root.mark, f"expected a mapping with sensor, stages and sinks, got {root.words()}")
     if not isinstance(root.content, dict):
         problems.raise_if_any()
-    for text in overrides:
-        root = apply(root, text, problems)
+    for override in overrides:
+        root = apply(root, override, problems)
     return root
 
 
@@ -185,12 +185,11 @@ def _source(root: Item, drafts: Sequence[Draft], problems: Problems) -> Draft | 
     return sources[0] if sources else None
 
 
-def _set_values(draft: Draft, values: Mapping[str, Any]) -> None:
-    """Replace parameters of a stage by those of options, whose names are their places."""
-    for name, value in values.items():
-        shown = f" {public_address(value)}" if isinstance(value, str) and value.isprintable() else ""
-        mark = Mark(f"--{name.replace('_', '-')}{shown}", 0, 0)
-        draft.item = replaced(draft.item, [name], wrap(value, mark), mark)
+def _set_values(draft: Draft, values: Sequence[Override]) -> None:
+    """Replace parameters of a stage."""
+    for override in values:
+        mark = Mark(override.origin, 0, 0)
+        draft.item = replaced(draft.item, [override.key], wrap(plain(override.value), mark), mark)
 
 
 def _params(draft: Draft, problems: Problems) -> StageParams | None:

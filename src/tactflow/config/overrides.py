@@ -1,9 +1,10 @@
-"""What the command line changes of a pipeline file: `--set a.b.c=VALUE`, and sinks that options add."""
+"""Changes to a pipeline file from outside it: `--set a.b.c=VALUE`, settings in Python, sinks of options."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,28 @@ from tactflow.system.redaction import public_setting
 from tactflow.system.spelling import did_you_mean
 
 
+@dataclass(frozen=True, slots=True)
+class Override:
+    """One value that replaces another.
+
+    key : dotted path, as in "stages.hull.min_area". value : a Python object; None for a whole stage or sink
+    removes it. origin : what a message about the value begins with, in place of file, line and column.
+    """
+
+    key: str
+    value: Any
+    origin: str
+
+
+def from_settings(settings: Mapping[str, Any]) -> list[Override]:
+    """Overrides from a program's `{"stages.hull.min_area": 50}`.
+
+    >>> from_settings({"sinks.zmq": None})
+    [Override(key='sinks.zmq', value=None, origin='settings')]
+    """
+    return [Override(key, value, "settings") for key, value in settings.items()]
+
+
 def as_yaml(value: Any) -> str:
     """A value as `--set` takes it: JSON, which is YAML too. Numbers and arrays of NumPy are plain ones.
 
@@ -23,26 +46,41 @@ def as_yaml(value: Any) -> str:
     >>> as_yaml({"path": Path("out/a.jsonl"), "rate": np.float32(0.5), "size": np.arange(2)})
     '{"path": "out/a.jsonl", "rate": 0.5, "size": [0, 1]}'
     """
-    return json.dumps(value, ensure_ascii=False, default=_plain)
+    return json.dumps(plain(value), ensure_ascii=False)
 
 
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
+def plain(value: Any) -> Any:
+    """A Python value as YAML would hold it: mappings, lists, text, numbers, booleans and None.
 
-
-def apply(root: Item, text: str, problems: Problems) -> Item:
-    """The document with one `--set` in it.
-
-    text : `a.b.c=VALUE`, with VALUE in YAML; null for a whole stage or sink removes it.
+    >>> plain({"size": (1, np.float32(0.5))})
+    {'size': [1, 0.5]}
     """
-    mark = Mark(f"--set {public_setting(text)}", 0, 0)
-    path, equals, value_text = text.partition("=")
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return value if isinstance(value, str | int | float | None) else str(value)
+
+
+def apply(root: Item, override: Override | str, problems: Problems) -> Item:
+    """The document with one override, or the text of a `--set`, in it."""
+    if isinstance(override, str):
+        mark = Mark(f"--set {public_setting(override)}", 0, 0)
+        path, equals, text = override.partition("=")
+        value = read_value(text, mark, problems) if equals else None
+        if equals and value is None:
+            return root
+    else:
+        mark, path = Mark(override.origin, 0, 0), override.key
+        value = wrap(plain(override.value), mark)
     keys = [key.strip() for key in path.split(".")]
-    if not equals or not all(keys):
-        problems.add(mark, "expected a.b.c=VALUE, as in stages.hull.min_area=50")
-        return root
-    value = read_value(value_text, mark, problems)
-    if value is None:
+    if value is None or not all(keys):
+        expected = "a.b.c=VALUE, as in stages.hull.min_area=50"
+        if not isinstance(override, str):
+            expected = f"a key such as stages.hull.min_area, got {path!r}"
+        problems.add(mark, f"expected {expected}")
         return root
     try:
         if value.content is None and len(keys) == 2 and keys[0] in ("stages", "sinks"):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactflow.config.load import load_pipeline
-from tactflow.config.overrides import as_yaml
+from tactflow.config.overrides import from_settings
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 
@@ -61,7 +61,7 @@ class Candidate:
 
     def load(self, file: Path, sensor: str | None = None) -> Pipeline:
         """The pipeline. Raises ConfigError as `load_pipeline` does."""
-        return load_pipeline(file, [f"{key}={as_yaml(value)}" for key, value in self.settings], sensor=sensor)
+        return load_pipeline(file, from_settings(dict(self.settings)), sensor=sensor)
 
     def changed(self, name: str, settings: Settings) -> Candidate:
         """The same with more settings."""
