@@ -15,6 +15,7 @@ pytest.importorskip("foxglove", reason="the extra foxglove is not installed")
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 from websockets.sync.client import connect
 
 from tactflow.engine.errors import StageError
@@ -22,7 +23,6 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message.encoding import Results
 from tactflow.sinks.foxglove import Foxglove
 from tests.clock import PATIENCE, until
-from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 TICK = Tick(Frame("left", 3, 1.5, PROCESSED))
 FOUND = Results(PROCESSED, CONTACT, FLOW, MARKERS)

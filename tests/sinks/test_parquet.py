@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
@@ -26,7 +27,6 @@ from tactflow.sinks.parquet import TABLES, Parquet
 from tactflow.vision.types import Depth, Force, Scale, Slip
 from tests.clock import PATIENCE, until
 from tests.messages import build_message
-from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
 

@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 import tactflow
 from tactflow.config.load import load_pipeline
@@ -32,7 +33,6 @@ from tactflow.recording.protobuf import decode, encode, unzigzag, zigzag
 from tactflow.recording.schemas import encode_annotations, plain_schema
 from tactflow.sinks.record import Record
 from tactflow.vision.types import Contact, Ellipse, Flow
-from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 PIPELINE = """\
 sensor: left    # a comment

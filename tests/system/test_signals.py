@@ -84,38 +84,6 @@ def test_other_threads_need_not_wait() -> None:
     assert entered == [True]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="has no signal mask")
-def test_no_signal_arrives_in_a_child_that_starts() -> None:
-    # What Python starts with the first process lets them arrive again.
-    program = """
-import signal
-from multiprocessing import resource_tracker
-from tactflow.system.signals import ENDING, blocked_in_children
-with blocked_in_children(ENDING):
-    resource_tracker.ensure_running()
-    print(set(ENDING) <= signal.pthread_sigmask(signal.SIG_BLOCK, []))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "True\n"
-
-
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
-def test_a_terminal_that_is_closed_does_not_end_what_python_starts_with_the_first_process() -> None:
-    program = """
-import re, signal
-from multiprocessing import resource_tracker
-from pathlib import Path
-from tactflow.system.signals import ENDING, blocked_in_children
-with blocked_in_children(ENDING):
-    resource_tracker.ensure_running()
-status = Path(f"/proc/{resource_tracker._resource_tracker._pid}/status").read_text()
-blocked = int(re.search("SigBlk:\\t(.*)", status)[1], 16)
-print(bool(blocked >> (signal.SIGHUP - 1) & 1))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "True\n"
-
-
 def test_the_exit_code_stands_wherever_the_signal_came(tmp_path: Path) -> None:
     # Seen to end by SIGINT in CPython 3.11 where a KeyboardInterrupt itself is raised.
     (tmp_path / "ending.py").write_text("""

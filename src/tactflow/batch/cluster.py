@@ -16,8 +16,9 @@ from tactflow.batch.executor import Headway, died
 from tactflow.batch.task import Outcome, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import ConfigError, StageError
+from tactflow.system.children import starting_children
 from tactflow.system.extras import missing
-from tactflow.system.signals import ENDING, blocked_in_children
+from tactflow.system.signals import ENDING
 
 CONNECT_SECONDS = 10.0
 """How long a scheduler may take to answer, s. Chosen by hand."""
@@ -138,7 +139,7 @@ def _distributed() -> Any:
 def _local_cluster(workers: int) -> Any:
     package = _distributed()
     # Dask itself ends its processes with SIGTERM.
-    with blocked_in_children([number for number in ENDING if number != signal.SIGTERM]):
+    with starting_children([number for number in ENDING if number != signal.SIGTERM]):
         return package.LocalCluster(
             n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.ERROR
         )

@@ -17,7 +17,8 @@ from tactflow.batch.executor import Headway
 from tactflow.batch.task import Outcome, Report, Task
 from tactflow.batch.work import work
 from tactflow.engine.errors import StageError
-from tactflow.system.signals import ENDING, blocked_in_children
+from tactflow.system.children import starting_children
+from tactflow.system.signals import ENDING
 
 Work = Callable[[Task, Report], Outcome]
 
@@ -44,7 +45,7 @@ class _Worker:
         self.total: int | None = None
         self.connection, theirs = _CONTEXT.Pipe()
         self.process: BaseProcess = _CONTEXT.Process(target=_serve, args=(theirs, work), daemon=True)
-        with blocked_in_children(ENDING):
+        with starting_children(ENDING):
             self.process.start()
         theirs.close()
 

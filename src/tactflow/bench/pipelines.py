@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from tactflow.classic.functions import contact_mask, difference, inpaint, mask_m
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Truth
+from tactflow.system.children import python_command
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.markers.detection import NoMarkersError
 
@@ -354,7 +354,7 @@ def peak_memory_mb(file: Path, recording: Path, sinks: Sequence[str]) -> float |
     ----------
     file : the pipeline's file. recording : what it reads. sinks : ids of its sinks, which are left out.
     """
-    command = [sys.executable, "-c", _MEASURE_MEMORY, "run", str(file), "--source", str(recording)]
+    command = python_command("-c", _MEASURE_MEMORY, "run", str(file), "--source", str(recording))
     command += ["--quiet", "--jsonl", os.devnull]
     for sink in sinks:
         command += ["--set", f"sinks.{sink}=null"]

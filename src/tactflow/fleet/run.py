@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -24,6 +23,7 @@ from tactflow.fleet.sinks import (
     sink_class,
 )
 from tactflow.fleet.supervisor import Member, Supervisor
+from tactflow.system.children import python_command
 from tactflow.system.signals import ending_handled
 
 LONGEST_ADDRESS = 107
@@ -97,8 +97,7 @@ def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequenc
     changed : settings that differ from what the user has asked for.
     """
     sinks = [added(node) for node in pipeline.sinks if str(node.mark) in request.added]
-    # Without -P, Python would look for its own modules in the current folder first.
-    command = [sys.executable, "-P", "-m", "tactflow", "run", str(request.file), "--sensor", sensor]
+    command = python_command("-m", "tactflow", "run", str(request.file), "--sensor", sensor)
     # Nobody else ends it if the supervisor is killed.
     command.append("--end-with-stdin")
     for text in (*request.overrides, *sinks, *changed):

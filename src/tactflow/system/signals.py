@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import FrameType
 
@@ -99,26 +98,3 @@ def ending_held_back() -> Iterator[None]:
                 signal.signal(number, earlier)
             for number in reversed(came):
                 afterwards.callback(signal.raise_signal, number)
-
-
-@contextmanager
-def blocked_in_children(numbers: Collection[int]) -> Iterator[None]:
-    """Let processes, and threads that start some, begin in a block which these signals never reach.
-
-    Ctrl-C on a terminal reaches every process there; the one of the command line decides. In this thread
-    they arrive after the block.
-    """
-    if sys.platform == "win32":
-        yield
-        return
-    # Imported here: the handlers of this module are set before anything large is imported.
-    from multiprocessing import resource_tracker
-
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
-        # Python starts it with the first process, and then lets Ctrl-C and SIGTERM arrive again.
-        resource_tracker.ensure_running()
-        signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

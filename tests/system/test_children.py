@@ -1,0 +1,62 @@
+"""Python processes that tactflow starts: what they import, and which signals reach them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tactflow.system.children import python_command
+from tests.clock import PATIENCE
+
+STARTS_A_CHILD = """
+import multiprocessing
+import re
+import signal
+from multiprocessing import resource_tracker
+from pathlib import Path
+from tactflow.system.children import starting_children
+from tactflow.system.signals import ENDING
+
+def blocked(process):
+    status = Path(f"/proc/{process}/status").read_text()
+    mask = int(re.search("SigBlk:\\t(.*)", status)[1], 16)
+    return all(mask >> (number - 1) & 1 for number in ENDING)
+
+if __name__ == "__main__":
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    with starting_children(ENDING):
+        child = multiprocessing.get_context("spawn").Process(target=print, args=("child",))
+        child.start()
+    assert blocked(child.pid)
+    assert blocked(resource_tracker._resource_tracker._pid)
+    child.join()
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
+"""
+SHADOW = "print('imported from the current folder')"
+
+
+def output(command: list[str], folder: Path) -> str:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_child_imports_nothing_from_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / "random.py").write_text(SHADOW)
+    program = "import random; print(random.random() < 1)"
+    assert output(python_command("-c", program), tmp_path) == "True\n"
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+def test_a_process_of_multiprocessing_imports_nothing_from_there_and_no_signal_reaches_it(
+    tmp_path: Path,
+) -> None:
+    here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
+    here.mkdir()
+    elsewhere.mkdir()
+    (here / "pickle.py").write_text(SHADOW)
+    (elsewhere / "program.py").write_text(STARTS_A_CHILD)
+    assert output([sys.executable, str(elsewhere / "program.py")], here) == "child\n"
