@@ -10,8 +10,7 @@ from pydantic import Field, model_validator
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import StageError
-from tactflow.engine.frame import Tick
-from tactflow.message.encoding import Results, encode_message
+from tactflow.message.result import Result, encode_message
 from tactflow.network.address import is_loopback
 from tactflow.system.extras import missing
 
@@ -120,17 +119,17 @@ class Foxglove(Sink):
         """messages : sent so far."""
         return {"messages": self._sent}
 
-    def write(self, tick: Tick, results: Results) -> None:
+    def write(self, result: Result) -> None:
         """Send what is looked at of one frame; never waits."""
         from tactflow.recording.frames import nanoseconds
         from tactflow.recording.schemas import encode_annotations, encode_picture
 
-        time = nanoseconds(tick.frame.t)
-        image = tick.frame.image if results.image is None else results.image
+        time = nanoseconds(result.frame.t)
+        image = result.frame.image if result.image is None else result.image
         encoders = {
             "image": lambda: encode_picture(encode_jpeg(image, self.params.quality), self._sensor, time),
-            "annotations": lambda: encode_annotations(results, time),
-            "results": lambda: encode_message(tick, results, detail=True),
+            "annotations": lambda: encode_annotations(result, time),
+            "results": lambda: encode_message(result, detail=True),
         }
         for name, channel in self._channels.items():
             if channel.has_sinks():

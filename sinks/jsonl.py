@@ -14,8 +14,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.engine.frame import Tick
-from tactflow.message.encoding import Results, encode_message
+from tactflow.message.result import Result, encode_message
 from tactflow.system.files import expanded, is_device, lead_nowhere, make_folder
 from tactflow.system.lines import LineFile, LineStream, open_pipe
 
@@ -135,7 +134,7 @@ class Jsonl(Sink):
             return {"lines": self._out.delivered, "dropped": self._out.dropped}
         return self._counts if self._out is None else {"lines": self._out.delivered}
 
-    def write(self, tick: Tick, results: Results) -> None:
+    def write(self, result: Result) -> None:
         """Add one line.
 
         Raises
@@ -146,9 +145,7 @@ class Jsonl(Sink):
         """
         if self._out is None:
             return
-        self._pending.append(
-            encode_message(tick, results, detail=self.params.detail, field=self.params.field)
-        )
+        self._pending.append(encode_message(result, detail=self.params.detail, field=self.params.field))
         now = time.monotonic()
         if self.params.path == "-" or now - self._flushed >= self.params.flush:
             self._flushed = now

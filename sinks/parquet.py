@@ -16,8 +16,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.engine.frame import Tick
-from tactflow.message.encoding import SCHEMA, Results, encode_message
+from tactflow.message.result import SCHEMA, Result, encode_message
 from tactflow.system.extras import missing
 from tactflow.system.files import claim_path, expanded, make_folder
 from tactflow.system.provenance import facts, texts
@@ -129,7 +128,7 @@ class Parquet(Sink):
         """frames : in complete parts. parts : of each table."""
         return self._counts
 
-    def write(self, tick: Tick, results: Results) -> None:
+    def write(self, result: Result) -> None:
         """Keep one frame, and write a part when it is time.
 
         Raises
@@ -137,7 +136,7 @@ class Parquet(Sink):
         StageError
             If the part cannot be written, for instance because the disk is full. The parts before stay.
         """
-        message = encode_message(tick, results, detail=True)
+        message = encode_message(result, detail=True)
         self._pending.append(message)
         self._bytes += len(message)
         if time.monotonic() - self._flushed >= self.params.flush or self._bytes >= PART_BYTES:

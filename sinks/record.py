@@ -14,9 +14,8 @@ from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Output, Recorder, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.engine.frame import Tick
 from tactflow.engine.rate import SLACK, RateLimit
-from tactflow.message.encoding import Results, encode_message
+from tactflow.message.result import Result, encode_message
 from tactflow.recording import missing_packages
 from tactflow.system.files import expanded, next_name
 from tactflow.system.provenance import arrays, facts, texts
@@ -197,7 +196,7 @@ class Record(Recorder):
         counts = {key: 0 if files is None else getattr(files, key) for key in ("frames", "files", "bytes")}
         return counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
 
-    def write(self, tick: Tick, results: Results) -> None:
+    def write(self, result: Result) -> None:
         """Record one frame, or keep it for later.
 
         Raises
@@ -206,11 +205,11 @@ class Record(Recorder):
             If it cannot be written. The file then ends with the frame before and can be played.
         """
         with self._lock:
-            if not self.wants() and not tick.frame.reference:
+            if not self.wants() and not result.frame.reference:
                 return
-            entry = self._entry(tick, results)
+            entry = self._entry(result)
             if self._trigger == "contact":
-                self._follow(results.contact is not None, tick.frame.t)
+                self._follow(result.contact is not None, result.frame.t)
             if self.recording and not self._ends:
                 self._backlog.append(entry)
             self._write_backlog(BACKLOG_SHARE)
@@ -226,23 +225,23 @@ class Record(Recorder):
             self._coder = None
             self._ring.clear()
 
-    def _entry(self, tick: Tick, results: Results) -> Entry:
+    def _entry(self, result: Result) -> Entry:
         from tactflow.recording.frames import nanoseconds
         from tactflow.recording.schemas import encode_annotations, encode_picture
         from tactflow.recording.writer import Entry
 
         assert self._coder is not None
-        frame = tick.frame
+        frame = result.frame
         time = nanoseconds(frame.t)
         message = picture = annotations = None
         # A reference image that is not part of the source has no results of its own.
         if frame.seq >= 0:
-            message = encode_message(tick, results, detail=True)
+            message = encode_message(result, detail=True)
             if self._previews is not None and self._previews.due(frame.t):
-                image = frame.image if results.image is None else results.image
+                image = frame.image if result.image is None else result.image
                 jpeg = encode_jpeg(image, self.params.quality)
                 picture = encode_picture(jpeg, self._sensor, time)
-                annotations = encode_annotations(results, time)
+                annotations = encode_annotations(result, time)
         pixels = self._coder.encode(frame)
         return Entry(time, frame.seq, frame.reference, frame.epoch, pixels, message, picture, annotations)
 

@@ -21,8 +21,7 @@ from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.drawing.results import dimmed, field_arrows
 from tactflow.engine.contract import StageParams
 from tactflow.engine.control import Control
-from tactflow.engine.frame import Tick
-from tactflow.message.encoding import Results, encode_message
+from tactflow.message.result import Result, encode_message
 from tactflow.network.address import is_loopback
 from tactflow.ports import Image, Valid
 from tactflow.view.address import Neighbours, address, bind
@@ -113,7 +112,7 @@ class View(Guiding):
         self._due = float("-inf")
         self._encoded = 0
         self._sending = threading.Lock()
-        self._last: tuple[Tick, Results, Valid | None, float] | None = None
+        self._last: tuple[Result, Valid | None, float] | None = None
 
     @classmethod
     def among(cls, params: View.Params, folder: Path) -> View.Params:
@@ -172,7 +171,7 @@ class View(Guiding):
         """encoded : pictures made; and those of `Hub.counters`."""
         return {"encoded": self._encoded} | ({} if self._hub is None else self._hub.counters())
 
-    def write(self, tick: Tick, results: Results, valid: Valid | None = None) -> None:
+    def write(self, result: Result, valid: Valid | None = None) -> None:
         """Send the plain picture and the result message; the page draws one over the other.
 
         Where no gel is, the picture is darker. Markers and hull come in tenths of a pixel; the field and the
@@ -184,8 +183,8 @@ class View(Guiding):
         now = time.perf_counter()
         # Counted from when this one was due, so that an uneven source does not lower the rate.
         self._due = max(self._due, now - self._interval / 2) + self._interval
-        captured = tick.frame.captured
-        self._last = tick, results, valid, (now - captured) * 1000 if captured else -1.0
+        captured = result.frame.captured
+        self._last = result, valid, (now - captured) * 1000 if captured else -1.0
         self._send(captured)
 
     def _send(self, captured: float = 0.0) -> None:
@@ -196,24 +195,24 @@ class View(Guiding):
         with self._sending:
             if self._hub is None or self._last is None:
                 return
-            tick, results, valid, latency = self._last
-            frame, contact = tick.frame, results.contact
+            result, valid, latency = self._last
+            frame, contact = result.frame, result.contact
             if contact is not None:
                 contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1), separate=())
-            message = encode_message(tick, results._replace(contact=contact, markers=None), detail=True)
-            image = frame.image if results.image is None else results.image
+            message = encode_message(result.replace(contact=contact, markers=None), detail=True)
+            image = frame.image if result.image is None else result.image
             jpeg = self._encode(image if valid is None else dimmed(image, valid))
-            heights, drawn = self._drawn(results, max(image.shape))
+            heights, drawn = self._drawn(result, max(image.shape))
             header = b'{"latency_ms":%.3f,"epoch":%d,"message":%b,%b' % (latency, frame.epoch, message, drawn)
             self._hub.publish(header, heights + jpeg, captured)
 
-    def _drawn(self, results: Results, side: int) -> tuple[bytes, bytes]:
+    def _drawn(self, result: Result, side: int) -> tuple[bytes, bytes]:
         """Heights, and as JSON what is drawn beside the message.
 
         A field or height map that there is, but that no page shows, is `true`: pages offer to show it.
         """
         assert self._hub is not None
-        markers, scale, field, depth = results.markers, results.scale, results.field, results.depth
+        markers, scale, field, depth = result.markers, result.scale, result.field, result.depth
         arrows, surface = (b"null" if one is None else b"true" for one in (field, depth))
         heights = b""
         if field is not None and "field" in self._hub.shown:

@@ -15,9 +15,9 @@ from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.frame import Frame
 from tactflow.engine.rate import RateLimit
-from tactflow.message.encoding import Results, encode_message
+from tactflow.message.result import Result, encode_message
 from tactflow.network.address import is_reachable, picks_a_port, refuse_high_port
 from tactflow.network.bound_socket import FloodError
 from tactflow.network.commands import Commands
@@ -251,27 +251,27 @@ class Zmq(Sink):
         """serialised : messages encoded. subscriptions : distinct ones now."""
         return {"serialised": self._serialised, "subscriptions": len(self._subscriptions)}
 
-    def write(self, tick: Tick, results: Results) -> None:
+    def write(self, result: Result) -> None:
         """Send one message to whoever has subscribed; never waits."""
         if not self.wants():
             return
-        body = encode_message(tick, results, detail=self.params.detail, field=self.params.field)
+        body = encode_message(result, detail=self.params.detail, field=self.params.field)
         self._serialised += 1
         self._send(self._topic + body)
-        if self._asked and tick.frame.seq >= 0 and self._rate.due(tick.frame.t):
-            self._send_pictures(tick.frame, results)
+        if self._asked and result.frame.seq >= 0 and self._rate.due(result.frame.t):
+            self._send_pictures(result.frame, result)
 
-    def _send_pictures(self, frame: Frame, results: Results) -> None:
+    def _send_pictures(self, frame: Frame, result: Result) -> None:
         """The picture and the depth map, for whom has asked for them."""
-        image = frame.image if results.image is None else results.image
+        image = frame.image if result.image is None else result.image
         height, width = image.shape[:2]
         about = {"sensor": self._sensor, "seq": frame.seq, "t": frame.t, "size": [width, height]}
         header = orjson.dumps(about) + b"\n"
         if "picture" in self._asked:
             self._send(self._extras["picture"] + header + encode_jpeg(image, self.params.quality))
         if "depth" in self._asked:
-            heights = None if results.depth is None else results.depth.heights
-            if heights is None and self._had_depth and results.contact is None:
+            heights = None if result.depth is None else result.depth.heights
+            if heights is None and self._had_depth and result.contact is None:
                 heights = np.zeros((height, width), np.float32)
             if heights is not None:
                 self._had_depth = True

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 
 import tactflow
-from tactflow.message.encoding import Results
-from tests.messages import build_message
 
 PIPELINE = """
 stages:
@@ -64,10 +62,7 @@ def test_a_stream_gives_what_the_pipeline_writes(folder: Path) -> None:
     assert [result.seq for result in streamed] == list(range(60))
     assert any(result.contact is not None for result in streamed)
     for result, line in zip(streamed, written, strict=True):
-        frame = tactflow.Frame(result.sensor, result.seq, result.t, np.zeros((400, 300, 3), np.uint8))
-        found = Results(None, result.contact, result.flow, result.markers)
-        tick = tactflow.Tick(frame, result.skipped)
-        assert build_message(tick, found, detail=True) == json.loads(line)
+        assert result.to_dict(detail=True) == json.loads(line)
 
 
 def test_a_stream_writes_no_file_unless_asked_to(folder: Path) -> None:
@@ -102,11 +97,11 @@ def test_an_error_in_the_loop_leaves_nothing_running() -> None:
 def test_images_come_when_they_are_asked_for() -> None:
     (without,) = tactflow.stream(max_frames=1)
     (result,) = tactflow.stream(max_frames=1, images=True)
-    assert without.image is without.frame is None
-    assert result.frame is not None
+    assert without.image is None
+    assert (without.frame.image.size, without.size) == (0, (300, 400))
     assert result.image is not None
-    assert (result.frame.shape, result.image.shape) == ((600, 800, 3), (400, 300, 3))
-    assert not result.frame.flags.writeable
+    assert (result.frame.image.shape, result.image.shape) == ((600, 800, 3), (400, 300, 3))
+    assert not result.frame.image.flags.writeable
 
 
 @pytest.mark.usefixtures("folder")
@@ -158,7 +153,7 @@ def test_arrays_of_a_result_cannot_be_written_to() -> None:
     assert result.markers is not None
     for array in (
         result.image,
-        result.frame,
+        result.frame.image,
         result.contact_mask,
         result.contact.hull,
         result.markers.position,

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Slip
 from tests.clock import LOOK_SECONDS
 from tests.conftest import REPOSITORY
+from tests.messages import Results, result_of
 
 EXAMPLES = REPOSITORY / "examples"
 CONTACT = Contact(200.0, (30.0, 20.0), 30.0, -0.577, np.array([[25.0, 15], [35, 15], [30, 28]]), None)
@@ -57,7 +57,7 @@ def said(stdout: Any, sink: Zmq, results: Results) -> str:
     reader.start()
     while reader.is_alive():
         seq = next(SEQ)
-        sink.write(Tick(Frame("main", seq, seq / 60, np.zeros((40, 60, 3), np.uint8))), results)
+        sink.write(result_of(Tick(Frame("main", seq, seq / 60, np.zeros((40, 60, 3), np.uint8))), results))
         reader.join(LOOK_SECONDS)
     return answer[0]
 

@@ -35,11 +35,10 @@ if TYPE_CHECKING:
     from tactflow.engine.frame import Absent as Absent
     from tactflow.engine.frame import Frame as Frame
     from tactflow.engine.frame import Tick as Tick
-    from tactflow.message.encoding import Results as Results
+    from tactflow.message.result import Result as Result
     from tactflow.network.remote_control import RemoteControl as RemoteControl
     from tactflow.network.subscriber import Subscriber as Subscriber
     from tactflow.sim.scenes import open_scene as open_scene
-    from tactflow.streaming import Result as Result
     from tactflow.streaming import stream as stream
     from tactflow.vision.types import Contact as Contact
     from tactflow.vision.types import Flow as Flow
@@ -50,14 +49,14 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "tactflow.api": ("load", "check", "run", "stage"),
-    "tactflow.streaming": ("stream", "Result"),
+    "tactflow.streaming": ("stream",),
     "tactflow.network.subscriber": ("Subscriber",),
     "tactflow.network.remote_control": ("RemoteControl",),
     "tactflow.sim.scenes": ("open_scene",),
     "tactflow.vision.types": ("Contact", "Flow", "Markers", "MarkerStatus"),
     "tactflow.engine.contract": ("Stage", "Sink", "Source", "StageParams"),
     "tactflow.engine.frame": ("Frame", "Tick", "Absent"),
-    "tactflow.message.encoding": ("Results",),
+    "tactflow.message.result": ("Result",),
     "tactflow.engine.errors": ("TactflowError", "ConfigError"),
 }
 """Module -> the public names that live there."""
@@ -74,7 +73,6 @@ __all__ = [
     "Markers",
     "RemoteControl",
     "Result",
-    "Results",
     "Sink",
     "Source",
     "Stage",

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.sinks.record import Record
+from tests.messages import Results, result_of
 
 
 @lru_cache(maxsize=10_000)
@@ -27,7 +27,7 @@ def record(path: str, counter: str) -> None:
     sink.open()
     count = os.open(counter, os.O_CREAT | os.O_WRONLY)
     for seq in range(1_000_000):
-        sink.write(Tick(Frame("main", seq, seq / 60, image(seq), reference=seq == 0)), Results())
+        sink.write(result_of(Tick(Frame("main", seq, seq / 60, image(seq), reference=seq == 0)), Results()))
         os.pwrite(count, (seq + 1).to_bytes(8, "little"), 0)
 
 

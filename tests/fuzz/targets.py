@@ -24,7 +24,7 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.plan import make_plan
-from tactflow.message.encoding import Results, encode_message
+from tactflow.message.result import encode_message
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
 from tactflow.network.subscriber import _parsed
@@ -43,6 +43,7 @@ from tactflow.view.hub import Hub, Wire
 from tactflow.view.server import Server
 from tactflow.vision.types import Contact, Flow, Markers, Scale
 from tests.conftest import REPOSITORY
+from tests.messages import Results, result_of
 from tests.sources.test_datasets import KEY, write_lerobot
 
 IMAGE = np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8)
@@ -296,14 +297,18 @@ def message() -> bytes:
     contact = Contact(12.5, (3.0, 4.0), 30.0, -0.577, np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]]), None)
     markers = Markers(np.zeros((2, 2)), np.ones((2, 2)), np.array([0, 2], np.uint8), np.ones(2))
     flow = Flow((1.0, -1.0), 2)
-    return encode_message(Tick(Frame("main", 3, 0.1, IMAGE)), Results(IMAGE, contact, flow, markers))
+    return encode_message(
+        result_of(Tick(Frame("main", 3, 0.1, IMAGE)), Results(IMAGE, contact, flow, markers))
+    )
 
 
 @contextmanager
 def messages(folder: Path) -> Iterator[Parser]:
     """A result message, as a Subscriber and `listen` take it."""
     del folder
-    nothing = encode_message(Tick(Frame("main", 4, 0.1, IMAGE), {"contact": "no_contact"}), Results(IMAGE))
+    nothing = encode_message(
+        result_of(Tick(Frame("main", 4, 0.1, IMAGE), skipped={"contact": "no_contact"}), Results(IMAGE))
+    )
 
     def feed(data: bytes) -> None:
         received = _parsed(data)
@@ -344,7 +349,7 @@ def subscriptions(folder: Path) -> Iterator[Parser]:
     def feed(data: bytes) -> None:
         _exchange(port, data, first=b"" if data.startswith(GREETING[:1]) else GREETING)
         sink.wants()
-        sink.write(tick, Results(IMAGE))
+        sink.write(result_of(tick, Results(IMAGE)))
 
     try:
         yield Parser(samples, feed)

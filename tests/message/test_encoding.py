@@ -14,11 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import STATUS_NAMES, Results, encode_message
+from tactflow.message.encoding import STATUS_NAMES
+from tactflow.message.result import encode_message
 from tactflow.message.schema import message_schema
 from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, MarkerStatus, Scale
-from tests.messages import build_message
+from tests.messages import Results, build_message, result_of
 
 VALIDATOR = jsonschema.Draft202012Validator(message_schema())
 
@@ -120,7 +121,7 @@ def test_the_field_is_told_where_it_is_asked_for() -> None:
     assert field is not None
     results = Results(PROCESSED, CONTACT, FLOW, markers, field=field)
     assert "field" not in build_message(TICK, results, detail=True)
-    message = json.loads(encode_message(TICK, results, field=True))
+    message = json.loads(encode_message(result_of(TICK, results), field=True))
     VALIDATOR.validate(message)
     rows, columns = field.grid.shape
     assert np.array(message["field"]["displacement"]).shape == (rows, columns, 2)
@@ -128,7 +129,7 @@ def test_the_field_is_told_where_it_is_asked_for() -> None:
     told = message["field"]
     last = np.array(told["first"]) + told["spacing"] * np.array([columns - 1, rows - 1])
     assert last == pytest.approx(field.grid.points[-1, -1])
-    empty = json.loads(encode_message(TICK, Results(PROCESSED), field=True))
+    empty = json.loads(encode_message(result_of(TICK, Results(PROCESSED)), field=True))
     VALIDATOR.validate(empty)
     assert empty["field"] is None
 
@@ -158,14 +159,16 @@ def test_without_a_processed_image_the_size_is_that_of_the_raw_one() -> None:
 
 
 def test_reasons_for_skipping_are_passed_on() -> None:
-    tick = Tick(TICK.frame, {"contact": "no_contact", "flow": "no_contact"})
+    tick = Tick(TICK.frame, skipped={"contact": "no_contact", "flow": "no_contact"})
     message = build_message(tick, Results())
     assert message["skipped"] == {"contact": "no_contact", "flow": "no_contact"}
     VALIDATOR.validate(message)
 
 
 def test_the_message_is_one_line() -> None:
-    assert b"\n" not in encode_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS), detail=True)
+    assert b"\n" not in encode_message(
+        result_of(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS)), detail=True
+    )
 
 
 def test_views_that_are_not_contiguous_and_other_number_types_are_written_correctly() -> None:
@@ -189,7 +192,7 @@ def test_numbers_arrive_as_they_were(rows: list[tuple[float, float, float, float
     table = np.array([row[:4] for row in rows], np.float64).reshape(-1, 4)
     status = np.array([row[4] for row in rows], np.uint8)
     markers = Markers(table[:, :2], table[:, 2:], status, np.zeros(len(rows)))
-    body = encode_message(TICK, Results(None, None, None, markers))
+    body = encode_message(result_of(TICK, Results(None, None, None, markers)))
     # Read with the standard library: another parser than the encoder's own.
     message = json.loads(body)
     assert message["markers"]["origin"] == table[:, :2].tolist()
@@ -220,13 +223,14 @@ def test_a_number_that_is_not_finite_is_refused_by_name(field: str, bad: float) 
     else:
         markers = replace(MARKERS, **{rest: points})
     with pytest.raises(ValueError, match=field):
-        encode_message(tick, Results(None, contact, flow, markers), detail=True)
+        encode_message(result_of(tick, Results(None, contact, flow, markers)), detail=True)
 
 
 def test_an_infinite_standard_error_is_refused() -> None:
     with pytest.raises(ValueError, match=r"markers\.stderr"):
         encode_message(
-            TICK, Results(None, None, None, replace(MARKERS, stderr=np.array([np.inf, 0, 0]))), detail=True
+            result_of(TICK, Results(None, None, None, replace(MARKERS, stderr=np.array([np.inf, 0, 0])))),
+            detail=True,
         )
 
 
@@ -258,7 +262,7 @@ def test_a_bad_position_is_refused_every_time_and_forgotten() -> None:
     bad = replace(MARKERS, position=np.array([[1.0, np.nan]]))
     for _ in range(2):
         with pytest.raises(ValueError, match=r"markers\.position"):
-            encode_message(TICK, Results(None, None, None, bad))
+            encode_message(result_of(TICK, Results(None, None, None, bad)))
     message = build_message(TICK, Results(None, None, None, MARKERS))
     assert message["markers"]["position"] == MARKERS.position.tolist()
 

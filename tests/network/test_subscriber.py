@@ -21,13 +21,14 @@ import zmq
 from tactflow.cli import listen
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results, encode_message
+from tactflow.message.result import encode_message
 from tactflow.network import subscriber
 from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import LONGEST_MESSAGE, Subscriber
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
 from tests.clock import PATIENCE, ManualClock, until
+from tests.messages import Results, result_of
 from tests.ros.programs import PACKAGE
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
@@ -56,7 +57,9 @@ class Publisher:
         for seq in seqs:
             flow = None if contact is None else FLOW
             self.sink.write(
-                Tick(Frame(self.sensor, seq, seq / 10, IMAGE)), Results(IMAGE, contact, flow, MARKERS)
+                result_of(
+                    Tick(Frame(self.sensor, seq, seq / 10, IMAGE)), Results(IMAGE, contact, flow, MARKERS)
+                )
             )
 
 
@@ -193,7 +196,7 @@ def test_a_subscriber_may_start_before_the_publisher_and_survives_its_restart() 
         sink = Zmq(Zmq.Params(endpoint=endpoint, wait_for_subscriber=LONG, linger=60))
         sink.open()
         for seq in seqs:
-            sink.write(Tick(Frame("main", seq, 0.0, IMAGE)), Results(IMAGE))
+            sink.write(result_of(Tick(Frame("main", seq, 0.0, IMAGE)), Results(IMAGE)))
         sink.close()
 
     with Subscriber(endpoint, timeout=LONG) as messages:
@@ -368,7 +371,9 @@ def test_what_is_no_result_message_is_passed_over_and_counted() -> None:
     with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
         port = publisher.bind_to_random_port("tcp://127.0.0.1")
         with Subscriber(f"tcp://127.0.0.1:{port}", timeout=PATIENCE) as results:
-            good = encode_message(Tick(Frame("main", 3, 0.1, np.zeros((4, 4, 3), np.uint8))), Results())
+            good = encode_message(
+                result_of(Tick(Frame("main", 3, 0.1, np.zeros((4, 4, 3), np.uint8))), Results())
+            )
 
             def heard() -> int:
                 publisher.send(b"tactflow.main " + good)
@@ -395,7 +400,7 @@ def test_whoever_sends_messages_as_long_as_no_result_is_heard_no_more() -> None:
 
 
 def test_what_a_publisher_sends_commands_no_terminal() -> None:
-    message = json.loads(encode_message(Tick(Frame("main", 3, 0.1, IMAGE)), Results()))
+    message = json.loads(encode_message(result_of(Tick(Frame("main", 3, 0.1, IMAGE)), Results())))
     message |= {"sensor": "\x1b[2Jmain", "skipped": {"contact": "\x9b2J"}}
     shown = listen.describe(message)
     assert "?[2Jmain 3" in shown
@@ -428,7 +433,7 @@ def test_results_and_commands_go_over_ipv6_too() -> None:
     try:
         with Subscriber(sink.endpoint, timeout=LONG) as messages:
             sink._wait_for_subscriber(LONG)
-            sink.write(Tick(Frame("main", 0, 0.0, IMAGE)), Results(IMAGE))
+            sink.write(result_of(Tick(Frame("main", 0, 0.0, IMAGE)), Results(IMAGE)))
             assert messages.receive()["seq"] == 0
         with RemoteControl(str(sink.control_endpoint), timeout=LONG) as run:
             assert run.ping()["message"] == "here"

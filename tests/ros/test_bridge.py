@@ -15,12 +15,12 @@ import pytest
 
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.network.keys import make_keys
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Scale, Slip
 from tests.clock import until
 from tests.conftest import REPOSITORY
+from tests.messages import Results, result_of
 from tests.ros.programs import Program, needs_rclpy
 from tests.sinks.test_view import FakeRun
 
@@ -91,7 +91,7 @@ class Pair:
         """A frame every 20 ms, as a camera would."""
         while not self._end.wait(0.02):
             frame = Frame("left", self._seq, T + self._seq / 50, IMAGE)
-            self.sink.write(Tick(frame), self._results)
+            self.sink.write(result_of(Tick(frame), self._results))
             self._seq += 1
 
     def receive(self, topic: str, results: Results = RESULTS) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.sinks.zmq import Zmq
 from tests.clock import LOOK_SECONDS, until
 from tests.conftest import REPOSITORY
+from tests.messages import result_of
 from tests.ros.test_bridge import CONTACT, IMAGE, RESULTS
 
 PYTHON = "/usr/bin/python3"
@@ -72,7 +73,7 @@ def test_every_topic_reaches_a_subscriber_with_its_capture_time_and_unit(tmp_pat
         listener = stack.enter_context(program(PYTHON, "-c", LISTEN, port=port, stdout=subprocess.PIPE))
         frame = Frame("main", 0, 1.7e9 + 0.125, IMAGE)
         while listener.poll() is None:
-            sink.write(Tick(frame), RESULTS)
+            sink.write(result_of(Tick(frame), RESULTS))
             sink._closing.wait(LOOK_SECONDS)
         assert listener.stdout is not None
         with listener.stdout as lines:

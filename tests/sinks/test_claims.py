@@ -13,10 +13,10 @@ import pytest
 from tactflow.engine.contract import Sink
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.sinks.images import Images
 from tactflow.sinks.jsonl import Jsonl
 from tactflow.sinks.video import Video
+from tests.messages import Results, result_of
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 
@@ -35,7 +35,10 @@ def video(folder: Path) -> Sink:
 
 def write(sink: Sink, seq: int) -> None:
     tick = Tick(Frame("main", seq, seq / 30, PICTURE))
-    sink.write(tick, Results() if isinstance(sink, Jsonl) else PICTURE)
+    if isinstance(sink, Jsonl):
+        sink.write(result_of(tick, Results()))
+    else:
+        sink.write(tick, PICTURE)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows itself refuses")

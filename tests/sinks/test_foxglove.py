@@ -20,9 +20,9 @@ from websockets.sync.client import connect
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.sinks.foxglove import Foxglove
 from tests.clock import PATIENCE, until
+from tests.messages import Results, result_of
 
 TICK = Tick(Frame("left", 3, 1.5, PROCESSED))
 FOUND = Results(PROCESSED, CONTACT, FLOW, MARKERS)
@@ -50,7 +50,7 @@ def test_a_viewer_gets_what_it_subscribes_to_and_nothing_else_is_encoded() -> No
                 viewer.send(json.dumps({"op": "subscribe", "subscriptions": [asked]}))
             until(lambda: sum(channel.has_sinks() for channel in sink._channels.values()) == 2)
             assert sink.wants()
-            sink.write(TICK, FOUND)
+            sink.write(result_of(TICK, FOUND))
             assert sink.counters() == {"messages": 2}
             got = {}
             while len(got) < 2:

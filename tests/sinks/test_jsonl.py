@@ -15,10 +15,10 @@ from pydantic import ValidationError
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.sinks import jsonl as jsonl_module
 from tactflow.sinks.jsonl import Jsonl
 from tests.clock import PATIENCE
+from tests.messages import Results, result_of
 from tests.sinks.full_disk import disk_full_after
 
 IMAGE = np.zeros((3, 4, 3), np.uint8)
@@ -36,7 +36,7 @@ def opened(path: Path | str, **params: Any) -> Jsonl:
 
 def write(sink: Jsonl, seqs: range) -> None:
     for seq in seqs:
-        sink.write(tick(seq), Results())
+        sink.write(result_of(tick(seq), Results()))
 
 
 def write_and_close(sink: Jsonl, seqs: range) -> None:
@@ -219,13 +219,13 @@ def test_a_reader_that_leaves_ends_the_output_quietly() -> None:
     program = """
 import numpy as np, sys
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
+from tests.messages import Results, result_of
 from tactflow.sinks.jsonl import Jsonl
 sink = Jsonl(Jsonl.Params(path="-"))
 sink.open()
 seq = 0
 while sink.wants():
-    sink.write(Tick(Frame("main", seq, 0.0, np.zeros((3, 4, 3), np.uint8))), Results())
+    sink.write(result_of(Tick(Frame("main", seq, 0.0, np.zeros((3, 4, 3), np.uint8))), Results()))
     seq += 1
 sink.close()
 print("more text that nobody reads")

@@ -20,13 +20,12 @@ from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.message.schema import message_schema
 from tactflow.sinks import parquet as parquet_module
 from tactflow.sinks.parquet import TABLES, Parquet
 from tactflow.vision.types import Depth, Force, Scale, Slip
 from tests.clock import PATIENCE, until
-from tests.messages import build_message
+from tests.messages import Results, build_message, result_of
 
 pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
 
@@ -50,7 +49,7 @@ FOUND = [
 
 def tick(seq: int) -> Tick:
     skipped = {"contact": "no_contact"} if seq % len(FOUND) == 0 else {}
-    return Tick(Frame("main", seq, seq / 30, PROCESSED), skipped)
+    return Tick(Frame("main", seq, seq / 30, PROCESSED), skipped=skipped)
 
 
 def opened(folder: Path, **params: Any) -> Parquet:
@@ -62,7 +61,7 @@ def opened(folder: Path, **params: Any) -> Parquet:
 def write(sink: Parquet, seqs: range) -> list[dict[str, Any]]:
     """Write frames; the messages about them."""
     for seq in seqs:
-        sink.write(tick(seq), FOUND[seq % len(FOUND)])
+        sink.write(result_of(tick(seq), FOUND[seq % len(FOUND)]))
     return [build_message(tick(seq), FOUND[seq % len(FOUND)], detail=True) for seq in seqs]
 
 
@@ -211,7 +210,7 @@ from tests.sinks.test_parquet import *
 def endless(folder):
     sink = opened(folder, flush=0.005)
     for seq in range(1_000_000):
-        sink.write(tick(seq), FOUND[seq % len(FOUND)])
+        sink.write(result_of(tick(seq), FOUND[seq % len(FOUND)]))
         Path(folder, "told").write_text(str(sink.counters()["frames"]))
 
 for line in sys.stdin:

@@ -17,12 +17,12 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.graph import Pipeline
-from tactflow.message.encoding import Results
 from tactflow.recording.frames import StoredFrame
 from tactflow.sinks.record import Record
 from tactflow.sources import open_source
 from tactflow.sources.mcap import Recording
 from tactflow.vision.types import Contact
+from tests.messages import Results, result_of
 from tests.sinks.full_disk import disk_full_after
 
 FPS = 10.0
@@ -53,7 +53,7 @@ def opened(path: Path, **params: Any) -> Record:
 def write(sink: Record, seqs: range, contact: Contact | None = None) -> None:
     for seq in seqs:
         if sink.wants() or seq == 0:
-            sink.write(tick(seq), Results(None, contact, None, None))
+            sink.write(result_of(tick(seq), Results(None, contact, None, None)))
 
 
 def seqs_in(path: Path) -> list[int]:
@@ -178,7 +178,7 @@ def test_the_ring_never_takes_more_memory_than_allowed(
     noise = np.random.default_rng(1).integers(0, 256, (500, 700, 3), np.uint8)
     sink = opened(tmp_path / "ring.mcap", ring=1000.0, memory=16, preview=0)
     for seq in range(30):
-        sink.write(Tick(Frame("main", seq, seq / FPS, noise)), Results())
+        sink.write(result_of(Tick(Frame("main", seq, seq / FPS, noise)), Results()))
         assert sink.counters()["ring_bytes"] <= 16_000_000
     assert 10 <= sink.counters()["ring_frames"] < 30
     assert caplog.text.count("because memory is limited to 16 MB") == 1
@@ -230,7 +230,7 @@ def test_a_ring_across_two_epochs_brings_the_references_of_the_older_one(tmp_pat
         frame = Frame(
             "main", seq, seq / FPS, image(seq), reference=seq in (0, 1, 25), epoch=1 if seq >= 25 else 0
         )
-        sink.write(Tick(frame), Results())
+        sink.write(result_of(Tick(frame), Results()))
     sink.start_recording()
     sink.close()
     source = open_source(str(tmp_path / "ring-001.mcap"))
@@ -326,7 +326,7 @@ def test_a_recording_in_several_files_is_the_same_as_in_one(rotation: dict[str, 
         pixels = np.random.default_rng(seq).integers(0, 256, (200, 250, 3), np.uint8)
         frame = Frame("main", seq, seq / FPS, pixels, reference=seq in (0, 1, 11), epoch=0 if seq < 11 else 1)
         for sink in (one, many):
-            sink.write(Tick(frame), Results())
+            sink.write(result_of(Tick(frame), Results()))
     one.close()
     many.close()
     files = [tmp_path / "many.mcap", *sorted(tmp_path.glob("many-*.mcap"))]

@@ -25,7 +25,6 @@ import tactflow
 from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
-from tactflow.message.encoding import Results
 from tactflow.message.schema import message_schema
 from tactflow.recording.frames import FrameCoder, StoredFrame
 from tactflow.recording.layout import layout
@@ -33,6 +32,7 @@ from tactflow.recording.protobuf import decode, encode, unzigzag, zigzag
 from tactflow.recording.schemas import encode_annotations, plain_schema
 from tactflow.sinks.record import Record
 from tactflow.vision.types import Contact, Ellipse, Flow
+from tests.messages import Results, result_of
 
 PIPELINE = """\
 sensor: left    # a comment
@@ -72,7 +72,10 @@ def test_pictures_are_foxglove_compressed_images(recording: Path) -> None:
 def test_annotations_of_foxglove_lie_on_contact_and_dots_counted_from_the_corner_of_a_pixel() -> None:
     tracked = replace(MARKERS, status=np.array([0, 1, 2], np.uint8))
     two = replace(CONTACT, separate=(CONTACT, replace(CONTACT, hull=CONTACT.hull + 100)))
-    encoded = encode_annotations(Results(PROCESSED, two, FLOW, tracked), 1_500_000_000)
+    encoded = encode_annotations(
+        result_of(Tick(Frame("main", 0, 0.0, PROCESSED)), Results(PROCESSED, two, FLOW, tracked)),
+        1_500_000_000,
+    )
     read = ImageAnnotations.FromString(encoded)
     assert (read.timestamp.seconds, read.timestamp.nanos) == (1, 500_000_000)
     places = [(one.type, np.array([(point.x, point.y) for point in one.points])) for one in read.points]
@@ -160,7 +163,9 @@ def test_results_are_valid_under_the_schema_in_the_file(tmp_path: Path) -> None:
     sink.open()
     contact = Contact(4.0, (1.0, 1.0), 10.0, -0.2, np.eye(3, 2), Ellipse((1.0, 1.0), (3.0, 2.0), 10.0), 0.5)
     pixels = np.zeros((3, 4, 3), np.uint8)
-    sink.write(Tick(Frame("main", 0, 0.0, pixels)), Results(None, contact, Flow((1.0, 2.0), 3), None))
+    sink.write(
+        result_of(Tick(Frame("main", 0, 0.0, pixels)), Results(None, contact, Flow((1.0, 2.0), 3), None))
+    )
     sink.close()
     with path.open("rb") as file:
         ((schema, channel, message),) = make_reader(file).iter_messages("/main/results")

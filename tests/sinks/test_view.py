@@ -30,7 +30,6 @@ from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.run import Runner
-from tactflow.message.encoding import Results
 from tactflow.network.address import is_loopback
 from tactflow.sinks.view import View
 from tactflow.view import server
@@ -38,7 +37,7 @@ from tactflow.view.address import address, bind
 from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Contact, Depth, Markers, Scale
 from tests.clock import PATIENCE, until
-from tests.messages import build_message
+from tests.messages import Results, build_message, result_of
 
 SECRET = "a-secret-of-some-length"
 
@@ -191,13 +190,14 @@ def picture(width: int = 60, height: int = 80) -> NDArray[np.uint8]:
 
 
 def tick(seq: int = 0) -> Tick:
-    return Tick(Frame("main", seq, seq / 60, picture(), time.perf_counter()), {"contact": "no_contact"})
+    frame = Frame("main", seq, seq / 60, picture(), time.perf_counter())
+    return Tick(frame, skipped={"contact": "no_contact"})
 
 
 def write(sink: View, seq: int) -> None:
     """Have a frame shown, as the engine does: when the sink wants one."""
     until(sink.wants)
-    sink.write(tick(seq), Results(picture(), None, None, None))
+    sink.write(result_of(tick(seq), Results(picture(), None, None, None)))
 
 
 # -- what pages are sent ------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ def write(sink: View, seq: int) -> None:
 def test_without_a_page_nothing_is_wanted_and_nothing_encoded(view: Callable[..., View]) -> None:
     sink = view()
     assert not sink.wants()
-    sink.write(tick(), Results(picture(), None, None, None))
+    sink.write(result_of(tick(), Results(picture(), None, None, None)))
     assert sink.counters()["encoded"] == 0
 
 
@@ -235,7 +235,7 @@ def test_a_page_is_sent_nothing_more_until_it_has_drawn(
     write(sink, 0)
     first, _ = browser.next("frame")
     until(lambda: not sink.wants())
-    sink.write(tick(1), Results(picture(), None, None, None))
+    sink.write(result_of(tick(1), Results(picture(), None, None, None)))
     assert sink.counters()["encoded"] == 1
     browser.say(ack=first["number"])
     write(sink, 2)
@@ -273,7 +273,7 @@ def test_a_page_that_reads_nothing_holds_up_neither_writing_nor_closing(
     noise = np.random.default_rng(1).integers(0, 256, (800, 800, 3)).astype(np.uint8)
     for number in range(1, 60):
         until(sink.wants)
-        sink.write(tick(number), Results(noise, None, None, None))
+        sink.write(result_of(tick(number), Results(noise, None, None, None)))
         fast.say(ack=fast.next("frame")[0]["number"])
         deaf.say(ack=number)
     assert fast.next("stats")["run"]["frames"] == 3
@@ -289,7 +289,7 @@ def test_max_fps_bounds_what_is_encoded(view: Callable[..., View], page: Callabl
     until(lambda: "screen_p50_ms" in sink.counters())
     # The page is ready, but the next frame is due in six days.
     assert not sink.wants()
-    sink.write(tick(1), Results(picture(), None, None, None))
+    sink.write(result_of(tick(1), Results(picture(), None, None, None)))
     assert sink.counters()["encoded"] == 1
 
 
@@ -299,7 +299,7 @@ def test_a_large_picture_is_reduced_and_its_coordinates_are_not(
     sink = view(max_size=64)
     browser = page(sink)
     until(sink.wants)
-    sink.write(tick(), Results(picture(100, 200), None, None, None))
+    sink.write(result_of(tick(), Results(picture(100, 200), None, None, None)))
     header, jpeg = browser.next("frame")
     shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
@@ -313,7 +313,7 @@ def test_without_a_processed_image_the_raw_one_is_shown(
     sink = view()
     browser = page(sink)
     until(sink.wants)
-    sink.write(tick(), Results())
+    sink.write(result_of(tick(), Results()))
     assert browser.next("frame")[0]["message"]["size"] == [60, 80]
 
 
@@ -340,10 +340,10 @@ def test_a_frame_that_was_under_way_is_not_taken_for_that_of_a_step(
     under_way = tick(0)
     browser.say(do="step")
     until(lambda: run.calls == ["step"])
-    sink.write(under_way, Results(picture()))
+    sink.write(result_of(under_way, Results(picture())))
     header, _ = browser.next("frame")
     assert sink.wants()
-    sink.write(tick(1), Results(picture()))
+    sink.write(result_of(tick(1), Results(picture())))
     assert not sink.wants()
     browser.say(ack=header["number"])
     assert browser.next("frame")[0]["message"]["seq"] == 1
@@ -368,7 +368,7 @@ def test_field_and_heights_are_sent_only_while_a_page_shows_them(
 
     def shown(seq: int) -> tuple[Any, bytes]:
         until(sink.wants)
-        sink.write(tick(seq), found)
+        sink.write(result_of(tick(seq), found))
         return answered()
 
     def answered() -> tuple[Any, bytes]:
@@ -577,7 +577,7 @@ def test_what_is_only_drawn_is_sent_in_tenths_of_a_pixel(
     origin = np.array([[1.04, 2.06], [-3.14159, 40.0], [5.0, 6.0]])
     markers = Markers(origin, origin + 0.5, np.array([0, 1, 2], np.uint8), np.full(3, np.nan))
     until(sink.wants)
-    sink.write(tick(), Results(picture(), contact, None, markers))
+    sink.write(result_of(tick(), Results(picture(), contact, None, markers)))
     header, _ = browser.next("frame")
     assert header["markers"] == {
         "origin": [10, 21, -31, 400, 50, 60],

@@ -18,12 +18,12 @@ from pydantic import ValidationError
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.network import bound_socket
 from tactflow.network.publisher import SEND_BUFFER
 from tactflow.sinks.zmq import MOST_OTHERS, Zmq
 from tactflow.vision.types import Depth, Markers
 from tests.clock import PATIENCE, until
+from tests.messages import Results, result_of
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 MANY = Markers(np.zeros((140, 2)), np.full((140, 2), 1 / 3), np.zeros(140, np.uint8), np.zeros(140))
@@ -43,7 +43,7 @@ def opened(**params: Any) -> Zmq:
 
 def write(sink: Zmq, seqs: range) -> None:
     for seq in seqs:
-        sink.write(tick(seq), Results(IMAGE, None, None, MANY))
+        sink.write(result_of(tick(seq), Results(IMAGE, None, None, MANY)))
 
 
 def wait_until_wanted(sink: Zmq) -> None:
@@ -349,7 +349,7 @@ def test_the_sensor_names_the_topic(subscribe: Subscribing) -> None:
     sink.open()
     socket = subscribe(sink.endpoint, b"tactflow.thumb")
     wait_until_wanted(sink)
-    sink.write(tick(4, "thumb"), Results(IMAGE, None, None, None))
+    sink.write(result_of(tick(4, "thumb"), Results(IMAGE, None, None, None)))
     topic, message = receive(socket)
     assert topic == b"tactflow.thumb"
     assert message["sensor"] == "thumb"
@@ -456,7 +456,7 @@ def test_pictures_and_depth_maps_go_to_who_asks_for_them_by_name(subscribe: Subs
     heights = np.arange(12, dtype=np.float32).reshape(3, 4)
     small = np.zeros((3, 4, 3), np.uint8)
     depth = Depth(heights, 11.0, None, 1.0, None)
-    sink.write(tick(0), Results(small, depth=depth))
+    sink.write(result_of(tick(0), Results(small, depth=depth)))
     header, _, data = picture.recv().partition(b"\n")
     assert header.startswith(b'tactflow_picture.main {"sensor":"main","seq":0,"t":0.0,"size":[4,3]}')
     assert data[:2] == b"\xff\xd8"
@@ -464,8 +464,8 @@ def test_pictures_and_depth_maps_go_to_who_asks_for_them_by_name(subscribe: Subs
 
     maps = subscribe(sink.endpoint, b"tactflow_depth.main")
     until(lambda: sink.wants() and "depth" in sink._asked)
-    sink.write(tick(1), Results(small, depth=depth))
-    sink.write(tick(2), Results(small))
+    sink.write(result_of(tick(1), Results(small, depth=depth)))
+    sink.write(result_of(tick(2), Results(small)))
     for expected in (heights, np.zeros((3, 4))):
         data = maps.recv().partition(b"\n")[2]
         assert np.array_equal(np.frombuffer(data, "<f4").reshape(3, 4), expected)

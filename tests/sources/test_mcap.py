@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import Results
 from tactflow.recording import records
 from tactflow.recording.frames import StoredFrame
 from tactflow.recording.protobuf import encode
@@ -27,6 +26,7 @@ from tactflow.recording.repair import repair
 from tactflow.sinks.record import Record
 from tactflow.sources import StampedReader, open_source
 from tactflow.stages.capture import Capture
+from tests.messages import Results, result_of
 
 FPS = 10.0
 UNIX = 1_700_000_000.123456789
@@ -55,7 +55,7 @@ def record(path: Path, made: Sequence[Frame], *, cut: bool = False) -> Path:
     sink = Record(Record.Params(path=str(path), preview=0))
     sink.open()
     for frame in made:
-        sink.write(Tick(frame), Results())
+        sink.write(result_of(Tick(frame), Results()))
     if cut:
         data = path.read_bytes()
         sink.close()
@@ -197,10 +197,10 @@ def test_at_its_own_pace_references_of_before_are_not_waited_for(tmp_path: Path)
     made = frames([0, *range(10_000, 10_003)])
     sink = Record(Record.Params(path=str(tmp_path / "a.mcap"), trigger="button"))
     sink.open()
-    sink.write(Tick(made[0]), Results())
+    sink.write(result_of(Tick(made[0]), Results()))
     sink.start_recording()
     for frame in made[1:]:
-        sink.write(Tick(frame), Results())
+        sink.write(result_of(Tick(frame), Results()))
     sink.close()
     # Waiting for frame 10 000 would take 1000 s, far beyond this test's time limit.
     same(captured(tmp_path / "a-001.mcap", realtime=True), made)

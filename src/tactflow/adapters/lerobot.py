@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError
-from tactflow.streaming import Result
+from tactflow.message.result import Result
 from tactflow.system.extras import missing
 from tactflow.vision.types import Scale
 

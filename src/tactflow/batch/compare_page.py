@@ -14,9 +14,8 @@ from tactflow.batch.page import filled_in, replaced
 from tactflow.batch.recordings import Recording
 from tactflow.batch.summary import Looker, picture_of, with_looker
 from tactflow.engine.errors import TactflowError
-from tactflow.engine.frame import Tick
 from tactflow.engine.graph import Pipeline
-from tactflow.message.encoding import Results
+from tactflow.message.result import Result
 
 SIDE = 420
 """Longer side of a picture, px. Chosen by hand."""
@@ -91,9 +90,9 @@ class _Keep(Looker):
         self._wanted = set(wanted)
         self.pictures: dict[int, str] = {}
 
-    def add(self, tick: Tick, results: Results) -> None:
-        if tick.frame.seq in self._wanted:
-            self.pictures[tick.frame.seq] = picture_of(tick.frame.image, results, SIDE)
+    def add(self, result: Result) -> None:
+        if result.seq in self._wanted:
+            self.pictures[result.seq] = picture_of(result, SIDE)
 
 
 Pictures = Mapping[tuple[str, int], str]

@@ -8,9 +8,9 @@ from dataclasses import replace
 from tactflow.batch.recordings import Recording
 from tactflow.batch.task import Part
 from tactflow.engine.errors import SourceError
-from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
-from tactflow.message.encoding import Results
+from tactflow.message.result import Result
 from tactflow.sources import open_source
 
 OVERLAP = 30
@@ -79,8 +79,8 @@ def _sink_of(cls: type, part: Part) -> type:
     """A sink that takes the frames of this part."""
 
     class OfPart(cls):  # type: ignore[misc]
-        def write(self, tick: Tick, results: Results) -> None:
-            if part.holds(tick.frame.seq):
-                super().write(tick, results)
+        def write(self, result: Result) -> None:
+            if part.holds(result.seq):
+                super().write(result)
 
     return OfPart

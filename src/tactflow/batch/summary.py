@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import base64
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.drawing.results import Annotator
-from tactflow.engine.conformance import own_sink
-from tactflow.engine.contract import Sink
-from tactflow.engine.frame import Tick
+from tactflow.engine.collect import with_collector
 from tactflow.engine.graph import Pipeline
-from tactflow.message.encoding import Results
+from tactflow.message.result import Result
 
 MOST_POINTS = 240
 """Points of a curve, before neighbours are merged: one a pixel of a plot. Chosen by hand."""
@@ -96,7 +93,7 @@ class Thumbnail:
 class Looker(Protocol):
     """Looks at every result of a run."""
 
-    def add(self, tick: Tick, results: Results) -> None:
+    def add(self, result: Result) -> None:
         """Take one frame."""
         ...
 
@@ -110,16 +107,16 @@ class Summary:
         self.largest = self.duration = 0.0
         self._first: bool | None = None
         self._pictures: list[Thumbnail] = []
-        self._best: tuple[Tick, Results] | None = None
+        self._best: Result | None = None
 
-    def add(self, tick: Tick, results: Results) -> None:
+    def add(self, result: Result) -> None:
         """Take one frame."""
-        contact, flow = results.contact, results.flow
+        contact, flow = result.contact, result.flow
         mean = None if flow is None or flow.mean is None else math.hypot(*flow.mean)
         area = 0.0 if contact is None else float(contact.area)
         angle = None if contact is None else contact.angle
-        self.curve.add(Point(tick.frame.t, area, mean, angle))
-        self.duration = tick.frame.t
+        self.curve.add(Point(result.t, area, mean, angle))
+        self.duration = result.t
         self.frames += 1
         self._first = contact is not None if self._first is None else self._first
         if contact is None:
@@ -128,8 +125,8 @@ class Summary:
         self.touching += 1
         self.contacts += self._best is None
         self.largest = max(self.largest, area)
-        if self._best is None or self._best[1].contact is None or area > self._best[1].contact.area:
-            self._best = tick, results
+        if self._best is None or self._best.contact is None or area > self._best.contact.area:
+            self._best = result
 
     @property
     def ends(self) -> tuple[bool, bool]:
@@ -140,13 +137,12 @@ class Summary:
         """Keep a picture of the contact that is over, if it is one of the largest."""
         if self._best is None:
             return
-        (tick, results), self._best = self._best, None
-        assert results.contact is not None
+        result, self._best = self._best, None
+        assert result.contact is not None
         smallest = min((picture.area for picture in self._pictures), default=0.0)
-        if len(self._pictures) == MOST_PICTURES and results.contact.area <= smallest:
+        if len(self._pictures) == MOST_PICTURES and result.contact.area <= smallest:
             return
-        frame = tick.frame
-        one = Thumbnail(frame.seq, frame.t, float(results.contact.area), picture_of(frame.image, results))
+        one = Thumbnail(result.seq, result.t, float(result.contact.area), picture_of(result))
         self._pictures = sorted([*self._pictures, one], key=lambda p: -p.area)[:MOST_PICTURES]
 
     def finished(self) -> dict[str, Any]:
@@ -156,30 +152,20 @@ class Summary:
         return {"curve": [tuple(point) for point in self.curve.points], "pictures": pictures}
 
 
-def picture_of(raw: NDArray[np.uint8], results: Results, side: int = PICTURE_SIDE) -> str:
+def picture_of(result: Result, side: int = PICTURE_SIDE) -> str:
     """The processed frame, or else the raw one, with what was found drawn on it: JPEG in base64.
 
-    raw : (H, W, 3) uint8 BGR. side : the longer one of the picture, px.
+    side : the longer one of the picture, px.
     """
-    image = raw if results.image is None else results.image
+    image = result.frame.image if result.image is None else result.image
     annotator = Annotator(text=False)
-    drawn = annotator(image, contact=results.contact, flow=results.flow, markers=results.markers)
+    drawn = annotator(image, contact=result.contact, flow=result.flow, markers=result.markers)
     scale = min(1.0, side / max(drawn.shape[:2]))
     resized = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small = np.asarray(resized, np.uint8)
     return base64.b64encode(encode_jpeg(small, _QUALITY)).decode()
 
 
-class _LookOn(Sink):
-    """Hands every result to whoever looks on."""
-
-    looker: Looker
-
-    def write(self, tick: Tick, results: Results) -> None:
-        self.looker.add(tick, results)
-
-
 def with_looker(pipeline: Pipeline, looker: Looker) -> Pipeline:
     """The pipeline with a sink that lets somebody look on."""
-    node = own_sink(pipeline, _LookOn, _SINK, "tactflow.batch", looker=looker)
-    return replace(pipeline, nodes={**pipeline.nodes, _SINK: node})
+    return with_collector(pipeline, Result, looker.add, name=_SINK, sinks=True)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterator, Mapping
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Absent:
-    """Stands in the place of a value that this tick does not have.
+    """Stands in the place of a value that this tick does not have; false in a condition.
 
     reason : a short snake_case word.
 
@@ -53,19 +54,94 @@ class Absent:
 
     reason: str
 
+    def __bool__(self) -> bool:
+        return False
 
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """What a sink may know about a tick besides the values of its input ports.
 
-    frame : the captured frame (its image is the raw one).
-    skipped : input port of this sink -> reason, for values that were not computed in this tick; "reference"
-        -> reason, where a stage asked for this frame to become a new reference.
+class Tick(Mapping[str, Any]):
+    """What the pipeline computed for one frame: a mapping from port names to values.
 
+    A value that is not there is an `Absent`. Where two stages have an output of the same name, the name alone
+    means the last one; each of them is also called `stage.port`.
+
+    A subclass that annotates attributes names the ports that it takes; each is a property that is None
+    where the value is absent. A sink whose `write` takes the subclass gets these ports::
+
+        class Brightness(Tick):
+            brightness: float | None
+
+    Parameters
+    ----------
+    frame : the captured frame; its image is the raw one.
+    values : port -> value or `Absent`. Not copied.
+    skipped : port -> reason, for values that were not computed in this tick: absent ones, and those that
+        repeat the last frame's (`unchanged`). "reference" -> reason, where a stage asked for this frame to
+        become a new reference. None: the reasons of the absent values.
+
+    Examples
+    --------
     >>> frame = Frame("main", 0, 0.0, np.zeros((4, 6, 3), np.uint8))
-    >>> Tick(frame, {"contact": "no_contact"}).skipped["contact"]
-    'no_contact'
+    >>> tick = Tick(frame, {"brightness": 31.5, "contact": Absent("no_contact")})
+    >>> tick["brightness"], tick.value("contact"), tick.skipped
+    (31.5, None, {'contact': 'no_contact'})
     """
 
-    frame: Frame
-    skipped: Mapping[str, str] = field(default_factory=dict[str, Any])
+    __slots__ = ("_values", "frame", "skipped")
+
+    def __init__(
+        self,
+        frame: Frame,
+        values: Mapping[str, Any] | None = None,
+        skipped: Mapping[str, str] | None = None,
+    ) -> None:
+        self.frame = frame
+        self._values = {} if values is None else values
+        if skipped is None:
+            skipped = {port: value.reason for port, value in self.items() if isinstance(value, Absent)}
+        self.skipped = skipped
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        for port in vars(cls).get("__annotations__", {}):
+            setattr(cls, port, _property_of(port))
+
+    def __getitem__(self, port: str) -> Any:
+        try:
+            return self._values[port]
+        except KeyError:
+            ports = ", ".join(self._values) or "no port"
+            raise KeyError(f"no stage gives the port {port}; there are {ports}") from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    # Comparing arrays element by element has no single answer.
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def value(self, port: str) -> Any:
+        """The value of a port; None where it is absent or no stage gives it."""
+        value = self._values.get(port)
+        return None if isinstance(value, Absent) else value
+
+    def replace(self, **values: Any) -> Self:
+        """A copy with other values for some ports."""
+        copied = copy(self)
+        copied._values = {**self._values, **values}
+        return copied
+
+    def __repr__(self) -> str:
+        there = [port for port in self if self.value(port) is not None]
+        frame = self.frame
+        held = ", ".join(there) or "nothing"
+        return f"<{type(self).__name__} {frame.sensor} {frame.seq} at {frame.t:.3f} s: {held}>"
+
+
+def _property_of(port: str) -> property:
+    def value(tick: Tick) -> Any:
+        return tick.value(port)
+
+    return property(value, doc=f"The port {port}; None where it is absent.")

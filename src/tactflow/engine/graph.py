@@ -97,6 +97,8 @@ class Node:
     input that nothing provides. mark : the place that set it up. gates : all must be open for it to run.
     segment : name given in the file, or None. queue : in front of its segment. max_rate : a sink's limit in
     Hz. marks : key of the node -> the place of its value, for those that the plan may refuse.
+    passive_inputs : names in a sink's result -> outputs that it holds where the tick has computed them for
+    others; they are never a reason to compute anything.
     """
 
     id: str
@@ -110,6 +112,7 @@ class Node:
     on_error: OnError = OnError()
     max_rate: float | None = None
     marks: Mapping[str, Mark] = field(default_factory=dict[str, Mark])
+    passive_inputs: Mapping[str, Ref] = field(default_factory=dict[str, Ref])
 
 
 @dataclass(frozen=True, slots=True)

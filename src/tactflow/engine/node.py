@@ -24,6 +24,7 @@ UNCONNECTED = 0
 """The place in that table that always holds None, for optional inputs that are connected to nothing."""
 
 _NONE = Absent("none")
+_NO_DEMAND = Absent("no_demand")
 
 
 class TickState:
@@ -40,7 +41,7 @@ class TickState:
         self.index = index
         self.frame = frame
         self.demand = demand
-        self.values: list[Any] = [_NONE] * slots
+        self.values: list[Any] = [_NO_DEMAND] * slots
         self.values[UNCONNECTED] = None
         self.reasons: dict[int, str] = {}
         self.renewed: str | None = None
@@ -87,7 +88,8 @@ class RunningNode:
         refs = [node.inputs.get(port.name) for port in self.ports]
         self.input_slots = [slots[ref.node, ref.port] if ref else UNCONNECTED for ref in refs]
         self._connected_slots = [slot for slot in self.input_slots if slot != UNCONNECTED]
-        self._named_slots = [(p.name, slot) for p, slot in zip(self.ports, self.input_slots, strict=True)]
+        shown = {**node.passive_inputs, **{name: ref for name, ref in node.inputs.items() if ref}}
+        self._shown = [(name, slots[ref.node, ref.port]) for name, ref in shown.items()]
         self.slots = [slots[node.id, port.name] for port in ports.outputs]
         self.gates = [RunningGate(gate, slots) for gate in node.gates] if skipping else []
         self.signals = {
@@ -102,7 +104,7 @@ class RunningNode:
         function = getattr(instance, METHODS[node.component.kind])
         self._function = _by_position(function, [parameter.name for parameter in ports.parameters])
         self._parameters = ports.parameters
-        self._one_port_each = all(len(p.ports) == 1 and p.group is None for p in ports.parameters)
+        self._one_port_each = all(p.group is None for p in ports.parameters)
         repeats = any(gate.repeats for gate in self.gates)
         self._is_pure = skipping and node.component.memory == "pure" and self.sink is None and not repeats
         self.last: Sequence[Any] | None = None
@@ -162,21 +164,26 @@ class RunningNode:
     def _arguments(self, values: Sequence[Any], tick: TickState) -> Sequence[Any]:
         """One argument for each parameter: a port's value, a group of them, or the tick."""
         arguments: list[Any] = []
-        left = iter(values)
+        rest = iter(values)
         for parameter in self._parameters:
-            if parameter.group is not None:
-                arguments.append(parameter.group(*islice(left, len(parameter.ports))))
-            else:
-                arguments.append(next(left) if parameter.ports else Tick(tick.frame, self.skipped(tick)))
+            if parameter.group is None:
+                arguments.append(next(rest))
+                continue
+            group = list(islice(rest, len(parameter.ports)))
+            is_tick = issubclass(parameter.group, Tick)
+            arguments.append(self._tick(parameter.group, tick) if is_tick else parameter.group(*group))
         return arguments
 
-    def skipped(self, tick: TickState) -> dict[str, str]:
-        """Input port -> why it was not computed, for those that were not; `reference` -> why it is new."""
-        reasons = tick.reasons
-        found = {name: reasons[slot] for name, slot in self._named_slots if slot in reasons}
+    def _tick(self, kind: type[Tick], tick: TickState) -> Tick:
+        """What a sink gets of a tick: its inputs, and why some were not computed."""
+        table, reasons = tick.values, tick.reasons
+        values = {name: table[slot] for name, slot in self._shown}
+        skipped = {name: reasons[slot] for name, slot in self._shown if slot in reasons}
         if tick.renewed is not None:
-            found["reference"] = tick.renewed
-        return found
+            skipped["reference"] = tick.renewed
+        if self.check is not None:
+            values = {name: self.check.read_only(value) for name, value in values.items()}
+        return kind(tick.frame, values, skipped)
 
     def inherited_reason(self, tick: TickState) -> str | None:
         """Why its outputs are repeated ones: the reason of its inputs, where all that are connected have one.
@@ -230,7 +237,7 @@ def _outputs(result: Any, count: int) -> Sequence[Any]:
     if isinstance(result, tuple):
         values = [_NONE if value is None else value for value in result]
     elif result is None or isinstance(result, Absent):
-        values = [result or _NONE] * count
+        values = [result if isinstance(result, Absent) else _NONE] * count
     else:
         values = [result] if count else []
     if len(values) != count:

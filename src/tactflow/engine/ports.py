@@ -10,7 +10,7 @@ import inspect
 import re
 import types
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -63,7 +63,7 @@ class Port:
 class Parameter:
     """One parameter of a stage's `process` or a sink's `write`.
 
-    ports : the input ports that it stands for; none for the tick. group : the NamedTuple that takes them
+    ports : the input ports that it stands for. group : the NamedTuple or subclass of Tick that takes them
     together; None where the one port is the parameter itself.
     """
 
@@ -172,6 +172,7 @@ def _ports(function: Callable[..., Any], method: str) -> Ports:
             )
         return Ports((), (_source_port(hints.get("return")),))
     found = [_parameter(parameter, hints.get(parameter.name), method) for parameter in parameters]
+    found = _without_twice_named(found)
     _check_names(found)
     if method == "process":
         if not any(parameter.ports for parameter in found):
@@ -186,35 +187,23 @@ def _parameter(parameter: inspect.Parameter, annotation: Any, method: str) -> Pa
     name = parameter.name
     if parameter.kind not in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
         raise _PortError(f"{name}: a port cannot be positional-only, *args or **kwargs; name each input")
-    if annotation is Tick:
-        _check_tick(name, method)
-        return Parameter(name, ())
+    if inspect.isclass(annotation) and issubclass(annotation, Tick):
+        if method != "write":
+            raise _PortError("only a sink may take a Tick; a stage can take the port frame: Frame")
+        return Parameter(name, ports_of(annotation), annotation)
     if _is_group(annotation):
-        return Parameter(name, _field_inputs(annotation), annotation)
-    if method == "write" and name == "tick":
-        raise _PortError("the parameter tick takes the Tick; annotate it as in tick: Tick")
-    if method == "write" and name == "results" and _says_nothing(annotation):
-        raise _PortError("the parameter results takes all results; annotate it as in results: Results")
+        return Parameter(name, ports_of(annotation), annotation)
+    if annotation is None and method == "write" and name in ("tick", "result", "results"):
+        raise _PortError(f"the parameter {name} takes the result; annotate it as in result: Result")
     return Parameter(name, (_input_port(parameter, annotation),))
-
-
-def _says_nothing(annotation: Any) -> bool:
-    """Whether it is no more than a container, or nothing at all."""
-    return (get_origin(annotation) or annotation) in (None, Any, object, dict, tuple, list)
-
-
-def _check_tick(name: str, method: str) -> None:
-    if method != "write":
-        raise _PortError("only a sink may take a Tick; a stage can take the port frame: Frame")
-    if name != "tick":
-        raise _PortError(f"the parameter that takes the Tick must be called tick, not {name}")
 
 
 def _is_group(annotation: Any) -> bool:
     return inspect.isclass(annotation) and issubclass(annotation, tuple) and hasattr(annotation, "_fields")
 
 
-def _field_inputs(group: type) -> tuple[Port, ...]:
+def ports_of(group: type) -> tuple[Port, ...]:
+    """The input ports that the annotations of a NamedTuple or of a subclass of Tick name."""
     ports = []
     for name, annotation in _field_hints(group).items():
         members = _members(annotation)
@@ -223,6 +212,18 @@ def _field_inputs(group: type) -> tuple[Port, ...]:
             _check_array(f"{group.__name__}.{name}", member)
         ports.append(Port(name, Union[types_], len(types_) < len(members)))  # noqa: UP007 (built at run time)
     return tuple(ports)
+
+
+def _without_twice_named(parameters: Sequence[Parameter]) -> list[Parameter]:
+    """A port that a parameter names is asked for by that parameter alone, not by the result beside it."""
+    named = {port.name for parameter in parameters if parameter.group is None for port in parameter.ports}
+
+    def rest(parameter: Parameter) -> Parameter:
+        if parameter.group is None or not issubclass(parameter.group, Tick):
+            return parameter
+        return replace(parameter, ports=[port for port in parameter.ports if port.name not in named])
+
+    return [rest(parameter) for parameter in parameters]
 
 
 def _check_names(parameters: Sequence[Parameter]) -> None:

@@ -1,4 +1,4 @@
-"""The result message `tactflow.frame/1`, which sinks publish; described by `message_schema.py`.
+"""The parts of a result message, as `orjson` takes them.
 
 Numbers are written with full precision (the shortest decimal that reads back as the same double); nothing
 is rounded.
@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from tactflow.engine.frame import Tick
-from tactflow.ports import Image
 from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.types import (
     Contact,
@@ -28,36 +26,10 @@ from tactflow.vision.types import (
     Slip,
 )
 
-SCHEMA = "tactflow.frame/1"
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
 """The word for each value of `MarkerStatus`."""
 
-_EXPLAINED = frozenset({"contact", "flow", "markers", "reference"})
-"""What `skipped` may name: the ports that are published, and the frame itself where a stage had it made a new
-reference."""
-
-_OPTIONS = orjson.OPT_SERIALIZE_NUMPY
-
-
-class Results(NamedTuple):
-    """What the pipeline found in one frame, for sinks: `def write(self, tick: Tick, results: Results)`.
-
-    image : the processed frame. scale, depth, force : only with a calibration. field, slip : only where a
-    stage of that name stands in the pipeline. Each is None where it was not computed or nothing was found.
-
-    >>> Results().contact is None
-    True
-    """
-
-    image: Image | None = None
-    contact: Contact | None = None
-    flow: Flow | None = None
-    markers: Markers | None = None
-    scale: Scale | None = None
-    depth: Depth | None = None
-    field: DisplacementField | None = None
-    slip: Slip | None = None
-    force: Force | None = None
+OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 
 
 class _Kept:
@@ -81,68 +53,23 @@ class _Kept:
             self._last = (data, dtype, None)
             return self._encodable(array)
         if text is None:
-            text = orjson.Fragment(orjson.dumps(self._encodable(array), option=_OPTIONS))
+            text = orjson.Fragment(orjson.dumps(self._encodable(array), option=OPTIONS))
             self._last = (data, dtype, text)
         return text
 
 
-def encode_message(tick: Tick, results: Results, *, detail: bool = False, field: bool = False) -> bytes:
-    """The result message of one frame, as JSON in UTF-8 on a single line without a line end.
-
-    Parameters
-    ----------
-    tick : the frame, and why values are missing.
-    results : in pixels of the processed frame; None becomes null. Of the image only the size is told; without
-        it, that of the raw frame.
-    detail : also tell `contact.confidence`, `flow.stderr`, `flow.rotation`, `flow.divergence`,
-        `flow.residual`, `flow.shear`, `markers.stderr`, and the standard errors of all these and of all that
-        is in mm.
-    field : also tell `field`.
-
-    Raises
-    ------
-    ValueError
-        If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
-    """
-    frame = tick.frame
-    image, contact, flow, markers, scale, depth, _, slip, force = results
-    pixels = frame.image if image is None else image
-    whole, contacts = _contacts(contact, scale, depth, detail)
-    message: dict[str, Any] = {
-        "schema": SCHEMA,
-        "sensor": frame.sensor,
-        "seq": frame.seq,
-        "t": _number(frame.t, "t"),
-        "size": [pixels.shape[1], pixels.shape[0]],
-        "contact": whole,
-        "contacts": contacts,
-        "flow": None if flow is None else _flow(flow, scale, detail),
-        "markers": None if markers is None else _markers(markers, detail),
-        "skipped": {port: reason for port, reason in tick.skipped.items() if port in _EXPLAINED},
-    }
-    if scale is not None:
-        message["scale"] = _scale(scale)
-    if slip is not None:
-        ratio = _number(slip.stick_ratio, "slip.stick_ratio")
-        message["slip"] = {"slipping": bool(slip.slipping), "stick_ratio": ratio}
-    if force is not None:
-        message["force"] = _force(force)
-    if field:
-        message["field"] = None if results.field is None else _field(results.field)
-    return orjson.dumps(message, option=_OPTIONS)
-
-
-def _scale(scale: Scale) -> dict[str, Any]:
+def encode_scale(scale: Scale) -> dict[str, Any]:
+    """The key `scale`."""
     return {
         "mm_per_px": _pair((scale.x, scale.y), "scale.mm_per_px"),
         "origin": _pair(scale.origin, "scale.origin"),
     }
 
 
-def _contacts(
+def encode_contacts(
     contact: Contact | None, scale: Scale | None, depth: Depth | None, detail: bool
 ) -> tuple[Any, list[Any]]:
-    """What touches as a whole, and each separate contact, for the encoder."""
+    """The keys `contact` and `contacts`."""
     if contact is None:
         return None, []
     whole = _contact(contact, scale, detail)
@@ -150,14 +77,14 @@ def _contacts(
         parts = [_contact(part, scale, detail) for part in contact.separate]
         return _with_depth(whole, depth, detail), parts
     # Told twice, encoded once.
-    text = orjson.Fragment(orjson.dumps(whole, option=_OPTIONS))
+    text = orjson.Fragment(orjson.dumps(whole, option=OPTIONS))
     return (text if depth is None else _with_depth(whole, depth, detail)), [text]
 
 
 def _contact(contact: Contact, scale: Scale | None, detail: bool) -> dict[str, Any]:
     ellipse = contact.ellipse
     result: dict[str, Any] = {
-        "area": _number(contact.area, "contact.area"),
+        "area": finite(contact.area, "contact.area"),
         "center": _pair(contact.center, "contact.center"),
         "angle": _optional(contact.angle, "contact.angle"),
         "slope": _optional(contact.slope, "contact.slope"),
@@ -173,9 +100,9 @@ def _contact(contact: Contact, scale: Scale | None, detail: bool) -> dict[str, A
     }
     if scale is not None:
         result["center_mm"] = _pair(scale.point(contact.center), "contact.center_mm")
-        result["area_mm2"] = _number(scale.area(contact.area), "contact.area_mm2")
+        result["area_mm2"] = finite(scale.area(contact.area), "contact.area_mm2")
     if detail:
-        result["confidence"] = _number(contact.confidence, "contact.confidence")
+        result["confidence"] = finite(contact.confidence, "contact.confidence")
         if scale is not None:
             result["center_mm_stderr"] = list(scale.point_stderr(contact.center))
             result["area_mm2_stderr"] = scale.area_stderr(contact.area)
@@ -186,8 +113,8 @@ def _with_depth(contact: dict[str, Any], depth: Depth | None, detail: bool) -> d
     if depth is None:
         return contact
     result = contact | {
-        "depth_mm": _number(depth.greatest, "contact.depth_mm"),
-        "volume_mm3": _number(depth.volume, "contact.volume_mm3"),
+        "depth_mm": finite(depth.greatest, "contact.depth_mm"),
+        "volume_mm3": finite(depth.volume, "contact.volume_mm3"),
     }
     if detail:
         result["depth_mm_stderr"] = _optional(depth.greatest_stderr, "contact.depth_mm_stderr")
@@ -195,7 +122,8 @@ def _with_depth(contact: dict[str, Any], depth: Depth | None, detail: bool) -> d
     return result
 
 
-def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
+def encode_flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
+    """The key `flow`."""
     result: dict[str, Any] = {
         "mean": None if flow.mean is None else _pair(flow.mean, "flow.mean"),
         "count": int(flow.count),
@@ -214,7 +142,16 @@ def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
     return result
 
 
-def _force(force: Force) -> dict[str, Any]:
+def encode_slip(slip: Slip) -> dict[str, Any]:
+    """The key `slip`."""
+    return {
+        "slipping": bool(slip.slipping),
+        "stick_ratio": finite(slip.stick_ratio, "slip.stick_ratio"),
+    }
+
+
+def encode_force(force: Force) -> dict[str, Any]:
+    """The key `force`."""
     return {
         "value": [_optional(part, "force.value") for part in force.value],
         "stderr": [_optional(part, "force.stderr") for part in force.stderr],
@@ -222,7 +159,8 @@ def _force(force: Force) -> dict[str, Any]:
     }
 
 
-def _field(field: DisplacementField) -> dict[str, Any]:
+def encode_field(field: DisplacementField) -> dict[str, Any]:
+    """The key `field`."""
     return {
         "first": list(field.grid.first),
         "spacing": field.grid.spacing,
@@ -231,7 +169,8 @@ def _field(field: DisplacementField) -> dict[str, Any]:
     }
 
 
-def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
+def encode_markers(markers: Markers, detail: bool) -> dict[str, Any]:
+    """The key `markers`."""
     result: dict[str, Any] = {
         "origin": _origin(markers.origin),
         "position": _position(markers.position),
@@ -246,7 +185,8 @@ def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
     return result
 
 
-def _number(value: float, name: str) -> float:
+def finite(value: float, name: str) -> float:
+    """The number; ValueError, with its name, for NaN and infinity."""
     number = float(value)
     if not math.isfinite(number):
         raise ValueError(f"{name}: required a finite number, got {number}")
@@ -254,11 +194,11 @@ def _number(value: float, name: str) -> float:
 
 
 def _optional(value: float | None, name: str) -> float | None:
-    return None if value is None else _number(value, name)
+    return None if value is None else finite(value, name)
 
 
 def _pair(pair: tuple[float, float], name: str) -> list[float]:
-    return [_number(pair[0], name), _number(pair[1], name)]
+    return [finite(pair[0], name), finite(pair[1], name)]
 
 
 def _points(points: NDArray[Any], name: str) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import GenerateJsonSchema
 
-from tactflow.message.encoding import SCHEMA
+from tactflow.message.result import SCHEMA
 from tactflow.vision.types import Evidence
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]

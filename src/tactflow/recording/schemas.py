@@ -20,7 +20,7 @@ from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyp
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
-from tactflow.message.encoding import Results
+from tactflow.message.result import Result
 from tactflow.message.schema import message_schema
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -72,10 +72,10 @@ def encode_picture(jpeg: bytes, sensor: str, nanoseconds: int) -> bytes:
     return bytes(picture.SerializeToString())
 
 
-def encode_annotations(results: Results, nanoseconds: int) -> bytes:
+def encode_annotations(result: Result, nanoseconds: int) -> bytes:
     """One `foxglove.ImageAnnotations`: outlines of contacts, dots by their status, arrows of displacements.
 
-    results : in pixels of the processed frame, which is the picture.
+    result : in pixels of the processed frame, which is the picture.
     """
     stamp = _stamp(nanoseconds)
 
@@ -88,11 +88,11 @@ def encode_annotations(results: Results, nanoseconds: int) -> bytes:
         )
 
     parts: list[PointsAnnotation] = []
-    contact = results.contact
+    contact = result.contact
     if contact is not None:
         separate = contact.separate or (contact,)
         parts += [drawn(PointsAnnotation.LINE_LOOP, one.hull, CONTACT, LINE) for one in separate]
-    markers = results.markers
+    markers = result.markers
     if markers is not None:
         parts.append(drawn(PointsAnnotation.LINE_LIST, _arrows(markers), ARROWS, LINE))
         for status, colour in DOTS.items():

@@ -1,0 +1,211 @@
+"""What the pipeline found in one frame: in Python, and as the message `tactflow.frame/1`.
+
+The schema of the message is in `tactflow.message.schema`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+import orjson
+
+from tactflow.engine.frame import Frame, Tick
+from tactflow.message import encoding
+from tactflow.message.decoding import decode_values
+from tactflow.ports import ContactMask, Image
+from tactflow.vision.flow.displacement_field import DisplacementField
+from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Scale, Slip
+
+SCHEMA = "tactflow.frame/1"
+
+_EXPLAINED = frozenset({"contact", "flow", "markers", "reference"})
+"""What `skipped` of a message may name: the ports that every message has, and the reference."""
+
+NO_PICTURE = np.zeros((0, 0, 3), np.uint8)
+"""The image of a frame whose pixels were not kept or never sent."""
+NO_PICTURE.flags.writeable = False
+
+
+class Result(Tick):
+    """What was found in one frame; a mapping from port names to values, with properties for the well-known.
+
+    Pixels are those of the processed frame, x right, y down; a property is None where nothing was found, or
+    no stage of the pipeline computes it. `result["brightness"]` is the output of a stage of your own.
+
+    frame : as captured: `seq`, `t`, and the raw image, (0, 0, 3) where pictures were not kept.
+    skipped : port -> why it was not computed in this frame: `unchanged` repeats the last value.
+    image : (H, W, 3) uint8 BGR, the processed frame.
+    contact, flow, markers : what touches the gel, how the gel has moved inside, and its dots.
+    contact_mask : (H, W) uint8, 255 in contact.
+    scale, depth, force : millimetres per pixel, how far the gel is pushed in, and by which force; only with a
+        calibration that knows it.
+    field, slip : displacement between the dots, and whether the contact slips; only where a stage of that
+        name stands in the pipeline.
+
+    >>> import tactflow
+    >>> result = next(tactflow.stream(source="sim:press", max_frames=1))
+    >>> result.seq, result.contact, len(result.markers.position)
+    (0, None, 80)
+    """
+
+    __slots__ = ("_message", "_size")
+
+    image: Image | None
+    contact: Contact | None
+    flow: Flow | None
+    markers: Markers | None
+    contact_mask: ContactMask | None
+    scale: Scale | None
+    depth: Depth | None
+    field: DisplacementField | None
+    slip: Slip | None
+    force: Force | None
+
+    def __init__(
+        self,
+        frame: Frame,
+        values: Mapping[str, Any] | None = None,
+        skipped: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(frame, values, skipped)
+        self._size: tuple[int, int] | None = None
+        self._message: dict[str, Any] | None = None
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """Every separate contact, that with the most pixels first; empty without one."""
+        contact = self.contact
+        return () if contact is None else contact.separate or (contact,)
+
+    @property
+    def sensor(self) -> str:
+        """Name of the sensor."""
+        return self.frame.sensor
+
+    @property
+    def seq(self) -> int:
+        """Index of the frame at the source, from 0; a dropped frame leaves a gap."""
+        return self.frame.seq
+
+    @property
+    def t(self) -> float:
+        """Capture time, s: from the start of a recording, or Unix time of a live source."""
+        return self.frame.t
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the processed frame, px; of the raw one where no stage processes it."""
+        if self._size is not None:
+            return self._size
+        image = self.value("image")
+        height, width = (self.frame.image if image is None else image).shape[:2]
+        return width, height
+
+    def to_dict(self, *, detail: bool = False, field: bool = False) -> dict[str, Any]:
+        """The result message as plain dicts, lists and numbers; options as for `encode_message`.
+
+        Of a result that was received, the message as it came.
+        """
+        if self._message is not None:
+            return self._message
+        message: dict[str, Any] = orjson.loads(encode_message(self, detail=detail, field=field))
+        return message
+
+    def to_json(self, *, detail: bool = False, field: bool = False) -> str:
+        """The result message as JSON on one line; options as for `encode_message`."""
+        return encode_message(self, detail=detail, field=field).decode()
+
+    def kept(self, *, pictures: bool) -> Self:
+        """A copy to keep: its arrays are read-only, and it is without pictures unless they are asked for."""
+        kept = copy(self)
+        kept._size = self.size
+        values = {port: _read_only(value) for port, value in self.items()}
+        if not pictures:
+            values = {port: value for port, value in values.items() if not _is_picture(value)}
+            kept.frame = replace(self.frame, image=NO_PICTURE)
+        kept._values = values
+        return kept
+
+    @classmethod
+    def from_message(cls, message: Mapping[str, Any] | bytes | str) -> Self:
+        """The result that a message tells of: without pictures, masks and height maps.
+
+        Raises
+        ------
+        ValueError : it is no result message.
+        """
+        try:
+            parsed: Any = message if isinstance(message, Mapping) else orjson.loads(message)
+            frame = Frame(str(parsed["sensor"]), int(parsed["seq"]), float(parsed["t"]), NO_PICTURE)
+            values, skipped = decode_values(parsed)
+            result = cls(frame, values, skipped)
+            result._size = tuple(parsed["size"])
+            result._message = parsed
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise ValueError(f"required a message of {SCHEMA}: {error!r}") from None
+        return result
+
+
+def _is_picture(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.shape[2:] == (3,)
+
+
+def _read_only(value: Any) -> Any:
+    """The same with arrays that cannot be written to: an array, or a dataclass that holds some."""
+    if isinstance(value, np.ndarray):
+        view = value.view()
+        view.flags.writeable = False
+        return view
+    if isinstance(value, tuple) and type(value) is tuple:
+        return tuple(map(_read_only, value))
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    parts = {field.name: getattr(value, field.name) for field in fields(value) if field.init}
+    locked = {name: _read_only(part) for name, part in parts.items()}
+    return replace(value, **{name: part for name, part in locked.items() if part is not parts[name]})
+
+
+def encode_message(result: Result, *, detail: bool = False, field: bool = False) -> bytes:
+    """The result message of one frame, as JSON in UTF-8 on a single line without a line end.
+
+    Parameters
+    ----------
+    result : in pixels of the processed frame; None becomes null.
+    detail : with `contact.confidence`, `flow.stderr`, `flow.rotation`, `flow.divergence`, `flow.residual`,
+        `flow.shear`, `markers.stderr`, and the standard errors of all these and of all that is in mm.
+    field : with `field`.
+
+    Raises
+    ------
+    ValueError
+        If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
+    """
+    if result._message is not None:
+        return orjson.dumps(result._message)
+    flow, markers, scale = result.flow, result.markers, result.scale
+    whole, contacts = encoding.encode_contacts(result.contact, scale, result.depth, detail)
+    message: dict[str, Any] = {
+        "schema": SCHEMA,
+        "sensor": result.sensor,
+        "seq": result.seq,
+        "t": encoding.finite(result.t, "t"),
+        "size": result.size,
+        "contact": whole,
+        "contacts": contacts,
+        "flow": None if flow is None else encoding.encode_flow(flow, scale, detail),
+        "markers": None if markers is None else encoding.encode_markers(markers, detail),
+        "skipped": {port: reason for port, reason in result.skipped.items() if port in _EXPLAINED},
+    }
+    if scale is not None:
+        message["scale"] = encoding.encode_scale(scale)
+    if result.slip is not None:
+        message["slip"] = encoding.encode_slip(result.slip)
+    if result.force is not None:
+        message["force"] = encoding.encode_force(result.force)
+    if field:
+        message["field"] = None if result.field is None else encoding.encode_field(result.field)
+    return orjson.dumps(message, option=encoding.OPTIONS)
