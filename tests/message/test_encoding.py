@@ -19,31 +19,12 @@ from tactflow.message.result import encode_message
 from tactflow.message.schema import message_schema
 from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, MarkerStatus, Scale
-from tests.messages import Results, build_message, result_of
+from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, SHEAR, Results, build_message, result_of
 
 VALIDATOR = jsonschema.Draft202012Validator(message_schema())
 
 RAW = np.zeros((600, 800, 3), np.uint8)
-PROCESSED = np.zeros((400, 300, 3), np.uint8)
 TICK = Tick(Frame("main", 36, 1.2, RAW))
-CONTACT = Contact(
-    area=5123.5,
-    center=(150.2, 201.7),
-    angle=-12.31,
-    slope=0.218,
-    hull=np.array([[1.0, 2.0], [3.0, 4.5], [0.1, 9.0]]),
-    ellipse=Ellipse((150.0, 200.0), (90.5, 60.25), -12.9),
-    confidence=0.75,
-    evidence="both",
-)
-SHEAR = {"shear": (0.02, -0.01), "rotation_stderr": 0.3, "divergence_stderr": 0.01, "shear_stderr": 0.01}
-FLOW = Flow((1.21, -0.33), 9, stderr=(0.1, 0.2), rotation=3.5, divergence=0.01, residual=0.05, **SHEAR)  # type: ignore[arg-type]
-MARKERS = Markers(
-    origin=np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]]),
-    position=np.array([[10.5, 20.5], [30.25, 40.0], [50.0, 61.0]]),
-    status=np.array([0, 1, 2], np.uint8),
-    stderr=np.array([0.02, np.nan, np.nan]),
-)
 
 
 def test_the_message_has_exactly_the_fields_of_the_contract() -> None:

@@ -15,14 +15,13 @@ pytest.importorskip("foxglove", reason="the extra foxglove is not installed")
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
-from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 from websockets.sync.client import connect
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.sinks.foxglove import Foxglove
 from tests.clock import PATIENCE, until
-from tests.messages import Results, result_of
+from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, Results, result_of
 
 TICK = Tick(Frame("left", 3, 1.5, PROCESSED))
 FOUND = Results(PROCESSED, CONTACT, FLOW, MARKERS)

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
@@ -25,7 +24,7 @@ from tactflow.sinks import parquet as parquet_module
 from tactflow.sinks.parquet import TABLES, Parquet
 from tactflow.vision.types import Depth, Force, Scale, Slip
 from tests.clock import PATIENCE, until
-from tests.messages import Results, build_message, result_of
+from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, Results, build_message, result_of
 
 pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
 

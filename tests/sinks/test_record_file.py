@@ -19,7 +19,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from tests.test_message import CONTACT, FLOW, MARKERS, PROCESSED
 
 import tactflow
 from tactflow.config.load import load_pipeline
@@ -32,7 +31,7 @@ from tactflow.recording.protobuf import decode, encode, unzigzag, zigzag
 from tactflow.recording.schemas import encode_annotations, plain_schema
 from tactflow.sinks.record import Record
 from tactflow.vision.types import Contact, Ellipse, Flow
-from tests.messages import Results, result_of
+from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, Results, result_of
 
 PIPELINE = """\
 sensor: left    # a comment
