@@ -16,10 +16,12 @@ import tactflow
 from tactflow.adapters.lerobot import DatasetWriter
 from tactflow.cli.main import main
 from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame, Tick
+from tactflow.message.result import Result
 from tactflow.sources import open_source
-from tactflow.streaming import Result
 from tactflow.system.files import claim_path
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
+from tests.messages import Results, result_of
 
 pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
 pytest.importorskip("av", reason="the extra lerobot is not installed")
@@ -76,7 +78,8 @@ def touched(scale: Scale | None, depth: Depth | None = None, force: Force | None
     contact = Contact(400.0, (41.5, 28.5), 90.0, None, np.zeros((0, 2)), None)
     image = np.zeros((48, 64, 3), np.uint8)
     flow = Flow((2.0, -1.0), 3)
-    return Result("main", 0, 0.0, contact, flow, None, None, {}, scale, depth, force, image=image)
+    results = Results(image, contact, flow, scale=scale, depth=depth, force=force)
+    return result_of(Tick(Frame("main", 0, 0.0, image)), results)
 
 
 def test_a_calibrated_recording_has_millimetres_and_newtons(tmp_path: Path) -> None:
@@ -86,9 +89,12 @@ def test_a_calibrated_recording_has_millimetres_and_newtons(tmp_path: Path) -> N
         touched(scale, depth, Force((0.5, -0.25, 2.5), (0.1, 0.1, 0.1), in_range=True)),
         touched(scale, depth, Force((None, None, 4.5), (None, None, 0.1), in_range=False)),
         touched(scale),
-        replace(touched(scale), contact=None, flow=None),
+        touched(scale).replace(contact=None, flow=None),
     ]
-    frames = [replace(result, seq=index, t=index / 10) for index, result in enumerate(results)]
+    frames = [
+        Result(replace(result.frame, seq=index, t=index / 10), dict(result))
+        for index, result in enumerate(results)
+    ]
     writer = DatasetWriter(tmp_path, 10, "press")
     writer.add(frames)
     writer.finish()
