@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -676,45 +676,6 @@ def test_a_page_that_is_gone_has_no_address(view: Callable[..., View]) -> None:
     assert str(sink.description).startswith("http://127.0.0.1:")
     sink.close()
     assert sink.description is None
-
-
-def test_connections_that_ask_for_nothing_keep_nobody_out(
-    view: Callable[..., View], stack: ExitStack, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server, "SILENT_SECONDS", 0.2)
-    sink = view()
-    where = urlsplit(str(sink.description))
-    silent = [
-        stack.enter_context(socket.create_connection((str(where.hostname), where.port or 0), PATIENCE))
-        for _ in range(2 * server.MAX_CONNECTIONS)
-    ]
-    for connection in silent:
-        with suppress(ConnectionError):
-            assert connection.recv(1) == b"", "closed by the server"
-    # From now on, silent ones may stay.
-    monkeypatch.setattr(server, "SILENT_SECONDS", PATIENCE)
-    assert get(sink).status == 200
-
-
-def test_a_connection_that_begins_a_second_request_and_waits_is_closed(
-    view: Callable[..., View], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server, "SILENT_SECONDS", 0.2)
-    where = urlsplit(str(view().description))
-    request = b"HEAD / HTTP/1.1\r\nHost: localhost\r\n\r\n"
-
-    def closed_after_an_answer() -> bool:
-        """Whether an answer came; who has asked too late is sent off without one."""
-        with socket.create_connection((str(where.hostname), where.port or 0), PATIENCE) as connection:
-            answered = False
-            with suppress(ConnectionError):
-                connection.sendall(request)
-                answered = connection.recv(65536).startswith(b"HTTP/1.1")
-                connection.sendall(request[:10])
-                assert connection.recv(65536) == b""
-            return answered
-
-    until(closed_after_an_answer)
 
 
 def test_a_request_whose_body_is_none_is_refused_without_a_traceback(

@@ -1,4 +1,4 @@
-"""Addresses of the live view; needs none of the view's packages."""
+"""Addresses of the live view. Imports none of the server's packages."""
 
 from __future__ import annotations
 
@@ -8,38 +8,37 @@ from collections.abc import Mapping
 from pathlib import Path
 
 LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "[::1]"})
-"""What a browser on this machine may call it."""
+"""Host names under which a browser on this machine may open the page."""
 
 WILDCARDS = frozenset({"0.0.0.0", "::"})
-"""Addresses that mean every interface of this machine."""
+"""Addresses that stand for all interfaces of this machine."""
 
 
 def bracketed(host: str) -> str:
-    """A host as it stands in an address: IPv6 in brackets."""
+    """A host as written in a URL: IPv6 in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 def address(host: str, port: int) -> str:
-    """The address of the page for people; a wildcard becomes the name of this machine."""
+    """URL of the page; a wildcard host becomes the name of this machine."""
     return f"http://{socket.gethostname() if host in WILDCARDS else bracketed(host)}:{port}/"
 
 
 def bind(host: str, port: int, *, tries: int = 20) -> socket.socket:
-    """A listening socket on `port`, or, where that is taken, on the next free one.
+    """Open a listening socket on `port`, or on the next free one.
 
-    host : address or name of this machine. port : 0 means any. tries : so many ports are tried, then any.
+    host : address or name of this machine. port : 0 picks any. tries : ports tried before any is taken.
 
     Raises
     ------
-    OSError
-        If the address is not of this machine, or the port is not allowed.
+    OSError : the address does not belong to this machine, or the port is not permitted.
     """
     family, _, _, _, resolved = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     candidates = range(port, min(port + tries, 65536)) if port else range(0)
     for candidate in (*candidates, 0):
         listener = socket.socket(family, socket.SOCK_STREAM)
         try:
-            # A run that was just ended leaves its port in a state that would otherwise refuse the next one.
+            # The port of a run that has just ended is otherwise refused for a while.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind((resolved[0], candidate, *resolved[2:]))
             listener.listen(64)
@@ -53,9 +52,9 @@ def bind(host: str, port: int, *, tries: int = 20) -> socket.socket:
 
 
 class Neighbours:
-    """How the views of a run of several sensors, one process each, find each other: a file each in a folder.
+    """Lets the views of several sensors (one process each) find each other through files in a folder.
 
-    folder : shared by them and by nobody else. sensor : whose view this is.
+    folder : shared by these views only. sensor : the one of this view.
     """
 
     def __init__(self, folder: Path, sensor: str) -> None:
@@ -63,23 +62,23 @@ class Neighbours:
         self._own = folder / f"{sensor}.view"
 
     def announce(self, port: int) -> None:
-        """Tell the others where this view is."""
+        """Publish the port of this view."""
         draft = self._own.with_suffix(".draft")
         draft.write_text(str(port))
         draft.replace(self._own)
 
     def leave(self) -> None:
-        """This view has ended."""
+        """Remove this view."""
         self._own.unlink(missing_ok=True)
 
     def __call__(self) -> Mapping[str, int]:
-        """Sensor -> port of every other view that is there now."""
+        """Sensor -> port of every other view."""
         found: dict[str, int] = {}
         for file in sorted(self._folder.glob("*.view")):
             if file != self._own:
                 try:
                     found[file.stem] = int(file.read_text())
                 except (OSError, ValueError):
-                    # It has ended in this moment.
+                    # That view has just ended.
                     continue
         return found

@@ -1,7 +1,7 @@
-"""Results as the page draws them, in fewer bytes than in the message.
+"""Compact encodings of markers and height maps for drawing in the browser.
 
-Browsers take in a message a kilobyte at a time, and each costs a switch between processes. So what is only
-drawn comes in tenths of a pixel, and a height map in as many cells as a screen can show.
+Coordinates that are only drawn are sent in tenths of a pixel, and a height map with as many cells as a screen
+can show.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ from tactflow.vision.types import Depth, Markers
 STATUS_LETTERS: Final = np.array([ord(name[0]) for name in STATUS_NAMES], np.uint8)
 """The first letter of the word for each value of `MarkerStatus`."""
 MOST_CELLS: Final = 96
-"""Cells of a surface along its longer side at most. Chosen by hand: a panel of the page is some 600 px."""
+"""Most cells of a surface along its longer side: a panel of the page is some 600 px wide."""
 LEAST_CELL: Final = 2.0
-"""Side of a cell at least, px: heights are computed at half the resolution of the picture."""
+"""Smallest side of a cell, px: heights are computed at half the resolution of the picture."""
 LEVELS: Final = 65535
-"""Steps from 0 to the greatest height; with 255 a shaded surface shows terraces."""
+"""Quantization steps from 0 to the greatest height; with 255 a shaded surface shows terraces."""
 
 
 def compact_markers(markers: Markers) -> bytes:
-    """The markers as JSON, a fifth of what they take in the message: x0, y0, x1, ... in tenths of a pixel,
-    and a string with the first letter of each status.
+    """Encode markers as JSON: x0, y0, x1, ... in tenths of a pixel, and the first letter of each status.
 
     >>> origin = np.array([[10.0, 20.0]])
     >>> compact_markers(Markers(origin, origin + 1.25, np.zeros(1, np.uint8), np.zeros(1)))
@@ -50,13 +49,13 @@ def compact_markers(markers: Markers) -> bytes:
 
 
 def compact_surface(depth: Depth) -> tuple[bytes, bytes]:
-    """A height map as JSON that describes it, and its heights.
+    """Encode a height map as a JSON header and binary heights.
 
     Returns
     -------
-    JSON : `box`, (x, y, width, height) of the part that is not 0, px; `size`, (columns, rows) of the cells
-        that it is divided into; `step`, mm; `bytes`, how many the heights take.
-    heights : of the cells, row by row, uint16 with the low byte first, in steps.
+    header : JSON with `box`, (x, y, width, height) of the non-zero part, px; `size`, (columns, rows) of its
+        cells; `step`, mm; `bytes`, length of the heights.
+    heights : of the cells in steps, row by row, little-endian uint16.
 
     >>> heights = np.zeros((40, 60), np.float32)
     >>> heights[10:20, 30:50] = 0.65535

@@ -1,4 +1,4 @@
-"""A session that people are guided through while a run lasts, such as the presses of a calibration."""
+"""Guided sessions shown on the live page, such as the presses of a calibration."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from tactflow.engine.contract import Sink
 
 
 class Session(Protocol):
-    """A session that is followed while the run lasts. From any thread."""
+    """A guided session; may be used from any thread."""
 
     state: Mapping[str, Any]
-    """What to do now and what was done, as the page takes it; replaced as a whole."""
+    """What to do next and what has been done, for the page; replaced as a whole."""
 
     def undo(self) -> None:
-        """Forget the last step."""
+        """Undo the last step."""
 
 
 class Guiding(Sink):
-    """A sink that can guide people through a session."""
+    """A sink that can show a guided session."""
 
     session: ClassVar[Session | None] = None
-    """The session that the run is part of; None in any other run."""
+    """The session of this run, if any."""
 
     @classmethod
     def through(cls, session: Session) -> type[Self]:
-        """The same sink, which guides through a session."""
+        """A subclass of this sink that shows a session."""
         return type(cls.__name__, (cls,), {"session": session})

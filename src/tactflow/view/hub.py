@@ -1,8 +1,8 @@
-"""Who is watching a run, and what each page is sent when.
+"""The open pages of the live view, and flow control for each of them.
 
-Every page has credit for one frame: the next one leaves only after the page said that it drew the last. So a
-slow page gets fewer frames, never older ones, and slows nobody else. While no page has credit, the hub wants
-nothing.
+Every page has credit for one frame: the next frame is sent only after the page has acknowledged drawing the
+last. So a slow page gets fewer frames, never older ones, and slows down nobody else. While no page has
+credit, the view wants no frame.
 """
 
 from __future__ import annotations
@@ -26,20 +26,19 @@ from tactflow.view.guided import Session
 log = logging.getLogger("tactflow")
 
 STATS_SECONDS = 0.5
-"""How often pages are told the statistics of the run, s. Chosen by hand."""
+"""Interval at which pages receive the statistics of the run, s."""
 
 STALE_SECONDS = 1.0
-"""A picture older than this is not shown to a page that has just opened, unless the run is paused, s.
-Chosen by hand."""
+"""Older pictures are not shown to a page that has just opened, unless the run is paused, s."""
 
 REST_MS = 250
-"""A page whose machine is full may ask for at most this long until its next frame. Chosen by hand."""
+"""Longest pause that a page on a busy machine may request before its next frame, ms."""
 
 SHOWN_IF_ASKED = frozenset({"field", "surface"})
-"""What is sent only while a page shows it."""
+"""Layers that are only sent to pages that show them."""
 
 MAX_PAGES = 16
-"""More pages than this at a time are turned away. Chosen by hand."""
+"""Open pages at a time; further ones are turned away."""
 
 
 class Wire(Protocol):
@@ -59,8 +58,10 @@ class Wire(Protocol):
 
 
 class Packet(NamedTuple):
-    """A frame as it is sent. number : counts from 1. captured, published : `time.perf_counter`, s,
-    at its capture and when the sink had its results.
+    """An encoded frame.
+
+    number : counts from 1. captured, published : `time.perf_counter` at capture, and when the sink got the
+    results, s.
     """
 
     number: int
@@ -70,12 +71,12 @@ class Packet(NamedTuple):
 
 
 class Page:
-    """One open page.
+    """State of one open page.
 
-    credit : it has asked for the next frame. shows : those of `SHOWN_IF_ASKED` that it shows. sent,
-    answered : numbers of the last frame it was sent, and of the last it has shown. captured, sent_at :
-    `time.perf_counter` of the one sent, s. screen_s : times from capture to screen of the last frames, s.
-    wake : there is something to send. ended : it is gone.
+    credit : whether it may be sent the next frame. shows : layers of `SHOWN_IF_ASKED` that it shows. sent,
+    answered : numbers of the last frame sent and of the last acknowledged. captured, sent_at :
+    `time.perf_counter` of the frame sent, s. screen_s : latest times from capture to screen, s. wake : set
+    when there is something to send. ended : the run is over.
     """
 
     def __init__(self, wire: Wire) -> None:
@@ -87,19 +88,19 @@ class Page:
         self.captured = 0.0
         self.sent_at = 0.0
         self.screen_s: deque[float] = deque(maxlen=64)
-        # The newest message of each kind: a page that does not read makes nothing pile up.
+        # Only the newest message of each kind is kept, so nothing piles up for a page that does not read.
         self.texts: dict[str, str] = {}
         self.wake = asyncio.Event()
         self.ended = False
 
     def post(self, kind: str, text: str) -> None:
-        """Have a text message sent, in place of an unsent one of the same kind."""
+        """Queue a text message, replacing an unsent one of the same kind."""
         self.texts[kind] = text
         self.wake.set()
 
     @property
     def stuck(self) -> bool:
-        """Whether the last frame is overdue: the page is hidden, or its connection is slow."""
+        """Whether the acknowledgement is overdue: the page is hidden, or its connection is slow."""
         return not self.credit and time.perf_counter() - self.sent_at > 2 * STATS_SECONDS
 
 
@@ -107,15 +108,15 @@ class Hub:
     """The pages that are open now.
 
     `publish`, `wanted`, `owed`, `shown` and `counters` may be used from any thread, the rest in the server's
-    loop.
+    event loop.
 
     Parameters
     ----------
     control : handle on the run; None shows frames without any control over it.
-    sensor : name of the sensor this run serves.
-    neighbours : tells the ports of other sensors' pages by their names.
-    again : publishes the last frame once more. Called in a thread of its own.
-    session : that the run is part of, if there is one.
+    sensor : name of the sensor.
+    neighbours : returns the ports of other sensors' pages by sensor name.
+    again : publishes the last frame once more; called in a worker thread.
+    session : the guided session that the run is part of, if any.
     """
 
     def __init__(
@@ -135,10 +136,10 @@ class Hub:
         self.wanted = False
         """Whether a page has credit."""
         self.owed = False
-        """Whether somebody asked for one single frame: it is shown however soon it comes."""
+        """Whether a single step was requested, whose frame is shown regardless of the rate limit."""
         self._owed_since = 0.0
         self.shown: frozenset[str] = frozenset()
-        """Those of `SHOWN_IF_ASKED` that some page shows."""
+        """Layers of `SHOWN_IF_ASKED` that at least one page shows."""
         self.pages: set[Page] = set()
         self._someone = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -160,19 +161,19 @@ class Hub:
     # -- from other threads -------------------------------------------------------------------------------
 
     def attach(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Tell which loop serves the pages."""
+        """Set the event loop that serves the pages."""
         self._loop = loop
 
     def publish(self, header: bytes, pixels: bytes, captured: float) -> None:
-        """Offer a frame to every page. From one thread, any; never waits.
+        """Offer a frame to every page; never blocks.
 
         Parameters
         ----------
-        header : JSON object that describes the frame, without its last brace.
-        pixels : heights of a surface, if the header describes one, then the picture as JPEG.
-        captured : `time.perf_counter` at its capture, s.
+        header : JSON object that describes the frame, without its closing brace.
+        pixels : heights of a surface, if the header describes one, followed by the JPEG picture.
+        captured : `time.perf_counter` at capture, s.
         """
-        # One that was under way when it was asked for is another one.
+        # A frame captured before the step was requested does not satisfy it.
         if captured >= self._owed_since:
             self.owed = False
         self._number += 1
@@ -184,8 +185,8 @@ class Hub:
             self._loop.call_soon_threadsafe(self._take, packet)
 
     def counters(self) -> dict[str, int]:
-        """pages : open now. sent : frames, over all pages. screen_*_ms : from capture to the page's reply
-        that it is drawn, so an upper bound of what the eye waits for."""
+        """Statistics: open `pages`, frames `sent` over all pages, and quantiles of the time from capture to
+        the page's acknowledgement, ms (an upper bound of the time to the screen)."""
         result = {"pages": len(self.pages), "sent": self._sent}
         for name, q in (("p50", 0.5), ("p99", 0.99)):
             value = self._screen.quantile(q)
@@ -196,7 +197,7 @@ class Hub:
     # -- the life of a page -------------------------------------------------------------------------------
 
     async def serve(self, wire: Wire) -> None:
-        """Look after a page until it goes away or the run ends."""
+        """Serve a page until it disconnects or the run ends."""
         page = Page(wire)
         page.post("hello", _text(type="hello", run=self.run_id, sensors=[self.sensor]))
         page.post("state", self.state())
@@ -220,14 +221,14 @@ class Hub:
             await asyncio.gather(sender, reader, return_exceptions=True)
 
     async def report(self) -> None:
-        """Tell the pages the statistics of the run, again and again, while there are pages."""
+        """Send the statistics of the run periodically while pages are open."""
         while True:
             await self._someone.wait()
             self.tell_stats()
             await asyncio.sleep(STATS_SECONDS)
 
     def end(self) -> None:
-        """The run is over: tell every page how it ended and let it go."""
+        """Tell every page how the run ended, and disconnect it."""
         snapshot = self._commands.snapshot()
         self._end = str(snapshot.get("end", "eos"))
         for page in self.pages:
@@ -236,13 +237,13 @@ class Hub:
             page.ended = True
 
     def tell_state(self) -> None:
-        """Tell every page what can be done now."""
+        """Send the current state to every page."""
         text = self.state()
         for page in self.pages:
             page.post("state", text)
 
     def tell_stats(self) -> None:
-        """Tell the pages that keep up the statistics so far, and what may have changed beside them."""
+        """Send statistics and state to the pages that keep up."""
         listeners = [page for page in self.pages if not page.stuck]
         if not listeners:
             return
@@ -256,7 +257,7 @@ class Hub:
             page.post("state", state)
 
     def state(self) -> str:
-        """The message that says what the run is doing, and which buttons work (null) or why not."""
+        """State message: what the run is doing, and for each button null or why it is disabled."""
         control = self.control
         source = None if control is None else control.source
         now = self._commands.state()
@@ -333,7 +334,7 @@ class Hub:
         page.shows = SHOWN_IF_ASKED.intersection(map(str, asked if isinstance(asked, list) else ()))
         before = self.shown
         self._recount()
-        # No further frame comes that would have it.
+        # While paused no further frame would bring the new layer.
         if self.shown - before and self.control is not None and self.control.paused:
             await asyncio.to_thread(self._again)
 
@@ -341,13 +342,13 @@ class Hub:
         if message["ack"] != page.sent or page.sent == page.answered:
             return
         page.answered = page.sent
-        # A hidden page draws nothing until it is looked at again: that is no delay.
+        # A hidden page draws only when it becomes visible again, which does not count as latency.
         if message.get("late") is not True and page.captured > 0:
             delay = time.perf_counter() - page.captured
             page.screen_s.append(delay)
             self._screen.add(delay)
         rest = message.get("rest")
-        # The machine that is full may be the one that runs the pipeline: let it have half of the time.
+        # The browser may share a busy machine with the pipeline: leave the pipeline half of the time.
         if isinstance(rest, int) and rest > 0:
             asyncio.get_running_loop().call_later(min(rest, REST_MS) / 1000, self._ready, page)
         else:
@@ -366,7 +367,7 @@ class Hub:
             refusal = self._refusal(name)
             if refusal is not None:
                 raise RefusedError(refusal)
-            # Starting or ending a recording may touch the disk; the other commands return at once.
+            # Starting or ending a recording may access the disk.
             await asyncio.to_thread(self._by_name[name], message.get("value"))
         except Exception as error:
             if not isinstance(error, RefusedError):
@@ -375,7 +376,7 @@ class Hub:
         self.tell_state()
 
     def _refusal(self, name: str) -> str | None:
-        """Why a command is not possible now, or None."""
+        """Why a command is not possible now; None if it is possible."""
         return "the run has ended" if self._end is not None else self._commands.refusal(name)
 
     def _step(self) -> None:

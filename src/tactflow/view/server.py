@@ -1,8 +1,7 @@
-"""HTTP and WebSocket for the live view, on a thread of its own.
+"""HTTP and WebSocket server of the live view, in a thread of its own.
 
-Serves a handful of fixed files and one WebSocket. What it refuses: requests under a host name that is not
-ours (a foreign name that was made to point here), WebSockets opened by other pages, and, where a token is
-set, WebSockets without it.
+Serves a handful of fixed files and one WebSocket. It refuses requests under a foreign host name (DNS
+rebinding), WebSockets opened by other pages, and, where a token is set, WebSockets without it.
 """
 
 from __future__ import annotations
@@ -37,17 +36,15 @@ HOST_HEADER = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?"
 
 START_SECONDS = 10.0
 CLOSE_SECONDS = 3.0
-"""How long the server may take to start, and to end, s. Chosen by hand."""
+"""Time limits for the server to start and to end, s."""
 
 MAX_CONNECTIONS = 128
-"""Connections at a time: each page opens up to seven. Each takes a file, of which a process may have 1024."""
-SILENT_SECONDS = 10.0
-"""Time within which a connection must have asked for something, again and again, s. Chosen by hand."""
+"""Connections at a time; more are answered with 503. Each page opens up to seven."""
 
 WRONG_TOKEN = 4401
 TOO_MANY = 4429
-"""WebSocket close codes of our own: the page must be told why, and a refused handshake tells it nothing.
-The range from 4000 is for private use (RFC 6455, 7.4.2); the rest follows HTTP 401 and 429."""
+"""WebSocket close codes: a refused handshake would not tell the page why. Codes from 4000 on are for private
+use (RFC 6455, 7.4.2); the rest follows HTTP 401 and 429."""
 
 TYPES = {
     "html": "text/html; charset=utf-8",
@@ -57,41 +54,21 @@ TYPES = {
 }
 
 
-class _BoundedConnection(H11Protocol):
-    """A connection that is closed if there are too many, or if it asks for nothing."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        if len(self.connections) > MAX_CONNECTIONS:
-            transport.abort()
-        else:
-            self.loop.call_later(SILENT_SECONDS, self._close_if_silent, None)
+class _Connection(H11Protocol):
+    """An HTTP connection that survives a malformed HEAD request, whose error page h11 refuses to send."""
 
     def send_400_response(self, msg: str) -> None:
-        """Say that the request is none, and hang up."""
-        # To HEAD there is no answer with words in it, and h11 refuses to send them.
+        """Answer 400 Bad Request and close the connection."""
         with contextlib.suppress(LocalProtocolError):
             super().send_400_response(msg)
         self.transport.close()
 
-    def _close_if_silent(self, last: object) -> None:
-        """Close it unless it has asked for something since `last`, the request that was its last one then."""
-        # One that became a page's WebSocket has another protocol now.
-        if self.transport.is_closing() or self.transport.get_protocol() is not self:
-            return
-        if self.cycle is last:
-            self.transport.abort()
-        else:
-            self.loop.call_later(SILENT_SECONDS, self._close_if_silent, self.cycle)
-
 
 class Server:
-    """Serves the page and the hub's messages on a listening socket, which it owns from now on.
+    """Serves the page and the hub's messages on a listening socket, which it takes over.
 
-    Parameters
-    ----------
-    host : the name or address that was configured; requests must be addressed to it or to loopback.
-    token : what a page must show to be let in; None lets in every page of our own.
+    host : configured name or address; requests must be addressed to it or to loopback.
+    token : secret that a page must present; None admits every page of this server.
     """
 
     def __init__(self, hub: Hub, listener: socket.socket, host: str, token: str | None) -> None:
@@ -107,11 +84,12 @@ class Server:
         config = uvicorn.Config(
             _Guard(app, host),
             loop="asyncio",
-            http=_BoundedConnection,
+            http=_Connection,
             ws="websockets-sansio",
             # Commands are short; pictures are compressed already.
             ws_max_size=4096,
             ws_per_message_deflate=False,
+            limit_concurrency=MAX_CONNECTIONS,
             lifespan="off",
             log_config=None,
             log_level="critical",
@@ -124,7 +102,7 @@ class Server:
         self._thread = threading.Thread(target=self._run, name="tactflow-view-server", daemon=True)
 
     def start(self) -> None:
-        """Begin to serve; returns when requests are answered."""
+        """Start serving; returns once requests are answered."""
         self._thread.start()
         self._ready.wait(START_SECONDS)
 
@@ -159,7 +137,7 @@ class Server:
             await self._server.serve(sockets=[self._listener])
         finally:
             reporter.cancel()
-            # A page that reads nothing would keep its connection, and what was sent to it, for ever.
+            # A page that reads nothing would keep its connection open for ever.
             for connection in list(self._server.server_state.connections):
                 transport = getattr(connection, "transport", None)
                 if transport is not None:
@@ -194,7 +172,7 @@ class Server:
             return
         await websocket.accept()
         if not self._admits(websocket):
-            # Guessing is slow.
+            # Slow down guessing.
             await asyncio.sleep(0.5)
             await websocket.close(WRONG_TOKEN, "token required")
         elif len(self.hub.pages) >= MAX_PAGES:
@@ -210,7 +188,7 @@ class Server:
 
 
 class _Wire:
-    """A WebSocket that ends quietly, whichever side ends it."""
+    """A WebSocket whose closing never raises, whichever side closes it first."""
 
     def __init__(self, websocket: WebSocket) -> None:
         self._websocket = websocket
@@ -225,16 +203,16 @@ class _Wire:
 
 
 class _Guard:
-    """Refuses requests under names that are not ours, and puts security headers on every answer."""
+    """Refuse requests under foreign host names, and add security headers to every response."""
 
     def __init__(self, app: ASGIApp, host: str) -> None:
         self._app = app
         wildcard = host in WILDCARDS
-        # On all interfaces our names cannot be known; there a token is required, and it protects.
+        # On all interfaces the valid names are unknown; there a token is required instead.
         self._names = None if wildcard else LOOPBACK_NAMES | {bracketed(host).lower()}
 
     def _is_ours(self, host: str) -> bool:
-        # The header goes into the policy below, so it must be nothing but a name and a port.
+        # The header is copied into the policy below, so only a name and a port are accepted.
         parts = HOST_HEADER.fullmatch(host)
         return parts is not None and (self._names is None or parts[1].lower() in self._names)
 
@@ -274,7 +252,7 @@ class _Guard:
 
 
 def _load_files() -> dict[str, bytes]:
-    """Everything the page may ask for, read once: no request reaches the file system."""
+    """All files of the page, read once: no request reaches the file system."""
     folder = resources.files("tactflow.view") / "page"
     return {
         item.name: item.read_bytes()
@@ -284,7 +262,7 @@ def _load_files() -> dict[str, bytes]:
 
 
 def _same_origin(headers: Headers) -> bool:
-    """Whether a WebSocket was opened by our own page; browsers always say by which."""
+    """Whether a WebSocket was opened by our own page, according to its Origin header."""
     origin, host = headers.get("origin", ""), headers.get("host", "")
     try:
         parts = urlsplit(origin)
