@@ -144,7 +144,7 @@ def speed(args: argparse.Namespace, folder: Path) -> None:
             call = watch(batch("default", part, out, "--workers", name[0]), f"part {number + 1}, {name}")
             walls[name] += call.wall
             outs.append(results(out))
-        counts += sum(1 for line in (out / "ledger" / "1-of-1.jsonl").read_bytes().split(b"\n") if line)
+        counts += len(list((out / "records").glob("*.json")))
         same = same and outs[0] == outs[1]
     rows = [by(name, counts, wall, walls["1 worker"] / counts) for name, wall in walls.items()]
     if args.data is None:
@@ -196,7 +196,7 @@ def on_cluster(args: argparse.Namespace, folder: Path) -> None:
             began = time.perf_counter()
             process = subprocess.Popen(batch("default", sources, out, "--scheduler", address))
             while deadly and process.poll() is None:
-                if len(list(out.glob("records/*"))) >= args.recordings // 3:
+                if len(list(out.glob("records/*.json"))) >= args.recordings // 3:
                     processes[-1].send_signal(signal.SIGKILL)
                     tell("a worker is killed")
                     break

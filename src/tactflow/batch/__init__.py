@@ -1,5 +1,6 @@
-"""A pipeline over many recordings: on the processors of this machine, on a Dask cluster, in shards.
+"""A pipeline over many recordings, on the processors of this machine or on a Dask cluster.
 
-`recordings` says which, `digests` what makes two results the same, `work` runs one recording, `local` and
-`cluster` are the executors, `run` hands work out, `folder` is what stands in `--out`, `page` shows it.
+`recordings` finds them, `run` decides what is missing and hands it to `workers`, `work` runs one recording,
+`summary` keeps curves and pictures of it, `store` is the folder of the results, `report` the table and the
+page of all runs, `compare` a table of how two pipelines differ.
 """

@@ -1,40 +1,36 @@
-"""Hands the work out, writes down what became of it, and stops well."""
+"""Decides what is missing, hands it to workers, and ends well."""
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from pathlib import Path
 
-from tactflow.batch.digests import fingerprint, result_key, versions
-from tactflow.batch.executor import Executor
-from tactflow.batch.folder import Folder, Ledger
 from tactflow.batch.recordings import Recording
-from tactflow.batch.task import Format, Outcome, PipelineRequest, Task
-from tactflow.batch.work import pipeline_for
+from tactflow.batch.store import Outcome, Store
+from tactflow.batch.work import Request, Task
+from tactflow.batch.workers import SCHEDULER_GONE, Workers
 from tactflow.engine.errors import StageError
 
 LOOK_EVERY = 0.2
-"""Time between two looks at workers and signals, s. Chosen by hand."""
+"""Time between two looks at signals, s: faster than people notice."""
+MOST_DEATHS = 3
+"""Recordings in a row that each kill a worker of their own: more likely is that no worker can run here."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is to be done and what is done already.
-
-    done : recordings whose result is there, with its outcome. left : the others. changed : how many of these
-    had a result of another input, pipeline or version; the rest of them are new or had failed.
-    """
+    """done : source -> outcome of an earlier call. left : what is to be done. changed : how many of these had
+    been done of another input, pipeline or version; the others are new or had failed."""
 
     done: Mapping[str, Outcome]
     left: Sequence[Recording]
     changed: int
 
-    @property
-    def words(self) -> str:
-        """For people."""
+    def __str__(self) -> str:
         total = len(self.done) + len(self.left)
         parts = [f"{total} recording{'' if total == 1 else 's'}"]
         if self.done:
@@ -46,136 +42,138 @@ class Plan:
         return ", ".join(parts)
 
 
-def resolved(
-    file: Path, overrides: Sequence[str], sensor: str | None, format_: Format, split: float = 0.0
-) -> PipelineRequest:
-    """A pipeline as workers are asked for it, checked.
-
-    split : length of the parts that recordings are cut into, s; 0 for none.
-
-    Raises
-    ------
-    ConfigError : the file is wrong.
-    """
-    request = PipelineRequest(os.path.abspath(file), tuple(overrides), sensor, split)
-    _, digest = pipeline_for(request, format_)
-    return replace(request, digest=digest, versions=tuple(versions().items()))
-
-
-def make_plan(
-    folder: Folder, recordings: Iterable[Recording], request: PipelineRequest, *, verify: bool = False
-) -> Plan:
-    """Compare what is asked for with what is there.
-
-    A recording whose size and time are as they were when it was read is not read again, unless `verify`.
-    """
-    known = {} if verify else folder.known(request.digest)
+def make_plan(store: Store, recordings: Iterable[Recording], request: Request) -> Plan:
+    """Compare what is asked for with what is there."""
     done: dict[str, Outcome] = {}
     left: list[Recording] = []
     changed = 0
     for recording in recordings:
-        outcome = known.get(recording.source)
-        if outcome is not None and _still_holds(folder, recording, outcome, request):
-            done[recording.source] = replace(outcome.of(recording), reused=True)
-            continue
-        left.append(recording)
-        changed += outcome is not None and outcome.status == "done"
+        outcome = store.outcome(recording)
+        if outcome is not None and store.is_done(recording, outcome, request.digest):
+            done[recording.source] = outcome
+        else:
+            left.append(recording)
+            changed += outcome is not None and outcome.status == "done"
     return Plan(done, left, changed)
-
-
-def _still_holds(folder: Folder, recording: Recording, outcome: Outcome, request: PipelineRequest) -> bool:
-    if outcome.key != result_key(outcome.input_digest, request.digest):
-        return False
-    path = recording.path
-    try:
-        same = path is None or outcome.input == fingerprint(path)
-    except OSError:
-        return False
-    return same and folder.is_whole(outcome)
-
-
-@dataclass(slots=True)
-class Stopping:
-    """How the user wants it to end: `signals` counts how often he has asked."""
-
-    signals: int = 0
-
-    def count(self, _number: int, _frame: object) -> None:
-        """Handler of the signals that ask to end."""
-        self.signals += 1
 
 
 @dataclass(slots=True)
 class Result:
     """How a batch ended.
 
-    outcomes : of every recording that was looked at, by source. undone : recordings that nobody has begun,
-    or that were given up. ended : why it ended early, or None.
+    outcomes : of every recording that was looked at, by source. undone : how many were not begun, or given
+    up. ended : why it ended early, or None.
     """
 
     outcomes: dict[str, Outcome]
-    undone: list[Recording] = field(default_factory=list[Recording])
+    undone: int = 0
     ended: str | None = None
 
     @property
     def failed(self) -> list[Outcome]:
-        """Those that failed or were set aside."""
+        """Those that failed."""
         return [outcome for outcome in self.outcomes.values() if outcome.status != "done"]
 
 
-def run_batch(
-    plan: Plan,
-    make_task: Callable[[Recording], Task],
-    executor: Executor,
-    ledger: Ledger,
-    *,
-    stopping: Stopping,
-    fail_fast: bool = False,
-    told: Callable[[Outcome], None] = lambda _: None,
-    shown: Callable[[Executor, int], None] = lambda _executor, _left: None,
-) -> Result:
-    """Work on what a plan has left.
+@dataclass
+class Batch:
+    """One call of a batch.
 
-    After one signal no more is begun, after a second what runs is given up. A full disk, or an executor that
-    is gone, ends it; what is done stays done.
-
-    told : about each outcome. shown : called several times a second with the number that is left.
+    signals : tells how often the user has asked to end. fail_fast : begin nothing more after a failure.
+    on_outcome : called with each outcome.
     """
-    waiting = deque(plan.left)
-    under_way: dict[str, Recording] = {}
-    result = Result(dict(plan.done))
-    try:
-        while waiting or under_way:
-            if stopping.signals > 1:
-                break
-            goes_on = not stopping.signals and result.ended is None
-            while goes_on and waiting and len(under_way) < executor.window:
-                recording = waiting.popleft()
-                under_way[recording.source] = recording
-                executor.submit(make_task(recording))
-            if not under_way:
-                break
-            for outcome in executor.finished(LOOK_EVERY):
-                del under_way[outcome.recording]
-                result.outcomes[outcome.recording] = outcome
-                result.ended = result.ended or _reason_to_end(outcome, fail_fast)
-                ledger.add(outcome)
-                told(outcome)
-            shown(executor, len(waiting) + len(under_way))
-    except StageError as error:
-        result.ended = result.ended or str(error)
-    finally:
-        executor.close(kill=bool(under_way))
-    if stopping.signals and (waiting or under_way):
-        result.ended = result.ended or "interrupted"
-    result.undone = [*under_way.values(), *waiting]
-    return result
 
+    store: Store
+    scratch: Path
+    request: Request
+    workers: Workers
+    signals: Callable[[], int]
+    fail_fast: bool = False
+    on_outcome: Callable[[Outcome], None] = lambda _: None
 
-def _reason_to_end(outcome: Outcome, fail_fast: bool) -> str | None:
-    """Why nothing more is begun after this outcome, or None."""
-    if outcome.disk_full:
-        return "the disk is full; make room and call again: what is done stays done"
-    if fail_fast and outcome.status != "done":
-        return "--fail-fast: a recording failed"
-    return None
+    def run(self, plan: Plan) -> Result:
+        """Work on what a plan has left.
+
+        After one signal no more is begun, after a second what runs is given up. A full disk, or workers that
+        are gone, end it; what is done stays done.
+        """
+        result = Result(dict(plan.done))
+        self._waiting = deque(plan.left)
+        self._running: dict[Future[Outcome], Recording] = {}
+        # Recordings of which one has killed a worker: they are tried again, each alone.
+        self._suspects: deque[Recording] = deque()
+        self._deaths = 0
+        try:
+            while self._waiting or self._suspects or self._running:
+                if self.signals() == 0 and result.ended is None:
+                    self._begin_more()
+                if not self._running or self.signals() > 1:
+                    break
+                for future in wait(self._running, LOOK_EVERY, FIRST_COMPLETED).done:
+                    self._finish(future, result)
+        except StageError as error:
+            result.ended = result.ended or str(error)
+        finally:
+            self.workers.close(kill=bool(self._running))
+        result.undone = len(plan.done) + len(plan.left) - len(result.outcomes)
+        if self.signals() and result.undone:
+            result.ended = result.ended or "interrupted"
+        return result
+
+    def _begin_more(self) -> None:
+        if self._suspects:
+            if not self._running:
+                self._begin(self._suspects[0])
+            return
+        slots = self.workers.slots
+        while self._waiting and len(self._running) < slots:
+            self._begin(self._waiting.popleft())
+
+    def _begin(self, recording: Recording) -> None:
+        task = Task(recording, self.request, str(self.store.path), str(self.scratch))
+        self._running[self.workers.submit(task)] = recording
+
+    def _finish(self, future: Future[Outcome], result: Result) -> None:
+        recording = self._running.pop(future)
+        alone = bool(self._suspects) and recording == self._suspects[0]
+        try:
+            outcome = future.result()
+            self._deaths = 0
+        except BrokenProcessPool:
+            if not alone:
+                self._suspects.append(recording)
+                return
+            self._deaths += 1
+            outcome = self._failed(
+                recording, "it killed its worker twice. Is memory short, or the file harmful?"
+            )
+        except CancelledError:
+            raise StageError(SCHEDULER_GONE) from None
+        except Exception as error:
+            outcome = self._failed(recording, f"on a worker: {type(error).__name__}: {error}")
+        if alone:
+            self._suspects.popleft()
+        if outcome.status != "done" and not outcome.disk_full:
+            self._save(recording, outcome)
+        result.outcomes[recording.source] = outcome
+        result.ended = result.ended or self._reason_to_end(outcome)
+        self.on_outcome(outcome)
+
+    def _failed(self, recording: Recording, error: str) -> Outcome:
+        return Outcome(recording.source, recording.name, "failed", error, pipeline=self.request.digest)
+
+    def _save(self, recording: Recording, outcome: Outcome) -> None:
+        try:
+            self.store.save(recording, outcome)
+        except OSError as error:
+            raise StageError(f"{self.store.records}: cannot be written: {error.strerror or error}") from error
+
+    def _reason_to_end(self, outcome: Outcome) -> str | None:
+        """Why nothing more is begun after this outcome, or None."""
+        if outcome.disk_full:
+            return "the disk is full; make room and call again: what is done stays done"
+        if self._deaths == MOST_DEATHS:
+            return f"{MOST_DEATHS} recordings in a row killed their workers; try fewer --workers"
+        if self.fail_fast and outcome.status != "done":
+            return "--fail-fast: a recording failed"
+        return None

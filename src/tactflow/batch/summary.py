@@ -1,124 +1,65 @@
-"""What a batch keeps of a recording for people: curves with a bounded number of points, and pictures."""
+"""What the page shows of a recording: contact area, flow and angle over time, and pictures of contacts."""
 
 from __future__ import annotations
 
-import base64
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.drawing.results import Annotator
-from tactflow.engine.collect import with_collector
-from tactflow.engine.graph import Pipeline
+from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
+from tactflow.report import COLORS, figure, picture
 
-MOST_POINTS = 240
-"""Points of a curve, before neighbours are merged: one a pixel of a plot. Chosen by hand."""
+MOST_POINTS = 480
+"""Points of a curve, before neighbours are merged: two a pixel of a plot."""
 MOST_PICTURES = 4
-"""Pictures of a recording. Chosen by hand: they fit in a line of the table."""
-PICTURE_SIDE = 160
-"""Longer side of a picture, px. Chosen by hand."""
+"""Pictures of a recording: they fit beside its plot."""
+PICTURE_SIDE = 240
+"""Longer side of a picture, px: about the height of the plot."""
 _QUALITY = 70
-"""JPEG quality of a picture, 1 to 100: some 4 kB. Chosen by hand."""
-_SINK = "tactflow.batch"
-"""Id of the sink that looks on; no id of a file has a point in it."""
+"""JPEG quality of a picture, 1 to 100: some 7 kB. Chosen by hand."""
 
 
 class Point(NamedTuple):
-    """A frame of a curve. t : s. area : of the contact, px^2. flow : length of the mean, px. angle : deg."""
+    """A frame of a curve. t : s. area : of the contact, px^2. flow : length of its mean, px. angle : deg."""
 
     t: float
     area: float
-    flow: float | None
-    angle: float | None
+    flow: float
+    angle: float
 
 
-class Curve:
-    """The frames of a recording of any length in a bounded number of points.
-
-    When there are too many, of each two the one with the larger contact stays: every point is a frame that
-    was, and no contact gets lost.
-
-    >>> curve = Curve(most=4)
-    >>> for t, area in enumerate([0, 0, 5, 9, 0, 0, 7, 0]):
-    ...     curve.add(Point(t, area, None, None))
-    >>> [point.area for point in curve.points]
-    [0, 9, 0, 7]
-    """
-
-    def __init__(self, most: int = MOST_POINTS) -> None:
-        self._most = most
-        self._kept: list[Point] = []
-        self._held: Point | None = None
-        self._count, self._every = 0, 1
-
-    def add(self, point: Point) -> None:
-        """Take the next frame."""
-        self._held = point if self._held is None else max(self._held, point, key=_area)
-        self._count += 1
-        if self._count < self._every:
-            return
-        if len(self._kept) == self._most:
-            self._kept = [max(pair, key=_area) for pair in zip(*[iter(self._kept)] * 2, strict=True)]
-            self._every *= 2
-            if self._count < self._every:
-                return
-        self._kept.append(self._held)
-        self._held, self._count = None, 0
-
-    @property
-    def points(self) -> list[Point]:
-        """The curve so far."""
-        return self._kept + ([] if self._held is None else [self._held])
-
-
-def _area(point: Point) -> float:
-    return point.area
-
-
-@dataclass(frozen=True, slots=True)
-class Thumbnail:
-    """A picture of a contact where it is largest: JPEG in base64."""
-
+class _Picture(NamedTuple):
     seq: int
     t: float
     area: float
-    jpeg: str
-
-
-class Looker(Protocol):
-    """Looks at every result of a run."""
-
-    def add(self, result: Result) -> None:
-        """Take one frame."""
-        ...
+    jpeg: bytes
 
 
 class Summary:
-    """Looks at every result of a run; memory does not grow with the recording."""
+    """Collects the frames of a run; memory does not grow with the length of the recording."""
 
     def __init__(self) -> None:
-        self.curve = Curve()
         self.frames = self.contacts = self.touching = 0
         self.largest = self.duration = 0.0
-        self._first: bool | None = None
-        self._pictures: list[Thumbnail] = []
+        self.points: list[Point] = []
+        self._frames_a_point = 1
+        self._pictures: list[_Picture] = []
         self._best: Result | None = None
 
     def add(self, result: Result) -> None:
         """Take one frame."""
         contact, flow = result.contact, result.flow
-        mean = None if flow is None or flow.mean is None else math.hypot(*flow.mean)
         area = 0.0 if contact is None else float(contact.area)
-        angle = None if contact is None else contact.angle
-        self.curve.add(Point(result.t, area, mean, angle))
+        mean = math.nan if flow is None or flow.mean is None else math.hypot(*flow.mean)
+        angle = math.nan if contact is None or contact.angle is None else contact.angle
+        self._add_point(Point(result.t, area, mean, angle))
         self.duration = result.t
         self.frames += 1
-        self._first = contact is not None if self._first is None else self._first
         if contact is None:
             self._end_contact()
             return
@@ -128,10 +69,16 @@ class Summary:
         if self._best is None or self._best.contact is None or area > self._best.contact.area:
             self._best = result
 
-    @property
-    def ends(self) -> tuple[bool, bool]:
-        """Whether there is a contact in the first frame, and in the last one so far."""
-        return bool(self._first), self._best is not None
+    def _add_point(self, point: Point) -> None:
+        """Of the frames of one point, keep the one with the largest contact: no contact gets lost."""
+        if self.frames % self._frames_a_point == 0:
+            self.points.append(point)
+        elif point.area > self.points[-1].area:
+            self.points[-1] = point
+        if len(self.points) == 2 * MOST_POINTS:
+            pairs = zip(self.points[::2], self.points[1::2], strict=True)
+            self.points = [max(pair, key=lambda p: p.area) for pair in pairs]
+            self._frames_a_point *= 2
 
     def _end_contact(self) -> None:
         """Keep a picture of the contact that is over, if it is one of the largest."""
@@ -139,33 +86,37 @@ class Summary:
             return
         result, self._best = self._best, None
         assert result.contact is not None
-        smallest = min((picture.area for picture in self._pictures), default=0.0)
-        if len(self._pictures) == MOST_PICTURES and result.contact.area <= smallest:
+        area = float(result.contact.area)
+        if len(self._pictures) == MOST_PICTURES and area <= self._pictures[-1].area:
             return
-        one = Thumbnail(result.seq, result.t, float(result.contact.area), picture_of(result))
-        self._pictures = sorted([*self._pictures, one], key=lambda p: -p.area)[:MOST_PICTURES]
+        taken = _Picture(result.seq, result.t, area, _jpeg(result))
+        self._pictures = sorted([*self._pictures, taken], key=lambda p: -p.area)[:MOST_PICTURES]
 
-    def finished(self) -> dict[str, Any]:
-        """Curve and pictures, as they are stored, at the end of the recording."""
+    def html(self) -> str:
+        """Plot and pictures, for the page. Without matplotlib, the pictures alone."""
         self._end_contact()
-        pictures = sorted(self._pictures, key=lambda picture: picture.seq)
-        return {"curve": [tuple(point) for point in self.curve.points], "pictures": pictures}
+        pictures = [picture(p.jpeg, f"{p.t:.2f} s") for p in sorted(self._pictures)]
+        try:
+            drawing, axes = figure(3, 1, size=(4.2, 2.8), sharex=True)
+        except ConfigError:
+            return "".join(pictures)
+        t, *curves = np.array(self.points, float).reshape(-1, 4).T
+        labels = ("area, px²", "flow, px", "angle, °")
+        for axis, curve, label, color in zip(axes, curves, labels, COLORS[:3], strict=True):
+            # A point between gaps is seen only as a dot.
+            axis.plot(t, curve, color=color, marker=".", markersize=2)
+            axis.set_ylabel(label, fontsize=8)
+            axis.tick_params(labelsize=8)
+        axes[2].set_ylim(-90, 90)
+        axes[2].set_xlabel("time, s", fontsize=8)
+        return "".join([picture(drawing), *pictures])
 
 
-def picture_of(result: Result, side: int = PICTURE_SIDE) -> str:
-    """The processed frame, or else the raw one, with what was found drawn on it: JPEG in base64.
-
-    side : the longer one of the picture, px.
-    """
+def _jpeg(result: Result) -> bytes:
+    """A small picture of the processed frame, or else of the raw one, with what was found drawn on it."""
     image = result.frame.image if result.image is None else result.image
-    annotator = Annotator(text=False)
-    drawn = annotator(image, contact=result.contact, flow=result.flow, markers=result.markers)
-    scale = min(1.0, side / max(drawn.shape[:2]))
-    resized = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    small = np.asarray(resized, np.uint8)
-    return base64.b64encode(encode_jpeg(small, _QUALITY)).decode()
-
-
-def with_looker(pipeline: Pipeline, looker: Looker) -> Pipeline:
-    """The pipeline with a sink that lets somebody look on."""
-    return with_collector(pipeline, Result, looker.add, name=_SINK, sinks=True)
+    annotate = Annotator(text=False)
+    drawn = annotate(image, contact=result.contact, flow=result.flow, markers=result.markers)
+    scale = min(1.0, PICTURE_SIDE / max(drawn.shape[:2]))
+    small = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return encode_jpeg(np.asarray(small, np.uint8), _QUALITY)

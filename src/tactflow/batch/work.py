@@ -1,4 +1,4 @@
-"""Works on one recording, in whatever process an executor has chosen for it."""
+"""Runs a pipeline over one recording, in any process."""
 
 from __future__ import annotations
 
@@ -9,269 +9,239 @@ import logging
 import math
 import os
 import socket
+import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import orjson
 
+import tactflow
 from tactflow.api import make_runner
-from tactflow.batch.digests import (
-    digest_of,
-    fingerprint,
-    input_digest,
-    pipeline_digest,
-    result_key,
-    versions,
-)
-from tactflow.batch.folder import Folder, remove
-from tactflow.batch.parts import OVERLAP, of_part
 from tactflow.batch.recordings import Recording
-from tactflow.batch.summary import Summary, with_looker
-from tactflow.batch.task import Format, Outcome, PipelineRequest, Report, Task, result_name
+from tactflow.batch.store import Format, Outcome, Store, file_name, fingerprint, remove
+from tactflow.batch.summary import Summary
+from tactflow.config.files_used import files_named
 from tactflow.config.load import load_pipeline
+from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
-from tactflow.engine.graph import Mark, Pipeline
-from tactflow.engine.run import Progress
+from tactflow.engine.graph import Mark, Node, Pipeline
+from tactflow.message.result import Result
 from tactflow.system.clock import SYSTEM
 
-DEADLY = 2
-"""Workers that a recording may kill before it is set aside."""
 _SRC = Mark("recording", 0, 0)
-"""Where the source stands: not in the pipeline file, which is not to blame for it."""
-_MOST_NOTES = 5
-"""Warnings that are kept of one recording. Chosen by hand."""
+"""Where the source is named: not in the pipeline file."""
+_MOST_WARNINGS = 5
+"""Warnings that are kept of one recording: the first ones say what the others repeat."""
+_WHERE_AND_WHEN = {"path", "overwrite", "append", "flush"}
+"""Parameters of a sink that do not change what it writes."""
 
 
-def work(task: Task, report: Report = lambda _done, _total: None) -> Outcome:
-    """Run the pipeline over one recording, unless its result is there.
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A pipeline, as any process can load it.
 
-    report : told how far it is. Never raises a TactflowError: what is wrong is in the outcome.
+    file : absolute. overrides : as for `--set`. sensor : of several; None is the only one. digest : expected.
     """
-    began = SYSTEM.now()
-    blank = Outcome(
-        task.recording.source,
-        task.recording.name,
-        "failed",
-        pipeline=task.pipeline.digest,
-        started=SYSTEM.unix(),
-        worker=f"{socket.gethostname()}:{os.getpid()}",
-        versions=versions(),
-    )
-    try:
-        with attempt(task) as attempts:
-            blank = replace(blank, attempts=attempts)
-            if attempts > DEADLY:
-                what = f"it killed its worker {DEADLY} times. Is memory short, or the file harmful?"
-                outcome = replace(blank, status="set aside", error=what, attempts=DEADLY)
-            else:
-                outcome = _result(task, blank, report)
-    except TactflowError as error:
-        outcome = replace(blank, error=str(error), disk_full=is_disk_full(error))
-    except OSError as error:
-        where = "" if error.filename is None else f"{error.filename}: "
-        what = f"{where}{error.strerror or error}"
-        outcome = replace(blank, error=what, disk_full=is_disk_full(error))
-    except Exception as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        what = f"{type(error).__name__}: {error} ({place.filename}:{place.lineno})"
-        outcome = replace(blank, error=what, disk_full=is_disk_full(error))
-    return replace(outcome, seconds=0.0 if outcome.reused else SYSTEM.now() - began)
+
+    file: str
+    overrides: tuple[str, ...]
+    sensor: str | None
+    format: Format
+    digest: str = ""
 
 
-@contextmanager
-def attempt(task: Task) -> Iterator[int]:
-    """Count that a worker begins a recording; the count is forgotten when the worker is through with it."""
-    marks = Path(task.scratch, f"{scratch_name(task)}.attempts")
-    with marks.open("ab") as file:
-        file.write(b"x")
-    attempts = marks.stat().st_size
-    try:
-        yield attempts
-    finally:
-        with suppress(OSError):
-            marks.unlink()
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A recording to work on. out : the folder of results. scratch : the folder for unfinished ones."""
+
+    recording: Recording
+    request: Request
+    out: str
+    scratch: str
 
 
-def scratch_name(task: Task) -> str:
-    """What files of a task are called while it is not finished: no two of a call have the same."""
-    name = hashlib.sha256(task.recording.source.encode()).hexdigest()[:16]
-    return name if task.part is None else f"{name}-{task.part.number}"
-
-
-def _result(task: Task, blank: Outcome, report: Report) -> Outcome:
-    """The outcome of a recording: that of an earlier call if its result is there, else of a run."""
-    path = task.recording.path
-    try:
-        before = None if path is None else fingerprint(path)
-        # The parts of a recording have one digest: the first one works it out.
-        read = "" if task.part is not None and task.part.number else input_digest(task.recording)
-    except OSError as error:
-        raise SourceError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
-    if task.part is not None:
-        return _part(task, replace(blank, input=before, input_digest=read), report)
-    key = result_key(read, task.pipeline.digest)
-    folder = Folder(Path(task.folder))
-    there = folder.outcome_of(key, verify=task.verify)
-    if there is not None:
-        return replace(there.of(task.recording), input=before, reused=True, started=blank.started)
-    found = replace(blank, key=key, input=before, input_digest=read)
-    unfinished = Path(task.scratch, f"{os.getpid()}-{scratch_name(task)}")
-    try:
-        found, summary = _run(task, found, unfinished, report)
-        found = moved_to_place(task, found, unfinished)
-    finally:
-        with suppress(OSError):
-            remove(unfinished)
-    _refuse_changed(task, found)
-    commit(task, found, summary.finished())
-    return found
-
-
-def _refuse_changed(task: Task, outcome: Outcome) -> None:
-    path = task.recording.path
-    if path is not None and fingerprint(path) != outcome.input:
-        raise SourceError(f"{path}: was changed while it was read; call again")
-
-
-def _part(task: Task, blank: Outcome, report: Report) -> Outcome:
-    """Run the pipeline over a part of a recording, and leave result and summary in the scratch folder."""
-    unfinished = Path(task.scratch, scratch_name(task))
-    if unfinished.exists():
-        # Of a worker that has died.
-        remove(unfinished)
-    found, summary = _run(task, blank, unfinished, report)
-    _refuse_changed(task, found)
-    told = {"outcome": asdict(found), "ends": summary.ends, **summary.finished()}
-    unfinished.with_suffix(".json").write_bytes(orjson.dumps(told))
-    return found
-
-
-def _run(task: Task, blank: Outcome, unfinished: Path, report: Report) -> tuple[Outcome, Summary]:
-    """Run the pipeline into a file of the scratch folder."""
-    summary = Summary()
-    pipeline = with_looker(_for_recording(task, unfinished), summary)
-    if task.part is not None:
-        pipeline = of_part(pipeline, task.part)
-    runner = make_runner(pipeline)
-
-    def progress(now: Progress) -> None:
-        report(now.frames, None if runner.source is None else runner.source.total)
-
-    with _notes() as notes:
-        result = runner.run(progress, interval_s=0.25)
-    if result.failure is not None:
-        raise result.failure
-    outcome = replace(
-        blank,
-        status="done",
-        frames=result.stats["frames"] if task.part is None else summary.frames,
-        dropped=result.stats["dropped"],
-        duration=summary.duration,
-        contacts=summary.contacts,
-        touching=summary.touching,
-        largest=summary.largest,
-        notes=tuple(notes),
-    )
-    return outcome, summary
-
-
-def moved_to_place(task: Task, outcome: Outcome, unfinished: Path) -> Outcome:
-    """Move a result that is whole from the scratch folder to where results are; the outcome names it."""
-    written, digest = fingerprint(unfinished), digest_of(unfinished)
-    name = result_name(task.recording, outcome.key, task.format)
-    place = Path(task.folder, "results", name)
-    if place.is_dir():
-        # Of a call that ended before it could say that this is complete; no folder replaces another.
-        remove(place)
-    unfinished.replace(place)
-    return replace(outcome, result=name, result_file=written, result_digest=digest)
-
-
-def commit(task: Task, outcome: Outcome, told: Mapping[str, Any]) -> None:
-    """Store what is told of a result: only what has this is complete."""
-    unfinished = Path(task.scratch, f"{os.getpid()}-{outcome.key}.json")
-    try:
-        unfinished.write_bytes(orjson.dumps({"outcome": asdict(outcome), **told}))
-        unfinished.replace(Folder(Path(task.folder)).records / f"{outcome.key}.json")
-    finally:
-        with suppress(OSError):
-            unfinished.unlink()
-
-
-def pipeline_for(request: PipelineRequest, format_: Format) -> tuple[Pipeline, str]:
-    """The pipeline with one sink, that of the results, and its digest.
-
-    A sink of that kind in the file is used as it stands there, but for where it writes.
+def resolved(file: Path, overrides: list[str], sensor: str | None, format_: Format) -> Request:
+    """The request for a pipeline, checked.
 
     Raises
     ------
-    ConfigError : the file is wrong, or its source is no stage that takes a `source`.
+    ConfigError : the pipeline is wrong, or its source takes no parameter `source`.
     """
-    loaded = load_pipeline(Path(request.file), request.overrides, sensor=request.sensor)
-    if not any(node.component.name == format_ for node in loaded.sinks):
+    request = Request(os.path.abspath(file), tuple(overrides), sensor, format_)
+    return replace(request, digest=pipeline_digest(load(request)))
+
+
+def load(request: Request) -> Pipeline:
+    """The pipeline with one sink, which writes the results; raises ConfigError.
+
+    A sink of the wanted format in the file is used with its settings, except for its path.
+    """
+    file, format_ = Path(request.file), request.format
+    pipeline = load_pipeline(file, request.overrides, sensor=request.sensor)
+    if not any(node.component.name == format_ for node in pipeline.sinks):
         extra = {f"--{format_}": {"path": os.devnull}}
-        loaded = load_pipeline(Path(request.file), request.overrides, extra, sensor=request.sensor)
-    sink = next(node.id for node in loaded.sinks if node.component.name == format_)
-    kept = {id_: n for id_, n in loaded.nodes.items() if n.component.kind != "sink" or id_ == sink}
-    pipeline = replace(loaded, nodes=kept, opencv_threads=1)
+        pipeline = load_pipeline(file, request.overrides, extra, sensor=request.sensor)
+    sink = next(node.id for node in pipeline.sinks if node.component.name == format_)
+    kept = {id_: n for id_, n in pipeline.nodes.items() if n.component.kind != "sink" or id_ == sink}
     if "source" not in pipeline.source.component.params.model_fields:
         raise ConfigError(f"{pipeline.source.mark}: a batch needs a source with the parameter source")
-    digest = pipeline_digest(pipeline)
-    if request.split:
-        digest = hashlib.sha256(f"{digest}\n{request.split!r} s, {OVERLAP} frames".encode()).hexdigest()
-    return pipeline, digest
+    return replace(pipeline, nodes=kept, opencv_threads=1)
 
 
-kept_pipeline_for = functools.lru_cache(maxsize=4)(pipeline_for)
-"""The same for many recordings: the digest in the request tells of a file that has changed."""
+_loaded = functools.lru_cache(maxsize=2)(load)
 
 
-def _for_recording(task: Task, path: Path) -> Pipeline:
+def pipeline_digest(pipeline: Pipeline) -> str:
+    """Digest of the resolved settings, the files that they name, and tactflow's version.
+
+    Of files, such as a calibration or Python code, it takes size and time of the last change.
+    """
+    stages = {node.id: _settings(pipeline, node) for node in pipeline.nodes.values()}
+    files = {path for node in pipeline.nodes.values() for path in _files(pipeline, node)}
+    described = {
+        "settings": {k: v for k, v in pipeline.settings.items() if k not in ("sinks", "stages")},
+        # In the order of the file: an input comes from the nearest stage above.
+        "nodes": list(stages.items()),
+        "files": [[str(path), fingerprint(path)] for path in sorted(files)],
+        "tactflow": tactflow.__version__,
+    }
+    return hashlib.sha256(orjson.dumps(described, default=str)).hexdigest()[:16]
+
+
+def _settings(pipeline: Pipeline, node: Node) -> Any:
+    """What a node is set to, apart from where it reads and writes."""
+    if node.component.kind == "sink":
+        return [node.component.name, node.params.model_dump(exclude=_WHERE_AND_WHEN)]
+    settings = dict(pipeline.settings["stages"].get(node.id) or {})
+    if node.id == pipeline.source.id:
+        settings = {key: value for key, value in settings.items() if key not in ("source", "realtime")}
+    return settings
+
+
+def _files(pipeline: Pipeline, node: Node) -> Iterator[Path]:
+    """Files that decide what a node computes."""
+    if pipeline.calibration is not None:
+        yield pipeline.calibration
+    if node.component.kind != "sink":
+        params = node.params if node.component.kind == "stage" else node.params.changed(source="")
+        yield from (path for path in files_named(params, pipeline.directory) if path.is_file())
+    module = node.component.cls.__module__
+    code = getattr(sys.modules.get(module), "__file__", None)
+    if code is not None and not module.startswith("tactflow."):
+        yield Path(code)
+
+
+def work(task: Task) -> Outcome:
+    """Run the pipeline over one recording, and save result and record; an error is in the outcome."""
+    began = SYSTEM.now()
+    outcome = Outcome(
+        task.recording.source,
+        task.recording.name,
+        "failed",
+        started_unix=SYSTEM.unix(),
+        worker=f"{socket.gethostname()}:{os.getpid()}",
+        tactflow=tactflow.__version__,
+        pipeline=task.request.digest,
+    )
+    unfinished = Path(task.scratch, file_name(task.recording))
+    try:
+        done, summary = _run(task, outcome, unfinished)
+        done = replace(done, took_s=SYSTEM.now() - began)
+        _publish(task, done, unfinished, summary)
+    except Exception as error:
+        with suppress(OSError):
+            remove(unfinished)
+        return replace(
+            outcome, error=_words(error), took_s=SYSTEM.now() - began, disk_full=_is_disk_full(error)
+        )
+    return done
+
+
+def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, Summary]:
+    """Run the pipeline into the scratch folder."""
+    path = task.recording.path
+    before = None if path is None else fingerprint(path)
+    # Of a worker that has died.
+    remove(unfinished)
+    summary = Summary()
+    pipeline = _pipeline_for(task, unfinished)
+    runner = make_runner(with_collector(pipeline, Result, summary.add, name="tactflow.batch", sinks=True))
+    with _warnings() as texts:
+        result = runner.run()
+    if result.failure is not None:
+        raise result.failure
+    if path is not None and fingerprint(path) != before:
+        raise SourceError(f"{path}: was changed while it was read; call again")
+    done = replace(
+        outcome,
+        status="done",
+        frames=result.stats["frames"],
+        dropped=result.stats["dropped"],
+        duration_s=summary.duration,
+        contacts=summary.contacts,
+        touching_frames=summary.touching,
+        largest_area_px2=summary.largest,
+        warnings="\n".join(texts) or None,
+        recording_is=before,
+        result_is=fingerprint(unfinished),
+        result=f"results/{unfinished.name}{'.jsonl' if task.request.format == 'jsonl' else ''}",
+    )
+    return done, summary
+
+
+def _publish(task: Task, outcome: Outcome, unfinished: Path, summary: Summary) -> None:
+    """Move a result to its place, then save its record: only with a record it is complete."""
+    place = Path(task.out, str(outcome.result))
+    if place.is_dir():
+        # No folder replaces another one.
+        remove(place)
+    unfinished.replace(place)
+    Store(Path(task.out)).save(task.recording, outcome, summary.html())
+
+
+def _pipeline_for(task: Task, path: Path) -> Pipeline:
     """The pipeline that reads this recording and writes to this path."""
-    pipeline, digest = kept_pipeline_for(task.pipeline, task.format)
-    if digest != task.pipeline.digest:
-        # The right file may come late.
-        kept_pipeline_for.cache_clear()
-        here, there = versions(), dict(task.pipeline.versions)
-        other = [
-            f"{name} {here.get(name)} instead of {there[name]}"
-            for name in there
-            if here.get(name) != there[name]
-        ]
+    pipeline = _loaded(task.request)
+    if pipeline_digest(pipeline) != task.request.digest:
+        _loaded.cache_clear()
         raise StageError(
-            f"the worker {socket.gethostname()} would compute something else: "
-            + (", ".join(other) or f"{task.pipeline.file}, or a file that it names, has changed; call again")
+            f"the worker {socket.gethostname()} would compute something else: it has tactflow "
+            f"{tactflow.__version__}, or {task.request.file} or a file that it names has changed; call again"
         )
     (sink,) = pipeline.sinks
-    # Not in parts of so many seconds each: the same recording shall give the same files.
-    flush = {"flush": math.inf} if task.format == "parquet" else {}
+    # One part for the whole table: the same recording gives the same files.
+    flush = {"flush": math.inf} if task.request.format == "parquet" else {}
     params = sink.params.changed(path=str(path), overwrite=True, **flush)
-    opened = reading(pipeline, task.recording)
-    return replace(opened, nodes={**opened.nodes, sink.id: replace(sink, params=params)})
-
-
-def reading(pipeline: Pipeline, recording: Recording) -> Pipeline:
-    """The pipeline with a recording as its source; its settings, which results keep, say so."""
     source = pipeline.source
-    wanted = {"source": recording.source, "realtime": False}
+    wanted = {"source": task.recording.source, "realtime": False}
     wanted = {key: value for key, value in wanted.items() if key in type(source.params).model_fields}
     stages = dict(pipeline.settings["stages"])
     stages[source.id] = {**(stages[source.id] or {}), **wanted}
-    settings = {
-        **pipeline.settings,
-        "stages": stages,
-        "sinks": {n.component.name: {} for n in pipeline.sinks},
+    # Results keep the settings as metadata.
+    settings = {**pipeline.settings, "stages": stages, "sinks": {sink.component.name: {}}}
+    nodes = {
+        **pipeline.nodes,
+        source.id: replace(source, params=source.params.changed(**wanted), mark=_SRC),
+        sink.id: replace(sink, params=params),
     }
-    nodes = {**pipeline.nodes, source.id: replace(source, params=source.params.changed(**wanted), mark=_SRC)}
     return replace(pipeline, nodes=nodes, settings=settings)
 
 
-def is_disk_full(error: BaseException | None) -> bool:
-    """Whether that is why, however deep it lies."""
+def _words(error: Exception) -> str:
+    """An error for people; one that nobody foresaw with the place in the code."""
+    if isinstance(error, TactflowError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error)
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({place.filename}:{place.lineno})"
+
+
+def _is_disk_full(error: BaseException | None) -> bool:
     while error is not None:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return True
@@ -279,24 +249,16 @@ def is_disk_full(error: BaseException | None) -> bool:
     return False
 
 
-class _Notes(logging.Handler):
-    """Keeps the first warnings."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if len(self.texts) < _MOST_NOTES:
-            self.texts.append(record.getMessage())
-
-
 @contextmanager
-def _notes() -> Iterator[list[str]]:
-    """What the run warns of."""
-    logger, handler = logging.getLogger("tactflow"), _Notes()
+def _warnings() -> Iterator[list[str]]:
+    """The first warnings that are logged in the block."""
+    texts: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: texts.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("tactflow")
     logger.addHandler(handler)
     try:
-        yield handler.texts
+        yield texts
     finally:
         logger.removeHandler(handler)
+        del texts[_MOST_WARNINGS:]

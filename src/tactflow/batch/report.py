@@ -1,0 +1,96 @@
+"""The table of all runs, for programs, and the page, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import orjson
+
+from tactflow.batch.recordings import Recording
+from tactflow.batch.store import Format, Outcome, Store
+from tactflow.engine.errors import ConfigError, StageError
+from tactflow.report import Html, Section, Table, link, mark, write_report
+from tactflow.system.extras import missing
+from tactflow.system.files import completed
+
+MOST_SHOWN = 1000
+"""Recordings that the page shows in detail: it has some 60 kB for each, and browsers open 60 MB."""
+NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full"}
+"""Fields of an outcome that only the command itself needs."""
+_TYPES = {"int": "int64", "float": "float64"}
+"""Python type -> Arrow type, where it is not a string."""
+
+Runs = Sequence[tuple[Recording, Outcome]]
+
+
+def require_pyarrow() -> None:
+    """Raise ConfigError with what to do where pyarrow is missing."""
+    if problem := missing("Parquet tables", "parquet", ["pyarrow"]):
+        raise ConfigError(f"{problem}; or give --format jsonl, which needs no package")
+
+
+def write_runs(store: Store, runs: Runs, format_: Format) -> Path:
+    """Write the table of runs, replacing an earlier one; returns its path. Raises StageError."""
+    path = store.path / f"runs.{format_}"
+    columns = [field for field in fields(Outcome) if field.name not in NOT_IN_TABLE]
+    rows = [{column.name: getattr(outcome, column.name) for column in columns} for _, outcome in runs]
+    try:
+        with completed(path) as partial:
+            if format_ == "jsonl":
+                partial.write_bytes(b"".join(orjson.dumps(row) + b"\n" for row in rows))
+            else:
+                import pyarrow as pa  # type: ignore[import-untyped]
+                import pyarrow.parquet as pq  # type: ignore[import-untyped]
+
+                types = [(c.name, getattr(pa, _TYPES.get(str(c.type), "string"))()) for c in columns]
+                pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(types)), partial)
+    except OSError as error:
+        raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return path
+
+
+def write_page(store: Store, runs: Runs, title: str) -> Path:
+    """Write `index.html`, replacing an earlier one; returns its path. Raises StageError."""
+    ordered = sorted(runs, key=lambda run: ("failed", "done", "not done").index(run[1].status))
+    done = [outcome for _, outcome in runs if outcome.status == "done"]
+    failed = sum(outcome.status == "failed" for _, outcome in runs)
+    text = (
+        f"{len(done)} done, {failed} failed, {len(runs) - len(done) - failed} not done; "
+        f"{sum(o.frames for o in done)} frames, {sum(o.contacts for o in done)} contacts; "
+        f"{sum(o.took_s for o in done):.0f} s of work"
+    )
+    if problem := missing("plots", "plot", ["matplotlib"]):
+        text += f"\n\nNo plots: {problem}"
+    shown = ordered[:MOST_SHOWN]
+    if len(shown) < len(ordered):
+        text += f"\n\nDetails of {len(shown)} of {len(ordered)} recordings, those that failed first."
+    sections = [Section("Runs", tables=[_table(ordered)]), *(_details(store, *run) for run in shown)]
+    return write_report(store.path / "index.html", title, sections, text)
+
+
+def _table(runs: Runs) -> Table:
+    columns = [
+        *("recording", "status", "frames", "duration, s", "frames/s", "contacts"),
+        *("touching, %", "largest contact, px²", "result"),
+    ]
+    rows: list[list[Any]] = []
+    for recording, outcome in runs:
+        row: list[Any] = [recording.name, mark(outcome.status, outcome.status == "done")]
+        if outcome.status == "done":
+            touching = 100.0 * outcome.touching_frames / max(1, outcome.frames)
+            rate = outcome.frames / outcome.took_s if outcome.took_s else None
+            row += [outcome.frames, outcome.duration_s, rate, outcome.contacts, touching]
+            row += [outcome.largest_area_px2, link("open", quote(str(outcome.result)))]
+        rows.append(row + [None] * (len(columns) - len(row)))
+    return Table(columns, rows)
+
+
+def _details(store: Store, recording: Recording, outcome: Outcome) -> Section:
+    """Why a recording failed, or its plot and pictures."""
+    text = "\n\n".join(filter(None, (outcome.error, outcome.warnings, recording.source)))
+    pictures = [Html(store.preview(recording))] if outcome.status == "done" else []
+    return Section(recording.name, text, pictures)

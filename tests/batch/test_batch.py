@@ -1,0 +1,287 @@
+"""`tactflow batch` does what is missing or has changed, and says what failed."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import shlex
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from tactflow.batch.work import Task
+from tactflow.cli import batch as command
+from tactflow.cli.main import main, make_parser
+from tactflow.sinks.jsonl import Jsonl
+from tests.batch.doubles import PIPELINE, InThisProcess, recording
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+class Call:
+    """Calls the command in a folder with a pipeline and recordings, again and again."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder = folder
+        self._capsys = capsys
+        self.told = ""
+
+    def __call__(self, *words: str, format_: str = "jsonl") -> int:
+        self._capsys.readouterr()
+        code = main(["batch", "p.yaml", "rec", "--out", "out", "--format", format_, *words])
+        self.told = self._capsys.readouterr().err
+        return code
+
+    def rows(self) -> list[dict[str, object]]:
+        lines = (self.folder / "out" / "runs.jsonl").read_text().splitlines()
+        return [json.loads(line) for line in lines]
+
+    def result(self, number: int) -> Path:
+        return self.folder / "out" / str(self.rows()[number]["result"])
+
+
+@pytest.fixture
+def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    """Two recordings of one name, of which nothing is done."""
+    (tmp_path / "p.yaml").write_text(PIPELINE)
+    recording(tmp_path / "rec" / "a" / "press.npy", brightness=180)
+    recording(tmp_path / "rec" / "b" / "press.npy", brightness=220)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command, "LocalProcesses", InThisProcess)
+    return Call(tmp_path, capsys)
+
+
+def test_every_recording_has_a_result_and_a_second_call_does_nothing(call: Call) -> None:
+    assert call() == 0
+    assert "2 done now, 0 done before, 0 failed" in call.told
+    assert [(row["name"], row["status"], row["frames"], row["contacts"]) for row in call.rows()] == [
+        ("a/press.npy", "done", 6, 1),
+        ("b/press.npy", "done", 6, 1),
+    ]
+    messages = [json.loads(line) for line in call.result(0).read_text().splitlines()]
+    assert [bool(message["contact"]) for message in messages] == [False] * 2 + [True] * 4
+    assert not list((call.folder / "out" / "unfinished").iterdir())
+    written = call.result(0).stat().st_mtime_ns
+    assert call() == 0
+    assert "0 done now, 2 done before, 0 failed" in call.told
+    assert call.result(0).stat().st_mtime_ns == written
+
+
+def test_the_page_has_pictures_and_plots_in_one_file(call: Call) -> None:
+    assert call() == 0
+    page = (call.folder / "out" / "index.html").read_text()
+    assert f"look at {call.folder / 'out' / 'index.html'}" in call.told
+    assert page.count("data:image/jpeg;base64,") == 2
+    assert page.count("time, s</text>") == 2
+    assert not re.search(r"(?:src|href)=\"?https?:", page)
+
+
+def test_only_what_has_changed_is_done_again(call: Call) -> None:
+    call()
+    recording(call.folder / "rec" / "b" / "press.npy", brightness=250)
+    call()
+    assert "1 done now, 1 done before" in call.told
+    assert "1 done of another input, pipeline or version" in call.told
+    call("--set", "stages.hull.min_area=7")
+    assert "2 done now, 0 done before" in call.told
+    recording(call.folder / "rec" / "c.npy")
+    call("--set", "stages.hull.min_area=7")
+    assert "1 done now, 2 done before" in call.told
+
+
+def test_code_beside_the_pipeline_is_part_of_the_pipeline(call: Call) -> None:
+    code = call.folder / "dim.py"
+    code.write_text(
+        "from tactflow import Stage\nfrom tactflow.ports import Image\n"
+        "class Dim(Stage):\n    memory = 'pure'\n"
+        "    def process(self, image: Image) -> Image:\n        return image // 2\n"
+    )
+    text = PIPELINE.replace("preprocess.image", "dim.image")
+    (call.folder / "p.yaml").write_text(text.replace("  difference", "  dim: {use: ./dim.py}\n  difference"))
+    call()
+    code.write_text(code.read_text().replace("// 2", "// 3 "))
+    call()
+    assert "2 done of another input, pipeline or version" in call.told
+
+
+@pytest.mark.parametrize("damage", ["cut off", "gone", "no record", "damaged record"])
+def test_a_result_that_is_not_as_it_was_written_is_made_again(call: Call, damage: str) -> None:
+    call()
+    path = call.result(1)
+    (record,) = (call.folder / "out" / "records").glob(f"{path.stem}.json")
+    whole = path.read_bytes()
+    if damage == "cut off":
+        os.truncate(path, 100)
+    elif damage == "gone":
+        path.unlink()
+    elif damage == "no record":
+        record.unlink()
+    else:
+        record.write_text('{"recording": "cut o')
+    assert call() == 0
+    assert "1 done now, 1 done before" in call.told
+    assert path.read_bytes() == whole
+
+
+def test_tables_are_whole_only_with_all_their_parts(call: Call) -> None:
+    pq = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow: pip install 'tactflow[parquet]'")
+    assert call(format_="parquet") == 0
+    runs = pq.read_table(call.folder / "out" / "runs.parquet").to_pylist()
+    assert [(row["name"], row["touching_frames"]) for row in runs] == [("a/press.npy", 4), ("b/press.npy", 4)]
+    tables = call.folder / "out" / runs[1]["result"]
+    assert pq.read_table(tables / "frames")["seq"].to_pylist() == list(range(6))
+    next(tables.rglob("*.parquet")).unlink()
+    call(format_="parquet")
+    assert "1 done now, 1 done before" in call.told
+    assert len(list(tables.rglob("*.parquet"))) == 3
+
+
+def test_one_that_fails_stops_no_other_and_is_tried_again(call: Call) -> None:
+    whole = call.folder / "rec" / "a" / "press.npy"
+    whole.write_bytes(b"<no array>")
+    assert call() == 3
+    assert "failed: a/press.npy: capture" in call.told
+    assert [row["status"] for row in call.rows()] == ["failed", "done"]
+    page = (call.folder / "out" / "index.html").read_text()
+    assert page.index("<h2>a/press.npy") < page.index("<h2>b/press.npy")
+    assert "not a .npy file" in page
+    recording(whole)
+    assert call() == 0
+    assert "1 done now, 1 done before, 0 failed" in call.told
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
+def test_a_pipe_or_a_device_fails_and_nobody_waits_for_its_end(call: Call) -> None:
+    os.mkfifo(call.folder / "rec" / "pipe.npy")
+    (call.folder / "rec" / "pictures").mkdir()
+    (call.folder / "rec" / "pictures" / "1.png").symlink_to("/dev/zero")
+    assert call() == 3
+    errors = [str(row["error"]) for row in call.rows() if row["status"] == "failed"]
+    assert len(errors) == 2
+    assert all("it is a pipe or a device, not a file" in error for error in errors)
+
+
+def test_fail_fast_begins_nothing_more(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(InThisProcess, "slots", 1)
+    (call.folder / "rec" / "a" / "press.npy").write_bytes(b"no array")
+    assert call("--fail-fast") == 3
+    assert [row["status"] for row in call.rows()] == ["failed", "not done"]
+
+
+def test_one_signal_finishes_what_runs_and_leaves_the_rest_for_the_next_call(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit = InThisProcess.submit
+
+    def interrupted(self: InThisProcess, task: Task) -> object:
+        signal.raise_signal(signal.SIGINT)
+        return submit(self, task)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(InThisProcess, "submit", interrupted)
+        patched.setattr(InThisProcess, "slots", 1)
+        assert call() == 130
+    assert "1 not done: call again to do the rest\nended early: interrupted" in call.told
+    assert call() == 0
+    assert "1 done now, 1 done before" in call.told
+
+
+def test_a_full_disk_ends_the_batch_and_loses_nothing(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    call()
+    recording(call.folder / "rec" / "c.npy")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Jsonl, "_flush", full)
+        assert call() == 3
+    assert "ended early: the disk is full" in call.told
+    assert call() == 0
+    assert "1 done now, 2 done before" in call.told
+
+
+def test_a_warning_is_reported_at_the_end_and_on_the_page(call: Call) -> None:
+    film = call.folder / "rec" / "film.avi"
+    assert main(["sim", "press?frames=6", "--out", str(film), "--quiet"]) == 0
+    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    assert call() == 0
+    assert "1 done with warnings: " in call.told
+    assert "of 6 frames; the file may be damaged; the table of runs has all" in call.told
+    assert "the file may be damaged" in (call.folder / "out" / "index.html").read_text()
+
+
+def test_shards_divide_the_work_and_share_the_table(call: Call) -> None:
+    assert call("--shard", "2/2") == 0
+    assert [row["status"] for row in call.rows()] == ["not done", "done"]
+    assert call("--shard", "1/2") == 0
+    assert [row["status"] for row in call.rows()] == ["done", "done"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such locks")
+def test_two_calls_do_not_work_in_one_folder_but_two_shards_do(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit = InThisProcess.submit
+    codes: list[int] = []
+
+    def meanwhile(self: InThisProcess, task: Task) -> object:
+        if not codes:
+            codes.append(main(["batch", "p.yaml", "rec", "--out", "out", "--format", "jsonl"]))
+            codes.append(
+                main(["batch", "p.yaml", "rec", "--out", "out", "--format", "jsonl", "--shard", "2/2"])
+            )
+        return submit(self, task)
+
+    monkeypatch.setattr(InThisProcess, "submit", meanwhile)
+    assert call() == 0
+    assert codes == [2, 0]
+    assert "another tactflow batch is at work in it" in call.told
+
+
+@pytest.mark.parametrize("format_", ["jsonl", "parquet"])
+def test_two_pipelines_are_compared_frame_by_frame(call: Call, format_: str) -> None:
+    if format_ == "parquet":
+        pytest.importorskip("pyarrow", reason="needs pyarrow: pip install 'tactflow[parquet]'")
+    (call.folder / "other.yaml").write_text(PIPELINE.replace("rotate: 0", "rotate: 180"))
+    assert call("--compare", "other.yaml", format_=format_) == 0
+    page = (call.folder / "out" / "compare.html").read_text()
+    row = page[page.index("<td>a/press.npy") :].partition("</tr>")[0]
+    cells = re.findall(r"<td[^>]*>([^<]*)", row)
+    # The square of 20 x 16 px at (20, 16) stands at (24, 16) once 64 x 48 px are turned by half.
+    assert cells[:5] == ["a/press.npy", "6", "4", "0", "0"]
+    assert float(cells[5]) == pytest.approx(16 / 24, abs=0.05)
+    assert float(cells[8]) == pytest.approx(4.0, abs=0.1)
+    assert (call.folder / "out" / "compare" / "index.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["p.yaml", "nothing", "--out", "o"], "nothing: no such file or folder"),
+        (["p.yaml", "--out", "o"], "there are no recordings"),
+        (["q.yaml", "rec", "--out", "o"], "there is no file q.yaml"),
+        (["p.yaml", "rec", "--out", "p.yaml"], "cannot be written into"),
+        (["p.yaml", "rec", "--out", "o", "--shard", "3/2"], "required I/N"),
+    ],
+)
+def test_a_wrong_command_line_starts_nothing(
+    call: Call, words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["batch", *words, "--format", "jsonl"]) == 2
+    assert told in capsys.readouterr().err
+    assert not (call.folder / "o").exists()
+
+
+def test_every_command_of_the_page_is_one() -> None:
+    page = (REPOSITORY / "docs" / "batch.md").read_text()
+    commands = re.findall(r"^tactflow (batch .*?)(?:  +#.*)?$", page, re.MULTILINE)
+    assert len(commands) > 3
+    parser = make_parser(["batch"])
+    for line in commands:
+        words = shlex.split(line.replace("$SLURM_ARRAY_TASK_ID", "3"))
+        assert parser.parse_args(words).out == Path("out"), line
