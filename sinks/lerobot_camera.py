@@ -13,8 +13,7 @@ from pydantic import Field, model_validator
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.frame import Tick
-from tactflow.network.address import is_reachable, picks_a_port
-from tactflow.network.bound_socket import FloodError
+from tactflow.network.address import Address
 from tactflow.network.publisher import Publisher
 from tactflow.ports import Image
 
@@ -48,7 +47,8 @@ class LerobotCamera(Sink):
 
         @model_validator(mode="after")
         def _guarded(self) -> LerobotCamera.Params:
-            if not self.open_to_all and is_reachable(self.endpoint):
+            address = Address.parse(self.endpoint)
+            if not self.open_to_all and not address.is_local:
                 raise ValueError(
                     f"{self.endpoint} can be reached from other machines, and LeRobot's camera knows no "
                     "keys: set endpoint to tcp://127.0.0.1:5555, or open_to_all: true to let everybody look"
@@ -58,7 +58,7 @@ class LerobotCamera(Sink):
     @classmethod
     def binds(cls, params: LerobotCamera.Params) -> dict[str, str]:
         """Its endpoint: LeRobot's camera reads one sensor there."""
-        return {} if picks_a_port(params.endpoint) else {"endpoint": params.endpoint}
+        return {} if Address.parse(params.endpoint).picks_a_port else {"endpoint": params.endpoint}
 
     def __init__(self, params: Params, sensor: str = "main") -> None:
         """Prepare; nothing is bound yet. sensor : LeRobot's `camera_name`."""
@@ -100,11 +100,6 @@ class LerobotCamera(Sink):
 
     def _is_read(self, publisher: Publisher) -> bool:
         """Whether anybody has subscribed."""
-        try:
-            while (event := publisher.next_event()) is not None:
-                self._readers += 1 if event[:1] == b"\x01" else -1
-        except FloodError as error:
-            log.warning("lerobot_camera: %s on %s; all readers are disconnected", error, self.endpoint)
-            publisher.renew()
-            self._readers = 0
+        while (event := publisher.next_event()) is not None:
+            self._readers += 1 if event[:1] == b"\x01" else -1
         return self._readers > 0

@@ -14,12 +14,10 @@ from pydantic import Field, field_validator, model_validator
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
-from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame
 from tactflow.engine.rate import RateLimit
 from tactflow.message.result import Result, encode_message
-from tactflow.network.address import is_reachable, picks_a_port, refuse_high_port
-from tactflow.network.bound_socket import FloodError
+from tactflow.network.address import Address
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
 from tactflow.network.publisher import SEND_BUFFER, Publisher
@@ -127,19 +125,19 @@ class Zmq(Sink):
 
         @field_validator("endpoint", "control")
         @classmethod
-        def _port_is_one(cls, endpoint: str | None) -> str | None:
-            refuse_high_port(endpoint or "")
-            return endpoint
+        def _is_an_address(cls, endpoint: str | None) -> str | None:
+            return endpoint and Address.parse(endpoint).text
 
         @model_validator(mode="after")
         def _guarded(self) -> Zmq.Params:
-            if self.keys is None and not self.open_to_all and is_reachable(self.endpoint):
+            if self.keys is None and not self.open_to_all and not Address.parse(self.endpoint).is_local:
                 raise ValueError(
                     f"{self.endpoint} can be reached from other machines, so keys are required: make some "
                     "with tactflow keys new and set keys to the publisher's folder, or endpoint to "
                     "tcp://127.0.0.1:5556; open_to_all: true lets everybody read who reaches it"
                 )
-            if self.control is not None and self.commanders is None and is_reachable(self.control):
+            open_control = self.control is not None and not Address.parse(self.control).is_local
+            if open_control and self.commanders is None:
                 raise ValueError(
                     f"{self.control} can be reached from other machines, so commands require keys: make some "
                     "with tactflow keys new and set keys or control_keys to the publisher's folder, or "
@@ -176,7 +174,6 @@ class Zmq(Sink):
         self._asked: frozenset[str] = frozenset()
         self._rate = RateLimit(params.pictures or None)
         self._had_depth = False
-        self._flooded = False
         self._wanted = False
         self._serialised = 0
         self._stats_wanted = False
@@ -187,7 +184,8 @@ class Zmq(Sink):
     @classmethod
     def binds(cls, params: Zmq.Params) -> dict[str, str]:
         """The address at which it takes commands; several sensors share only the one of the results."""
-        return {} if params.control is None or picks_a_port(params.control) else {"control": params.control}
+        control = params.control
+        return {} if control is None or Address.parse(control).picks_a_port else {"control": control}
 
     @classmethod
     def publishes(cls, params: Zmq.Params) -> Publication:
@@ -311,39 +309,20 @@ class Zmq(Sink):
         if self._publisher is None or self._socket is None:
             return
         changed = False
-        try:
-            for _ in range(EVENTS_AT_ONCE):
-                event = self._publisher.next_event()
-                if event is None:
-                    break
-                changed = True
-                if event[:1] == b"\x01" and self._is_kept(event[1:]):
-                    self._subscriptions.add(event[1:])
-                elif event[:1] == b"\x00":
-                    self._subscriptions.discard(event[1:])
-        except FloodError as error:
-            self._begin_anew(error)
+        for _ in range(EVENTS_AT_ONCE):
+            event = self._publisher.next_event()
+            if event is None:
+                break
             changed = True
+            if event[:1] == b"\x01" and self._is_kept(event[1:]):
+                self._subscriptions.add(event[1:])
+            elif event[:1] == b"\x00":
+                self._subscriptions.discard(event[1:])
         if not changed:
             return
         self._asked = frozenset(name for name in self._extras if self._asks_for(name))
         self._wanted = bool(self._asked) or any(map(self._asks_for_results, self._subscriptions))
         self._stats_wanted = any(map(_asks_for_statistics, self._subscriptions))
-
-    def _begin_anew(self, reason: FloodError) -> None:
-        """Disconnect all subscribers, who come again by themselves."""
-        assert self._publisher is not None
-        if not self._flooded:
-            log.warning("zmq: %s on %s; all subscribers are disconnected", reason, self.endpoint)
-        self._flooded = True
-        self._subscriptions.clear()
-        self._socket = None
-        try:
-            self._publisher.renew()
-        except StageError as error:
-            log.warning("zmq: nothing is published any more: %s", error)
-        else:
-            self._socket = self._publisher.socket
 
     def _is_kept(self, subscription: bytes) -> bool:
         """Of those to others only some are counted, or their memory would have no bound."""

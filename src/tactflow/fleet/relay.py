@@ -11,8 +11,6 @@ from contextlib import contextmanager
 
 import zmq
 
-from tactflow.engine.errors import StageError
-from tactflow.network.bound_socket import FloodError
 from tactflow.network.publisher import SEND_BUFFER, Publisher
 
 POLL_MS = 100
@@ -74,21 +72,18 @@ class _Relay:
     def run(self) -> None:
         """Body of the thread."""
         # A context of its own: nobody asks the sensors of this run for keys.
-        with zmq.Context() as context:
-            flooded = True
-            while flooded:
-                with context.socket(zmq.XSUB) as back:
-                    back.linger = 0
-                    # As in the sink: a slow reader shall not be seconds behind.
-                    back.rcvhwm = self._backlog
-                    with back.get_monitor_socket(COMES_OR_GOES) as connections:
-                        for source in self._upstream:
-                            back.connect(source)
-                        flooded = self._pass_on(back, connections)
-                        back.disable_monitor()
+        with zmq.Context() as context, context.socket(zmq.XSUB) as back:
+            back.linger = 0
+            # As in the sink: a slow reader shall not be seconds behind.
+            back.rcvhwm = self._backlog
+            with back.get_monitor_socket(COMES_OR_GOES) as connections:
+                for source in self._upstream:
+                    back.connect(source)
+                self._pass_on(back, connections)
+                back.disable_monitor()
 
-    def _pass_on(self, back: zmq.Socket[bytes], connections: zmq.Socket[bytes]) -> bool:
-        """Until told to stop; True: until subscribers took too much and were disconnected."""
+    def _pass_on(self, back: zmq.Socket[bytes], connections: zmq.Socket[bytes]) -> None:
+        """Until told to stop."""
         # Imported here: it imports asyncio, which the run of one sensor does without.
         from zmq.utils.monitor import recv_monitor_message
 
@@ -105,19 +100,10 @@ class _Relay:
                 is_new = recv_monitor_message(connections)["event"] == zmq.EVENT_CONNECTED
                 connected += 1 if is_new else -1
             events = dict(poller.poll(POLL_MS))
-            try:
-                event = self._publisher.next_event()
-            except FloodError as error:
-                print(f"tactflow: {error}; all subscribers are disconnected", file=sys.stderr)
-                try:
-                    self._publisher.renew()
-                except StageError as failure:
-                    print(f"tactflow: nothing is published any more: {failure}", file=sys.stderr)
-                    return False
-                return True
+            event = self._publisher.next_event()
             if event is not None:
                 back.send(event)
             if back in events:
                 front.send(back.recv())
             elif (end < math.inf and not connected) or time.monotonic() > end:
-                return False
+                return

@@ -1,65 +1,77 @@
-"""What an address means, and who can reach it."""
+"""Addresses of ZeroMQ sockets, and who can reach them."""
 
 from __future__ import annotations
 
 import ipaddress
 import re
+from dataclasses import dataclass
 
 LOOPBACK_INTERFACES = frozenset({"lo", "lo0"})
-"""What Linux and macOS call the network that ends in this machine; an address may name it."""
+"""Names of the loopback interface on Linux and macOS, which an address may give instead of a number."""
 
 HIGHEST_PORT = 65535
-"""Ports are numbers of 16 bits."""
+"""Ports are numbers of 16 bits. ZeroMQ wraps larger ones around silently."""
 
 
-def refuse_high_port(endpoint: str) -> None:
-    """Raise ValueError for a port that is none: ZeroMQ takes a larger number and means another port.
+@dataclass(frozen=True, slots=True)
+class Address:
+    """`tcp://HOST:PORT` or `ipc://PATH`.
 
-    >>> refuse_high_port("tcp://127.0.0.1:70000")
-    Traceback (most recent call last):
-    ValueError: required a port up to 65535, got 70000
+    host : name, number or `*` (all interfaces); None for ipc. port : None where the system picks one (`*`, 0)
+    and for ipc.
+
+    >>> Address.parse("tcp://127.0.0.1:*")
+    Address(text='tcp://127.0.0.1:*', host='127.0.0.1', port=None)
     """
-    port = re.fullmatch(r"tcp://.*:(\d+)", endpoint)
-    if port is not None and int(port[1]) > HIGHEST_PORT:
-        raise ValueError(f"required a port up to {HIGHEST_PORT}, got {port[1]}")
+
+    text: str
+    host: str | None
+    port: int | None
+
+    @classmethod
+    def parse(cls, text: str) -> Address:
+        """Parse an address; raises ValueError with what is required.
+
+        >>> Address.parse("tcp://127.0.0.1:70000")
+        Traceback (most recent call last):
+        ValueError: required a port up to 65535, got 70000
+        """
+        if re.fullmatch("ipc://.+", text):
+            return cls(text, None, None)
+        tcp = re.fullmatch(r"tcp://(.+):(\d+|\*)", text)
+        if tcp is None:
+            example = "tcp://127.0.0.1:5556, tcp://*:5556 or ipc:///tmp/tactflow"
+            raise ValueError(f"required an address such as {example}, got {text!r}")
+        port = 0 if tcp[2] == "*" else int(tcp[2])
+        if port > HIGHEST_PORT:
+            raise ValueError(f"required a port up to {HIGHEST_PORT}, got {port}")
+        return cls(text, tcp[1].strip("[]"), port or None)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this machine can reach it.
+
+        >>> Address.parse("tcp://[::1]:5556").is_local, Address.parse("tcp://*:5556").is_local
+        (True, False)
+        """
+        return self.host is None or self.host in LOOPBACK_INTERFACES or is_loopback(self.host)
+
+    @property
+    def picks_a_port(self) -> bool:
+        """Whether the system picks the port."""
+        return self.host is not None and self.port is None
+
+    @property
+    def is_ipv6(self) -> bool:
+        """Whether it is an IPv6 address, which ZeroMQ accepts only where an option is set."""
+        return self.host is not None and ":" in self.host
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name can be reached from this machine only."""
+    """Whether a host name or number can be reached from this machine only."""
     if host == "localhost":
         return True
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def is_reachable(endpoint: str) -> bool:
-    """Whether other machines can reach an address.
-
-    >>> is_reachable("tcp://*:5556"), is_reachable("tcp://127.0.0.1:5556"), is_reachable("ipc:///tmp/tactflow")
-    (True, False, False)
-    """
-    scheme, _, place = endpoint.partition("://")
-    if scheme in ("ipc", "inproc"):
-        return False
-    host = place.rpartition(":")[0].strip("[]")
-    return not (scheme == "tcp" and (is_loopback(host) or host in LOOPBACK_INTERFACES))
-
-
-def picks_a_port(endpoint: str) -> bool:
-    """Whether an address leaves its port to the system.
-
-    >>> picks_a_port("tcp://127.0.0.1:*"), picks_a_port("tcp://127.0.0.1:5556"), picks_a_port("ipc:///tmp/a")
-    (True, False, False)
-    """
-    return endpoint.startswith("tcp://") and endpoint.endswith((":*", ":0"))
-
-
-def is_ipv6(endpoint: str) -> bool:
-    """Whether an address is one of IPv6, which ZeroMQ takes only where it is told to.
-
-    >>> is_ipv6("tcp://[::1]:5556"), is_ipv6("tcp://127.0.0.1:5556"), is_ipv6("ipc:///tmp/a[1]")
-    (True, False, False)
-    """
-    return endpoint.startswith("tcp://[")

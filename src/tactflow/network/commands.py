@@ -1,4 +1,4 @@
-"""What may be asked of a run from outside: by its page, and by programs over ZeroMQ."""
+"""Commands to a run from outside: from its live page, and from programs over ZeroMQ."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from tactflow.engine.control import Control
 
 
 class RefusedError(Exception):
-    """There is no such command, or it is not possible now; says why."""
+    """The command does not exist, or is not possible now; says why."""
 
 
 class Commands:
-    """Does what is asked of a run, or says why not. From any thread.
+    """Carries out commands to a run, or says why not. From any thread.
 
     control : handle on the run; None: nothing is possible.
+
+    Every command raises RefusedError where `refusal` gives a reason.
     """
 
     def __init__(self, control: Control | None) -> None:
@@ -30,10 +32,10 @@ class Commands:
         if control is None:
             return "the run cannot be controlled"
         source = control.source
-        if name == "step":
-            if source is not None and source.live:
-                return "a live source cannot be stepped"
-            return None if control.paused else "pause first"
+        if name == "step" and source is not None and source.live:
+            return "a live source cannot be stepped"
+        if name == "step" and not control.paused:
+            return "pause first"
         if name == "reference" and (source is None or type(source).retake is Source.retake):
             return "this source cannot take a new reference"
         if name == "record" and control.recorder() is None:
@@ -42,22 +44,22 @@ class Commands:
 
     def pause(self, paused: bool) -> None:
         """Hold capturing, or go on."""
-        self._possible("pause").pause(paused)
+        self._admitted("pause").pause(paused)
 
     def step(self) -> None:
         """While paused, let one frame through."""
-        self._possible("step").step()
+        self._admitted("step").step()
 
     def take_reference(self) -> None:
         """Take the next frames as a new reference."""
-        self._possible("reference").retake_reference()
+        self._admitted("reference").retake_reference()
 
     def record(self, on: bool) -> Recorder:
-        """Begin or finish a recording; the sink that does.
+        """Begin or finish a recording; returns the sink that records.
 
         It touches the disk, so it may take a while. Raises StageError if the file cannot be written.
         """
-        recorder = self._possible("record").recorder()
+        recorder = self._admitted("record").recorder()
         assert recorder is not None
         if on:
             recorder.start_recording()
@@ -67,36 +69,29 @@ class Commands:
 
     def stop(self) -> None:
         """End the run."""
-        self._possible("stop").stop()
+        self._admitted("stop").stop()
 
     def state(self) -> dict[str, Any]:
-        """paused, recording : bool. source : in words, None where there is none yet."""
-        control = self._control
-        source = None if control is None else control.source
-        recorder = None if control is None else control.recorder()
+        """paused, recording : bool. source : its state in words, None before it is opened."""
+        if self._control is None:
+            return {"paused": False, "recording": False, "source": None}
+        source, recorder = self._control.source, self._control.recorder()
         return {
-            "paused": control is not None and control.paused,
+            "paused": self._control.paused,
             "recording": recorder is not None and recorder.recording,
             "source": None if source is None else source.state,
         }
 
     def snapshot(self) -> dict[str, Any]:
         """The statistics so far; empty where there are none yet."""
-        if self._control is None:
-            return {}
         try:
-            return dict(self._control.snapshot())
+            return {} if self._control is None else dict(self._control.snapshot())
         except RuntimeError:
-            # The run is still opening its sinks: its tables grew while they were read. The next one is whole.
+            # The run is still opening its sinks, and its tables grew while they were read.
             return {}
 
-    def _possible(self, name: str) -> Control:
-        """The run, if a command is possible now.
-
-        Raises
-        ------
-        RefusedError : it is not.
-        """
+    def _admitted(self, name: str) -> Control:
+        """The run, if it can carry out a command now; else raises RefusedError."""
         refusal = self.refusal(name)
         if refusal is not None:
             raise RefusedError(refusal)

@@ -20,7 +20,7 @@ from tactflow.network.connection import Connection
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5557"
 """Where `tactflow control` looks for a run that takes commands."""
 LONGEST_ANSWER = 1 << 20
-"""Bytes of an answer at most; statistics have some ten thousand. Chosen by hand."""
+"""Largest answer, bytes; statistics have some ten thousand. Chosen by hand."""
 Answer = dict[str, Any]
 
 
@@ -32,17 +32,18 @@ class RemoteControl(Connection):
 
     Parameters
     ----------
-    endpoint : address that the run takes commands at. timeout : how long to wait for an answer, s.
-    keys : the subscriber's folder that `tactflow keys new` makes, where the run asks for keys.
+    endpoint : address at which the run takes commands. timeout : how long to wait for an answer, s.
+    keys : the subscriber's folder made by `tactflow keys new`, where the run requires keys.
 
     Raises
     ------
     ValueError
-        From the constructor: the endpoint is no address, the folder has no keys, the timeout is not positive.
+        From the constructor: the endpoint is not an address, the folder has no valid keys, the timeout is not
+        positive.
     TimeoutError
         From every method: no answer came. It is not known whether the command was carried out.
     PermissionError
-        From every method: the run does not admit us: it asks for keys, or for others.
+        From every method: the run does not admit us: it requires keys, or other ones.
     RuntimeError
         From every method: the run says that it is not possible, and why.
 
@@ -62,13 +63,9 @@ class RemoteControl(Connection):
         if not 0 < timeout < math.inf:
             raise ValueError(f"timeout: required a number of seconds above 0, got {timeout}")
         self.timeout = timeout
-        options: dict[int, int | bytes] = {
-            # After a timeout another command may be sent, and a late answer is not taken for its.
-            zmq.REQ_RELAXED: 1,
-            zmq.REQ_CORRELATE: 1,
-            zmq.MAXMSGSIZE: LONGEST_ANSWER,
-        }
-        super().__init__(zmq.REQ, endpoint, options, keys, DEFAULT_ENDPOINT)
+        # After a timeout another command may be sent; a late answer is not taken for the answer to that.
+        options: dict[int, int | bytes] = {zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1}
+        super().__init__(zmq.REQ, endpoint, options | {zmq.MAXMSGSIZE: LONGEST_ANSWER}, keys)
 
     def ping(self) -> Answer:
         """Whether the run is there."""
@@ -83,7 +80,7 @@ class RemoteControl(Connection):
         return self.ask("take_reference")
 
     def pause(self) -> Answer:
-        """Hold capturing: a recording waits, a live source's frames are let go."""
+        """Hold capturing: a recording waits, frames of a live source are dropped."""
         return self.ask("pause")
 
     def resume(self) -> Answer:
@@ -95,7 +92,7 @@ class RemoteControl(Connection):
         return self.ask("record_start")
 
     def record_stop(self) -> Answer:
-        """Finish the recording; nothing if there is none."""
+        """Finish the recording, if there is one."""
         return self.ask("record_stop")
 
     def ask(self, command: str) -> Answer:
@@ -107,32 +104,20 @@ class RemoteControl(Connection):
         while self._wait(end - time.monotonic()):
             # A late answer to an earlier command wakes us, and is dropped by the socket.
             with suppress(zmq.Again):
-                return self._understood(self._socket.recv(zmq.NOBLOCK))
-        known = ", and are these keys for it" if self._has_keys else ""
+                return self._checked(self._socket.recv(zmq.NOBLOCK))
+        keys_hint = ", and are these its keys" if self._has_keys else ""
         raise TimeoutError(
             f"no answer from {self.endpoint} within {self.timeout:g} s; is tactflow running with "
-            f"sinks.zmq.control set to it{known}?"
+            f"sinks.zmq.control set to it{keys_hint}?"
         )
 
-    def _understood(self, received: bytes) -> Answer:
-        """The answer that was received; RuntimeError if it says no, or is none."""
+    def _checked(self, received: bytes) -> Answer:
+        """The answer; raises RuntimeError if it is a refusal, or does not come from tactflow."""
         try:
-            answer = orjson.loads(received)
-        except ValueError:
-            answer = None
-        if not isinstance(answer, dict) or not _is_answer(answer):
-            raise RuntimeError(f"{self.endpoint} does not answer as tactflow does")
-        if not answer["ok"]:
-            raise RuntimeError(answer["message"])
+            answer: Answer = orjson.loads(received)
+            is_done, message, _ = answer["ok"], str(answer["message"]), answer["state"]["sensor"]
+        except (ValueError, TypeError, KeyError):
+            raise RuntimeError(f"{self.endpoint} does not answer as tactflow does") from None
+        if not is_done:
+            raise RuntimeError(message)
         return answer
-
-
-def _is_answer(answer: Answer) -> bool:
-    """Whether what programs rely on is there and of its type; there may be more."""
-    state = answer.get("state")
-    return (
-        isinstance(answer.get("ok"), bool)
-        and isinstance(answer.get("message"), str)
-        and (not answer["ok"] or (isinstance(state, dict) and isinstance(state.get("sensor"), str)))
-        and isinstance(answer.get("stats", {}), dict)
-    )

@@ -121,7 +121,7 @@ class Subscriber(Connection):
             # The space ends the topic: `main` is not to receive `main2`.
             zmq.SUBSCRIBE: b"tactflow." if sensor is None else f"tactflow.{sensor} ".encode(),
         }
-        super().__init__(zmq.SUB, endpoint, options, keys, DEFAULT_ENDPOINT)
+        super().__init__(zmq.SUB, endpoint, options, keys)
 
     def receive(self) -> dict[str, Any]:
         """The next message; waits for it. What is no result message is passed over and counted.

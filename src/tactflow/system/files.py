@@ -16,7 +16,6 @@ from typing import IO, TextIO
 
 if sys.platform != "win32":
     import fcntl
-    import resource
 
 
 def expanded(text: str) -> Path:
@@ -123,10 +122,6 @@ if sys.platform == "win32":
         """None: as above."""
         return None
 
-    def files_left() -> int:
-        """Plenty: Windows has no small limit."""
-        return sys.maxsize
-
 else:
 
     def claim(file: IO[bytes]) -> None:
@@ -167,17 +162,6 @@ else:
             raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it") from None
         except OSError:
             return
-
-    def files_left() -> int:
-        """How many more files, or connections, this process may open."""
-        most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        try:
-            # The system gives the lowest free number.
-            number = os.open(os.devnull, os.O_RDONLY)
-        except OSError:
-            return 0
-        os.close(number)
-        return sys.maxsize if most == resource.RLIM_INFINITY else most - number
 
 
 class Unheard(io.TextIOWrapper):
