@@ -12,11 +12,11 @@ from typing import Any
 
 import cv2
 
-from tactflow.config.complaints import validated
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
 from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
+from tactflow.config.validation import validated
 from tactflow.engine.conformance import build
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Pipeline

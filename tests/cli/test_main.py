@@ -232,7 +232,7 @@ def test_the_summary_of_one_frame(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_name_that_is_no_text_is_pointed_at(tmp_path: Path) -> None:
     done = program("run", "--source", "\udcff.png", "--quiet", cwd=tmp_path)
     assert done.returncode == 2
-    assert "--source: stages.capture: '\\udcff.png' is not UTF-8; rename the file" in done.stderr
+    assert "--source: '\\udcff.png' is not UTF-8; rename the file" in done.stderr
 
 
 @pytest.mark.parametrize("option", ["--stats", "--trace"])

@@ -256,7 +256,7 @@ class TestSet:
     @pytest.mark.parametrize(
         ("override", "words"),
         [
-            ("stages.prepare.gamma=x", "stages.prepare.gamma: expected a number, got 'x'"),
+            ("stages.prepare.gamma=x", "stages.prepare.gamma: should be a valid number, got 'x'"),
             ("stages.prepare.gama=3", "stages.prepare.gama: unknown parameter; did you mean gamma?"),
             ("stages.outlin.min_area=3", "there is no stage called outlin"),
             ("stages.outlin=null", "there is no stage 'outlin' to remove; did you mean outline?"),
@@ -271,7 +271,7 @@ class TestSet:
             ("stages.prepare.gamma=!!python/name:os.system x", "not allowed"),
             ("stages.outline.when=tuching", "stages.outline.when: there is no signal 'tuching'"),
             ("sinks.out.in.image=compare.contact_mask", "but compare.contact_mask"),
-            ("sensor=a b", "sensor: expected a word"),
+            ("sensor=a b", "sensor: should be a word"),
         ],
     )
     def test_its_mistakes_name_the_option(self, override: str, words: str, load: Load) -> None:
@@ -334,7 +334,9 @@ class TestOptionsOfTheCommandLine:
         assert nodes["jsonl_2"].mark == Mark("--jsonl", 0, 0)
 
     def test_a_mistake_in_an_added_sink_names_the_option(self, load: Load) -> None:
-        with pytest.raises(ConfigError, match=r"^--jsonl: sinks\.jsonl\.path: expected text, got 3"):
+        with pytest.raises(
+            ConfigError, match=r"^--jsonl: sinks\.jsonl\.path: should be a valid string, got 3"
+        ):
             load(BODY, extra_sinks={"--jsonl": {"path": 3}})
 
 

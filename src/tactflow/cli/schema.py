@@ -30,9 +30,9 @@ def run(args: argparse.Namespace) -> int:
 
         schema = layout(args.sensor)
     else:
-        from tactflow.config.registry import available
+        from tactflow.config.registry import catalogue
         from tactflow.config.schema import pipeline_schema
 
-        schema = pipeline_schema(available())
+        schema = pipeline_schema(catalogue()[0])
     print(json.dumps(schema, indent=2))
     return 0

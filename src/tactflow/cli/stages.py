@@ -15,9 +15,9 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from tactflow.config.document import shown
 from tactflow.config.models import is_word
 from tactflow.config.registry import Section, catalogue, names, resolve
-from tactflow.config.yamlmap import shown
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 from tactflow.engine.ports import Port, describe_type

@@ -3,35 +3,26 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from pydantic import ValidationError
-
 from tactflow.config import sensors, wiring
-from tactflow.config.complaints import complain
-from tactflow.config.files_used import FileId, file_id, files_read, files_written
+from tactflow.config.document import Document, described, dotted, read_document
+from tactflow.config.files_used import file_id, files_named, files_written
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
-from tactflow.config.overrides import Override, add_sinks, apply, plain, replaced
+from tactflow.config.overrides import Override, add_sinks, apply
 from tactflow.config.registry import Section, code_place, resolve
 from tactflow.config.shipped import is_packaged
+from tactflow.config.validation import validate
 from tactflow.config.wiring import Draft
-from tactflow.config.yamlmap import Item, Problems, read_yaml, wrap
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Gate, Mark, Node, OnError, Pipeline, Queue
+from tactflow.engine.graph import Gate, Node, OnError, Pipeline, Queue
 from tactflow.engine.plan import plan_problems
 from tactflow.system.files import expanded
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
-
-_NO_MEMORY = (
-    "; a gate has no memory: put the stage hold behind the signal, as in "
-    "held: {{use: hold, {key}: 3, in: {{signal: difference.touching}}}}, and write when: held"
-)
-_ADVICE = {key: _NO_MEMORY.format(key=key) for key in ("hold", "at_least_every")}
 
 
 def load_pipeline(
@@ -55,41 +46,42 @@ def load_pipeline(
     ------
     ConfigError : the message holds every mistake with file, line, column, source line and a caret.
     """
-    problems = Problems()
-    root = add_sinks(_read(path, overrides, problems), extra_sinks or {})
-    root, name = sensors.select(root, sensor, problems)
-    file = _envelope(root, problems)
-    drafts = _drafts(root, path.parent, problems)
-    source = _source(root, drafts, problems)
+    document = _read(path, overrides)
+    add_sinks(document, extra_sinks or {})
+    name = sensors.select(document, sensor)
+    file = validate(PipelineFile, document)
+    drafts = _drafts(document, path.parent)
+    source = _source(document, drafts)
     if source is not None:
-        _set_values(source, source_values)
+        for override in source_values:
+            apply(document, override, source.keys)
     for draft in drafts:
-        draft.params = _params(draft, problems)
-    drafts = _one_writer_each(drafts, extra_sinks or {}, problems)
-    _writes_nothing_that_is_read(drafts, path.parent, problems)
-    wiring.connect(drafts, problems)
-    drafts = wiring.ordered(drafts, problems)
-    _check_needs(drafts, problems)
-    calibration = _calibration(root, path.parent, problems)
-    problems.raise_if_any()
+        draft.settings = document.mapping(*draft.keys)
+        draft.params = _params(draft, document)
+    drafts = _check_files(drafts, extra_sinks or {}, path.parent, document)
+    wiring.connect(drafts, document)
+    drafts = wiring.ordered(drafts, document)
+    _check_needs(drafts, document)
+    calibration = _calibration(document, path.parent)
+    document.raise_if_mistaken()
     assert file is not None, "what is wrong with it was raised"
     entries: dict[str, Entry] = {**file.stages, **file.sinks}
     pipeline = Pipeline(
         file=str(path),
         directory=path.parent,
         sensor=name,
-        nodes={draft.id: _node(draft, entries[draft.id]) for draft in drafts},
+        nodes={draft.id: _node(draft, entries[draft.id], document) for draft in drafts},
         skipping=file.skipping,
         opencv_threads=file.opencv_threads,
         realtime_priority=file.realtime_priority,
-        runs=max(1, len(sensors.names(root))),
+        runs=max(1, len(sensors.names(document))),
         calibration=calibration,
-        warnings=_warnings(root, drafts),
-        settings=_settings(root, name, drafts),
+        warnings=_warnings(document, drafts),
+        settings=_settings(document, name, drafts),
     )
     for mark, message in plan_problems(pipeline):
-        problems.add(mark, message)
-    problems.raise_if_any()
+        document.report_at(mark, message)
+    document.raise_if_mistaken()
     return pipeline
 
 
@@ -100,228 +92,167 @@ def sensor_names(path: Path, overrides: Sequence[Override | str] = ()) -> list[s
     ------
     ConfigError : the file is no YAML mapping, or an override cannot be applied.
     """
-    problems = Problems()
-    root = _read(path, overrides, problems)
-    problems.raise_if_any()
-    return sensors.names(root)
+    document = _read(path, overrides)
+    document.raise_if_mistaken()
+    return sensors.names(document)
 
 
-def _read(path: Path, overrides: Sequence[Override | str], problems: Problems) -> Item:
+def _read(path: Path, overrides: Sequence[Override | str]) -> Document:
     """The document with its overrides."""
-    root = read_yaml(path, problems)
-    if root.content is None:
-        problems.add(root.mark, "the file is empty; required: a mapping with sensor, stages and sinks")
-    elif not isinstance(root.content, dict):
-        problems.add(root.mark, f"expected a mapping with sensor, stages and sinks, got {root.words()}")
-    if not isinstance(root.content, dict):
-        problems.raise_if_any()
+    document = read_document(path)
+    if not isinstance(document.root, dict):
+        found = (
+            "the file is empty"
+            if document.root is None
+            else f"expected a mapping, got {described(document.root)}"
+        )
+        document.report((), f"{found}; required: a mapping with sensor, stages and sinks")
+        document.raise_if_mistaken()
     for override in overrides:
-        root = apply(root, override, problems)
-    return root
+        apply(document, override)
+    return document
 
 
-def _envelope(root: Item, problems: Problems) -> PipelineFile | None:
-    """The file as its model describes it; None if something in it is wrong."""
-    try:
-        return PipelineFile.model_validate(root.plain())
-    except ValidationError as error:
-        complain(error, PipelineFile, root, "", problems, advice=_misplaced(root) | _ADVICE)
-        return None
-
-
-def _misplaced(root: Item) -> dict[str, str]:
-    """For each stage and sink of the file, as if it stood beside `stages`: where it belongs."""
-    ids = {
-        id_: section
-        for section in _SECTIONS
-        if section in root.entries
-        for id_ in root.entries[section].item.entries
-    }
-    return {id_: f"; did you mean {section}.{id_}?" for id_, section in ids.items()}
-
-
-def _drafts(root: Item, directory: Path, problems: Problems) -> list[Draft]:
-    """The stages and sinks of the file; what `_envelope` refuses of them is left out here."""
+def _drafts(document: Document, directory: Path) -> list[Draft]:
+    """The stages and sinks of the file, without those whose id is wrong."""
     drafts: dict[str, Draft] = {}
     for section in _SECTIONS:
-        entries = root.entries[section].item.entries if section in root.entries else {}
-        for id_, entry in entries.items():
-            item = entry.item if entry.item.is_mapping else Item(None, entry.mark)
-            draft = Draft(id_, section, entry.mark, item)
+        for id_ in document.mapping(section):
+            draft = Draft(id_, section, document.key_mark(section, id_), document.mapping(section, id_))
             if id_ in drafts:
-                other = drafts[id_]
-                taken = f"the id {id_} is taken by {other.path} ({other.mark})"
-                problems.add(draft.mark, f"{draft.path}: {taken}")
+                first = drafts[id_]
+                taken = f"the id {id_} is taken by {dotted(first.keys)} ({first.mark})"
+                document.report(draft.keys, taken, at_key=True)
             elif is_word(id_):
                 drafts[id_] = draft
-                _resolve(draft, directory, problems)
+                _resolve(draft, directory, document)
     return list(drafts.values())
 
 
-def _resolve(draft: Draft, directory: Path, problems: Problems) -> None:
-    entry = draft.item.entries.get("use")
-    use = draft.id if entry is None else entry.item.content
+def _resolve(draft: Draft, directory: Path, document: Document) -> None:
+    """Find the class of a stage or sink."""
+    use = draft.settings.get("use", draft.id)
     if not isinstance(use, str):
         return
+    place = (*draft.keys, "use") if "use" in draft.settings else draft.keys
     # On the command line, and in a pipeline that nobody can put a file beside, it means the current folder.
-    own = is_packaged(directory) or (entry is not None and not entry.item.mark.line)
+    own = is_packaged(directory) or ("use" in draft.settings and not document.mark(*place).line)
     try:
         draft.component = resolve(use, draft.section, *([Path()] if own else []), directory)
     except ConfigError as error:
-        mark, path = (draft.mark, draft.path) if entry is None else (entry.item.mark, f"{draft.path}.use")
-        problems.add(mark, f"{path}: {error}")
+        document.report(place, str(error), at_key=place == draft.keys)
 
 
-def _source(root: Item, drafts: Sequence[Draft], problems: Problems) -> Draft | None:
+def _source(document: Document, drafts: Sequence[Draft]) -> Draft | None:
     """The source of frames; that there is none, or more than one, is a mistake."""
     stages = [draft for draft in drafts if draft.section == "stages"]
     sources = [draft for draft in stages if draft.component and draft.component.kind == "source"]
-    entry = root.entries.get("stages")
-    if not sources and entry and entry.item.is_mapping and all(draft.component for draft in stages):
-        problems.add(entry.mark, "stages: there is no source of frames; add the stage capture")
-    for other in sources[1:]:
+    readable = document.has("stages") and isinstance(document.get("stages"), dict | None)
+    if not sources and readable and all(draft.component for draft in stages):
+        document.report(("stages",), "there is no source of frames; add the stage capture", at_key=True)
+    for extra in sources[1:]:
         first = f"{sources[0].id} ({sources[0].mark})"
-        problems.add(other.mark, f"{other.path}: a pipeline has one source, but {first} is one already")
+        document.report(extra.keys, f"a pipeline has one source, but {first} is one already", at_key=True)
     return sources[0] if sources else None
 
 
-def _set_values(draft: Draft, values: Sequence[Override]) -> None:
-    """Replace parameters of a stage."""
-    for override in values:
-        mark = Mark(override.origin, 0, 0)
-        draft.item = replaced(draft.item, [override.key], wrap(plain(override.value), mark), mark)
-
-
-def _params(draft: Draft, problems: Problems) -> StageParams | None:
-    """What the component's own model makes of the parameters; None if it refuses them."""
+def _params(draft: Draft, document: Document) -> StageParams | None:
+    """The parameters as the component's own model; None if they are wrong."""
     if draft.component is None:
         return None
-    model = draft.component.params
-    keys = {key for key in RESERVED if key != "max_rate" or draft.section == "sinks"}
-    given = {key: entry for key, entry in draft.item.entries.items() if key not in keys}
-    strange = [entry.item for entry in given.values() if not _is_text(entry.item.plain())]
-    for item in strange:
-        problems.add(item.mark, f"{draft.path}: {item.plain()!r} is not UTF-8; rename the file")
-    if strange:
-        return None
-    whole = Item(given, draft.mark)
+    reserved = {key for key in RESERVED if key != "max_rate" or draft.section == "sinks"}
     try:
-        # JSON, because pydantic's strict rules for it fit YAML too: a list may become a tuple, but text or a
-        # boolean never becomes a number.
-        return model.model_validate_json(json.dumps(whole.plain()), strict=True)
-    except ValidationError as error:
-        complain(error, model, whole, draft.path, problems, noun="parameter", other_keys=sorted(keys))
+        return validate(draft.component.params, document, draft.keys, without=reserved, noun="parameter")
     except Exception as error:
         reason = f"{type(error).__name__}: {error} ({code_place(error.__traceback__)})"
-        problems.add(draft.mark, f"{draft.path}: the parameters fail: {reason}")
+        document.report(draft.keys, f"the parameters fail: {reason}", at_key=True)
     return None
 
 
-def _is_text(value: Any) -> bool:
-    """False for a name of a file that no encoding can write, as the command line may pass it."""
-    try:
-        json.dumps(value, ensure_ascii=False, default=str).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+def _check_files(
+    drafts: Sequence[Draft], options: Collection[str], directory: Path, document: Document
+) -> list[Draft]:
+    """Report sinks that write the same file, or what a stage reads: its source, a reference.
 
-
-def _one_writer_each(drafts: Sequence[Draft], options: Collection[str], problems: Problems) -> list[Draft]:
-    """The drafts without those that an option adds for a file that is written anyway, just as it asks.
-
-    Any other two sinks that would write the same file are a mistake.
+    Returns the drafts without those that an option adds for a file which the same sink writes anyway.
     """
-    kept: list[Draft] = []
+    readers = {
+        file_id(path): draft
+        for draft in drafts
+        if draft.section == "stages" and draft.params is not None
+        for path in files_named(draft.params, directory)
+    }
     writers: dict[str, Draft] = {}
+    kept = []
     for draft in drafts:
-        places = _written(draft)
-        place = next((place for place in places if place in writers), None)
-        other = writers[place] if place is not None else None
-        if other and draft.mark.file in options and _does_as_much(other, draft):
+        written = files_written(draft.component.cls, draft.params) if draft.component and draft.params else []
+        shared = next((path for path in written if path in writers), None)
+        writer = writers[shared] if shared else None
+        if writer and draft.mark.file in options and _does_as_much(writer, draft):
             continue
         kept.append(draft)
-        if other:
-            there = f"{other.id} ({other.mark}) writes {place} already; choose another path"
-            problems.add(draft.mark, f"{draft.path}: {there}")
-        writers |= {place: draft for place in places if place not in writers}
+        if writer:
+            message = f"{writer.id} ({writer.mark}) writes {shared} already; choose another path"
+            document.report(draft.keys, message, at_key=True)
+        for path in written:
+            writers.setdefault(path, draft)
+            if (reader := readers.get(file_id(path))) and file_id(path):
+                message = f"{path} is what {dotted(reader.keys)} reads; choose another path"
+                document.report(draft.keys, message, at_key=True)
     return kept
 
 
-def _writes_nothing_that_is_read(drafts: Sequence[Draft], directory: Path, problems: Problems) -> None:
-    """Report sinks that would write over what a stage reads: its source, a reference, a calibration."""
-    readers: dict[FileId, Draft] = {}
-    for draft in drafts:
-        if draft.section == "stages" and draft.params is not None:
-            readers |= dict.fromkeys(files_read(draft.params, directory), draft)
-    for draft in drafts:
-        for place in _written(draft):
-            reader = readers.get(identity) if (identity := file_id(place)) else None
-            if reader is not None:
-                there = f"{place} is what {reader.path} reads; choose another path"
-                problems.add(draft.mark, f"{draft.path}: {there}")
+def _does_as_much(writer: Draft, added: Draft) -> bool:
+    """Whether a sink writes all that the added one would, which has no settings of its own."""
+    classes = {draft.component.cls for draft in (writer, added) if draft.component}
+    return len(classes) == 1 and "max_rate" not in writer.settings
 
 
-def _calibration(root: Item, directory: Path, problems: Problems) -> Path | None:
+def _calibration(document: Document, directory: Path) -> Path | None:
     """The calibration file that the pipeline names; that it is not there is a mistake."""
-    entry = root.entries.get("calibration")
-    if entry is None or not isinstance(entry.item.content, str):
+    name = document.get("calibration")
+    if not isinstance(name, str):
         return None
-    named = expanded(entry.item.content)
-    paths = (directory / named, named)
+    paths = (directory / expanded(name), expanded(name))
     for path in paths:
         if path.is_file():
             return path
     looked = " or ".join(dict.fromkeys(str(path.absolute()) for path in paths))
-    problems.add(entry.item.mark, f"calibration: there is no file {looked}; `tactflow calibrate` makes one")
+    document.report(("calibration",), f"there is no file {looked}; `tactflow calibrate` makes one")
     return None
 
 
-def _does_as_much(there: Draft, added: Draft) -> bool:
-    """Whether a sink writes all that one without settings of its own would write."""
-    if there.component is None or added.component is None:
-        return False
-    return there.component.cls is added.component.cls and "max_rate" not in there.item.entries
-
-
-def _written(draft: Draft) -> list[str]:
-    """The files and folders that a sink writes, as far as it is known to be one."""
-    if draft.component is None or draft.params is None:
-        return []
-    return files_written(draft.component.cls, draft.params)
-
-
-def _check_needs(drafts: Sequence[Draft], problems: Problems) -> None:
+def _check_needs(drafts: Sequence[Draft], document: Document) -> None:
     """Report parameters that need an input which is not connected."""
-    if problems.found:
+    if document.mistakes:
         # Another mistake may be why it is not connected.
         return
     for draft in drafts:
         for port, name in draft.params.needed_inputs().items() if draft.params else ():
             if draft.inputs.get(port) is None:
-                entry = draft.item.entries.get(name)
                 what = f"{getattr(draft.params, name)} needs {port}, which no stage gives"
-                problems.add(
-                    entry.item.mark if entry else draft.mark,
-                    f"{draft.path}.{name}: {what}; add a stage that does",
-                )
+                place = (*draft.keys, name)
+                document.report(place, f"{what}; add a stage that does", at_key=name not in draft.settings)
 
 
-def _node(draft: Draft, entry: Entry) -> Node:
+def _node(draft: Draft, entry: Entry, document: Document) -> Node:
     """The node that a right draft describes."""
     assert draft.component is not None, "a stage without one was reported"
     assert draft.params is not None, "parameters that are wrong were reported"
-    cls, entries = draft.component.cls, draft.item.entries
+    cls = draft.component.cls
     # A picture for people must never stop the run.
     on_error = OnError("disable" if issubclass(cls, Sink) and cls.observer else "stop")
     if entry.on_error:
         on_error = OnError(entry.on_error.action, entry.on_error.budget)
-    # What the command line makes it read may not be there: then the file is not to blame.
-    read = entries.get("source") if draft.component.kind == "source" else None
-    mark = read.item.mark if read and not read.item.mark.line else draft.mark
+    mark = draft.mark
+    if draft.component.kind == "source" and not (origin := document.mark(*draft.keys, "source")).line:
+        # What the command line makes it read may not be there: then the file is not to blame.
+        mark = origin
     gates = [
         Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
         for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
     ]
+    marked = [key for key in ("segment", "queue") if key in draft.settings]
     return Node(
         id=draft.id,
         component=draft.component,
@@ -333,30 +264,27 @@ def _node(draft: Draft, entry: Entry) -> Node:
         queue=Queue(entry.queue.capacity, entry.queue.when_full),
         on_error=on_error,
         max_rate=entry.max_rate if isinstance(entry, SinkEntry) else None,
-        marks={key: entries[key].item.mark for key in ("segment", "queue") if key in entries},
+        marks={key: document.mark(*draft.keys, key) for key in marked},
     )
 
 
-def _settings(root: Item, sensor: str, drafts: Sequence[Draft]) -> dict[str, Any]:
+def _settings(document: Document, sensor: str, drafts: Sequence[Draft]) -> dict[str, Any]:
     """What the file and all that changes it come to, for one sensor."""
-    sections = {
-        section: {draft.id: draft.item.plain() for draft in drafts if draft.section == section}
-        for section in _SECTIONS
-    }
-    plain = {key: entry.item.plain() for key, entry in root.entries.items() if key != "sensors"}
-    return plain | {"sensor": sensor} | sections
+    sections: dict[str, dict[str, Any]] = {section: {} for section in _SECTIONS}
+    for draft in drafts:
+        sections[draft.section][draft.id] = document.get(*draft.keys)
+    kept = {key: value for key, value in document.root.items() if key != "sensors"}
+    return kept | {"sensor": sensor} | sections
 
 
-def _warnings(root: Item, drafts: Sequence[Draft]) -> list[str]:
+def _warnings(document: Document, drafts: Sequence[Draft]) -> list[str]:
     warnings = []
     if not any(draft.section == "sinks" for draft in drafts):
-        entry = root.entries.get("sinks")
-        mark = entry.mark if entry else root.mark
-        warnings.append(f"{mark}  there are no sinks, so nothing will be computed")
-    calibration = root.entries.get("calibration")
+        warnings.append(f"{document.key_mark('sinks')}  there are no sinks, so nothing will be computed")
     users = (draft.component.cls for draft in drafts if draft.component)
-    if calibration and calibration.item.content and not any(map(_takes_calibration, users)):
-        warnings.append(f"{calibration.mark}  calibration: no stage uses it; add untouched, scale and depth")
+    if document.get("calibration") and not any(map(_takes_calibration, users)):
+        mark = document.key_mark("calibration")
+        warnings.append(f"{mark}  calibration: no stage uses it; add untouched, scale and depth")
     return warnings
 
 

@@ -4,80 +4,71 @@
       left:  {stages: {capture: {source: /dev/video0}}}
       right: {stages: {capture: {source: /dev/video2}, preprocess: {rotate: 270}}}
 
-What stands under a sensor's name is laid over the rest of the file; null removes a stage, a sink or a
-parameter. `{sensor}` in any text of a sink stands for the sensor's name.
+The changes of a sensor are laid over the rest of the file; null removes a stage, a sink or a parameter.
+`{sensor}` in any text of a sink stands for the sensor's name.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+from tactflow.config.document import Document, Keys
 from tactflow.config.models import Changes, is_word
-from tactflow.config.yamlmap import Entry, Item, Problems
 from tactflow.system.spelling import did_you_mean
 
 PLACEHOLDER = "{sensor}"
 
 
-def names(root: Item) -> list[str]:
+def names(document: Document) -> list[str]:
     """The sensors that a file names under `sensors:`, in order; empty if it has none."""
-    entry = root.entries.get("sensors")
-    return [str(name) for name in entry.item.entries] if entry else []
+    return list(document.mapping("sensors"))
 
 
-def select(root: Item, chosen: str | None, problems: Problems) -> tuple[Item, str]:
-    """The document for one sensor, and the sensor's name.
+def select(document: Document, chosen: str | None) -> str:
+    """Turn the document into that of one sensor; returns the sensor's name.
 
     chosen : a name of `sensors:`, or None for the first one, or for the only one of a file without it.
     """
-    entry = root.entries.get("sensors")
-    single = root.entries.get("sensor")
-    if entry is None:
-        own = single.item.content if single else None
-        name = own if isinstance(own, str) and is_word(own) else "main"
-        if chosen is not None and chosen != name:
-            problems.add(root.mark, f"there is no sensor {chosen!r}; the file's only sensor is {name}")
-        return _named(root, name), name
-    if single is not None:
-        there = f"the names stand under sensors ({entry.mark}) already; leave this one out"
-        problems.add(single.mark, f"sensor: {there}")
-    known = names(root)
-    if chosen is not None and chosen not in known:
-        problems.add(entry.mark, f"sensors: there is no {chosen!r}{did_you_mean(chosen, known)}")
-    name = chosen if chosen in known else known[0] if known else "main"
-    given = entry.item.entries[name].item.entries if known else {}
-    changes = {key: value for key, value in given.items() if key in Changes.model_fields}
-    return _named(_laid_over(root, Item(changes, entry.mark)), name), name
+    known = names(document)
+    if not document.has("sensors"):
+        name = document.get("sensor")
+        name = name if isinstance(name, str) and is_word(name) else "main"
+        if chosen not in (None, name):
+            document.report((), f"there is no sensor {chosen!r}; the file's only sensor is {name}")
+    else:
+        if document.has("sensor"):
+            there = document.key_mark("sensors")
+            message = f"the names stand under sensors ({there}) already; leave this one out"
+            document.report(("sensor",), message, at_key=True)
+        if chosen is not None and chosen not in known:
+            hint = did_you_mean(chosen, known)
+            document.report(("sensors",), f"there is no {chosen!r}{hint}", at_key=True)
+        name = chosen if chosen in known else known[0] if known else "main"
+        for key in document.mapping("sensors", name):
+            if key in Changes.model_fields:
+                _lay_over(document, ("sensors", name, key), (key,))
+    if document.mapping("sinks"):
+        document.root["sinks"] = _filled_in(document.root["sinks"], name)
+    return name
 
 
-def _laid_over(base: Item, changes: Item, depth: int = 0) -> Item:
-    """A copy of `base` with the changes in it; parts that an alias shares stay as they are."""
-    if not isinstance(changes.content, dict) or not base.is_mapping:
-        return changes
-    entries = dict(base.entries)
-    for key, entry in changes.content.items():
-        old = entries.get(key)
-        if entry.item.content is None and depth > 0 and old is not None:
-            del entries[key]
-        elif old is None:
-            entries[key] = entry
-        else:
-            entries[key] = Entry(entry.mark, _laid_over(old.item, entry.item, depth + 1))
-    return Item(entries, base.mark)
+def _lay_over(document: Document, change: Keys, target: Keys) -> None:
+    """Put a value of `sensors:` over the one of the file; mappings are merged."""
+    value = document.get(*change)
+    if value is None and len(target) > 1 and document.has(*target):
+        del document.mapping(*target[:-1])[str(target[-1])]
+    elif isinstance(value, dict) and isinstance(document.get(*target), dict):
+        for key in value:
+            _lay_over(document, (*change, key), (*target, key))
+    else:
+        document.copy(change, target)
 
 
-def _named(root: Item, name: str) -> Item:
-    sinks = root.entries.get("sinks")
-    if sinks is None:
-        return root
-    return Item(root.entries | {"sinks": Entry(sinks.mark, _filled_in(sinks.item, name))}, root.mark)
-
-
-def _filled_in(item: Item, name: str) -> Item:
-    content = item.content
-    if isinstance(content, str):
-        return Item(content.replace(PLACEHOLDER, name), item.mark)
-    if isinstance(content, list):
-        return Item([_filled_in(part, name) for part in content], item.mark)
-    if isinstance(content, dict):
-        entries = {key: Entry(entry.mark, _filled_in(entry.item, name)) for key, entry in content.items()}
-        return Item(entries, item.mark)
-    return item
+def _filled_in(value: Any, name: str) -> Any:
+    if isinstance(value, str):
+        return value.replace(PLACEHOLDER, name)
+    if isinstance(value, list):
+        return [_filled_in(part, name) for part in value]
+    if isinstance(value, dict):
+        return {key: _filled_in(part, name) for key, part in value.items()}
+    return value

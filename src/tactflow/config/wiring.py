@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
+from tactflow.config.document import Document, Keys, dotted
 from tactflow.config.registry import Section, catalogue
-from tactflow.config.yamlmap import Entry, Item, Problems
 from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Component, Mark, Ref
 from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
@@ -17,7 +18,7 @@ from tactflow.system.spelling import did_you_mean
 class Draft:
     """A stage or sink of the file before its inputs are connected.
 
-    section : "stages" or "sinks". mark, item : its place in the file, and its settings.
+    mark : of its key. settings : what stands under it.
     component : None when `use` could not be resolved; what depends on it is then not judged.
     params : None when they are wrong.
     inputs, gates : filled by `connect`; for each gate the port, and the signal that says what closed means.
@@ -27,7 +28,7 @@ class Draft:
     id: str
     section: Section
     mark: Mark
-    item: Item
+    settings: dict[str, Any]
     component: Component | None = None
     params: StageParams | None = None
     inputs: dict[str, Ref | None] = field(default_factory=dict)
@@ -35,9 +36,9 @@ class Draft:
     edges: list[tuple[Ref, Mark]] = field(default_factory=list)
 
     @property
-    def path(self) -> str:
-        """What messages call it: `stages.hull`."""
-        return f"{self.section}.{self.id}"
+    def keys(self) -> Keys:
+        """Where it stands in the document."""
+        return (self.section, self.id)
 
     @property
     def outputs(self) -> dict[str, Port]:
@@ -45,13 +46,13 @@ class Draft:
         return {port.name: port for port in self.component.ports.outputs} if self.component else {}
 
 
-def connect(drafts: Sequence[Draft], problems: Problems) -> None:
-    """Connect every input and gate by name or as `in:` and `when:` say; mistakes are added to `problems`.
+def connect(drafts: Sequence[Draft], document: Document) -> None:
+    """Connect every input and gate by name or as `in:` and `when:` say; mistakes are recorded.
 
     An input takes the output of its name from the nearest stage above it, in a sink from the last stage that
     has it.
     """
-    wiring = _Wiring(drafts, problems)
+    wiring = _Wiring(drafts, document)
     for draft in drafts:
         if draft.component is not None:
             wiring.connect_inputs(draft, draft.component)
@@ -60,7 +61,7 @@ def connect(drafts: Sequence[Draft], problems: Problems) -> None:
             wiring.connect_gates(draft, draft.component)
 
 
-def ordered(drafts: Sequence[Draft], problems: Problems) -> list[Draft]:
+def ordered(drafts: Sequence[Draft], document: Document) -> list[Draft]:
     """Sort so that every output comes before its users, else in the order of the file; reports a cycle."""
     by_id = {draft.id: draft for draft in drafts}
     done: dict[str, Draft] = {}
@@ -70,7 +71,7 @@ def ordered(drafts: Sequence[Draft], problems: Problems) -> list[Draft]:
         if draft.id in done:
             return
         if draft.id in chain:
-            _report_cycle([by_id[name] for name in chain[chain.index(draft.id) :]], problems)
+            _report_cycle([by_id[name] for name in chain[chain.index(draft.id) :]], document)
             return
         chain.append(draft.id)
         for ref, _ in draft.edges:
@@ -83,7 +84,7 @@ def ordered(drafts: Sequence[Draft], problems: Problems) -> list[Draft]:
     return list(done.values())
 
 
-def _report_cycle(members: Sequence[Draft], problems: Problems) -> None:
+def _report_cycle(members: Sequence[Draft], document: Document) -> None:
     steps = []
     for user, giver in zip(members, [*members[1:], members[0]], strict=True):
         steps.append(next((user, ref, mark) for ref, mark in user.edges if ref.node == giver.id))
@@ -92,77 +93,70 @@ def _report_cycle(members: Sequence[Draft], problems: Problems) -> None:
     steps = steps[start:] + steps[:start]
     ring = " -> ".join([steps[0][1].node, *(user.id for user, _, _ in steps)])
     takes = "; ".join(f"{user.id} takes {ref} ({mark})" for user, ref, mark in steps)
-    problems.add(steps[0][2], f"{steps[0][0].path}: the stages form a cycle, {ring}: {takes}")
+    user, _, mark = steps[0]
+    document.report_at(mark, f"{dotted(user.keys)}: the stages form a cycle, {ring}: {takes}")
 
 
 class _Wiring:
-    def __init__(self, drafts: Sequence[Draft], problems: Problems) -> None:
-        self._problems = problems
+    def __init__(self, drafts: Sequence[Draft], document: Document) -> None:
+        self._document = document
         self._by_id = {draft.id: draft for draft in drafts}
         self._stages = [draft for draft in drafts if draft.section == "stages"]
         self._complete = all(draft.component is not None for draft in self._stages)
 
     def connect_inputs(self, draft: Draft, component: Component) -> None:
-        explicit = self._explicit(draft, component)
+        document = self._document
+        explicit = document.mapping(*draft.keys, "in")
+        names = [port.name for port in component.ports.inputs]
+        for name in explicit.keys() - set(names):
+            hint = did_you_mean(name, names, "inputs: ") if names else "; a source has no inputs"
+            document.report((*draft.keys, "in", name), f"{draft.id} has no input {name}{hint}", at_key=True)
         unused = draft.params.unused_inputs() if draft.params else ()
         for port in component.ports.inputs:
             draft.inputs[port.name] = None
-            mark = draft.mark
+            place, mark, ref = draft.keys, draft.mark, None
             if port.name in explicit:
-                item = explicit[port.name].item
-                mark = item.mark
-                path = f"{draft.path}.in.{port.name}"
-                if item.content is None:
-                    if not port.optional:
-                        self._problems.add(mark, f"{path}: this input is required; name the output to take")
-                    continue
-                ref = self._reference(item, path, draft)
-            elif port.optional and port.name in unused:
-                continue
-            else:
-                path = draft.path
+                place = (*draft.keys, "in", port.name)
+                mark = document.mark(*place)
+                if explicit[port.name] is not None:
+                    ref = self._reference(explicit[port.name], place, draft)
+                elif not port.optional:
+                    document.report(place, "this input is required; name the output to take")
+            elif not (port.optional and port.name in unused):
                 ref = self._nearest(port.name, draft)
                 if ref is None and not port.optional and self._complete:
-                    self._problems.add(mark, f"{path}: {self._dangling(port, draft)}")
+                    document.report(place, self._dangling(port, draft), at_key=True)
             if ref is not None:
-                self._check_type(ref, port, mark, path)
+                self._check_type(ref, port, mark, place)
                 draft.inputs[port.name] = ref
                 draft.edges.append((ref, mark))
 
     def connect_gates(self, draft: Draft, component: Component) -> None:
-        entry = draft.item.entries.get("when")
-        if entry is None or entry.item.content is None:
+        place: Keys = (*draft.keys, "when")
+        when = draft.settings.get("when")
+        if when is None:
             return
-        path = f"{draft.path}.when"
         if component.kind == "source":
-            self._problems.add(entry.mark, f"{path}: a source cannot be gated; gate the stages behind it")
+            message = "a source cannot be gated; gate the stages behind it"
+            self._document.report(place, message, at_key=True)
             return
-        several = isinstance(entry.item.content, list)
-        for index, item in enumerate(entry.item.content if several else [entry.item]):
-            inner = f"{path}.{index}" if several else path
-            if isinstance(item.content, str):
-                self._gate(item, inner, draft)
-            elif "signal" in item.entries:
-                self._gate(item.entries["signal"].item, f"{inner}.signal", draft)
+        gates = (
+            [((*place, i), gate) for i, gate in enumerate(when)]
+            if isinstance(when, list)
+            else [(place, when)]
+        )
+        for keys, gate in gates:
+            if isinstance(gate, dict):
+                self._gate(gate.get("signal"), (*keys, "signal"), draft)
+            else:
+                self._gate(gate, keys, draft)
 
-    def _explicit(self, draft: Draft, component: Component) -> Mapping[str, Entry]:
-        entry = draft.item.entries.get("in")
-        if entry is None:
-            return {}
-        path = f"{draft.path}.in"
-        names = [port.name for port in component.ports.inputs]
-        for name, given in entry.item.entries.items():
-            if name not in names:
-                hint = did_you_mean(name, names, "inputs: ") if names else "; a source has no inputs"
-                self._problems.add(given.mark, f"{path}.{name}: {draft.id} has no input {name}{hint}")
-        return entry.item.entries
-
-    def _reference(self, item: Item, path: str, user: Draft, by_port: bool = False) -> Ref | None:
+    def _reference(self, text: Any, place: Keys, user: Draft, by_port: bool = False) -> Ref | None:
         """The output that `stage.port`, `stage`, or (with `by_port`) the name of a port means."""
-        text = item.content
         if not isinstance(text, str):
             # The model of the file reports it.
             return None
+        document = self._document
         stage, dot, port = text.partition(".")
         if by_port and not dot:
             ref = self._nearest(text, user)
@@ -172,17 +166,17 @@ class _Wiring:
         if giver is None:
             # A signal that nobody gives may be one of a stage that could not be found.
             if self._complete or dot or not by_port:
-                self._problems.add(item.mark, f"{path}: {self._unknown(text, user, by_port)}")
+                document.report(place, self._unknown(text, user, by_port))
         elif giver.section == "sinks":
-            self._problems.add(item.mark, f"{path}: {stage} is a sink and gives nothing")
+            document.report(place, f"{stage} is a sink and gives nothing")
         elif giver.component is not None:
             outputs = list(giver.outputs)
             if dot and port not in outputs:
                 hint = did_you_mean(port, outputs, "it gives ")
-                self._problems.add(item.mark, f"{path}: {stage} ({giver.mark}) has no output {port!r}{hint}")
+                document.report(place, f"{stage} ({giver.mark}) has no output {port!r}{hint}")
             elif not dot and len(outputs) > 1:
                 refs = ", ".join(f"{stage}.{name}" for name in outputs)
-                self._problems.add(item.mark, f"{path}: {stage} has several outputs; name one of {refs}")
+                document.report(place, f"{stage} has several outputs; name one of {refs}")
             else:
                 return Ref(stage, port if dot else outputs[0])
         return None
@@ -214,14 +208,14 @@ class _Wiring:
         kind = port_type(self._by_id[ref.node].outputs[ref.port].annotation)
         return kind if isinstance(kind, SignalPort) else None
 
-    def _check_type(self, ref: Ref, port: Port, mark: Mark, path: str) -> None:
+    def _check_type(self, ref: Ref, port: Port, mark: Mark, place: Keys) -> None:
         giver = self._by_id[ref.node]
         output = giver.outputs[ref.port]
         reason = mismatch(output, port)
         if reason is not None:
-            self._problems.add(
+            self._document.report_at(
                 mark,
-                f"{path}: the input {port.name} takes {describe_type(port.annotation)}, but {ref} "
+                f"{dotted(place)}: the input {port.name} takes {describe_type(port.annotation)}, but {ref} "
                 f"({giver.mark}) gives {describe_type(output.annotation)}: {reason}",
             )
 
@@ -237,42 +231,27 @@ class _Wiring:
         makers = [c.name for c in catalogue()[0] if port.name in (output.name for output in c.ports.outputs)]
         if makers:
             return text + f"; it comes from the stage {' or '.join(makers)}"
-        return text + self._one_of_the_type(port, user)
+        return text
 
-    def _one_of_the_type(self, port: Port, user: Draft) -> str:
-        """Advice for an input whose name nobody gives, where exactly one output has its type."""
-        outputs = [(draft, output) for draft in self._above(user) for output in draft.outputs.values()]
-        fits = [Ref(draft.id, output.name) for draft, output in outputs if mismatch(output, port) is None]
-        if len(fits) != 1:
-            return ""
-        (ref,) = fits
-        return (
-            f"; {ref.port} ({ref.node}) has this type: name the parameter {ref.port}, "
-            f"or say in: {{{port.name}: {ref}}}"
-        )
-
-    def _gate(self, item: Item, path: str, draft: Draft) -> None:
-        ref = self._reference(item, path, draft, by_port=True)
+    def _gate(self, text: Any, place: Keys, draft: Draft) -> None:
+        ref = self._reference(text, place, draft, by_port=True)
         if ref is None:
             return
         signal = self._signal(ref)
         if signal is None:
             giver = self._by_id[ref.node]
             kind = describe_type(giver.outputs[ref.port].annotation)
-            self._problems.add(
-                item.mark,
-                f"{path}: a gate takes a signal (a bool port such as touching), but {ref} "
-                f"({giver.mark}) gives {kind}",
-            )
+            needed = "a gate takes a signal (a bool port such as touching)"
+            self._document.report(place, f"{needed}, but {ref} ({giver.mark}) gives {kind}")
             return
         draft.gates.append((ref, self._meaning(ref, signal)))
-        draft.edges.append((ref, item.mark))
+        draft.edges.append((ref, self._document.mark(*place)))
 
-    def _meaning(self, ref: Ref, signal: SignalPort, seen: Sequence[str] = ()) -> SignalPort:
+    def _meaning(self, ref: Ref, signal: SignalPort, visited: Sequence[str] = ()) -> SignalPort:
         """The signal that says what a closed gate means: for one that only holds another, that other one."""
         giver = self._by_id[ref.node]
-        for source in giver.inputs.values() if signal.closed is None and giver.id not in seen else ():
+        for source in giver.inputs.values() if signal.closed is None and giver.id not in visited else ():
             held = self._signal(source) if source else None
             if source and held:
-                return self._meaning(source, held, [*seen, giver.id])
+                return self._meaning(source, held, [*visited, giver.id])
         return signal

@@ -1,0 +1,329 @@
+"""A pipeline file as plain values, with the place of each; mistakes are shown with source line and caret."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Mark
+
+Keys = tuple[str | int, ...]
+"""Where a value stands in a document: keys of mappings and indices of lists, from the root."""
+
+MAX_BYTES: Final = 256 * 1024
+"""Size limit of a pipeline file: a hundred times the longest shipped one."""
+MAX_VALUES: Final = 100_000
+"""Limit on the values of a document with its aliases written out, so that aliases of aliases cannot fill the
+memory. A file of `MAX_BYTES` without aliases hardly reaches it."""
+MAX_SHOWN: Final = 150
+"""Longest source line that is shown whole, in characters: a longer one would wrap and misplace the caret."""
+
+
+def shown(value: Any) -> str:
+    """A plain value as YAML would write it, shortened."""
+    if value is None or isinstance(value, bool):
+        return "nothing" if value is None else str(value).lower()
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def described(value: Any) -> str:
+    """A value as messages show what they got."""
+    return "a mapping" if isinstance(value, dict) else "a list" if isinstance(value, list) else shown(value)
+
+
+def dotted(keys: Keys) -> str:
+    """A place as messages name it.
+
+    >>> dotted(("stages", "hull", "when", 0))
+    'stages.hull.when.0'
+    """
+    return ".".join(map(str, keys))
+
+
+class Document:
+    """The values of a pipeline file, where each was written, and the mistakes that were found in them.
+
+    root : mappings, lists, text, numbers, booleans and None. file : its name in messages; or the origin of
+    values that no file holds, such as an option of the command line.
+    """
+
+    def __init__(self, file: str, root: Any = None, *, line: int = 0) -> None:
+        self.root = root
+        self.lines: list[str] = []
+        self.marks: dict[Keys, Mark] = {(): Mark(file, line, line)}
+        self.key_marks: dict[Keys, Mark] = {}
+        # What was changed later, from the outside or by `sensors:`, and where the new value was written.
+        self._changes: list[tuple[Keys, Mark | Keys]] = []
+        self.mistakes: dict[tuple[Mark, str], None] = {}
+
+    def get(self, *keys: str | int) -> Any:
+        """The value at a place; None if there is none."""
+        value = self.root
+        for key in keys:
+            if isinstance(value, dict):
+                value = value.get(key)
+            elif isinstance(value, list) and isinstance(key, int) and key < len(value):
+                value = value[key]
+            else:
+                return None
+        return value
+
+    def mapping(self, *keys: str | int) -> dict[str, Any]:
+        """The mapping at a place; empty if there is something else."""
+        value = self.get(*keys)
+        return value if isinstance(value, dict) else {}
+
+    def has(self, *keys: str | int) -> bool:
+        """Whether a mapping of the document has this key."""
+        return keys[-1] in self.mapping(*keys[:-1])
+
+    def mark(self, *keys: str | int) -> Mark:
+        """Where a value was written; of one that is missing, where the mapping around it begins."""
+        for target, origin in reversed(self._changes):
+            if keys[: len(target)] == target:
+                return origin if isinstance(origin, Mark) else self.mark(*origin, *keys[len(target) :])
+        while keys not in self.marks:
+            keys = keys[:-1]
+        return self.marks[keys]
+
+    def key_mark(self, *keys: str | int) -> Mark:
+        """Where the key of a value was written."""
+        for target, origin in reversed(self._changes):
+            if keys[: len(target)] == target:
+                if isinstance(origin, Mark):
+                    return self.key_marks.get(keys, origin) if keys == target else origin
+                return self.key_mark(*origin, *keys[len(target) :])
+        return self.key_marks.get(keys) or self.mark(*keys)
+
+    def set(self, keys: Keys, value: Any, mark: Mark) -> None:
+        """Replace a value, or add it with the mappings around it.
+
+        Raises
+        ------
+        ConfigError : the keys lead through a value that has no parts.
+        """
+        parent: Any = self.root
+        place: Keys = ()
+        created: Keys | None = None
+        for key in keys[:-1]:
+            place = (*place, _index(parent, key, place))
+            if isinstance(parent, dict) and parent.get(key) is None:
+                parent[key] = {}
+                created = created or place
+            parent = parent[place[-1]]
+        place = (*place, _index(parent, keys[-1], place))
+        parent[place[-1]] = value
+        self._changes.append((created or place, mark))
+
+    def copy(self, source: Keys, target: Keys) -> None:
+        """Put a value at another key of a mapping; it keeps its place."""
+        self.mapping(*target[:-1])[str(target[-1])] = self.get(*source)
+        self._changes.append((target, source))
+
+    def report(self, keys: Keys, message: str, *, at_key: bool = False) -> None:
+        """Record a mistake in a value, or in its key."""
+        mark = self.key_mark(*keys) if at_key else self.mark(*keys)
+        self.report_at(mark, f"{dotted(keys)}: {message}" if keys else message)
+
+    def report_at(self, mark: Mark, message: str) -> None:
+        """Record a mistake at a place; the same one only once."""
+        self.mistakes[mark, message] = None
+
+    def raise_if_mistaken(self) -> None:
+        """Raise a ConfigError that holds every mistake, those of the file in its order."""
+        if self.mistakes:
+            found = sorted(self.mistakes, key=lambda item: (not item[0].line, item[0].line, item[0].column))
+            raise ConfigError(*[self._block(mark, message) for mark, message in found])
+
+    def _block(self, mark: Mark, message: str) -> str:
+        # Text from a file may hold line breaks and control characters.
+        message = _printable(message)
+        head = f"{mark}  {message}" if mark.line else f"{_printable(mark.file)}: {message}"
+        if not 0 < mark.line <= len(self.lines):
+            return head
+        line, column = _printable(self.lines[mark.line - 1]), mark.column - 1
+        start = max(0, column - MAX_SHOWN // 2) if len(line) > MAX_SHOWN else 0
+        return f"{head}\n    {line[start : start + MAX_SHOWN]}\n    {' ' * (column - start)}^"
+
+
+def _index(parent: Any, key: str | int, place: Keys) -> str | int:
+    """The key of a part of `parent`, which stands at `place`; in a list a number."""
+    if isinstance(parent, dict):
+        return key
+    if not isinstance(parent, list):
+        raise ConfigError(f"{dotted(place)} is {described(parent)}, so it has no {key}")
+    if not str(key).isdecimal() or int(key) >= len(parent):
+        raise ConfigError(f"{dotted(place)} is a list with {len(parent)} items, counted from 0")
+    return int(key)
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+def read_document(path: Path) -> Document:
+    """Read a YAML file. Duplicate keys and the like are recorded in the document.
+
+    Raises
+    ------
+    ConfigError : the file cannot be read, or is not YAML.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{path} is a folder; required: a pipeline file (YAML)")
+    try:
+        with path.open("rb") as stream:
+            # A device such as /dev/zero has no end.
+            data = stream.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise ConfigError(f"there is no file {path}") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ConfigError(f"cannot read {path}: {reason}") from None
+    if len(data) > MAX_BYTES:
+        raise ConfigError(f"{path} is larger than {MAX_BYTES // 1024} KiB; required: a pipeline file (YAML)")
+    document = Document(str(path), line=1)
+    text = data.decode("utf-8-sig", "replace")
+    document.lines = text.splitlines()
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        mark = _end(str(path), data[: error.start].decode("utf-8-sig"))
+        document.report_at(mark, f"byte 0x{data[error.start]:02x} is not UTF-8 text; save the file as UTF-8")
+        document.raise_if_mistaken()
+    if not _parse(text, document):
+        document.raise_if_mistaken()
+    return document
+
+
+def parse_value(text: str) -> Any:
+    """A value that the command line gives as YAML.
+
+    Raises
+    ------
+    ConfigError : what is wrong with it, without a place.
+
+    >>> parse_value("[1, 2e-3]")
+    [1, 0.002]
+    """
+    document = Document("", line=1)
+    _parse(text, document)
+    if document.mistakes:
+        raise ConfigError(*[message for _, message in document.mistakes])
+    return document.root
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML's plain values; dates stay text, and 1e-3 is a number as in YAML 1.2."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, regexp) for tag, regexp in resolvers if not tag.endswith((":timestamp", ":value"))]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+_TAG = "tag:yaml.org,2002:"
+_SCALARS = frozenset(_TAG + name for name in ("null", "bool", "int", "float", "str"))
+
+
+def _parse(text: str, document: Document) -> bool:
+    """Fill a document from YAML; False if it cannot be read, which is recorded."""
+    file = document.mark().file
+    try:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        if node is not None:
+            document.root = _Values(loader, document).value(node, ())
+        return True
+    except yaml.reader.ReaderError as error:
+        mark = _end(file, text[: error.position])
+        document.report_at(mark, f"the character #x{error.character:04x} is not allowed in YAML")
+    except yaml.MarkedYAMLError as error:
+        where = error.problem_mark or error.context_mark
+        mark = Mark(file, where.line + 1, where.column + 1) if where else Mark(file, 1, 1)
+        document.report_at(mark, _yaml_message(error, text))
+    except RecursionError:
+        document.report_at(Mark(file, 1, 1), "not a pipeline: values are nested too deeply")
+    return False
+
+
+def _end(file: str, before: str) -> Mark:
+    """The place that comes after some text of a file."""
+    return Mark(file, before.count("\n") + 1, len(before) - before.rfind("\n"))
+
+
+def _yaml_message(error: yaml.MarkedYAMLError, text: str) -> str:
+    """What PyYAML says, with advice for the usual mistakes."""
+    where = error.problem_mark
+    if where is not None and "\t" in [*text.splitlines(), ""][where.line][: where.column + 1]:
+        return "a tab character; YAML is indented with blanks"
+    if "expected a single document" in str(error.context):
+        return "a second document starts here; a pipeline file holds one"
+    message = " ".join(f"not valid YAML: {error.problem} {error.context or ''}".split())
+    if error.context_mark is not None and error.context:
+        message += f" that starts in line {error.context_mark.line + 1}"
+    return message + ("; text with ': ' in it needs quotes" if "mapping values are not" in message else "")
+
+
+class _Values:
+    """Turns PyYAML's nodes into values and records their places; aliases are written out."""
+
+    def __init__(self, loader: _Loader, document: Document) -> None:
+        self._loader = loader
+        self._document = document
+
+    def value(self, node: yaml.Node, keys: Keys) -> Any:
+        """The plain value of a node that stands at `keys`."""
+        self._document.marks[keys] = self._mark(node)
+        if len(self._document.marks) > MAX_VALUES:
+            too_many = f"more than {MAX_VALUES} values, with aliases written out"
+            raise yaml.MarkedYAMLError(problem=too_many, problem_mark=node.start_mark)
+        if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
+            return self._mapping(node, keys)
+        if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
+            return [self.value(part, (*keys, index)) for index, part in enumerate(node.value)]
+        if not isinstance(node, yaml.ScalarNode) or node.tag not in _SCALARS:
+            self._report(node, f"the tag {node.tag.replace(_TAG, '!!')} is not allowed; write plain values")
+            return None
+        try:
+            return self._loader.construct_object(node)
+        except (ValueError, LookupError):
+            self._report(node, f"{node.value!r} is not a valid {node.tag.removeprefix(_TAG)}")
+            return None
+
+    def _mapping(self, node: yaml.MappingNode, keys: Keys) -> dict[str, Any]:
+        first: dict[str, yaml.Mark] = {}
+        for key_node, _ in node.value:
+            if key_node.tag == _TAG + "merge":
+                continue
+            key, mark = key_node.value, key_node.start_mark
+            if key_node.tag != _TAG + "str":
+                hint = f"; put {key} in quotes" if isinstance(key, str) else ""
+                self._report(key_node, f"a key must be text{hint}")
+            elif (there := first.setdefault(key, mark)) is not mark:
+                where = f"line {there.line + 1}, column {there.column + 1}"
+                self._report(key_node, f"{key}: duplicate key; it is already in {where}")
+        self._loader.flatten_mapping(node)
+        # Merged keys come first. Without those that are overridden, an alias finds no duplicates here.
+        node.value = list(
+            {key.value: (key, value) for key, value in node.value if isinstance(key.value, str)}.values()
+        )
+        values = {}
+        for key_node, value_node in node.value:
+            place: Keys = (*keys, key_node.value)
+            values[key_node.value] = self.value(value_node, place)
+            self._document.key_marks[place] = self._mark(key_node)
+        return values
+
+    def _report(self, node: yaml.Node, message: str) -> None:
+        self._document.report_at(self._mark(node), message)
+
+    def _mark(self, node: yaml.Node) -> Mark:
+        return Mark(self._document.mark().file, node.start_mark.line + 1, node.start_mark.column + 1)

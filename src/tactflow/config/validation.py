@@ -1,0 +1,174 @@
+"""Checks values against pydantic models and reports every error at its place in the document."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from tactflow.config.document import Document, Keys, described, dotted, shown
+from tactflow.config.models import WORD
+from tactflow.engine.contract import StageParams
+from tactflow.system.spelling import closest, did_you_mean
+
+Model = TypeVar("Model", bound=BaseModel)
+
+_YAML_TERMS = {
+    r"^(Input|String|List|Tuple|Dictionary) (?=should )": "",
+    r"\ban? (valid )?(object|dictionary)\b": "a mapping",
+    r"\ba valid array\b": "a list",
+    r" after validation": "",
+    rf"match pattern '{re.escape(WORD)}'": "be a word of letters, digits, _ and -",
+}
+"""Words of pydantic -> words for those who write YAML."""
+_WITHOUT_VALUE = ("missing", "extra_forbidden", "value_error", "assertion_error", "too_short", "too_long")
+"""Errors that the value itself does not explain."""
+
+
+def validate(
+    model: type[Model],
+    document: Document,
+    keys: Keys = (),
+    *,
+    without: Collection[str] = (),
+    noun: str = "key",
+) -> Model | None:
+    """The mapping at `keys` as its model; None if it has mistakes, which are recorded.
+
+    without : keys of the mapping that do not belong to the model. noun : what messages call its keys.
+    """
+    values = {key: value for key, value in document.mapping(*keys).items() if key not in without}
+    try:
+        # Pydantic's strict rules for JSON fit YAML: a list may become a tuple, but text and booleans never
+        # become numbers.
+        return model.model_validate_json(json.dumps(values), strict=True)
+    except ValidationError as error:
+        report(error, model, document, keys, also=without, noun=noun)
+        return None
+
+
+def validated(model: type[StageParams], values: Mapping[str, Any], name: str, *, origin: str) -> StageParams:
+    """The parameters that a program gives a stage or sink, as its own model.
+
+    name : what a message calls the stage. origin : what it begins with, in place of file, line and column.
+
+    Raises
+    ------
+    ConfigError : every mistake in the values.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        document = Document(origin, {name: dict(values)})
+        report(error, model, document, (name,), noun="parameter")
+        document.raise_if_mistaken()
+        raise
+
+
+def report(
+    error: ValidationError,
+    model: type[BaseModel],
+    document: Document,
+    keys: Keys,
+    *,
+    also: Collection[str] = (),
+    noun: str = "key",
+) -> None:
+    """Record each error of a validation at its own value; those of a union together, as one mistake.
+
+    keys : what was validated. also : keys that may stand there besides those of the model.
+    """
+    groups: dict[Keys, list[tuple[ErrorDetails, Keys]]] = {}
+    for detail in error.errors(include_url=False):
+        place, rest = _place(document, keys, detail)
+        kind, inside = detail["type"], place[len(keys) : -1]
+        if kind == "json_invalid":
+            document.report(keys, "a text is not UTF-8; rename the file", at_key=True)
+        elif kind == "missing" and not rest:
+            field = _fields(model, inside).get(str(place[-1]))
+            about = f" ({field.description})" if field and field.description else ""
+            message = f"{dotted(place)}: {_message(detail)}{about}"
+            document.report_at(document.key_mark(*place[:-1]), message)
+        elif kind == "extra_forbidden" and not rest:
+            known = [*_fields(model, inside), *(() if inside else sorted(also))]
+            hint = did_you_mean(str(place[-1]), known, "there are ")
+            document.report(place, f"unknown {noun}{hint}", at_key=True)
+        elif rest == ("[key]",):
+            document.report(place, f"{_message(detail)}, got {shown(place[-1])}", at_key=True)
+        else:
+            groups.setdefault(place, []).append((detail, rest))
+    for place, members in groups.items():
+        document.report(place, _words(members, document.get(*place)), at_key=place == keys)
+
+
+def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, Keys]:
+    """The value that an error is about, and the rest of its location: the member of a union, and in it."""
+    place, rest = keys, list(detail["loc"])
+    while rest:
+        value = document.get(*place)
+        if isinstance(value, dict) and rest[0] in value:
+            place = (*place, rest.pop(0))
+        elif isinstance(rest[0], int) and (not isinstance(value, list) or rest[0] < len(value)):
+            # One item may stand for a list of one.
+            index = rest.pop(0)
+            place = (*place, index) if isinstance(value, list) else place
+        else:
+            break
+    if detail["type"] == "missing" and len(rest) == 1:
+        place = (*place, rest.pop())
+    return place, tuple(rest)
+
+
+def _words(members: Sequence[tuple[ErrorDetails, Keys]], value: Any) -> str:
+    """One message for the errors of a value: several where the members of a union were tried."""
+    texts, choices, got = [], [], ""
+    for detail, rest in members:
+        texts.append("".join(f"{key}: " for key in rest[1:]) + _message(detail))
+        if detail["type"] == "literal_error":
+            choices += re.findall("'([^']*)'", detail["ctx"]["expected"])
+        if detail["type"] not in _WITHOUT_VALUE:
+            got = f", got {described(value)}"
+    first, *others = dict.fromkeys(texts)
+    text = " or ".join([first, *(other.removeprefix("should be ") for other in others)]) + got
+    guess = closest(value, choices) if isinstance(value, str) else None
+    return f"{text}; did you mean {guess}?" if guess else text
+
+
+def _message(detail: ErrorDetails) -> str:
+    """What pydantic says, in YAML's terms."""
+    if detail["type"] == "missing":
+        item = isinstance(detail["loc"][-1], int)
+        return "this item of the list is missing" if item else "required, but not given"
+    if detail["type"] == "extra_forbidden":
+        return "unknown key"
+    if detail["type"] in ("value_error", "assertion_error"):
+        return str(detail["ctx"]["error"])
+    text = detail["msg"]
+    for pattern, words in _YAML_TERMS.items():
+        text = re.sub(pattern, words, text)
+    return text[0].lower() + text[1:]
+
+
+def _fields(model: type[BaseModel], location: Keys) -> dict[str, FieldInfo]:
+    """The fields of the (nested) model at a location, by the names they have in a file."""
+    models: list[type[BaseModel]] = [model]
+    for part in location:
+        field = _named(models).get(str(part))
+        # Items of lists and values of mappings are of the models in the annotation around them.
+        models = _models_in(field.annotation) if field else models
+    return _named(models)
+
+
+def _named(models: Sequence[type[BaseModel]]) -> dict[str, FieldInfo]:
+    return {field.alias or name: field for model in models for name, field in model.model_fields.items()}
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
