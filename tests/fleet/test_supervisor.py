@@ -143,7 +143,7 @@ def test_a_process_that_gives_no_sign_of_life_is_killed_and_started_again(
     gaps = [later - earlier for earlier, later in pairwise(starts)]
     # It lived for ten seconds only, so the pause doubles.
     assert gaps == pytest.approx([10 + HANG_AFTER + FIRST_PAUSE, 10 + HANG_AFTER + 2 * FIRST_PAUSE], abs=0.5)
-    assert capsys.readouterr().err.count("left has given no sign of life for 60 s; it is killed\n") == 2
+    assert capsys.readouterr().err.count("left has hung for 60 s and is killed\n") == 2
     assert machine.starts["right"] == [0.0]
 
 

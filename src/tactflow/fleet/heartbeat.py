@@ -1,8 +1,7 @@
-"""Signs of life: a sensor's process touches a file every second, and its supervisor watches that file.
+"""Heartbeats: a sensor's process touches a file every second, and its supervisor watches that file.
 
-A process that hangs is one that does not touch it: it was stopped, it waits for a lock that nobody opens, or
-one of its stages has been at the same frame all the time. One that waits for frames, or for somebody to take
-its results, touches it.
+A process hangs if it stops touching the file: it was stopped, is deadlocked, or one of its stages does not
+finish a frame. Waiting for frames, or for readers of its results, is not hanging.
 """
 
 from __future__ import annotations
@@ -15,19 +14,18 @@ from pathlib import Path
 from tactflow.system.files import status
 
 BEAT_EVERY = 1.0
-"""Time between two signs of life, s. Chosen by hand."""
+"""Interval of the heartbeat, s."""
 HANG_AFTER = 60.0
-"""A process without a sign of life for so long, s, hangs. Chosen by hand: to start takes a few seconds, ten
-on a machine with other work; one frame in a slow stage takes a second."""
+"""Time without a heartbeat, s, after which a process hangs. To start takes a few seconds, ten on a busy
+machine; a frame in a slow stage takes a second."""
 LONGEST_LOOK = 1.0
-"""Time between two looks counts as no longer than this, s: while the supervisor itself was stopped, it has
-missed signs of life. Chosen by hand."""
+"""Longest time counted between two polls, s: a supervisor that was stopped itself has missed heartbeats."""
 
 
 class Headway:
-    """Tells whether every thread has got on since that was last so.
+    """Tells whether every thread has made progress since the last time that all had.
 
-    calls : thread -> number of the call that it is in; one that waits is left out.
+    calls : returns thread -> number of its current call; waiting threads are left out.
 
     >>> numbers = {"compute": 1}
     >>> headway = Headway(lambda: dict(numbers))
@@ -43,7 +41,7 @@ class Headway:
         self._before: Mapping[str, int] = {}
 
     def __call__(self) -> bool:
-        """Whether no call that is under way was under way the last time that the answer was yes."""
+        """Whether no current call was already running when the answer was last yes."""
         now = self._calls()
         gets_on = self._before.items().isdisjoint(now.items())
         if gets_on:
@@ -52,7 +50,7 @@ class Headway:
 
 
 def start_beating(path: Path, headway: Callable[[], bool]) -> None:
-    """Touch a file every second from now on, if there is headway."""
+    """Touch a file every second from now on while there is progress."""
     threading.Thread(target=_beat, args=(path, headway), name="tactflow-heartbeat", daemon=True).start()
 
 
@@ -65,10 +63,10 @@ def _beat(path: Path, headway: Callable[[], bool]) -> None:
 
 
 class SignOfLife:
-    """How long a process has been silent, as its supervisor sees it.
+    """How long a process has been silent, from its supervisor's view.
 
-    path : the file that it touches. limit : how long it may be silent, s; while it starts, no less than
-    `HANG_AFTER`. silent : how long it has been, s.
+    path : the file that the process touches. limit : longest silence, s; at least `HANG_AFTER` while it
+    starts. silent : time since the last heartbeat, s.
     """
 
     def __init__(self, path: Path, limit: float = HANG_AFTER) -> None:
@@ -80,18 +78,18 @@ class SignOfLife:
         self._touched: int | None = None
 
     def start(self, now: float) -> None:
-        """A new process has just been started, at a time in seconds."""
+        """Begin to watch a process started at time `now`, s."""
         self.silent = 0.0
         self._looked = now
         self._heard = False
 
     @property
     def limit(self) -> float:
-        """How long the process may be silent now, s."""
+        """Longest silence that is accepted now, s."""
         return self._limit if self._heard else max(self._limit, HANG_AFTER)
 
     def look(self, now: float) -> bool:
-        """Look whether there was a sign since the last look; whether the silence is too long."""
+        """Check for a heartbeat; returns whether the silence is too long."""
         there = status(str(self.path))
         touched = None if there is None else there.st_mtime_ns
         self.silent += min(now - self._looked, LONGEST_LOOK)
@@ -101,5 +99,5 @@ class SignOfLife:
         return self.silent > self.limit
 
     def excuse(self, now: float) -> None:
-        """The time since the last look does not count."""
+        """Do not count the time since the last check."""
         self._looked = now

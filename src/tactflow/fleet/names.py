@@ -1,4 +1,4 @@
-"""What each sensor's process calls a file that the command line names once for all of them."""
+"""File names of each sensor's process, made from one name given for all of them."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from tactflow.engine.errors import ConfigError
 from tactflow.system.files import expanded, is_device
 
 STREAMS = ("/dev/stdout", "/dev/stderr")
-"""They lead to the supervisor, even where what they stand for is a regular file just now."""
+"""Streams that lead to the supervisor, even if they are redirected to a regular file."""
 
 
 def with_name(path: str, sensor: str) -> str:
-    """The file that one sensor's process writes where the command line names `path` for all of them.
+    """The file that one sensor's process writes, given the `path` on the command line.
 
-    Standard output and devices are the same for all.
+    Standard output and devices are shared by all.
 
     Raises
     ------
-    ConfigError : it is a folder.
+    ConfigError : the path is a folder.
 
     >>> with_name("out.jsonl", "left")
     'out-left.jsonl'
@@ -41,9 +41,9 @@ def with_name(path: str, sensor: str) -> str:
 
 
 def name_problems(files: Mapping[str, str], sensors: Sequence[str]) -> list[str]:
-    """One message for each option whose file not every sensor can have its own of.
+    """Error messages for options whose path cannot be split by sensor.
 
-    files : option -> the file it names.
+    files : option -> path.
     """
     problems = []
     for option, path in files.items():

@@ -27,17 +27,16 @@ from tactflow.system.children import python_command
 from tactflow.system.signals import ending_handled
 
 LONGEST_ADDRESS = 107
-"""Bytes that the path of a local socket may have (Linux; elsewhere four less)."""
+"""Longest path of a local socket, bytes (Linux; four less elsewhere)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What every sensor's process is asked to do.
+    """What to run for every sensor.
 
     file : the pipeline file. overrides : for `--set`. added : options of the command line that added sinks,
-    as in the marks of these. files : option -> the file it names, of which each sensor writes its own.
-    hang_after : time without a sign of life, s, after which its process is killed. options : all other words
-    of the command line.
+    as in the marks of these. files : option -> path, of which each sensor gets its own. hang_after : time
+    without a heartbeat, s, after which a process is killed. options : remaining command-line arguments.
     """
 
     file: Path
@@ -82,7 +81,7 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
 
 
 def _scratch_folder(pipelines: Mapping[str, Pipeline]) -> tempfile.TemporaryDirectory[str]:
-    """A folder for addresses, whose paths may not be long."""
+    """A temporary folder whose path is short enough for socket addresses."""
     longest = max(
         len(f"{sensor}.{node.id}") for sensor, one in pipelines.items() for node in one.nodes.values()
     )
@@ -92,13 +91,10 @@ def _scratch_folder(pipelines: Mapping[str, Pipeline]) -> tempfile.TemporaryDire
 
 
 def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequence[str]) -> list[str]:
-    """The command that runs one sensor.
-
-    changed : settings that differ from what the user has asked for.
-    """
+    """The command that runs one sensor. changed : settings added to the user's."""
     sinks = [added(node) for node in pipeline.sinks if str(node.mark) in request.added]
     command = python_command("-m", "tactflow", "run", str(request.file), "--sensor", sensor)
-    # Nobody else ends it if the supervisor is killed.
+    # So that it ends when the supervisor is killed.
     command.append("--end-with-stdin")
     for text in (*request.overrides, *sinks, *changed):
         command += ["--set", text]
@@ -108,7 +104,7 @@ def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequenc
 
 
 def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scratch: Path) -> list[str]:
-    """Settings of one sensor's sinks that follow from the other sensors beside it."""
+    """Settings of one sensor's sinks that depend on the other sensors."""
     relayed = {node.id for one in shared for name, node in one.sinks if name == sensor}
     settings = []
     for node in pipeline.sinks:
@@ -120,5 +116,5 @@ def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scr
 
 
 def _private(scratch: Path, sensor: str, node: Node) -> str:
-    """The address at which a sink publishes to the relay."""
+    """Address at which a sink publishes to the relay."""
     return f"ipc://{scratch}/{sensor}.{node.id}"

@@ -1,4 +1,4 @@
-"""What the sinks of several sensors declare: files they write, addresses they publish at."""
+"""Files and addresses declared by the sinks of several sensors: conflicts, sharing, restarts."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from tactflow.system.files import is_device, status
 
 
 class _State(NamedTuple):
-    """What tells whether somebody has written to a file or folder.
+    """Identity and version of a file or folder.
 
-    size : of a file in bytes; of a folder, how much stands in it.
+    size : bytes of a file; number of entries of a folder.
     """
 
     device: int
@@ -29,10 +29,7 @@ class _State(NamedTuple):
 
 
 class WatchedSink:
-    """The files and folders of one sink of one sensor, watched from before its sensor's first start.
-
-    node : the sink.
-    """
+    """The outputs of one sink, watched from before the first start of its sensor."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -40,16 +37,15 @@ class WatchedSink:
 
     @property
     def overrides(self) -> list[str]:
-        """Settings (`--set`) with which the sink is started now.
+        """Settings (`--set`) with which the sink is restarted, so that what it has written is kept.
 
-        What it has written so far must stay. For a file to which it has not come yet, what the user wants
-        still holds.
+        Before it has written anything, the user's own settings apply.
         """
         return changes(self._node, self._params)
 
     @property
     def refused(self) -> Path | None:
-        """What the sink would refuse to write to if it were started now, None if there is nothing."""
+        """An existing output that the sink would refuse to replace if restarted now, or None."""
         for output in written_files(self._node, self._params):
             now = _state(output)
             if output.refuses_existing and now is not None and now.size > 0:
@@ -70,7 +66,7 @@ def sink_class(node: Node) -> type[Sink]:
 
 
 def written_files(node: Node, params: StageParams) -> Sequence[Output]:
-    """The files and folders that a sink declares with these parameters, without devices and streams."""
+    """The files and folders that a sink declares, without devices and streams."""
     declared: Sequence[Output] = sink_class(node).outputs(params)
     return [
         output for output in declared if str(output.path) not in STREAMS and not is_device(str(output.path))
@@ -78,21 +74,21 @@ def written_files(node: Node, params: StageParams) -> Sequence[Output]:
 
 
 def changes(node: Node, params: StageParams) -> list[str]:
-    """`sinks.ID.KEY=VALUE` for every parameter in which `params` differ from those of the sink."""
+    """`sinks.ID.KEY=VALUE` for every parameter that differs from the sink's own."""
     old, new = _plain(node.params), _plain(params)
     return [f"sinks.{node.id}.{key}={as_yaml(value)}" for key, value in new.items() if value != old.get(key)]
 
 
 def added(node: Node) -> str:
-    """The override that adds a sink which an option of the command line has added."""
+    """The override that adds the same sink as an option of the command line did."""
     given = node.params.model_dump(mode="json", by_alias=True, exclude_unset=True)
     return f"sinks.{node.id}={as_yaml({'use': node.component.name} | given)}"
 
 
 def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
-    """One message for each sink that would write or listen where another sensor's does.
+    """Error messages for sinks that would write or listen where another sensor's sink does.
 
-    pipelines : sensor -> its pipeline. Results may be published at one address, if by the same keys.
+    pipelines : sensor -> its pipeline. Results may be published at one address with the same keys.
     """
     problems = [
         f"{node.mark}  sinks.{node.id}.keys: required the same for all sensors that publish at {one.address}"
@@ -113,7 +109,7 @@ def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
 
 
 def _taken(node: Node, sensor: str) -> Iterator[tuple[str, str, str]]:
-    """What a sink takes for itself alone: (parameter, "write FILE" or "listen at ADDRESS", advice)."""
+    """Resources that a sink needs exclusively: (parameter, "write FILE" or "listen at ADDRESS", advice)."""
     for output in written_files(node, node.params):
         advice = f"put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
         yield output.parameter, f"write {output.path}", advice
@@ -123,10 +119,9 @@ def _taken(node: Node, sensor: str) -> Iterator[tuple[str, str, str]]:
 
 
 class Shared(NamedTuple):
-    """An address at which several sinks would publish.
+    """An address at which several sinks publish.
 
-    sinks : (sensor, its sink). backlog : messages. keys : as in `Publication`. linger : the longest of the
-    sinks', s.
+    sinks : (sensor, sink). backlog : messages. keys : as in `Publication`. linger : longest of the sinks', s.
     """
 
     address: str
@@ -137,10 +132,7 @@ class Shared(NamedTuple):
 
 
 def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
-    """The addresses that the sinks of several sensors share.
-
-    pipelines : sensor -> its pipeline.
-    """
+    """Addresses shared by sinks of several sensors. pipelines : sensor -> its pipeline."""
     found: dict[str, Shared] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
@@ -161,7 +153,7 @@ def _plain(params: StageParams) -> dict[str, object]:
 
 
 def _state(output: Output) -> _State | None:
-    """The present state of a regular file or a folder; None if there is none."""
+    """State of a regular file or folder; None if it does not exist."""
     there = status(str(output.path))
     is_kind = stat.S_ISDIR if output.kind == "folder" else stat.S_ISREG
     if there is None or not is_kind(there.st_mode):

@@ -1,4 +1,4 @@
-"""Starts a process for each sensor, passes signals on, starts again what failed."""
+"""Starts a process for each sensor, forwards signals, and restarts what failed."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from tactflow.system.files import lead_nowhere
 from tactflow.system.signals import INTERRUPTED
 
 FIRST_PAUSE = 1.0
-"""Time before the first new start after a failure, s; it doubles with each further one. Chosen by hand."""
+"""Pause before the first restart, s; it doubles with each further failure (exponential back-off)."""
 LONGEST_PAUSE = 30.0
-"""Never longer than this, s. Chosen by hand."""
+"""Upper limit of that pause, s."""
 GIVE_UP_AFTER = 5
-"""Failures in a row after which a sensor is not started again. Chosen by hand."""
+"""Failures in a row after which a sensor is given up."""
 GOOD_RUN = 30.0
-"""A process that ran so long, s, starts with the first pause again when it fails. Chosen by hand."""
+"""A process that ran this long, s, resets the count of failures."""
 KILL_AT = 3
-"""Signals after which processes that have not ended are killed; the first lets them finish."""
+"""Number of the signal that kills the processes; the first lets them finish, the second ends them."""
 LOOK_EVERY = 0.05
-"""Time between two looks at the processes, s. Chosen by hand."""
+"""Poll interval, s."""
 
 Process = subprocess.Popen[bytes]
 
 
 def start_process(command: Sequence[str]) -> Process:
-    """Start the process of a sensor; its output comes through pipes."""
-    # A session of its own: Ctrl-C on the terminal reaches the supervisor alone, which passes it on once.
-    # Its standard input ends with the supervisor.
+    """Start the process of a sensor, with pipes for its input and output."""
+    # In a session of its own, Ctrl-C on the terminal reaches the supervisor alone, which forwards it once.
+    # Closing its standard input, as the death of the supervisor does, ends the process.
     return subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
@@ -51,11 +51,11 @@ def start_process(command: Sequence[str]) -> Process:
 class Member:
     """One sensor's process and its history.
 
-    command : runs the sensor. sign : whether its process is alive. sinks : what it has written decides how it
-    is started again.
-    process : the present one; None between two. started, start_at : when it was started, and when it may be
-    started next, s. told : signals passed on to the process; KILL_AT if it was killed. failures : in a row.
-    code : how the sensor ended for good. readers : threads that pass its output on.
+    command : runs the sensor. sign : its heartbeat. sinks : what they have written decides with which
+    parameters the sensor is restarted.
+    process : the running one; None between two. started, start_at : when it was started, and when it may be
+    restarted, s. signals_sent : signals forwarded to the process; KILL_AT if it was killed. failures : in a
+    row. code : final exit code. readers : threads that forward its output.
     """
 
     sensor: str
@@ -65,13 +65,13 @@ class Member:
     process: Process | None = None
     started: float = 0.0
     start_at: float = 0.0
-    told: int = 0
+    signals_sent: int = 0
     failures: int = 0
     code: int | None = None
     readers: list[threading.Thread] = field(default_factory=list[threading.Thread])
 
     def next_command(self) -> list[str]:
-        """The command that starts the sensor now: what it has written so far must stay."""
+        """The command that (re)starts the sensor and keeps what it has written so far."""
         command = list(self.command)
         for sink in self.sinks:
             for text in sink.overrides:
@@ -82,7 +82,7 @@ class Member:
 class Supervisor:
     """Keeps the processes of several sensors running until each has ended for good.
 
-    start : starts a command. clock : seconds. pause : waits so many seconds.
+    start : starts a command. clock : returns the time, s. pause : sleeps, s.
     """
 
     def __init__(
@@ -97,15 +97,15 @@ class Supervisor:
         self._signals = 0
         self._refused = False
         self._unwritten = False
-        # Who does not read results shall not keep messages back.
+        # Separate locks: a blocked reader of results must not hold up messages.
         self._results, self._messages = threading.Lock(), threading.Lock()
 
     def run(self, members: Sequence[Member]) -> int:
-        """Until every process has ended for good; the exit code.
+        """Supervise until every process has ended for good.
 
         Returns
         -------
-        0 if all ended well, 130 after a second signal, else the exit code of the first sensor that failed.
+        The exit code: 0 if all ended well, 130 after a second signal, else that of the first failed sensor.
         """
         while any(member.code is None for member in members):
             for member in members:
@@ -120,7 +120,7 @@ class Supervisor:
 
     @property
     def _ends(self) -> int:
-        """How often a process is to be told to end."""
+        """Number of signals that each process should have received."""
         return max(self._signals, int(self._refused or self._unwritten))
 
     def _attend(self, member: Member) -> None:
@@ -134,14 +134,14 @@ class Supervisor:
             return
         code = member.process.poll()
         if code is None:
-            if self._signals >= KILL_AT and member.told < KILL_AT:
-                member.told = KILL_AT
+            if self._signals >= KILL_AT and member.signals_sent < KILL_AT:
+                member.signals_sent = KILL_AT
                 member.process.kill()
-            elif member.told < self._ends:
-                # Not SIGINT, for which a process that is still importing shows a traceback. And one at a
-                # time: two at once may arrive as one.
+            elif member.signals_sent < self._ends:
+                # SIGINT would show a traceback in a process that is still importing. One signal at a time:
+                # two at once may be merged.
                 member.process.send_signal(signal.SIGTERM)
-                member.told += 1
+                member.signals_sent += 1
             self._look_for_life(member, member.process)
             return
         if member.process.stdin is not None:
@@ -149,27 +149,27 @@ class Supervisor:
         member.process = None
         if code in (0, ConfigError.exit_code, INTERRUPTED) or self._ends:
             member.code = self._last_code(member, code)
-            # The command line or the file is wrong for this sensor, so the whole is: end the others.
+            # A wrong command line or file is wrong for the whole run: end the others.
             self._refused |= code == ConfigError.exit_code
         else:
             self._start_again(member, code)
 
     def _look_for_life(self, member: Member, process: Process) -> None:
-        """Kill a process that hangs."""
-        if member.told >= KILL_AT:
+        """Kill a process whose heartbeat has stopped."""
+        if member.signals_sent >= KILL_AT:
             return
         if self._results.locked() or self._messages.locked():
-            # It may wait for us, who wait for somebody that reads what we write.
+            # It may be blocked by our own reader.
             member.sign.excuse(self._clock())
         elif member.sign.look(self._clock()):
-            self._say(member, f"has given no sign of life for {member.sign.limit:g} s; it is killed")
-            member.told = KILL_AT
+            self._say(member, f"has hung for {member.sign.limit:g} s and is killed")
+            member.signals_sent = KILL_AT
             process.kill()
 
     def _last_code(self, member: Member, code: int) -> int:
-        """What counts as the exit code of a sensor that is not started again."""
+        """Exit code of a sensor that is not restarted."""
         if self._ends and self._signals < 2 and code in (-signal.SIGINT, -signal.SIGTERM, INTERRUPTED):
-            # The one signal came before the process could catch it.
+            # The signal came before the process had installed its handler.
             return 0
         if code < 0:
             self._say(member, f"was ended by signal {-code}")
@@ -177,7 +177,7 @@ class Supervisor:
         return code
 
     def _start_again(self, member: Member, code: int) -> None:
-        """Plan the next start after a failure, if there is to be one."""
+        """Schedule the restart after a failure, or give up."""
         refused = next((path for sink in member.sinks if (path := sink.refused)), None)
         if code == StageError.exit_code and refused is not None:
             self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
@@ -195,7 +195,7 @@ class Supervisor:
 
     def _start(self, member: Member) -> None:
         member.process = self._start_process(member.next_command())
-        member.started, member.told = self._clock(), 0
+        member.started, member.signals_sent = self._clock(), 0
         member.sign.start(member.started)
         assert member.process.stdout is not None
         assert member.process.stderr is not None
@@ -208,7 +208,7 @@ class Supervisor:
             member.readers.append(reader)
 
     def _copy(self, stream: IO[bytes], target: TextIO, prefix: str) -> None:
-        """Pass whole lines on, so that those of two processes do not mix; they need not be text."""
+        """Forward whole lines, so that those of two processes do not mix; they may be any bytes."""
         with stream:
             for line in stream:
                 self._write(target, prefix.encode() + line)
@@ -217,7 +217,7 @@ class Supervisor:
         self._write(sys.stderr, f"tactflow: {member.sensor} {text}\n".encode())
 
     def _write(self, target: TextIO, line: bytes) -> None:
-        """Write at once. When the reader has gone away, fall silent; when the disk is full, end the run."""
+        """Write and flush. If the reader has gone, discard the rest; if the disk is full, end the run."""
         with self._results if target is sys.stdout else self._messages:
             try:
                 target.flush()
@@ -230,6 +230,6 @@ class Supervisor:
                     sys.stderr.write(f"tactflow: standard output: {error.strerror}; the run ends\n")
 
     def count_signal(self, _number: int, _frame: FrameType | None) -> None:
-        """Handler of the signals that ask to end."""
-        # Nothing else: this may be in the middle of starting a process, which would not be told.
+        """Signal handler of the supervisor."""
+        # Only count: a process may be starting right now, and would miss a signal sent from here.
         self._signals += 1
