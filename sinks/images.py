@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Literal
@@ -14,10 +13,11 @@ from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.ports import Picture
-from tactflow.system.files import claim_path, expanded, make_folder, next_name
+from tactflow.system.files import expanded, make_folder, next_name
+from tactflow.system.outputs import cannot_write
 
 UNFINISHED = ".unfinished"
-"""Name of a picture until all of it is written: none is ever seen in half."""
+"""Name of a picture until all of it is written, so that nobody reads half of one."""
 
 
 class Images(Sink):
@@ -54,7 +54,6 @@ class Images(Sink):
         self.description = str(self._folder)
         self._next = 0
         self._files = 0
-        self._claim: int | None = None
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
 
     @classmethod
@@ -73,16 +72,13 @@ class Images(Sink):
         Raises
         ------
         StageError
-            If it holds frames already and `overwrite` is not set, it cannot be created, or another run
-            writes into it.
+            If it holds frames already and `overwrite` is not set, or it cannot be created.
         """
         try:
             make_folder(self._folder)
-            present = next(self._folder.glob("frame-*.[pj][np]g"), None)
-            if present is None or self.params.overwrite:
-                self._claim = claim_path(self._folder)
         except OSError as error:
             raise StageError(f"{self._folder}: cannot be written into: {error.strerror or error}") from error
+        present = next(self._folder.glob("frame-*.[pj][np]g"), None)
         if present is not None and not self.params.overwrite:
             raise StageError(
                 f"{self._folder}: holds frames already ({present.name}, ...); set overwrite: true or give "
@@ -114,14 +110,6 @@ class Images(Sink):
         except OSError as error:
             with suppress(OSError):
                 unfinished.unlink()
-            raise StageError(
-                f"{path}: cannot be written: {error.strerror or error}; "
-                f"the {self._files} pictures written before are whole"
-            ) from error
+            kept = f"the {self._files} pictures written before are whole"
+            raise cannot_write(path, error, kept) from error
         self._files += 1
-
-    def close(self) -> None:
-        """Let others write into the folder."""
-        if self._claim is not None:
-            os.close(self._claim)
-            self._claim = None

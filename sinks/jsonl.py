@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import errno
-import logging
-import sys
-import time
 from collections.abc import Sequence
-from contextlib import suppress
 
 from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
-from tactflow.engine.errors import StageError
 from tactflow.message.result import Result, encode_message
-from tactflow.system.files import expanded, is_device, lead_nowhere, make_folder
-from tactflow.system.lines import LineFile, LineStream, open_pipe
-
-log = logging.getLogger("tactflow")
+from tactflow.system.files import expanded, is_device
+from tactflow.system.lines import LineFile, LineStream
+from tactflow.system.outputs import refuse_existing
 
 
 class Jsonl(Sink):
@@ -64,12 +57,9 @@ class Jsonl(Sink):
         """
         super().__init__(params)
         self._control = control
-        self._name = "standard output" if params.path == "-" else params.path
-        self.description = self._name
+        self.description = "standard output" if params.path == "-" else params.path
         self._out: LineFile | LineStream | None = None
-        self._pending: list[bytes] = []
-        self._flushed = 0.0
-        self._counts = {"lines": 0}
+        self._closed = False
 
     @classmethod
     def outputs(cls, params: Jsonl.Params) -> Sequence[Output]:
@@ -93,46 +83,23 @@ class Jsonl(Sink):
             If the file exists and neither `overwrite` nor `append` is set, or it cannot be written.
         """
         path, p = expanded(self.params.path), self.params
-        try:
-            if p.path == "-":
-                self._out = LineStream(sys.stdout.buffer, self._waits)
-            elif is_device(p.path):
-                pipe = open_pipe(path, lambda: not self._hurried)
-                self._out = None if pipe is None else LineStream(pipe, self._waits)
-            elif path.is_file() and path.stat().st_size > 0 and not (p.overwrite or p.append):
-                raise StageError(
-                    f"{path}: this file exists; set overwrite: true to replace it, append: true to continue "
-                    "it, or give another path"
-                )
-            else:
-                make_folder(path.parent)
-                self._out = LineFile(path, replaces=p.overwrite, continues=p.append)
-        except OSError as error:
-            raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
-        self._flushed = time.monotonic()
-
-    @property
-    def _hurried(self) -> bool:
-        return self._control is not None and self._control.hurried
-
-    @property
-    def _live(self) -> bool:
-        source = None if self._control is None else self._control.source
-        return source is not None and source.live
-
-    def _waits(self) -> bool:
-        """Whether to wait for a slow reader."""
-        return not self._live and not self._hurried
+        if p.path == "-" or is_device(p.path):
+            self._out = LineStream(p.path, self._control)
+            return
+        empty = path.is_file() and path.stat().st_size == 0
+        changes = p.overwrite or p.append or empty
+        refuse_existing(path, overwrite=changes, others="append: true to continue it, ")
+        self._out = LineFile(path, replaces=p.overwrite, every=p.flush)
 
     def wants(self) -> bool:
         """False once the reader of standard output has gone away."""
-        return self._out is not None
+        return self._out is not None and not self._closed and not self._out.ended
 
     def counters(self) -> dict[str, int]:
         """lines : written so far. dropped : lines that the reader of a pipe did not take."""
-        if isinstance(self._out, LineStream):
-            return {"lines": self._out.delivered, "dropped": self._out.dropped}
-        return self._counts if self._out is None else {"lines": self._out.delivered}
+        lines = 0 if self._out is None else self._out.delivered
+        dropped = {"dropped": self._out.dropped} if isinstance(self._out, LineStream) else {}
+        return {"lines": lines} | dropped
 
     def write(self, result: Result) -> None:
         """Add one line.
@@ -143,13 +110,9 @@ class Jsonl(Sink):
             If the file cannot be written, for instance because the disk is full. The file then ends with the
             last line that fitted.
         """
-        if self._out is None:
-            return
-        self._pending.append(encode_message(result, detail=self.params.detail, field=self.params.field))
-        now = time.monotonic()
-        if self.params.path == "-" or now - self._flushed >= self.params.flush:
-            self._flushed = now
-            self._flush(self._out)
+        if self._out is not None and self.wants():
+            p = self.params
+            self._out.send(encode_message(result, detail=p.detail, field=p.field))
 
     def close(self) -> None:
         """Write what is left and close the file.
@@ -159,40 +122,6 @@ class Jsonl(Sink):
         StageError
             If that is not possible, or the reader of a pipe did not take all lines of a recording.
         """
-        out = self._out
-        if out is None:
-            return
-        try:
-            self._flush(out, last=True)
-            if out.dropped and not self._live:
-                raise StageError(
-                    f"{self._name}: its reader took only {out.delivered} lines before the run was stopped; "
-                    f"{out.dropped} more are lost"
-                )
-        finally:
-            self._counts = self.counters()
-            self._out = None
-            if self.params.path != "-":
-                with suppress(OSError):
-                    out.close()
-
-    def _flush(self, out: LineFile | LineStream, *, last: bool = False) -> None:
-        lines, self._pending = self._pending, []
-        already = out.dropped
-        try:
-            out.send(lines)
-            if last:
-                out.finish()
-        except OSError as error:
-            if self.params.path == "-" and error.errno in (errno.EPIPE, errno.ECONNRESET):
-                log.debug("standard output was closed by its reader")
-                self._counts = self.counters()
-                self._out = None
-                lead_nowhere(sys.stdout)
-                return
-            raise StageError(
-                f"{self._name}: cannot be written: {error.strerror or error}; "
-                f"the {out.delivered} lines written before are complete"
-            ) from error
-        if out.dropped and not already:
-            log.warning("%s: its reader is too slow: lines are dropped", self._name)
+        if self._out is not None and not self._closed:
+            self._closed = True
+            self._out.close()

@@ -20,7 +20,6 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from tactflow.cli.main import main
-from tactflow.recording.writer import About, RecordingWriter
 from tactflow.sim import open_scene
 from tactflow.sources import open_source
 from tests.cli.kill_me import image
@@ -212,20 +211,6 @@ def test_repair_can_write_elsewhere_and_replaces_nothing_unasked(
     with copy.open("rb") as file:
         assert make_reader(file).get_summary() is not None
     assert len(stamps(copy)) == 3
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows refuses to open it twice")
-def test_a_file_that_is_being_recorded_is_left_to_its_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "a.mcap"
-    writer = RecordingWriter(path, About("main"))
-    assert main(["repair", str(path)]) == 2
-    assert "is still being recorded" in capsys.readouterr().err
-    with pytest.raises(BlockingIOError, match="another run is writing to it"):
-        RecordingWriter(path, About("main"), overwrite=True)
-    writer.finish()
-    assert main(["repair", str(path)]) == 0
 
 
 @pytest.mark.parametrize(("content", "words"), [(b"no", "is not an MCAP file"), (None, "no such file")])

@@ -28,10 +28,11 @@ from tactflow.message.result import encode_message
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
 from tactflow.network.subscriber import _parsed
-from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME, FrameCoder
+from tactflow.recording.frames import FrameCoder, RawFrame
 from tactflow.recording.records import NotARecordingError
 from tactflow.recording.repair import repair
-from tactflow.recording.writer import About, Entry, RecordingWriter
+from tactflow.recording.schemas import protobuf_type
+from tactflow.recording.writer import Entry, RecordingWriter
 from tactflow.sinks.zmq import Zmq
 from tactflow.sources.bags import Bag
 from tactflow.sources.base import FrameReader, Normaliser
@@ -127,14 +128,14 @@ def recordings(folder: Path) -> Iterator[Parser]:
 
 def _recording(path: Path, *, finished: bool) -> bytes:
     coder = FrameCoder()
-    writer = RecordingWriter(path, About("main", {"tactflow": "1"}, {"pipeline.yaml": "{}"}), overwrite=True)
+    writer = RecordingWriter(path, "main", overwrite=True)
     for seq in range(4):
         frame = Frame("main", seq, seq / 10, IMAGE, reference=seq == 0)
         writer.write(Entry(round(seq * 1e8), seq, seq == 0, 0, coder.encode(frame), b"{}"))
     if finished:
         writer.finish()
     else:
-        writer.abandon()
+        writer.close()
     return path.read_bytes()
 
 
@@ -143,7 +144,8 @@ def _other_recording(packing: CompressionType) -> bytes:
     file = io.BytesIO()
     writer = Writer(file, chunk_size=1024, compression=packing)
     writer.start()
-    schema = writer.register_schema(TYPE_NAME, "protobuf", DESCRIPTOR)
+    kind = protobuf_type(RawFrame)
+    schema = writer.register_schema(kind.name, *kind.schema)
     channel = writer.register_channel("/main/frames", "protobuf", schema)
     coder = FrameCoder()
     for seq in range(4):

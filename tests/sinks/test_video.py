@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from tactflow.drawing import film as film_module
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.sinks import video as video_module
 from tactflow.sinks.video import Video
 
 Pixels = NDArray[np.uint8]
@@ -70,11 +70,11 @@ def test_a_lossless_film_gives_back_every_bit(suffix: str, size: tuple[int, int]
 def test_a_codec_that_loses_bits_is_not_accepted_as_lossless(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(video_module.LOSSLESS_CODECS, ".avi", ("FFVH", "HFYU"))
+    monkeypatch.setitem(film_module.LOSSLESS_CODECS, ".avi", ("FFVH", "HFYU"))
     shown = pictures(3)
     film(tmp_path / "film.avi", shown, lossless=True)
     np.testing.assert_array_equal(play(tmp_path / "film.avi")[0], shown)
-    monkeypatch.setitem(video_module.LOSSLESS_CODECS, ".avi", ("FFVH", "MJPG"))
+    monkeypatch.setitem(film_module.LOSSLESS_CODECS, ".avi", ("FFVH", "MJPG"))
     with pytest.raises(StageError, match=r"cannot encode \.avi losslessly"):
         film(tmp_path / "other.avi", shown, lossless=True)
     assert not (tmp_path / "other.avi").exists()
@@ -154,7 +154,7 @@ def test_a_film_that_did_not_fit_on_the_disk_is_an_error(
 
 
 def test_a_disk_that_is_nearly_full_stops_the_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(video_module, "MIN_FREE_BYTES", 1 << 62)
+    monkeypatch.setattr(film_module, "MIN_FREE_BYTES", 1 << 62)
     with pytest.raises(StageError, match="the disk is full"):
         film(tmp_path / "film.avi", pictures(20))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import tracemalloc
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -12,21 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 import zstandard
-from mcap.reader import make_reader
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.engine.frame import Frame, Tick
-from tactflow.recording import records
+from tactflow.engine.frame import Frame
+from tactflow.message.result import Result
 from tactflow.recording.frames import StoredFrame
-from tactflow.recording.protobuf import encode
-from tactflow.recording.records import Damage, intact_records
-from tactflow.recording.repair import repair
 from tactflow.sinks.record import Record
 from tactflow.sources import StampedReader, open_source
 from tactflow.stages.capture import Capture
-from tests.messages import Results, result_of
 
 FPS = 10.0
 UNIX = 1_700_000_000.123456789
@@ -55,7 +48,7 @@ def record(path: Path, made: Sequence[Frame], *, cut: bool = False) -> Path:
     sink = Record(Record.Params(path=str(path), preview=0))
     sink.open()
     for frame in made:
-        sink.write(result_of(Tick(frame), Results()))
+        sink.write(Result(frame))
     if cut:
         data = path.read_bytes()
         sink.close()
@@ -124,33 +117,6 @@ def test_a_file_that_was_not_finished_is_played_with_a_warning(
     assert "tactflow repair" in caplog.text
 
 
-def test_wherever_a_file_is_cut_whole_frames_come_back(tmp_path: Path) -> None:
-    made = frames(range(5))
-    path = record(tmp_path / "a.mcap", made)
-    data = path.read_bytes()
-    cut, fixed = tmp_path / "cut.mcap", tmp_path / "fixed.mcap"
-    counts = []
-    for length in range(8, len(data), 97):
-        cut.write_bytes(data[:length])
-        result = repair(cut, fixed)
-        with fixed.open("rb") as file:
-            again = [m.data for _, _, m in make_reader(file, validate_crcs=True).iter_messages()]
-        assert len(again) == result.messages
-        assert not result.finished
-        # A frame and its message lie in one chunk.
-        count = len(again) // 2
-        assert len(again) == 2 * count
-        if count:
-            same(captured(cut), made[:count])
-            same(captured(fixed), made[:count])
-        else:
-            with pytest.raises(SourceError, match="no frame"):
-                captured(cut)
-        counts.append(count)
-    assert counts == sorted(counts)
-    assert set(counts) == set(range(6))
-
-
 @pytest.mark.parametrize("cut", [False, True])
 def test_start_skips_ahead_but_shows_the_references_that_are_in_force(tmp_path: Path, cut: bool) -> None:
     made = frames(range(40), references=(0, 1, 20, 21))
@@ -197,10 +163,10 @@ def test_at_its_own_pace_references_of_before_are_not_waited_for(tmp_path: Path)
     made = frames([0, *range(10_000, 10_003)])
     sink = Record(Record.Params(path=str(tmp_path / "a.mcap"), trigger="button"))
     sink.open()
-    sink.write(result_of(Tick(made[0]), Results()))
+    sink.write(Result(made[0]))
     sink.start_recording()
     for frame in made[1:]:
-        sink.write(result_of(Tick(frame), Results()))
+        sink.write(Result(frame))
     sink.close()
     # Waiting for frame 10 000 would take 1000 s, far beyond this test's time limit.
     same(captured(tmp_path / "a-001.mcap", realtime=True), made)
@@ -270,92 +236,10 @@ def test_a_recording_without_a_frame_is_a_clear_error(tmp_path: Path) -> None:
         open_source(str(record(tmp_path / "a.mcap", [])))
 
 
-def test_damage_in_the_middle_of_a_whole_file_is_reported(tmp_path: Path) -> None:
-    path = record(tmp_path / "a.mcap", frames(range(9)))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    path.write_bytes(data)
-    with pytest.raises(SourceError, match=r"is damaged .*tactflow repair keeps all that is intact"):
-        captured(path)
-
-
-def test_one_wrong_bit_costs_one_frame_wherever_it_lies(tmp_path: Path) -> None:
-    made = frames(range(6))
-    data = record(tmp_path / "a.mcap", made).read_bytes()
-    flipped, fixed = tmp_path / "flipped.mcap", tmp_path / "fixed.mcap"
-    for place in range(8, len(data), 211):
-        changed = bytearray(data)
-        changed[place] ^= 1 << (place % 8)
-        flipped.write_bytes(changed)
-        repair(flipped, fixed)
-        assert flipped.read_bytes() == changed
-        again = captured(fixed)
-        kept = [frame for frame in made if any(frame.seq == other.seq for other in again)]
-        assert len(kept) >= len(made) - 1, place
-        same(again, kept)
-
-
-def chunk(data: bytes, compression: str, size: int) -> bytes:
-    """One chunk of an MCAP file."""
-    name = compression.encode()
-    beginning = struct.pack("<QQQII", 0, 0, size, 0, len(name)) + name
-    body = beginning + struct.pack("<Q", len(data)) + data
-    return struct.pack("<BQ", 6, len(body)) + body
-
-
-@pytest.mark.parametrize(
-    ("data", "compression", "size"),
-    [
-        (zstandard.compress(bytes(64 << 20)), "zstd", 100),
-        (zstandard.compress(bytes(100)), "zstd", 1 << 60),
-        (b"no such thing", "zstd", 100),
-        (b"no such thing", "lz4", 100),
-        (bytes(100), "brotli", 100),
-        (bytes(100), "", 1 << 60),
-    ],
-    ids=["bomb", "absurd size", "garbage", "lz4 garbage", "unknown", "plain of another size"],
-)
-def test_a_chunk_that_cannot_be_unpacked_is_passed_over(
-    tmp_path: Path, data: bytes, compression: str, size: int
-) -> None:
-    path = record(tmp_path / "a.mcap", frames(range(3)))
-    whole = path.read_bytes()
-    with path.open("rb") as file:
-        before = len(list(intact_records(file)))
-    hostile = chunk(data, compression, size)
-    path.write_bytes(whole[:8] + hostile + whole[8:])
-    tracemalloc.start()
-    with path.open("rb") as file:
-        records = list(intact_records(file))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert [record for record in records if isinstance(record, Damage)] == [Damage(8, 8 + len(hostile))]
-    assert len(records) == before + 1
-    # What the file itself holds, several times over; none of the sizes that it claims.
-    assert peak < 10 * len(whole) + len(data)
-
-
-@pytest.mark.parametrize("t", [float("nan"), float("-inf"), 1e300])
-def test_a_time_that_is_none_is_an_error_of_the_recording(tmp_path: Path, t: float) -> None:
-    path = record(tmp_path / "a.mcap", frames(range(4)))
-    stored = encode([(4, 3 / FPS)])
-    whole = path.read_bytes()
-    assert whole.count(stored) == 1
-    path.write_bytes(whole.replace(stored, encode([(4, t)])))
-    # Without the checksum of its chunk, which is zero where a writer made none.
-    unchecked = records.get_chunk_data_stream
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(records, "get_chunk_data_stream", lambda chunk, **_: unchecked(chunk))
-        source = open_source(str(path))
-        assert [source.read() is None for _ in range(3)] == [False] * 3
-        with pytest.raises(SourceError, match=r"a\.mcap, 0\.3 s: required a frame's time within"):
-            source.read()
-
-
 def test_a_frame_that_claims_more_pixels_than_any_camera_has_is_refused() -> None:
-    huge = StoredFrame(0, 0.0, False, 0, (1 << 16, 1 << 16), memoryview(zstandard.compress(bytes(100))))
+    huge = StoredFrame(0, 0.0, False, 0, (1 << 16, 1 << 16), zstandard.compress(bytes(100)))
     with pytest.raises(ValueError, match="65536 x 65536"):
         huge.image()
-    bomb = StoredFrame(0, 0.0, False, 0, (8, 4), memoryview(zstandard.compress(bytes(64 << 20))))
+    bomb = StoredFrame(0, 0.0, False, 0, (8, 4), zstandard.compress(bytes(64 << 20)))
     with pytest.raises(ValueError, match="required 96 bytes"):
         bomb.image()

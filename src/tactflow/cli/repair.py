@@ -13,7 +13,6 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from tactflow.cli.notes import say
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.recording import missing_packages
-from tactflow.system.files import claim
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +54,6 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--out: {out} is the file to repair; name another one")
     if out.exists() and not args.overwrite:
         raise ConfigError(f"{out} is already there; give --overwrite to replace it, or --out FILE")
-    _refuse_if_in_use(path)
     try:
         handle, name = tempfile.mkstemp(dir=out.absolute().parent, prefix=f".{out.stem}-", suffix=".mcap")
         os.close(handle)
@@ -66,16 +64,6 @@ def run(args: argparse.Namespace) -> int:
         return _repair(path, copy, out, quiet=args.quiet)
     finally:
         copy.unlink(missing_ok=True)
-
-
-def _refuse_if_in_use(path: Path) -> None:
-    try:
-        with path.open("rb") as file:
-            claim(file)
-    except BlockingIOError:
-        raise ConfigError(f"{path}: is still being recorded; repair it when that run has ended") from None
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _repair(path: Path, copy: Path, out: Path, *, quiet: bool) -> int:

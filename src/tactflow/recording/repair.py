@@ -7,33 +7,26 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
-from mcap.summary import Summary
+from mcap.records import Attachment, Channel, DataEnd, Header, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from tactflow.recording.reader import read_summary
-from tactflow.recording.records import Damage, intact_records
-from tactflow.recording.writer import NEVER
+from tactflow.recording.records import Damage, intact_records, read_summary
 
 CHUNK_BYTES = 1 << 22
-"""Bytes after which a chunk of the copy ends, as other writers do it."""
+"""Size of the copy's chunks, bytes, as other writers choose it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
     """What `repair` found.
 
-    finished : the file was whole. messages : how many were kept. damage : what belonged to no intact record.
+    finished : the file was whole. messages : how many were kept. lost : bytes that belong to no intact
+    record.
     """
 
     finished: bool
     messages: int
-    damage: tuple[Damage, ...] = ()
-
-    @property
-    def lost(self) -> int:
-        """Bytes that belonged to no intact record."""
-        return sum(gap.end - gap.start for gap in self.damage)
+    lost: int = 0
 
 
 def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -> Repaired:
@@ -44,27 +37,34 @@ def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -
     Raises
     ------
     NotARecordingError
-        If it is no MCAP file. OSError if one cannot be read or the other not written.
+        If it is not an MCAP file. OSError if one cannot be read or the other not written.
     """
-    messages, whole, damage = 0, False, []
+    messages = lost = 0
+    whole = False
     with path.open("rb") as source, out.open("wb") as target:
-        copy = _Copy(Writer(target, chunk_size=NEVER, compression=CompressionType.NONE))
+        writer = Writer(target, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         summary = read_summary(source)
+        records = intact_records(source)
+        first = next(records, None)
+        header = first if isinstance(first, Header) else Header("", "")
+        writer.start(header.profile, header.library)
+        copy = _Copy(writer)
         if summary is not None:
-            copy.know(summary)
-        for record in intact_records(source):
+            # The chunk that describes them may be damaged.
+            for described in (*summary.schemas.values(), *summary.channels.values()):
+                copy.add(described)
+        for record in (first, *records):
             if isinstance(record, Damage):
-                damage.append(record)
-            else:
+                lost += record.end - record.start
+            elif record is not None:
                 messages += copy.add(record)
                 whole = whole or isinstance(record, DataEnd)
             if report is not None:
                 report(source.tell())
-        copy.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
         target.flush()
         os.fsync(target.fileno())
-    finished = whole and summary is not None and not damage
-    return Repaired(finished, messages, tuple(damage))
+    return Repaired(whole and summary is not None and not lost, messages, lost)
 
 
 class _Copy:
@@ -72,33 +72,18 @@ class _Copy:
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
-        self._started = False
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
-        self._summary = Summary()
-        self._pending = 0
 
-    def know(self, summary: Summary) -> None:
-        """Where to look up the schemas and channels of a chunk that is damaged."""
-        self._summary = summary
-
-    def add(self, record: object) -> int:
-        """Copy one record; returns the number of messages in it."""
+    def add(self, record: McapRecord) -> bool:
+        """Copy one record; whether it is a message that could be copied."""
         writer = self._writer
-        if isinstance(record, Header) and not self._started:
-            self._start(record.profile, record.library)
-            return 0
-        if not self._started:
-            self._start()
-        if isinstance(record, Message) and record.channel_id not in self._channels:
-            self._look_up(record.channel_id)
         if isinstance(record, Schema) and record.id not in self._schemas:
             self._schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
         elif isinstance(record, Channel) and record.id not in self._channels:
-            schema = self._schemas.get(record.schema_id)
-            if schema is not None:
+            if record.schema_id in self._schemas:
                 self._channels[record.id] = writer.register_channel(
-                    record.topic, record.message_encoding, schema, record.metadata
+                    record.topic, record.message_encoding, self._schemas[record.schema_id], record.metadata
                 )
         elif isinstance(record, Attachment):
             writer.add_attachment(
@@ -114,29 +99,5 @@ class _Copy:
                 sequence=record.sequence,
                 data=record.data,
             )
-            self._pending += len(record.data)
-            if self._pending > CHUNK_BYTES:
-                writer.flush()  # type: ignore[no-untyped-call]
-                self._pending = 0
-            return 1
-        return 0
-
-    def _look_up(self, channel_id: int) -> None:
-        """Describe a channel as the index does."""
-        channel = self._summary.channels.get(channel_id)
-        if channel is None:
-            return
-        schema = self._summary.schemas.get(channel.schema_id)
-        if schema is not None:
-            self.add(schema)
-        self.add(channel)
-
-    def _start(self, profile: str = "", library: str = "") -> None:
-        self._writer.start(profile, library)
-        self._started = True
-
-    def finish(self) -> None:
-        """Write what is pending, and the index."""
-        if not self._started:
-            self._start()
-        self._writer.finish()  # type: ignore[no-untyped-call]
+            return True
+        return False

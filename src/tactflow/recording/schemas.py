@@ -16,12 +16,12 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from google.protobuf.message import Message  # type: ignore[import-untyped]
-from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
 from tactflow.message.result import Result
 from tactflow.message.schema import message_schema
+from tactflow.recording.frames import timestamp
 from tactflow.vision.types import Markers, MarkerStatus
 
 RESULT_TYPE = "tactflow.frame"
@@ -51,24 +51,26 @@ class ChannelType(NamedTuple):
     packing: str
 
 
+def protobuf_type(message: type[Message]) -> ChannelType:
+    """The channel type for a protobuf class."""
+    schema = build_file_descriptor_set(message).SerializeToString()
+    return ChannelType(message.DESCRIPTOR.full_name, ("protobuf", schema), "protobuf")
+
+
 @functools.cache
 def channel_types() -> dict[str, ChannelType]:
-    """What is in the channels for people: `image`, `annotations` and `results`."""
+    """The channels for people: `image`, `annotations` and `results`."""
     results = json.dumps(plain_schema(message_schema())).encode()
-    foxglove: dict[str, type[Message]] = {"image": CompressedImage, "annotations": ImageAnnotations}
     return {
-        channel: ChannelType(
-            message.DESCRIPTOR.full_name,
-            ("protobuf", build_file_descriptor_set(message).SerializeToString()),
-            "protobuf",
-        )
-        for channel, message in foxglove.items()
-    } | {"results": ChannelType(RESULT_TYPE, ("jsonschema", results), "json")}
+        "image": protobuf_type(CompressedImage),
+        "annotations": protobuf_type(ImageAnnotations),
+        "results": ChannelType(RESULT_TYPE, ("jsonschema", results), "json"),
+    }
 
 
 def encode_picture(jpeg: bytes, sensor: str, nanoseconds: int) -> bytes:
     """One `foxglove.CompressedImage`."""
-    picture = CompressedImage(timestamp=_stamp(nanoseconds), data=jpeg, format="jpeg", frame_id=sensor)
+    picture = CompressedImage(timestamp=timestamp(nanoseconds), data=jpeg, format="jpeg", frame_id=sensor)
     return bytes(picture.SerializeToString())
 
 
@@ -77,7 +79,7 @@ def encode_annotations(result: Result, nanoseconds: int) -> bytes:
 
     result : in pixels of the processed frame, which is the picture.
     """
-    stamp = _stamp(nanoseconds)
+    stamp = timestamp(nanoseconds)
 
     def drawn(
         kind: PointsAnnotation.Type.ValueType, points: NDArray[np.float64], colour: Color, thickness: float
@@ -110,11 +112,6 @@ def _arrows(markers: Markers) -> NDArray[np.float64]:
     left, right = tip - HEAD * (moved - across), tip - HEAD * (moved + across)
     ends: NDArray[np.float64] = np.stack([tail, tip, tip, left, tip, right], axis=1).reshape(-1, 2)
     return ends
-
-
-def _stamp(nanoseconds: int) -> Timestamp:
-    seconds, rest = divmod(nanoseconds, 1_000_000_000)
-    return Timestamp(seconds=seconds, nanos=rest)
 
 
 def plain_schema(schema: dict[str, Any]) -> dict[str, Any]:

@@ -1,26 +1,30 @@
-"""Writes recordings."""
+"""Writes one recording file."""
 
 from __future__ import annotations
 
-import io
+import errno
 import json
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from io import BufferedWriter, FileIO
 from pathlib import Path
-from typing import IO, cast
+from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
+from tactflow.engine.control import Control
 from tactflow.message.schema import message_schema
-from tactflow.recording.frames import DESCRIPTOR, TYPE_NAME
-from tactflow.recording.schemas import channel_types
-from tactflow.system.files import claim, make_folder, taken_away
+from tactflow.recording.frames import RawFrame
+from tactflow.recording.schemas import channel_types, protobuf_type
+from tactflow.system import provenance
+from tactflow.system.outputs import cannot_write, create, refuse_interference
 
 NEVER = 1 << 62
-"""Size at which a chunk would end by itself, bytes: they are ended by hand."""
+"""Size at which a chunk would end by itself, bytes: each ends with a frame."""
 _OVERHEAD = 200
-"""About what an entry takes in memory beside its data, bytes: the object and its fields. Chosen by hand."""
+"""Memory of an entry beside its data, bytes: the object and its fields. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,40 +47,30 @@ class Entry:
 
     @property
     def size(self) -> int:
-        """Bytes of memory, about."""
-        others = (self.message, self.picture, self.annotations)
-        return len(self.frame) + sum(len(other or b"") for other in others) + _OVERHEAD
-
-
-@dataclass(frozen=True, slots=True)
-class About:
-    """What a recording says about itself.
-
-    sensor : name. facts : metadata, such as versions. texts : attachments by name, in UTF-8. arrays : others,
-    as the bytes of `.npz` files.
-    """
-
-    sensor: str
-    facts: Mapping[str, str] = field(default_factory=dict[str, str])
-    texts: Mapping[str, str] = field(default_factory=dict[str, str])
-    arrays: Mapping[str, bytes] = field(default_factory=dict[str, bytes])
+        """Approximate memory, bytes."""
+        parts = (self.frame, self.message, self.picture, self.annotations)
+        return sum(len(part or b"") for part in parts) + _OVERHEAD
 
 
 class RecordingWriter:
-    """One file that is being recorded.
-
-    After each `write` all of it is with the operating system.
+    """One file that is being recorded. After each `write`, everything is with the operating system.
 
     Parameters
     ----------
     path : the file; its folder is created.
-    about : written at once.
+    sensor : names the channels.
+    control : the run, whose versions, source, pipeline and calibration are attached; or None.
     overwrite : replace an existing file.
+
+    Attributes
+    ----------
+    frames, bytes : written so far. begins : time of the first frame on the file's time line, ns.
 
     Raises
     ------
-    OSError
-        If the file is there already (FileExistsError) or cannot be written.
+    StageError
+        If the file is there already or cannot be written; from every method. After an error, the frames
+        written before can be played.
 
     Examples
     --------
@@ -87,7 +81,7 @@ class RecordingWriter:
     >>> from tactflow.recording.reader import look_into
     >>> packed = FrameCoder().encode(Frame("main", 0, 0.0, np.zeros((6, 8, 3), np.uint8)))
     >>> with TemporaryDirectory() as folder:
-    ...     writer = RecordingWriter(Path(folder, "press.mcap"), About("main"))
+    ...     writer = RecordingWriter(Path(folder, "press.mcap"), "main")
     ...     writer.write(Entry(time=0, seq=0, reference=True, epoch=0, frame=packed))
     ...     writer.finish()
     ...     contents = look_into(Path(folder, "press.mcap"))
@@ -95,135 +89,119 @@ class RecordingWriter:
     (True, 1, '/main/frames')
     """
 
-    def __init__(self, path: Path, about: About, *, overwrite: bool = False) -> None:
+    def __init__(
+        self, path: Path, sensor: str, control: Control | None = None, *, overwrite: bool = False
+    ) -> None:
         self.path = path
-        self.frames = 0
-        make_folder(path.parent)
-        self._file = _WholeRecords(path, overwrite=overwrite)
-        try:
-            self._writer = Writer(
-                cast("IO[bytes]", self._file), chunk_size=NEVER, compression=CompressionType.NONE
-            )
-            self._writer.start(profile="", library="tactflow")
-            self._describe(about)
-            self._file.keep()
-        except BaseException:
-            self._file.close()
-            raise
+        self.frames = self.begins = self.bytes = 0
+        create(path, overwrite=overwrite)
+        self._file = BufferedWriter(_CountedFile(path, "ab"))
+        self._writer = Writer(self._file, chunk_size=NEVER, compression=CompressionType.NONE)
+        self._writer.start(profile="", library="tactflow")
+        with self._errors():
+            self._describe(sensor, control)
+            self._flush()
 
-    @property
-    def bytes(self) -> int:
-        """Length of the file so far."""
-        return self._file.tell()
-
-    def _describe(self, about: About) -> None:
-        writer, name = self._writer, about.sensor
-        frame_type = writer.register_schema(TYPE_NAME, "protobuf", DESCRIPTOR)
-        self._frames = writer.register_channel(f"/{name}/frames", "protobuf", frame_type)
-        self._references = writer.register_channel(f"/{name}/references", "protobuf", frame_type)
-        self._others = {
-            channel: writer.register_channel(
-                f"/{name}/{channel}", kind.packing, writer.register_schema(kind.name, *kind.schema)
+    def _describe(self, sensor: str, control: Control | None) -> None:
+        writer = self._writer
+        types = channel_types()
+        raw = protobuf_type(RawFrame)
+        schema = writer.register_schema(raw.name, *raw.schema)
+        self._channels = {
+            name: writer.register_channel(f"/{sensor}/{name}", raw.packing, schema)
+            for name in ("frames", "references")
+        } | {
+            name: writer.register_channel(
+                f"/{sensor}/{name}", kind.packing, writer.register_schema(kind.name, *kind.schema)
             )
-            for channel, kind in channel_types().items()
+            for name, kind in types.items()
         }
-        writer.add_metadata("tactflow", dict(about.facts))
-        texts = {"message.schema.json": json.dumps(message_schema(), indent=1)} | dict(about.texts)
-        for file, text in texts.items():
-            kind = "application/json" if file.endswith(".json") else "application/yaml"
-            writer.add_attachment(0, 0, file, kind, text.encode())
-        for file, data in about.arrays.items():
-            writer.add_attachment(0, 0, file, "application/octet-stream", data)
+        writer.add_metadata("tactflow", provenance.facts(sensor, control))
+        texts = {"message.schema.json": json.dumps(message_schema(), indent=1)} | provenance.texts(control)
+        for name, text in texts.items():
+            kind = "application/json" if name.endswith(".json") else "application/yaml"
+            writer.add_attachment(0, 0, name, kind, text.encode())
+        for name, data in provenance.arrays(control).items():
+            writer.add_attachment(0, 0, name, "application/octet-stream", data)
 
     def write(self, entry: Entry, time: int | None = None) -> None:
         """Add one frame and what belongs to it.
 
         time : on the file's time line, ns, if it is not the frame's own.
-
-        Raises
-        ------
-        OSError
-            If not all of it could be written. The file then ends after the frame before.
         """
-        at = entry.time if time is None else time
-        number = max(entry.seq, 0) & 0xFFFFFFFF
-        frames = self._references if entry.reference else self._frames
-        parts: Sequence[tuple[int, bytes | None]] = (
-            (frames, entry.frame),
-            (self._others["results"], entry.message),
-            (self._others["image"], entry.picture),
-            (self._others["annotations"], entry.annotations),
-        )
-        for channel, data in parts:
-            if data is not None:
-                self._writer.add_message(
-                    channel, log_time=max(at, 0), publish_time=max(at, 0), sequence=number, data=data
-                )
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        self._file.keep()
+        at = max(entry.time if time is None else time, 0)
+        parts = {
+            "references" if entry.reference else "frames": entry.frame,
+            "results": entry.message,
+            "image": entry.picture,
+            "annotations": entry.annotations,
+        }
+        with self._errors():
+            for channel, data in parts.items():
+                if data is not None:
+                    self._writer.add_message(
+                        self._channels[channel],
+                        log_time=at,
+                        publish_time=at,
+                        sequence=max(entry.seq, 0) & 0xFFFFFFFF,
+                        data=data,
+                    )
+            self._flush()
+        self.begins = at if self.frames == 0 else self.begins
         self.frames += 1
 
-    def interference(self) -> str | None:
-        """What another program has done to the file: "removed", "replaced", "cut", or None, nothing."""
-        return self._file.interference(self.path)
-
     def finish(self) -> None:
-        """Add the index and close the file. Raises OSError as `write` does."""
-        try:
+        """Add the index and close the file."""
+        with self._errors():
+            self._refuse_interference()
             self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.keep()
-        finally:
+            self.bytes = self._file.tell()
             self._file.close()
 
-    def abandon(self) -> None:
-        """Close the file as it is, without an index."""
-        self._file.close()
+    def close(self) -> None:
+        """Close the file as it is; without an index if it was not finished."""
+        # Not the buffer: what it could not write it would try again.
+        self._file.raw.close()
 
+    def _flush(self) -> None:
+        self._refuse_interference()
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self.bytes = self._file.tell()
 
-class _WholeRecords(io.BufferedIOBase):
-    """A file that, after a failed write, ends where `keep` was called last.
+    def _refuse_interference(self) -> None:
+        ours = os.fstat(self._file.fileno())
+        refuse_interference(self.path, ours, f"its {self.frames} frames are not in it", self.bytes)
 
-    Nothing is held back in this process: what was written survives it.
-    """
-
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
-        super().__init__()
-        create = 0 if overwrite and path.exists() else os.O_CREAT | os.O_EXCL
-        # At the end whatever happens: a file that another program has cut then stays too short.
-        flags = os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0) | create
-        self._file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
-        claim(self._file)
-        self._file.truncate()
-        self._kept = 0
-        self._at = 0
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: bytes) -> int:  # type: ignore[override]
-        view = memoryview(data)
-        done = 0
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Close the file when an error occurs, and say what became of its frames."""
         try:
-            # An unbuffered file may take only a part, and says why at the next attempt.
-            while done < len(view):
-                done += self._file.write(view[done:])
-        except OSError:
-            os.ftruncate(self._file.fileno(), self._kept)
+            yield
+        except OSError as error:
+            with suppress(OSError):
+                os.ftruncate(self._file.fileno(), self.bytes)
+            self.close()
+            hint = "free some space, then " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+            raise cannot_write(
+                self.path,
+                error,
+                f"the {self.frames} frames written before are complete and can be played; "
+                f"{hint}tactflow repair {self.path} adds the index",
+            ) from error
+        except BaseException:
+            self.close()
             raise
-        self._at += done
-        return done
+
+
+class _CountedFile(FileIO):
+    """A file to append to, which knows what was written whatever other programs do to it."""
+
+    _written = 0
+
+    def write(self, data: Any, /) -> int:
+        written = super().write(data)
+        self._written += written
+        return written
 
     def tell(self) -> int:
-        return self._at
-
-    def interference(self, path: Path) -> str | None:
-        ours = os.fstat(self._file.fileno())
-        return taken_away(path, ours) or ("cut" if ours.st_size < self._at else None)
-
-    def keep(self) -> None:
-        """Everything so far is whole."""
-        self._kept = self._at
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
+        return self._written

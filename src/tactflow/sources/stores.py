@@ -101,8 +101,7 @@ class McapFile:
         """Find out what is in it; the number of messages of each channel, if the index has that."""
         from mcap.records import Channel, Schema
 
-        from tactflow.recording.reader import read_summary
-        from tactflow.recording.records import NotARecordingError, intact_records
+        from tactflow.recording.records import NotARecordingError, intact_records, read_summary
 
         try:
             with self._path.open("rb") as file:

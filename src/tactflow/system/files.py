@@ -87,18 +87,6 @@ def completed(path: Path) -> Iterator[Path]:
                 partial.unlink()
 
 
-def taken_away(path: Path, ours: os.stat_result) -> str | None:
-    """What another program has done to a file that we write: "removed", "replaced" or None, nothing.
-
-    ours : what the system says about the file that we have open.
-    """
-    try:
-        there = path.stat()
-    except OSError:
-        return "removed"
-    return None if os.path.samestat(there, ours) else "replaced"
-
-
 def make_folder(folder: Path) -> None:
     """Make a folder and all above it, unless it is there.
 
@@ -115,33 +103,17 @@ def make_folder(folder: Path) -> None:
 
 if sys.platform == "win32":
 
-    def claim(_file: IO[bytes]) -> None:
-        """Nothing: Windows itself refuses to replace a file that is open."""
-
     def claim_path(_path: Path) -> int | None:
-        """None: as above."""
+        """None: Windows itself refuses to replace a file that is open."""
         return None
 
 else:
 
-    def claim(file: IO[bytes]) -> None:
-        """Claim a file for as long as it is open; one that is refused is closed.
+    def claim_path(path: Path) -> int | None:
+        """Claim a file or a folder that is there, until the descriptor returned is closed.
 
         The claim binds only those who ask. It ends with the process, however that ends; where the file system
         knows no claims, everybody gets one.
-
-        Raises
-        ------
-        BlockingIOError : another run has claimed it.
-        """
-        try:
-            _claim(file.fileno())
-        except BlockingIOError:
-            file.close()
-            raise
-
-    def claim_path(path: Path) -> int | None:
-        """Claim a file or a folder that is there, as `claim` does, until the descriptor returned is closed.
 
         Raises
         ------
@@ -149,19 +121,13 @@ else:
         """
         number = os.open(path, os.O_RDONLY)
         try:
-            _claim(number)
-        except BlockingIOError:
-            os.close(number)
-            raise
-        return number
-
-    def _claim(number: int) -> None:
-        try:
             fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            os.close(number)
             raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it") from None
         except OSError:
-            return
+            pass
+        return number
 
 
 class Unheard(io.TextIOWrapper):

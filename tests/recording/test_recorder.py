@@ -7,22 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 import pytest
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from tactflow.config.load import load_pipeline
-from tactflow.engine.errors import ConfigError, StageError
-from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
+from tactflow.engine.run import Runner
+from tactflow.message.result import Result
 from tactflow.recording.frames import StoredFrame
 from tactflow.sinks.record import Record
 from tactflow.sources import open_source
 from tactflow.sources.mcap import Recording
 from tactflow.vision.types import Contact
-from tests.messages import Results, result_of
 from tests.sinks.full_disk import disk_full_after
 
 FPS = 10.0
@@ -40,8 +40,8 @@ def image(seq: int) -> NDArray[np.uint8]:
     return np.random.default_rng(seq + 1000).integers(0, 256, (12, 17, 3), np.uint8)
 
 
-def tick(seq: int, **more: Any) -> Tick:
-    return Tick(Frame("main", seq, seq / FPS, image(seq), reference=seq == 0, **more))
+def frame_of(seq: int) -> Frame:
+    return Frame("main", seq, seq / FPS, image(seq), reference=seq == 0)
 
 
 def opened(path: Path, **params: Any) -> Record:
@@ -53,7 +53,7 @@ def opened(path: Path, **params: Any) -> Record:
 def write(sink: Record, seqs: range, contact: Contact | None = None) -> None:
     for seq in seqs:
         if sink.wants() or seq == 0:
-            sink.write(result_of(tick(seq), Results(None, contact, None, None)))
+            sink.write(Result(frame_of(seq), {"contact": contact}))
 
 
 def seqs_in(path: Path) -> list[int]:
@@ -93,12 +93,6 @@ def test_an_existing_file_is_replaced_only_when_told_to(tmp_path: Path) -> None:
     assert seqs_in(path) == [0, 1, 2]
 
 
-def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(StageError, match="cannot be written"):
-        opened(tmp_path / "file" / "a.mcap")
-
-
 def test_the_button_makes_numbered_files_each_with_the_references(tmp_path: Path) -> None:
     (tmp_path / "press-007.mcap").write_bytes(b"older")
     sink = opened(tmp_path / "press.mcap", trigger="button")
@@ -124,18 +118,6 @@ def test_the_button_makes_numbered_files_each_with_the_references(tmp_path: Path
     assert seqs_in(tmp_path / "press-009.mcap") == [0, 20, 21, 22, 23]
 
 
-def test_after_the_first_file_the_button_goes_on_with_numbers(tmp_path: Path) -> None:
-    sink = opened(tmp_path / "press.mcap")
-    write(sink, range(3))
-    sink.stop_recording()
-    write(sink, range(3, 5))
-    sink.start_recording()
-    write(sink, range(5, 7))
-    sink.close()
-    assert seqs_in(tmp_path / "press.mcap") == [0, 1, 2]
-    assert seqs_in(tmp_path / "press-001.mcap") == [0, 5, 6]
-
-
 def test_the_ring_saves_its_last_seconds_while_frames_go_on(tmp_path: Path) -> None:
     sink = opened(tmp_path / "ring.mcap", ring=2.0)
     write(sink, range(100))
@@ -147,14 +129,6 @@ def test_the_ring_saves_its_last_seconds_while_frames_go_on(tmp_path: Path) -> N
     assert not sink.recording
     sink.close()
     assert seqs_in(tmp_path / "ring-001.mcap") == [0, *range(79, 100)]
-
-
-def test_the_ring_is_saved_even_if_the_run_ends_at_once(tmp_path: Path) -> None:
-    sink = opened(tmp_path / "ring.mcap", ring=2.0)
-    write(sink, range(50))
-    sink.start_recording()
-    sink.close()
-    assert seqs_in(tmp_path / "ring-001.mcap") == [0, *range(29, 50)]
 
 
 def test_the_ring_is_saved_at_once_while_the_run_is_paused(tmp_path: Path) -> None:
@@ -178,7 +152,7 @@ def test_the_ring_never_takes_more_memory_than_allowed(
     noise = np.random.default_rng(1).integers(0, 256, (500, 700, 3), np.uint8)
     sink = opened(tmp_path / "ring.mcap", ring=1000.0, memory=16, preview=0)
     for seq in range(30):
-        sink.write(result_of(Tick(Frame("main", seq, seq / FPS, noise)), Results()))
+        sink.write(Result(Frame("main", seq, seq / FPS, noise)))
         assert sink.counters()["ring_bytes"] <= 16_000_000
     assert 10 <= sink.counters()["ring_frames"] < 30
     assert caplog.text.count("because memory is limited to 16 MB") == 1
@@ -230,7 +204,7 @@ def test_a_ring_across_two_epochs_brings_the_references_of_the_older_one(tmp_pat
         frame = Frame(
             "main", seq, seq / FPS, image(seq), reference=seq in (0, 1, 25), epoch=1 if seq >= 25 else 0
         )
-        sink.write(result_of(Tick(frame), Results()))
+        sink.write(Result(frame))
     sink.start_recording()
     sink.close()
     source = open_source(str(tmp_path / "ring-001.mcap"))
@@ -254,15 +228,6 @@ def test_a_full_disk_is_a_clear_error_and_what_was_written_can_be_played(tmp_pat
     assert f"the {len(seqs)} frames written before are complete" in str(caught.value)
     # A frame takes under 2 kB, so the limit is reached within one frame's size.
     assert path.stat().st_size > limit - 8000
-
-
-def test_a_disk_that_is_full_at_the_end_keeps_all_frames(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    sink = opened(path)
-    write(sink, range(5))
-    with disk_full_after(path.stat().st_size), pytest.raises(StageError, match="the 5 frames"):
-        sink.close()
-    assert seqs_in(path) == list(range(5))
 
 
 def test_without_the_extra_the_error_says_what_to_install(
@@ -289,23 +254,6 @@ def test_parameters_that_make_no_sense_are_refused(params: dict[str, Any], words
         Record.Params(**params)
 
 
-@pytest.mark.parametrize("kind", ["named", "wired to nothing"])
-def test_a_contact_that_no_stage_gives_cannot_begin_a_recording(tmp_path: Path, kind: str) -> None:
-    file = tmp_path / "pipeline.yaml"
-    wire = "" if kind == "named" else "    in: {contact: null}\n"
-    stages = "stages:\n  capture: {source: 'sim:press'}\n  preprocess: {}\n"
-    if kind != "named":
-        stages += "  marker_mask: {}\n  inpaint: {}\n  difference: {}\n  hull: {}\n"
-    file.write_text(f"{stages}sinks:\n  record:\n    path: a.mcap\n{wire}    trigger: contact\n")
-    line = 1 + file.read_text().splitlines().index("    trigger: contact")
-    with pytest.raises(
-        ConfigError, match=rf"pipeline.yaml:{line}:\d+  sinks.record.trigger: contact needs contact"
-    ):
-        load_pipeline(file)
-    file.write_text(file.read_text().replace("trigger: contact", "trigger: button"))
-    load_pipeline(file)
-
-
 def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
     """Topic, time and data of all that belongs to frames, without references that a file begins with."""
     with path.open("rb") as file:
@@ -326,7 +274,7 @@ def test_a_recording_in_several_files_is_the_same_as_in_one(rotation: dict[str, 
         pixels = np.random.default_rng(seq).integers(0, 256, (200, 250, 3), np.uint8)
         frame = Frame("main", seq, seq / FPS, pixels, reference=seq in (0, 1, 11), epoch=0 if seq < 11 else 1)
         for sink in (one, many):
-            sink.write(result_of(Tick(frame), Results()))
+            sink.write(Result(frame))
     one.close()
     many.close()
     files = [tmp_path / "many.mcap", *sorted(tmp_path.glob("many-*.mcap"))]
@@ -348,21 +296,27 @@ def test_a_recording_in_several_files_is_the_same_as_in_one(rotation: dict[str, 
         assert stamps[0].reference, "each file begins with the references of its first frame"
 
 
-def test_pictures_come_at_their_own_rate(tmp_path: Path) -> None:
-    for rate, count in ((0.0, 0), (2.0, 8), (10.0, 40), (240.0, 40)):
-        path = tmp_path / f"{rate}.mcap"
-        sink = opened(path, preview=rate)
-        write(sink, range(40))
+def test_a_run_loses_no_frame_where_one_file_ends_and_the_next_begins(tmp_path: Path) -> None:
+    file = tmp_path / "pipeline.yaml"
+    file.write_text(
+        'stages:\n  capture: {source: "sim:idle?frames=120"}\n'
+        f"sinks:\n  record: {{path: '{tmp_path / 'a.mcap'}', rotate_after: 0.05, preview: 0}}\n"
+    )
+    result = Runner(load_pipeline(file)).run()
+    files = [tmp_path / "a.mcap", *sorted(tmp_path.glob("a-*.mcap"))]
+    assert sum(topic == "/main/results" for path in files for topic, *_ in messages_in(path)) == 120
+    assert result.stats["sinks"]["record"]["counters"]["files"] == len(files) == 40
+
+
+def test_a_file_that_is_taken_away_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    for what in ("removed", "cut"):
+        sink = opened(path, overwrite=True)
+        write(sink, range(3))
+        if what == "removed":
+            path.unlink()
+        else:
+            path.write_bytes(b"")
+        with pytest.raises(StageError, match=f"was {what} by another program .* its 3 frames are not in it"):
+            write(sink, range(3, 4))
         sink.close()
-        with path.open("rb") as file:
-            assert len(list(make_reader(file).iter_messages("/main/image"))) == count
-
-
-def test_results_are_the_messages_that_other_sinks_publish(tmp_path: Path) -> None:
-    sink = opened(tmp_path / "a.mcap")
-    write(sink, range(2), TOUCH)
-    sink.close()
-    with (tmp_path / "a.mcap").open("rb") as file:
-        messages = [orjson.loads(m.data) for _, _, m in make_reader(file).iter_messages("/main/results")]
-    assert [message["seq"] for message in messages] == [0, 1]
-    assert messages[1]["contact"]["area"] == 4.0

@@ -1,0 +1,174 @@
+"""A video file, written frame by frame and checked at the end: FFmpeg reports no failed write."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import statistics
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import StageError
+from tactflow.system.outputs import create, refuse_interference
+
+log = logging.getLogger("tactflow")
+
+CODECS = {".avi": "MJPG", ".mkv": "mp4v", ".mp4": "mp4v", ".m4v": "mp4v", ".mov": "mp4v"}
+LOSSLESS_CODECS = {".avi": ("HFYU", "FFV1"), ".mkv": ("HFYU", "FFV1")}
+FRAMES_TO_MEASURE_RATE = 12
+"""Frames held back at the start, because their rate is not known before. Chosen by hand."""
+MIN_FREE_BYTES = 16 << 20
+"""Free space, bytes, at which the disk counts as full: what is under way and the index still fit. By hand."""
+
+
+class Film:
+    """A video file that is being written.
+
+    Pictures with an odd side get one more row or column, a copy of the last: otherwise the encoder would cut
+    it off.
+
+    Parameters
+    ----------
+    path : the file; its extension chooses the codec. lossless : keep every bit. fps : frames per second, or
+    None, the rate of the first frames. overwrite : replace an existing file.
+
+    Raises
+    ------
+    StageError : the file exists or cannot be written, or OpenCV cannot encode it; from every method.
+
+    Attributes
+    ----------
+    frames : written so far.
+    """
+
+    def __init__(
+        self, path: Path, *, lossless: bool = False, fps: float | None = None, overwrite: bool = False
+    ) -> None:
+        self.frames = 0
+        self._path = path
+        self._fps = fps
+        self._held: list[tuple[float, NDArray[np.uint8]]] = []
+        self._writer: cv2.VideoWriter | None = None
+        self._size: tuple[int, int] | None = None
+        create(path, overwrite=overwrite)
+        self._ours = path.stat()
+        suffix = path.suffix.lower()
+        self._codec = self._lossless_codec(suffix) if lossless else CODECS[suffix]
+
+    def add(self, t: float, picture: NDArray[np.uint8]) -> None:
+        """Add one frame. t : its time, s. picture : (H, W, 3) uint8 BGR.
+
+        Also refuses a picture of another size, and ends the film when the disk is nearly full.
+        """
+        size = (picture.shape[1], picture.shape[0])
+        self._size = self._size or size
+        if size != self._size:
+            raise StageError(
+                f"{self._path}: a video has one size, {self._size[0]} x {self._size[1]}, but this frame is "
+                f"{size[0]} x {size[1]}"
+            )
+        if self._writer is not None:
+            self._write(self._writer, picture)
+            return
+        self._held.append((t, picture))
+        if self._fps is not None or len(self._held) >= FRAMES_TO_MEASURE_RATE:
+            self._start(*size)
+
+    def close(self) -> None:
+        """Finish the file, and check that all frames are in it; without any, it is removed."""
+        try:
+            if self._held and self._size is not None:
+                self._start(*self._size)
+        finally:
+            writer, self._writer = self._writer, None
+            if writer is not None:
+                writer.release()
+        if writer is not None:
+            refuse_interference(self._path, self._ours, f"its {self.frames} frames are not in it")
+            problem = film_problem(self._path, self.frames)
+            if problem is not None:
+                raise StageError(f"{self._path}: {problem}; is the disk full, or the size of files limited?")
+        elif self.frames == 0:
+            self._path.unlink(missing_ok=True)
+
+    def _start(self, width: int, height: int) -> None:
+        rate = self._fps or _rate([t for t, _ in self._held])
+        # FFmpeg would wait for ever for the reader of a pipe in its place.
+        refuse_interference(self._path, self._ours, "nothing was written")
+        writer = cv2.VideoWriter(
+            str(self._path),
+            cv2.CAP_FFMPEG,
+            cv2.VideoWriter.fourcc(*self._codec),
+            rate,
+            (width + width % 2, height + height % 2),
+        )
+        if not writer.isOpened():
+            raise StageError(f"{self._path}: this OpenCV cannot encode {self._path.suffix}; try .avi or .mkv")
+        self._writer = writer
+        log.info("%s: %d x %d, %g fps, %s", self._path, width, height, rate, self._codec)
+        held, self._held = self._held, []
+        for _, picture in held:
+            self._write(writer, picture)
+
+    def _write(self, writer: cv2.VideoWriter, picture: NDArray[np.uint8]) -> None:
+        if shutil.disk_usage(self._path.parent).free < MIN_FREE_BYTES:
+            # Its end still fits.
+            self._writer = None
+            writer.release()
+            problem = film_problem(self._path, self.frames) if self.frames else None
+            kept = problem or f"the {self.frames} frames written before can be played"
+            raise StageError(f"{self._path}: the disk is full; {kept}")
+        height, width = picture.shape[:2]
+        writer.write(cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
+        self.frames += 1
+
+    def _lossless_codec(self, suffix: str) -> str:
+        """A codec that gives back every bit of a small film: some silently halve the colours' resolution."""
+        # Noise has detail in every channel.
+        frames = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)
+        with tempfile.TemporaryDirectory(dir=self._path.parent, prefix=".tactflow-") as folder:
+            for codec in LOSSLESS_CODECS[suffix]:
+                probe = str(Path(folder, f"{codec}{suffix}"))
+                writer = cv2.VideoWriter(
+                    probe, cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), 30.0, (64, 48)
+                )
+                for frame in frames:
+                    writer.write(frame)
+                writer.release()
+                capture = cv2.VideoCapture(probe, cv2.CAP_FFMPEG)
+                same = all(np.array_equal(frame, capture.read()[1]) for frame in frames)
+                capture.release()
+                if same:
+                    return codec
+        self._path.unlink()
+        raise StageError(f"{self._path}: this OpenCV cannot encode {suffix} losslessly; try .avi or .mkv")
+
+
+def film_problem(path: Path, frames: int) -> str | None:
+    """What keeps a film from being read to its last frame, or None.
+
+    frames : how many there are to be. A file that was cut off may still claim all of them.
+    """
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            return "it cannot be played, as its end could not be written"
+        claimed = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        capture.set(cv2.CAP_PROP_POS_FRAMES, frames - 1)
+        there = capture.get(cv2.CAP_PROP_POS_FRAMES) == frames - 1 and capture.grab()
+        if claimed == frames and there:
+            return None
+        return f"it ends before its {frames} frames, as its end could not be written"
+    finally:
+        capture.release()
+
+
+def _rate(times: list[float]) -> float:
+    """Frames per second, from the median step between times, s; 30 where there is none."""
+    steps = [later - earlier for earlier, later in pairwise(times) if later > earlier]
+    return min(max(1.0 / statistics.median(steps), 0.01), 1000.0) if steps else 30.0

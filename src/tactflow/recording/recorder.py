@@ -1,0 +1,253 @@
+"""Records the frames of a run: to files that follow each other, and the last seconds to memory."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from tactflow.drawing.jpeg import encode_jpeg
+from tactflow.engine.control import Control
+from tactflow.engine.rate import SLACK, RateLimit
+from tactflow.message.result import Result, encode_message
+from tactflow.recording.frames import FrameCoder, nanoseconds
+from tactflow.recording.schemas import encode_annotations, encode_picture
+from tactflow.recording.writer import Entry, RecordingWriter
+from tactflow.system.files import next_name
+
+log = logging.getLogger("tactflow")
+
+BACKLOG_SHARE = 4
+"""Frames from memory that are written per new frame, so that saving them never holds up the run."""
+
+
+class FrameRecorder:
+    """Records frames to one file or several, from any of three triggers. From any thread.
+
+    A file begins with the references that its first frame is compared with, so that it can be played by
+    itself. Files but the first carry a number, `press-001.mcap`, and never replace another.
+
+    Parameters
+    ----------
+    path : the file. sensor : names the channels. control : the run, which the file describes; or None.
+    trigger : "start" and "button" wait for `start`; "contact" records each contact to its own file.
+    ring : the last seconds that are kept in memory and become the beginning of the file; None: none.
+    memory : limit for these, MB. after : time that is recorded after a contact, s.
+    rotate_size, rotate_after : begin another file after so many MB or seconds; None: never.
+    preview : rate of the JPEG pictures, Hz; 0: none. quality : of these, 1 to 100.
+
+    Attributes
+    ----------
+    path : of the file that was opened last. counts : frames, files and bytes (of finished files) so far.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        sensor: str = "main",
+        control: Control | None = None,
+        *,
+        trigger: Literal["start", "button", "contact"] = "start",
+        ring: float | None = None,
+        memory: int = 2048,
+        after: float = 1.0,
+        rotate_size: int | None = None,
+        rotate_after: float | None = None,
+        preview: float = 10.0,
+        quality: int = 80,
+    ) -> None:
+        self.path = path
+        self.counts = {"frames": 0, "files": 0, "bytes": 0}
+        self._name = path
+        self._sensor = sensor
+        self._control = control
+        self._trigger = trigger
+        self._ring_ns = 0 if ring is None else round(ring * 1e9)
+        self._memory = memory * 1_000_000
+        self._after = after
+        self._rotate_size = None if rotate_size is None else rotate_size * 1_000_000
+        self._rotate_after = None if rotate_after is None else rotate_after * 1e9
+        self._previews = RateLimit(preview) if preview else None
+        self._quality = quality
+        self._lock = threading.RLock()
+        self._coder = FrameCoder()
+        self._file: RecordingWriter | None = None
+        self._ends: int | None = None
+        self._backlog: deque[Entry] = deque()
+        self._references: list[Entry] = []
+        self._ring: deque[Entry] = deque()
+        self._ring_bytes = 0
+        self._warned = False
+        self._touching = False
+
+    @property
+    def recording(self) -> bool:
+        """Whether a file is being written."""
+        return self._file is not None
+
+    @property
+    def wants(self) -> bool:
+        """Whether frames are written or kept."""
+        return self.recording or self._ring_ns > 0 or self._trigger == "contact"
+
+    @property
+    def kept(self) -> dict[str, int]:
+        """ring_frames, ring_bytes : in memory now."""
+        return {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
+
+    def start(self, *, numbered: bool = True, overwrite: bool = False) -> None:
+        """Begin a file with what the ring holds, which then is all of it. Nothing while recording.
+
+        numbered : begin a new, numbered file; else that of the name itself.
+
+        Raises
+        ------
+        StageError
+            If it cannot be written, or exists and `overwrite` is not set.
+        """
+        with self._lock:
+            if self.recording:
+                return
+            self._open(next_name(self._name) if numbered else self._name, overwrite=overwrite)
+            if numbered:
+                log.info("record: %s", self.path)
+            self._backlog = deque(self._ring)
+            self._ends = self._backlog[-1].time if self._backlog else None
+            # While the run is paused, no frame comes that would take the ring along.
+            if self._backlog and self._control is not None and self._control.paused:
+                self.stop()
+
+    def stop(self) -> None:
+        """Finish the file, with all that belongs to it. Nothing while not recording. Raises StageError."""
+        with self._lock:
+            while self._is_due():
+                self._write(self._backlog.popleft())
+            self._finish()
+
+    def add(self, result: Result) -> None:
+        """Record one frame, or keep it for later.
+
+        Raises
+        ------
+        StageError
+            If it cannot be written. The file then ends with the frame before and can be played.
+        """
+        with self._lock:
+            if not self.wants and not result.frame.reference:
+                return
+            entry = self._entry(result)
+            if self._trigger == "contact":
+                self._follow(result.contact is not None, result.frame.t)
+            if self.recording:
+                self._backlog.append(entry)
+            for _ in range(BACKLOG_SHARE):
+                if self._is_due():
+                    self._write(self._backlog.popleft())
+            if self._backlog and not self._is_due():
+                self._finish()
+            self._keep(entry)
+
+    def _entry(self, result: Result) -> Entry:
+        frame = result.frame
+        time = nanoseconds(frame.t)
+        entry = Entry(time, frame.seq, frame.reference, frame.epoch, self._coder.encode(frame))
+        if frame.seq < 0:
+            # A reference image that is not part of the source has no result.
+            return entry
+        entry = replace(entry, message=encode_message(result, detail=True))
+        if self._previews is None or not self._previews.due(frame.t):
+            return entry
+        jpeg = encode_jpeg(frame.image if result.image is None else result.image, self._quality)
+        picture = encode_picture(jpeg, self._sensor, time)
+        return replace(entry, picture=picture, annotations=encode_annotations(result, time))
+
+    def _follow(self, touching: bool, t: float) -> None:
+        """Begin a file when a contact begins; it ends some time after the contact."""
+        if touching and not self._touching:
+            self.start()
+        if touching:
+            self._ends = nanoseconds(t + self._after + SLACK)
+        self._touching = touching
+
+    def _is_due(self) -> bool:
+        """Whether the next entry of the backlog belongs to the file."""
+        return bool(self._backlog) and (self._ends is None or self._backlog[0].time <= self._ends)
+
+    def _keep(self, entry: Entry) -> None:
+        """Remember the entry in the ring, and references for as long as frames of their epoch may follow."""
+        ring = self._ring
+        if self._ring_ns:
+            ring.append(entry)
+            self._ring_bytes += entry.size
+            while ring and ring[0].time < entry.time - self._ring_ns:
+                self._ring_bytes -= ring.popleft().size
+            while ring and self._ring_bytes > self._memory:
+                self._ring_bytes -= ring.popleft().size
+                self._warn_of_memory()
+        if entry.reference:
+            self._references.append(entry)
+        oldest = min(waiting[0].epoch for waiting in (ring, self._backlog, [entry]) if waiting)
+        self._references = [reference for reference in self._references if reference.epoch >= oldest]
+
+    def _warn_of_memory(self) -> None:
+        if not self._warned:
+            self._warned = True
+            log.warning(
+                "record: the ring holds only %.1f s, because memory is limited to %d MB; raise memory",
+                (self._ring[-1].time - self._ring[0].time) / 1e9 if self._ring else 0,
+                self._memory // 1_000_000,
+            )
+
+    def _open(self, path: Path, *, overwrite: bool = False) -> RecordingWriter:
+        self._file = RecordingWriter(path, self._sensor, self._control, overwrite=overwrite)
+        self.path = path
+        return self._file
+
+    def _write(self, entry: Entry) -> None:
+        """Write one entry, where the file is large or long enough to a further one."""
+        file = self._file
+        assert file is not None
+        try:
+            if file.frames and self._is_full(file, entry):
+                # `recording` stays True meanwhile, or the run would leave out the next frame.
+                self._finish_file(file)
+                file = self._open(next_name(self._name))
+                log.info("record: %s", self.path)
+            if file.frames == 0:
+                for reference in self._references:
+                    if reference.epoch == entry.epoch and reference.seq < entry.seq:
+                        # At the beginning of the file's time line, without results of that time.
+                        file.write(
+                            replace(reference, message=None, picture=None, annotations=None), entry.time
+                        )
+            file.write(entry)
+        except BaseException:
+            self._file = None
+            self._backlog.clear()
+            raise
+        self.counts["frames"] += 1
+
+    def _references_of(self, entry: Entry) -> list[Entry]:
+        """The references before an entry that it is compared with."""
+        return [r for r in self._references if r.epoch == entry.epoch and r.seq < entry.seq]
+
+    def _is_full(self, file: RecordingWriter, entry: Entry) -> bool:
+        size, after = self._rotate_size, self._rotate_after
+        return (size is not None and file.bytes >= size) or (
+            after is not None and entry.time - file.begins >= after
+        )
+
+    def _finish(self) -> None:
+        file, self._file = self._file, None
+        self._backlog.clear()
+        self._ends = None
+        if file is not None:
+            self._finish_file(file)
+
+    def _finish_file(self, file: RecordingWriter) -> None:
+        file.finish()
+        self.counts["files"] += 1
+        self.counts["bytes"] += file.bytes

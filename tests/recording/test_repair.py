@@ -1,0 +1,123 @@
+"""Recordings that were cut off or damaged: everything intact comes back, bit for bit."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+from tactflow.engine.frame import Frame
+from tactflow.message.result import Result
+from tactflow.recording.repair import repair
+from tactflow.sinks.record import Record
+from tactflow.sources import open_source
+from tactflow.sources.mcap import Recording
+
+
+def image(seq: int) -> NDArray[np.uint8]:
+    return np.random.default_rng(seq + 1000).integers(0, 256, (12, 17, 3), np.uint8)
+
+
+def record(path: Path, count: int) -> bytes:
+    sink = Record(Record.Params(path=str(path), preview=0))
+    sink.open()
+    for seq in range(count):
+        sink.write(Result(Frame("main", seq, seq / 10, image(seq), reference=seq == 0)))
+    sink.close()
+    return path.read_bytes()
+
+
+def seqs_in(path: Path) -> list[int]:
+    """The frames of a recording, after comparing their pixels with what was written."""
+    source = open_source(str(path))
+    assert isinstance(source, Recording)
+    seqs = []
+    for pixels, _, stamp in iter(source.read_stamped, None):
+        np.testing.assert_array_equal(pixels, image(stamp.seq))
+        seqs.append(stamp.seq)
+    return seqs
+
+
+def test_wherever_a_file_is_cut_whole_frames_come_back(tmp_path: Path) -> None:
+    data = record(tmp_path / "a.mcap", 5)
+    cut, fixed = tmp_path / "cut.mcap", tmp_path / "fixed.mcap"
+    counts = []
+    for length in range(8, len(data), 97):
+        cut.write_bytes(data[:length])
+        result = repair(cut, fixed)
+        with fixed.open("rb") as file:
+            again = list(make_reader(file, validate_crcs=True).iter_messages())
+        assert len(again) == result.messages
+        assert not result.finished
+        # A frame and its message lie in one chunk.
+        count = len(again) // 2
+        if count:
+            assert seqs_in(cut) == seqs_in(fixed) == list(range(count))
+        else:
+            with pytest.raises(SourceError, match="no frame"):
+                open_source(str(cut))
+        counts.append(count)
+    assert counts == sorted(counts)
+    assert set(counts) == set(range(6))
+
+
+def test_one_wrong_bit_costs_few_frames_wherever_it_lies(tmp_path: Path) -> None:
+    count = 6
+    data = record(tmp_path / "a.mcap", count)
+    flipped, fixed = tmp_path / "flipped.mcap", tmp_path / "fixed.mcap"
+    lost = []
+    for place in range(8, len(data), 211):
+        changed = bytearray(data)
+        changed[place] ^= 1 << (place % 8)
+        flipped.write_bytes(changed)
+        repair(flipped, fixed)
+        assert flipped.read_bytes() == changed
+        lost.append(count - len(seqs_in(fixed)))
+    # In its data, it costs the frame; in the length of a record, reading goes on at a later frame.
+    assert max(lost) <= 2
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_damage_in_the_middle_is_reported(tmp_path: Path, finished: bool) -> None:
+    path = tmp_path / "a.mcap"
+    data = bytearray(record(path, 40))
+    # Behind the schemas, which the first chunk holds, and before the last frames.
+    data[50_000] ^= 0xFF
+    path.write_bytes(data if finished else data[:-300])
+    with pytest.raises(SourceError, match=r"is damaged .*tactflow repair keeps all that is intact"):
+        seqs_in(path)
+
+
+def chunk(data: bytes, compression: str, size: int) -> bytes:
+    """One chunk of an MCAP file."""
+    name = compression.encode()
+    beginning = struct.pack("<QQQII", 0, 0, size, 0, len(name)) + name
+    body = beginning + struct.pack("<Q", len(data)) + data
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+@pytest.mark.parametrize(
+    ("data", "compression", "size"),
+    [
+        (zstandard.compress(bytes(100)), "zstd", 1 << 60),
+        (b"no such thing", "zstd", 100),
+        (b"no such thing", "lz4", 100),
+        (bytes(range(1, 101)), "", 1 << 60),
+    ],
+    ids=["absurd size", "garbage", "lz4 garbage", "plain garbage"],
+)
+def test_a_chunk_that_cannot_be_unpacked_is_passed_over(
+    tmp_path: Path, data: bytes, compression: str, size: int
+) -> None:
+    path, fixed = tmp_path / "a.mcap", tmp_path / "fixed.mcap"
+    whole = record(path, 3)
+    path.write_bytes(whole[:8] + chunk(data, compression, size) + whole[8:])
+    result = repair(path, fixed)
+    assert not result.finished
+    assert seqs_in(fixed) == [0, 1, 2]
