@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
-from typing import Any
 
-from tactflow import Subscriber
+from tactflow import Result, Subscriber
 
 CLOSING = 30.0
 """How fast the gripper closes while nothing touches, mm/s."""
@@ -36,17 +35,17 @@ class Gripper:
         self.width = max(self.width - step, 0.0)
 
 
-def grasp(gripper: Gripper, results: Iterable[dict[str, Any]]) -> None:
-    """Close until touch, then hold; says when that changes. results : messages of tactflow."""
+def grasp(gripper: Gripper, results: Iterable[Result]) -> None:
+    """Close until touch, then hold; says when that changes. results : as received from tactflow."""
     before, last = None, None
     for result in results:
-        slip, t = result.get("slip"), result["t"]
+        slip, t = result.slip, result.t
         seconds = 0.0 if last is None else min(max(t - last, 0.0), LONGEST_STEP)
         last = t
-        if result["contact"] is None:
+        if result.contact is None:
             state = "closing"
             gripper.close_by(CLOSING * seconds)
-        elif slip is not None and slip["slipping"]:
+        elif slip is not None and slip.slipping:
             state = "slips, tightening"
             gripper.close_by(TIGHTENING * seconds)
         else:

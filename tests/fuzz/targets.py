@@ -24,10 +24,9 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.engine.plan import make_plan
-from tactflow.message.result import encode_message
+from tactflow.message.result import Result, encode_message
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
-from tactflow.network.subscriber import _parsed
 from tactflow.recording.frames import FrameCoder, RawFrame
 from tactflow.recording.records import NotARecordingError
 from tactflow.recording.repair import repair
@@ -313,10 +312,10 @@ def messages(folder: Path) -> Iterator[Parser]:
     )
 
     def feed(data: bytes) -> None:
-        received = _parsed(data)
-        if received is not None:
-            listen.describe(received)
-            listen._cells(received)
+        with suppress(ValueError):
+            result = Result.from_message(data)
+            listen.describe(result)
+            listen._cells(result)
 
     yield Parser([message(), nothing], feed)
 

@@ -70,7 +70,7 @@ def test_another_process_reads_with_the_right_keys_and_not_with_wrong_ones_or_no
     publisher: str, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
     with Subscriber(publisher, timeout=PATIENCE, keys=folders[1]) as messages:
-        assert messages.receive()["seq"] == 1
+        assert messages.receive().seq == 1
     stranger = strangers_keys(tmp_path / "other", folders[1])
     for keys, reason in ((stranger, "does not admit these keys"), (None, "requires keys")):
         subscriber = Subscriber(publisher, timeout=PATIENCE, keys=keys)
@@ -116,7 +116,7 @@ def test_the_relay_of_several_sensors_requires_keys_and_their_own_processes_need
         ):
             assert sensor.socket.recv() == b"\x01tactflow."
             sensor.socket.send(MESSAGE)
-            assert messages.receive()["seq"] == 1
+            assert messages.receive().seq == 1
             with Subscriber(finder.endpoint, timeout=PATIENCE) as stranger, pytest.raises(PermissionError):
                 stranger.receive()
     finally:

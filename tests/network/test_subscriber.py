@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import runpy
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -22,14 +20,12 @@ from tactflow.cli import listen
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.result import encode_message
-from tactflow.network import subscriber
 from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import LONGEST_MESSAGE, Subscriber
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.clock import PATIENCE, ManualClock, until
+from tests.clock import PATIENCE, until
 from tests.messages import Results, result_of
-from tests.ros.programs import PACKAGE
 
 IMAGE = np.zeros((300, 400, 3), np.uint8)
 CONTACT = Contact(5123.5, (150.2, 201.7), -12.31, 0.218, np.zeros((3, 2)), None)
@@ -70,13 +66,14 @@ def publisher() -> Iterator[Publisher]:
     publisher.sink.close()
 
 
-def test_every_message_arrives_as_a_dict(publisher: Publisher) -> None:
+def test_every_message_arrives_as_a_result(publisher: Publisher) -> None:
     with Subscriber(publisher.endpoint, timeout=LONG) as messages:
         publisher.wait()
         publisher.send(0, 1, 2, contact=CONTACT)
         received = list(islice(messages, 3))
-        assert [message["seq"] for message in received] == [0, 1, 2]
-        assert received[0]["contact"]["area"] == 5123.5
+        assert [result.seq for result in received] == [0, 1, 2]
+        assert received[0].contact is not None
+        assert (received[0].contact.area, received[0].size) == (5123.5, (400, 300))
         assert (messages.received, messages.lost) == (3, 0)
 
 
@@ -86,7 +83,7 @@ def test_statistics_that_somebody_else_asked_for_are_no_results(publisher: Publi
         assert publisher.sink._socket is not None
         publisher.sink._socket.send(b'tactflow.stats {"frames": 7}')
         publisher.send(5)
-        assert next(iter(messages))["seq"] == 5
+        assert next(iter(messages)).seq == 5
         assert messages.received == 1
 
 
@@ -105,7 +102,7 @@ def test_gaps_in_seq_are_counted_as_lost(seqs: list[int], lost: int, publisher: 
     with Subscriber(publisher.endpoint, timeout=LONG) as messages:
         publisher.wait()
         publisher.send(*seqs)
-        assert [messages.receive()["seq"] for _ in seqs] == seqs
+        assert [messages.receive().seq for _ in seqs] == seqs
         assert messages.lost == lost
 
 
@@ -118,14 +115,14 @@ def test_latest_gives_the_newest_and_counts_what_it_skipped(publisher: Publisher
         while publisher.sink.counters()["subscriptions"] < 2:
             publisher.wait()
         publisher.send(0)
-        assert messages.receive()["seq"] == 0
+        assert messages.receive().seq == 0
         publisher.send(*range(1, 100))
         for _ in range(100):
-            last = probe.receive()["seq"]
+            last = probe.receive().seq
         assert last == 99
         seqs = [0]
         while seqs[-1] < 99:
-            seqs.append(messages.receive()["seq"])
+            seqs.append(messages.receive().seq)
         assert seqs == sorted(set(seqs))
         assert messages.lost == 99 - (len(seqs) - 1)
 
@@ -138,7 +135,7 @@ def test_a_sensor_can_be_chosen_and_its_name_is_matched_whole() -> None:
     ):
         publisher.wait()
         publisher.send(0)
-        assert same.receive()["sensor"] == "main2"
+        assert same.receive().sensor == "main2"
         with pytest.raises(TimeoutError):
             other.receive()
     publisher.sink.close()
@@ -159,34 +156,6 @@ def test_silence_is_a_timeout_that_says_what_to_check(publisher: Publisher) -> N
             next(iter(messages))
 
 
-@pytest.mark.parametrize("timeout", [3e6, 1e300])
-def test_a_wait_may_be_longer_than_zeromq_can_count(timeout: float, publisher: Publisher) -> None:
-    with Subscriber(publisher.endpoint, timeout=timeout) as messages:
-        publisher.wait()
-        publisher.send(5)
-        assert messages.receive()["seq"] == 5
-
-
-class Ticking(ManualClock):
-    """A clock that goes on by a little whenever somebody looks at it, unless it is stopped."""
-
-    stopped = False
-
-    def now(self) -> float:
-        self.advance(0.0 if self.stopped else 0.02)
-        return super().now()
-
-
-def test_a_long_wait_is_made_of_short_ones(publisher: Publisher, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subscriber, "LONGEST_WAIT", 0.001)
-    clock = Ticking()
-    with Subscriber(publisher.endpoint, timeout=0.5, clock=clock) as messages:
-        began = clock.now()
-        with pytest.raises(TimeoutError, match=r"for 0.5 s"):
-            messages.receive()
-        assert clock.now() - began >= 0.5
-
-
 def test_a_subscriber_may_start_before_the_publisher_and_survives_its_restart() -> None:
     first = Publisher()
     endpoint = first.endpoint
@@ -204,7 +173,7 @@ def test_a_subscriber_may_start_before_the_publisher_and_survives_its_restart() 
             # In a thread: a subscriber subscribes again only while it waits for messages.
             thread = threading.Thread(target=run, args=(seqs,))
             thread.start()
-            assert [messages.receive()["seq"] for _ in seqs] == seqs
+            assert [messages.receive().seq for _ in seqs] == seqs
             thread.join()
         assert messages.lost == 0
 
@@ -215,20 +184,12 @@ def test_an_address_that_makes_no_sense_is_refused(endpoint: str) -> None:
         Subscriber(endpoint)
 
 
-@pytest.mark.parametrize("connect", [Subscriber, RemoteControl])
-def test_a_port_that_there_is_not_is_not_taken_for_another(connect: type) -> None:
-    with pytest.raises(ValueError, match="required a port up to 65535, got 70000"):
-        connect("tcp://127.0.0.1:70000")
-
-
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"timeout": -1.0}, "timeout: required None or a number of seconds from 0, got -1"),
+        ({"timeout": -1.0}, r"timeout: required None or 0 to 1e\+06 seconds, got -1"),
         ({"timeout": float("nan")}, "timeout: required"),
-        ({"backlog": -1}, "backlog: required 1 to 2147483647 messages, got -1"),
-        ({"backlog": 0}, "backlog: required"),
-        ({"backlog": 2**40}, "backlog: required"),
+        ({"backlog": 0}, "backlog: required 1 to 2147483647 messages, got 0"),
     ],
 )
 def test_wrong_numbers_are_refused_with_what_is_required(wrong: dict[str, Any], words: str) -> None:
@@ -237,9 +198,7 @@ def test_wrong_numbers_are_refused_with_what_is_required(wrong: dict[str, Any], 
 
 
 def test_a_subscriber_needs_no_opencv() -> None:
-    program = (
-        "import sys, tactflow.network.subscriber; sys.exit('cv2' in sys.modules or 'numpy' in sys.modules)"
-    )
+    program = "import sys; from tactflow import Subscriber; sys.exit('cv2' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False, timeout=PATIENCE).returncode == 0
 
 
@@ -296,18 +255,6 @@ def test_listen_prints_the_messages_as_they_are(
     assert [json.loads(line)["seq"] for line in lines] == [0, 1]
 
 
-def test_listen_ends_well_when_messages_stop_coming(
-    publisher: Publisher, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(subscriber, "LONGEST_WAIT", 0.001)
-    # Time passes from the first message on.
-    clock = Ticking()
-    clock.stopped = True
-    monkeypatch.setattr(listen, "Subscriber", partial(Subscriber, clock=clock))
-    monkeypatch.setattr(listen, "describe", lambda _: setattr(clock, "stopped", False))
-    assert run_listen(publisher, "--timeout", "1.5", send=lambda: publisher.send(0)) == 0
-
-
 def test_listen_reports_that_nothing_came(publisher: Publisher) -> None:
     with pytest.raises(SourceError, match="is tactflow running"):
         listen.run(parse(publisher.endpoint, "--timeout", "0.05"))
@@ -316,11 +263,6 @@ def test_listen_reports_that_nothing_came(publisher: Publisher) -> None:
 def test_listen_refuses_a_table_without_a_terminal() -> None:
     with pytest.raises(ConfigError, match="--table needs a terminal"):
         listen.run(parse("--table"))
-
-
-def test_listen_refuses_an_address_that_makes_no_sense() -> None:
-    with pytest.raises(ConfigError, match="required an address"):
-        listen.run(parse("nowhere"))
 
 
 @pytest.mark.parametrize(
@@ -332,17 +274,6 @@ def test_listen_refuses_wrong_options(words: tuple[str, ...], capsys: pytest.Cap
         parse(*words)
     assert raised.value.code == 2
     assert words[0] in capsys.readouterr().err
-
-
-def test_ctrl_c_ends_listen_quietly(
-    publisher: Publisher, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(_: Subscriber) -> dict[str, Any]:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Subscriber, "receive", interrupted)
-    assert listen.run(parse(publisher.endpoint)) == 0
-    assert capsys.readouterr() == ("", "")
 
 
 def test_the_table_shows_the_latest_values(
@@ -385,7 +316,7 @@ def test_what_is_no_result_message_is_passed_over_and_counted() -> None:
             for body in (b"{", b'{"seq": []}', b"{}", contact, good):
                 publisher.send(b"tactflow.main " + body)
             while results.malformed < 4:
-                assert results.receive()["seq"] == 3
+                assert results.receive().seq == 3
 
 
 def test_whoever_sends_messages_as_long_as_no_result_is_heard_no_more() -> None:
@@ -400,20 +331,10 @@ def test_whoever_sends_messages_as_long_as_no_result_is_heard_no_more() -> None:
 
 
 def test_what_a_publisher_sends_commands_no_terminal() -> None:
-    message = json.loads(encode_message(result_of(Tick(Frame("main", 3, 0.1, IMAGE)), Results())))
-    message |= {"sensor": "\x1b[2Jmain", "skipped": {"contact": "\x9b2J"}}
-    shown = listen.describe(message)
+    result = result_of(Tick(Frame("\x1b[2Jmain", 3, 0.1, IMAGE), skipped={"contact": "\x9b2J"}), Results())
+    shown = listen.describe(result)
     assert "?[2Jmain 3" in shown
     assert "(?2J)" in shown
-
-
-def test_invented_sensors_take_no_memory() -> None:
-    with Subscriber() as results:
-        for number in range(2 * subscriber.MOST_SENSORS):
-            results._count(f"sensor{number}", 0)
-        results._count("sensor0", 3)
-        assert len(results._last_seq) == subscriber.MOST_SENSORS
-        assert results.lost == 2
 
 
 def has_ipv6() -> bool:
@@ -434,19 +355,8 @@ def test_results_and_commands_go_over_ipv6_too() -> None:
         with Subscriber(sink.endpoint, timeout=LONG) as messages:
             sink._wait_for_subscriber(LONG)
             sink.write(result_of(Tick(Frame("main", 0, 0.0, IMAGE)), Results(IMAGE)))
-            assert messages.receive()["seq"] == 0
+            assert messages.receive().seq == 0
         with RemoteControl(str(sink.control_endpoint), timeout=LONG) as run:
             assert run.ping()["message"] == "here"
-    finally:
-        sink.close()
-
-
-@pytest.mark.skipif(not has_ipv6(), reason="this machine has no IPv6")
-def test_the_bridge_to_ros_takes_addresses_of_ipv6_too() -> None:
-    link = runpy.run_path(str(PACKAGE / "tactflow_ros" / "link.py"))
-    sink = Zmq(Zmq.Params(endpoint="tcp://[::1]:*", control="tcp://[::1]:*"))
-    sink.open()
-    try:
-        assert link["ask"](sink.control_endpoint, "ping", "", LONG) == (True, "here")
     finally:
         sink.close()

@@ -87,8 +87,7 @@ def _note(direct: Subscriber, arrivals: dict[float, int]) -> None:
     direct.timeout = SILENCE
     try:
         while True:
-            message = direct.receive()
-            arrivals[message["t"]] = time.monotonic_ns()
+            arrivals[direct.receive().t] = time.monotonic_ns()
     except TimeoutError:
         return
 

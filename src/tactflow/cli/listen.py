@@ -7,15 +7,16 @@ import math
 import sys
 import time
 from collections import deque
-from typing import Any
+
+import numpy as np
 
 from tactflow.cli.options import positive, seconds
 from tactflow.cli.printable import printable
 from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.message.result import Result
 from tactflow.network.subscriber import DEFAULT_ENDPOINT, Subscriber
 from tactflow.system.signals import ending_handled, interrupt
-
-Message = dict[str, Any]
+from tactflow.vision.types import Markers, MarkerStatus
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,31 +73,34 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def describe(message: Message) -> str:
-    """A result message in one line for people."""
-    contact, flow, markers = message["contact"], message["flow"], message["markers"]
-    parts = [f"{message['sensor']} {message['seq']}", f"t {message['t']:.3f} s"]
+def describe(result: Result) -> str:
+    """A result in one line for people."""
+    contact, flow, markers = result.contact, result.flow, result.markers
+    parts = [f"{result.sensor} {result.seq}", f"t {result.t:.3f} s"]
     if contact is not None:
-        parts.append(f"contact {contact['area']:.0f} px^2 at {_pair(contact['center'], '.1f')}")
-        parts.append(f"angle {_angle(contact['angle'])}")
+        parts.append(f"contact {contact.area:.0f} px^2 at {_pair(contact.center, '.1f')}")
+        parts.append(f"angle {_angle(contact.angle)}")
     else:
-        parts.append(_missing("contact", message, "no contact"))
+        parts.append(_missing("contact", result, "no contact"))
     if flow is not None:
-        mean = "-" if flow["mean"] is None else f"{_pair(flow['mean'], '+.2f')} px"
-        parts.append(f"flow {mean} of {flow['count']}")
+        mean = "-" if flow.mean is None else f"{_pair(flow.mean, '+.2f')} px"
+        parts.append(f"flow {mean} of {flow.count}")
     if markers is not None:
-        status = markers["status"]
-        parts.append(f"markers {status.count('tracked')}/{len(status)}")
+        parts.append(f"markers {_tracked(markers)}")
     return printable("  ".join(parts))
 
 
-def _missing(port: str, message: Message, usual: str) -> str:
-    reason = message["skipped"].get(port, "no_contact")
+def _missing(port: str, result: Result, usual: str) -> str:
+    reason = result.skipped.get(port, "no_contact")
     return usual if reason == "no_contact" else f"no {port} ({reason})"
 
 
-def _pair(pair: list[float], form: str) -> str:
+def _pair(pair: tuple[float, float], form: str) -> str:
     return f"({pair[0]:{form}}, {pair[1]:{form}})"
+
+
+def _tracked(markers: Markers) -> str:
+    return f"{np.count_nonzero(markers.status == MarkerStatus.TRACKED)}/{len(markers.status)}"
 
 
 def _angle(angle: float | None) -> str:
@@ -126,32 +130,32 @@ def _table(subscriber: Subscriber, count: float) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    rows: dict[str, tuple[Message, deque[float]]] = {}
+    rows: dict[str, tuple[Result, deque[float]]] = {}
 
     def table() -> Table:
-        result = Table("sensor", "seq", "contact", "area, px^2", "angle, deg", "flow, px", "markers", "Hz")
-        for sensor, (message, arrivals) in sorted(rows.items()):
-            result.add_row(Text(printable(sensor)), *_cells(message), _rate(arrivals))
-        result.caption = f"{subscriber.received} received, {subscriber.lost} lost"
-        return result
+        shown = Table("sensor", "seq", "contact", "area, px^2", "angle, deg", "flow, px", "markers", "Hz")
+        for sensor, (result, arrivals) in sorted(rows.items()):
+            shown.add_row(Text(printable(sensor)), *_cells(result), _rate(arrivals))
+        shown.caption = f"{subscriber.received} received, {subscriber.lost} lost"
+        return shown
 
     with Live(table(), get_renderable=table, refresh_per_second=10):
         while subscriber.received < count:
-            message = subscriber.receive()
-            arrivals = rows.get(message["sensor"], (message, deque[float](maxlen=60)))[1]
+            result = subscriber.receive()
+            arrivals = rows.get(result.sensor, (result, deque[float](maxlen=60)))[1]
             arrivals.append(time.monotonic())
-            rows[message["sensor"]] = (message, arrivals)
+            rows[result.sensor] = (result, arrivals)
 
 
-def _cells(message: Message) -> list[str]:
-    contact, flow, markers = message["contact"], message["flow"], message["markers"]
+def _cells(result: Result) -> list[str]:
+    contact, flow, markers = result.contact, result.flow, result.markers
     return [
-        str(message["seq"]),
-        "no" if contact is None else _pair(contact["center"], ".1f"),
-        "" if contact is None else f"{contact['area']:.0f}",
-        "" if contact is None else _angle(contact["angle"]).removesuffix(" deg"),
-        "" if flow is None or flow["mean"] is None else _pair(flow["mean"], "+.2f"),
-        "" if markers is None else f"{markers['status'].count('tracked')}/{len(markers['status'])}",
+        str(result.seq),
+        "no" if contact is None else _pair(contact.center, ".1f"),
+        "" if contact is None else f"{contact.area:.0f}",
+        "" if contact is None else _angle(contact.angle).removesuffix(" deg"),
+        "" if flow is None or flow.mean is None else _pair(flow.mean, "+.2f"),
+        "" if markers is None else _tracked(markers),
     ]
 
 

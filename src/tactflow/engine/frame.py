@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +104,11 @@ class Tick(Mapping[str, Any]):
         super().__init_subclass__()
         for port in vars(cls).get("__annotations__", {}):
             setattr(cls, port, _property_of(port))
+
+    @classmethod
+    def port_types(cls) -> dict[str, Any]:
+        """Port that the class names -> its annotation."""
+        return get_type_hints(cls, include_extras=True)
 
     def __getitem__(self, port: str) -> Any:
         try:

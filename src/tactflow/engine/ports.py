@@ -294,7 +294,7 @@ def _named_output(result: Any) -> str:
 
 def _field_hints(group: type) -> dict[str, Any]:
     try:
-        return get_type_hints(group, include_extras=True)
+        return group.port_types() if issubclass(group, Tick) else get_type_hints(group, include_extras=True)
     except NameError as error:
         raise _PortError(
             f"the fields of {group.__name__} use {error.name}, which is not known when the program runs; "

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.types import (
     Contact,
     Depth,
@@ -25,6 +24,9 @@ from tactflow.vision.types import (
     Scale,
     Slip,
 )
+
+if TYPE_CHECKING:
+    from tactflow.vision.flow.displacement_field import DisplacementField
 
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
 """The word for each value of `MarkerStatus`."""

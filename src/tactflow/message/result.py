@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self, get_type_hints
 
 import numpy as np
 import orjson
@@ -17,8 +17,10 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message import encoding
 from tactflow.message.decoding import decode_values
 from tactflow.ports import ContactMask, Image
-from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Scale, Slip
+
+if TYPE_CHECKING:
+    from tactflow.vision.flow.displacement_field import DisplacementField
 
 SCHEMA = "tactflow.frame/1"
 
@@ -74,6 +76,13 @@ class Result(Tick):
         super().__init__(frame, values, skipped)
         self._size: tuple[int, int] | None = None
         self._message: dict[str, Any] | None = None
+
+    @classmethod
+    def port_types(cls) -> dict[str, Any]:
+        """The types of the ports. Importing this module alone does not import OpenCV."""
+        from tactflow.vision.flow.displacement_field import DisplacementField
+
+        return get_type_hints(cls, localns={"DisplacementField": DisplacementField}, include_extras=True)
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -132,21 +141,24 @@ class Result(Tick):
 
     @classmethod
     def from_message(cls, message: Mapping[str, Any] | bytes | str) -> Self:
-        """The result that a message tells of: without pictures, masks and height maps.
+        """Build a result from a received message; it has no pictures, masks or height maps.
 
         Raises
         ------
-        ValueError : it is no result message.
+        ValueError : the message is not a result message.
         """
         try:
             parsed: Any = message if isinstance(message, Mapping) else orjson.loads(message)
-            frame = Frame(str(parsed["sensor"]), int(parsed["seq"]), float(parsed["t"]), NO_PICTURE)
+            if not (isinstance(parsed["sensor"], str) and isinstance(parsed["seq"], int)):
+                raise TypeError("required a text as sensor and a whole number as seq")
+            frame = Frame(parsed["sensor"], parsed["seq"], float(parsed["t"]), NO_PICTURE)
             values, skipped = decode_values(parsed)
             result = cls(frame, values, skipped)
-            result._size = tuple(parsed["size"])
+            width, height = parsed.get("size", (0, 0))
+            result._size = int(width), int(height)
             result._message = parsed
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise ValueError(f"required a message of {SCHEMA}: {error!r}") from None
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ValueError(f"required a message {SCHEMA}: {type(error).__name__}: {error}") from None
         return result
 
 
