@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import select
 import socket
@@ -12,20 +11,15 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
-import numpy as np
-import orjson
 from pydantic import Field, model_validator
 
-from tactflow.drawing.jpeg import encode_jpeg
-from tactflow.drawing.results import dimmed, field_arrows
 from tactflow.engine.contract import StageParams
 from tactflow.engine.control import Control
-from tactflow.message.result import Result, encode_message
+from tactflow.message.result import Result
 from tactflow.network.address import is_loopback
-from tactflow.ports import Image, Valid
+from tactflow.ports import Valid
 from tactflow.view.address import Neighbours, address, bind
-from tactflow.view.compact import compact_markers, compact_surface
+from tactflow.view.compact import encode_packet
 from tactflow.view.guided import Guiding
 
 if TYPE_CHECKING:
@@ -34,8 +28,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("tactflow")
 
-FIELD_ARROWS = 14.0
-"""Distance of the arrows of a displacement field in a picture of 400 px, px. Chosen by hand."""
+LOOK_EVERY = 0.2
+"""Time between two looks whether the run has ended before anybody came, s. Chosen by hand."""
 
 
 class View(Guiding):
@@ -106,9 +100,8 @@ class View(Guiding):
         self._hub: Hub | None = None
         self._server: Server | None = None
         self._door: threading.Thread | None = None
-        self._closed = False
+        self._closed = threading.Event()
         self._neighbours = None if params.neighbours is None else Neighbours(Path(params.neighbours), sensor)
-        self._interval = 1.0 / params.max_fps
         self._due = float("-inf")
         self._encoded = 0
         self._sending = threading.Lock()
@@ -132,7 +125,6 @@ class View(Guiding):
         port = listener.getsockname()[1]
         if p.port not in (0, port) and self._neighbours is None:
             log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
-        self._closing = socket.socketpair()
         self._door = threading.Thread(
             target=self._answer, args=(listener,), name="tactflow-view-door", daemon=True
         )
@@ -145,11 +137,11 @@ class View(Guiding):
             threading.Thread(target=webbrowser.open, args=(with_token,), daemon=True).start()
 
     def _answer(self, listener: socket.socket) -> None:
-        """Start the server at the first visit: what it needs takes a tenth of a run's start to import."""
-        select.select([listener, self._closing[1]], [], [])
-        if self._closed:
-            listener.close()
-            return
+        """Start the server at the first visit: its packages take a tenth of a run's start to import."""
+        while not select.select([listener], [], [], LOOK_EVERY)[0]:
+            if self._closed.is_set():
+                listener.close()
+                return
         try:
             from tactflow.view.hub import Hub
             from tactflow.view.server import Server
@@ -172,17 +164,13 @@ class View(Guiding):
         return {"encoded": self._encoded} | ({} if self._hub is None else self._hub.counters())
 
     def write(self, result: Result, valid: Valid | None = None) -> None:
-        """Send the plain picture and the result message; the page draws one over the other.
-
-        Where no gel is, the picture is darker. Markers and hull come in tenths of a pixel; the field and the
-        height map only if a page shows them.
-        """
+        """Send the picture and the results; the page draws one over the other."""
         # What was wanted a moment ago may have become too much meanwhile.
-        if self._hub is None or not self.wants():
+        if not self.wants():
             return
-        now = time.perf_counter()
+        now, interval = time.perf_counter(), 1.0 / self.params.max_fps
         # Counted from when this one was due, so that an uneven source does not lower the rate.
-        self._due = max(self._due, now - self._interval / 2) + self._interval
+        self._due = max(self._due, now - interval / 2) + interval
         captured = result.frame.captured
         self._last = result, valid, (now - captured) * 1000 if captured else -1.0
         self._send(captured)
@@ -193,48 +181,21 @@ class View(Guiding):
         captured : `time.perf_counter` at its capture, s; 0 where the delay until it is seen tells nothing.
         """
         with self._sending:
-            if self._hub is None or self._last is None:
+            hub, p = self._hub, self.params
+            if hub is None or self._last is None:
                 return
             result, valid, latency = self._last
-            frame, contact = result.frame, result.contact
-            if contact is not None:
-                contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1), separate=())
-            message = encode_message(result.replace(contact=contact, markers=None), detail=True)
-            image = frame.image if result.image is None else result.image
-            jpeg = self._encode(image if valid is None else dimmed(image, valid))
-            heights, drawn = self._drawn(result, max(image.shape))
-            header = b'{"latency_ms":%.3f,"epoch":%d,"message":%b,%b' % (latency, frame.epoch, message, drawn)
-            self._hub.publish(header, heights + jpeg, captured)
-
-    def _drawn(self, result: Result, side: int) -> tuple[bytes, bytes]:
-        """Heights, and as JSON what is drawn beside the message.
-
-        A field or height map that there is, but that no page shows, is `true`: pages offer to show it.
-        """
-        assert self._hub is not None
-        markers, scale, field, depth = result.markers, result.scale, result.field, result.depth
-        arrows, surface = (b"null" if one is None else b"true" for one in (field, depth))
-        heights = b""
-        if field is not None and "field" in self._hub.shown:
-            arrows = compact_markers(field_arrows(field, FIELD_ARROWS * max(1.0, side / 400)))
-        if depth is not None and "surface" in self._hub.shown:
-            surface, heights = compact_surface(depth)
-        return heights, b'"markers":%b,"scale":%b,"field":%b,"surface":%b,"guide":%b' % (
-            b"null" if markers is None else compact_markers(markers),
-            b"null" if scale is None else b"[%.8g,%.8g]" % (scale.x, scale.y),
-            *(arrows, surface),
-            b"null" if self.session is None else orjson.dumps(self.session.state),
-        )
-
-    def _encode(self, image: Image) -> bytes:
-        height, width = image.shape[:2]
-        factor = self.params.max_size / max(height, width)
-        if factor < 1:
-            size = (max(1, round(width * factor)), max(1, round(height * factor)))
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        jpeg = encode_jpeg(image, self.params.quality)
-        self._encoded += 1
-        return jpeg
+            packet = encode_packet(
+                result,
+                valid,
+                hub.shown,
+                latency_ms=latency,
+                guide=None if self.session is None else self.session.state,
+                quality=p.quality,
+                max_size=p.max_size,
+            )
+            self._encoded += 1
+            hub.publish(*packet, captured)
 
     def close(self) -> None:
         """Tell the pages that the run has ended, and serve no more."""
@@ -243,11 +204,9 @@ class View(Guiding):
             return
         if self._neighbours is not None:
             self._neighbours.leave()
-        self._closed = True
-        self._closing[0].close()
+        self._closed.set()
         door.join()
-        self._closing[1].close()
         if self._server is not None:
             self._server.close()
-        # What is told at the end of a run shall not name a page that is gone.
+        # A summary at the end of a run does not name a page that is gone.
         self.description = None

@@ -4,31 +4,26 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 
 import numpy as np
 import orjson
-import zmq
 from pydantic import Field, field_validator, model_validator
 
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Publication, Sink, StageParams
 from tactflow.engine.control import Control
-from tactflow.engine.frame import Frame
 from tactflow.engine.rate import RateLimit
 from tactflow.message.result import Result, encode_message
 from tactflow.network.address import Address
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
-from tactflow.network.publisher import SEND_BUFFER, Publisher
+from tactflow.network.publisher import SEND_BUFFER
+from tactflow.network.topics import TopicPublisher
+from tactflow.ports import Image
 
 log = logging.getLogger("tactflow")
 
 STATS_TOPIC = b"tactflow.stats "
-EVENTS_AT_ONCE = 100
-"""Subscriptions that are looked at for one frame, so that a flood of them holds nothing up."""
-MOST_OTHERS = 1000
-"""Subscriptions up to which also those to other sensors are counted."""
 LARGEST = 2**31 - 1
 """ZeroMQ takes its numbers as `int` of C."""
 
@@ -163,20 +158,13 @@ class Zmq(Sink):
         self.description = params.endpoint
         self._sensor = sensor
         self._control = control
-        self._topic = f"tactflow.{sensor} ".encode()
-        # Sockets belong to one thread at a time: `wants` is called by another thread than `write`.
-        self._lock = threading.Lock()
-        self._publisher: Publisher | None = None
-        self._socket: zmq.Socket[bytes] | None = None
-        self._subscriptions: set[bytes] = set()
-        extras = ("picture", "depth") if params.pictures else ()
-        self._extras = {name: f"tactflow_{name}.{sensor} ".encode() for name in extras}
-        self._asked: frozenset[str] = frozenset()
+        self._topic, self._picture_topic, self._depth_topic = (
+            f"tactflow{kind}.{sensor} ".encode() for kind in ("", "_picture", "_depth")
+        )
+        self._publisher: TopicPublisher | None = None
         self._rate = RateLimit(params.pictures or None)
         self._had_depth = False
-        self._wanted = False
         self._serialised = 0
-        self._stats_wanted = False
         self._closing = threading.Event()
         self._stats_thread: threading.Thread | None = None
         self._commands: ControlSocket | None = None
@@ -212,8 +200,7 @@ class Zmq(Sink):
             If an address is taken or cannot be bound, or the keys are wrong.
         """
         p = self.params
-        self._publisher = Publisher(p.endpoint, p.backlog, p.send_buffer, p.keys)
-        self._socket = self._publisher.socket
+        self._publisher = TopicPublisher(p.endpoint, p.backlog, p.send_buffer, p.keys)
         self.endpoint = self._publisher.endpoint
         self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
         log.info("publishing %s", self.description)
@@ -221,74 +208,70 @@ class Zmq(Sink):
             commands = Commands(self._control)
             self._commands = ControlSocket(p.control, p.commanders, self._sensor, commands)
             log.info("taking commands on %s", self.control_endpoint)
-        self._wait_for_subscriber(p.wait_for_subscriber)
+        self.wait_for_subscriber(p.wait_for_subscriber)
         if self._control is not None and p.stats_every:
-            # Not in the run's threads: statistics shall also come while no frame does.
+            # Not in the run's threads: statistics also come while no frame does.
             self._stats_thread = threading.Thread(
-                target=self._publish_statistics, args=(self._control,), name="tactflow-stats", daemon=True
+                target=self._publish_statistics,
+                args=(self._publisher, self._control),
+                name="tactflow-stats",
+                daemon=True,
             )
             self._stats_thread.start()
 
-    def _wait_for_subscriber(self, seconds: float) -> None:
-        deadline = time.monotonic() + seconds
-        while not self.wants() and (left := deadline - time.monotonic()) > 0:
-            assert self._socket is not None
-            self._socket.poll(max(int(min(left, 0.1) * 1000), 1))
+    def wait_for_subscriber(self, seconds: float) -> bool:
+        """Wait until somebody has subscribed to the results, at most so long; whether somebody has."""
+        return self._publisher is not None and self._publisher.wait_for(self._topic, seconds)
+
+    def _asked(self) -> list[bytes]:
+        """The topics of pictures and depth maps that somebody has subscribed to by name."""
+        if self._publisher is None or not self.params.pictures:
+            return []
+        topics = (self._picture_topic, self._depth_topic)
+        return [topic for topic in topics if self._publisher.is_subscribed(topic, by_name=True)]
 
     def wants(self) -> bool:
         """Whether anybody has subscribed to this sensor. From any thread; takes about 3 us."""
-        # While a message is being sent, the last answer is good enough.
-        if self._lock.acquire(blocking=False):
-            try:
-                self._read_subscriptions()
-            finally:
-                self._lock.release()
-        return self._wanted
+        publisher = self._publisher
+        return publisher is not None and (publisher.is_subscribed(self._topic) or bool(self._asked()))
 
     def counters(self) -> dict[str, int]:
         """serialised : messages encoded. subscriptions : distinct ones now."""
-        return {"serialised": self._serialised, "subscriptions": len(self._subscriptions)}
+        subscriptions = 0 if self._publisher is None else len(self._publisher.subscriptions)
+        return {"serialised": self._serialised, "subscriptions": subscriptions}
 
     def write(self, result: Result) -> None:
         """Send one message to whoever has subscribed; never waits."""
-        if not self.wants():
+        if self._publisher is None or not self.wants():
             return
-        body = encode_message(result, detail=self.params.detail, field=self.params.field)
+        p, frame = self.params, result.frame
+        self._publisher.send(self._topic + encode_message(result, detail=p.detail, field=p.field))
         self._serialised += 1
-        self._send(self._topic + body)
-        if self._asked and result.frame.seq >= 0 and self._rate.due(result.frame.t):
-            self._send_pictures(result.frame, result)
+        asked = self._asked()
+        if asked and frame.seq >= 0 and self._rate.due(frame.t):
+            image = frame.image if result.image is None else result.image
+            height, width = image.shape[:2]
+            about = {"sensor": self._sensor, "seq": frame.seq, "t": frame.t, "size": [width, height]}
+            for topic in asked:
+                data = self._data(topic, image, result)
+                if data is not None:
+                    self._publisher.send(topic + orjson.dumps(about) + b"\n" + data)
 
-    def _send_pictures(self, frame: Frame, result: Result) -> None:
-        """The picture and the depth map, for whom has asked for them."""
-        image = frame.image if result.image is None else result.image
-        height, width = image.shape[:2]
-        about = {"sensor": self._sensor, "seq": frame.seq, "t": frame.t, "size": [width, height]}
-        header = orjson.dumps(about) + b"\n"
-        if "picture" in self._asked:
-            self._send(self._extras["picture"] + header + encode_jpeg(image, self.params.quality))
-        if "depth" in self._asked:
-            heights = None if result.depth is None else result.depth.heights
-            if heights is None and self._had_depth and result.contact is None:
-                heights = np.zeros((height, width), np.float32)
-            if heights is not None:
-                self._had_depth = True
-                self._send(self._extras["depth"] + header + heights.astype("<f4").tobytes())
+    def _data(self, topic: bytes, image: Image, result: Result) -> bytes | None:
+        """The picture as JPEG, or the depth map; None where the calibration knows no depth."""
+        if topic == self._picture_topic:
+            return encode_jpeg(image, self.params.quality)
+        if result.depth is not None:
+            self._had_depth = True
+            return result.depth.heights.astype("<f4").tobytes()
+        flat = self._had_depth and result.contact is None
+        return np.zeros(image.shape[:2], "<f4").tobytes() if flat else None
 
-    def _send(self, message: bytes) -> None:
-        with self._lock:
-            if self._socket is not None:
-                self._socket.send(message, zmq.NOBLOCK)
-
-    def _publish_statistics(self, control: Control) -> None:
+    def _publish_statistics(self, publisher: TopicPublisher, control: Control) -> None:
         """Body of the thread that publishes the statistics while somebody has asked for them."""
         while not self._closing.wait(self.params.stats_every):
-            with self._lock:
-                self._read_subscriptions()
-                wanted = self._stats_wanted
-            if not wanted:
-                continue
-            self._send(STATS_TOPIC + orjson.dumps({"sensor": self._sensor, **control.snapshot()}))
+            if publisher.is_subscribed(STATS_TOPIC, by_name=True):
+                publisher.send(STATS_TOPIC + orjson.dumps({"sensor": self._sensor, **control.snapshot()}))
 
     def close(self) -> None:
         """Deliver what is under way, for at most `linger` seconds, and free the addresses."""
@@ -298,50 +281,5 @@ class Zmq(Sink):
         self._closing.set()
         if self._stats_thread is not None:
             self._stats_thread.join()
-        with self._lock:
-            publisher, self._publisher = self._publisher, None
-            self._socket = None
-            self._wanted = False
-        if publisher is not None:
-            publisher.close(self.params.linger)
-
-    def _read_subscriptions(self) -> None:
-        if self._publisher is None or self._socket is None:
-            return
-        changed = False
-        for _ in range(EVENTS_AT_ONCE):
-            event = self._publisher.next_event()
-            if event is None:
-                break
-            changed = True
-            if event[:1] == b"\x01" and self._is_kept(event[1:]):
-                self._subscriptions.add(event[1:])
-            elif event[:1] == b"\x00":
-                self._subscriptions.discard(event[1:])
-        if not changed:
-            return
-        self._asked = frozenset(name for name in self._extras if self._asks_for(name))
-        self._wanted = bool(self._asked) or any(map(self._asks_for_results, self._subscriptions))
-        self._stats_wanted = any(map(_asks_for_statistics, self._subscriptions))
-
-    def _is_kept(self, subscription: bytes) -> bool:
-        """Of those to others only some are counted, or their memory would have no bound."""
-        ours = (
-            self._asks_for_results(subscription)
-            or _asks_for_statistics(subscription)
-            or any(subscription.startswith(topic.rstrip()) for topic in self._extras.values())
-        )
-        return ours or len(self._subscriptions) < MOST_OTHERS
-
-    def _asks_for(self, extra: str) -> bool:
-        """Whether somebody has subscribed to pictures or depth maps, by their full name."""
-        name = self._extras[extra].rstrip()
-        return any(subscription.startswith(name) for subscription in self._subscriptions)
-
-    def _asks_for_results(self, subscription: bytes) -> bool:
-        """A subscription is a prefix of the message; it may be longer than the topic."""
-        return self._topic.startswith(subscription) or subscription.startswith(self._topic)
-
-
-def _asks_for_statistics(subscription: bytes) -> bool:
-    return subscription.startswith(STATS_TOPIC.rstrip())
+        if self._publisher is not None:
+            self._publisher.close(self.params.linger)

@@ -46,7 +46,7 @@ class Publisher:
 
     def wait(self) -> None:
         """Until somebody has subscribed."""
-        self.sink._wait_for_subscriber(LONG)
+        self.sink.wait_for_subscriber(LONG)
         assert self.sink.wants()
 
     def send(self, *seqs: int, contact: Contact | None = None) -> None:
@@ -80,8 +80,8 @@ def test_every_message_arrives_as_a_result(publisher: Publisher) -> None:
 def test_statistics_that_somebody_else_asked_for_are_no_results(publisher: Publisher) -> None:
     with Subscriber(publisher.endpoint, timeout=LONG) as messages:
         publisher.wait()
-        assert publisher.sink._socket is not None
-        publisher.sink._socket.send(b'tactflow.stats {"frames": 7}')
+        assert publisher.sink._publisher is not None
+        publisher.sink._publisher.send(b'tactflow.stats {"frames": 7}')
         publisher.send(5)
         assert next(iter(messages)).seq == 5
         assert messages.received == 1
@@ -353,7 +353,7 @@ def test_results_and_commands_go_over_ipv6_too() -> None:
     sink.open()
     try:
         with Subscriber(sink.endpoint, timeout=LONG) as messages:
-            sink._wait_for_subscriber(LONG)
+            sink.wait_for_subscriber(LONG)
             sink.write(result_of(Tick(Frame("main", 0, 0.0, IMAGE)), Results(IMAGE)))
             assert messages.receive().seq == 0
         with RemoteControl(str(sink.control_endpoint), timeout=LONG) as run:

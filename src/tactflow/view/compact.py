@@ -1,4 +1,4 @@
-"""Compact encodings of markers and height maps for drawing in the browser.
+"""What a page is sent about one frame, with compact encodings of markers and height maps.
 
 Coordinates that are only drawn are sent in tenths of a pixel, and a height map with as many cells as a screen
 can show.
@@ -6,15 +6,21 @@ can show.
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import Final
+from collections.abc import Collection, Mapping
+from typing import Any, Final
 
 import cv2
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from tactflow.drawing.jpeg import encode_jpeg
+from tactflow.drawing.results import dimmed, field_arrows
 from tactflow.message.encoding import STATUS_NAMES
+from tactflow.message.result import Result, encode_message
+from tactflow.ports import Image, Valid
 from tactflow.vision.types import Depth, Markers
 
 STATUS_LETTERS: Final = np.array([ord(name[0]) for name in STATUS_NAMES], np.uint8)
@@ -25,6 +31,61 @@ LEAST_CELL: Final = 2.0
 """Smallest side of a cell, px: heights are computed at half the resolution of the picture."""
 LEVELS: Final = 65535
 """Quantization steps from 0 to the greatest height; with 255 a shaded surface shows terraces."""
+FIELD_ARROWS = 14.0
+"""Distance of the arrows of a displacement field in a picture of 400 px, px. Chosen by hand."""
+
+
+def encode_packet(
+    result: Result,
+    valid: Valid | None,
+    shown: Collection[str],
+    *,
+    latency_ms: float,
+    guide: Mapping[str, Any] | None,
+    quality: int,
+    max_size: int,
+) -> tuple[bytes, bytes]:
+    """The header, JSON without its closing brace, and the heights of a surface followed by the JPEG picture.
+
+    The picture is plain, and darker where there is no gel; the page draws the results over it. A field or
+    height map that no page shows is `true`: pages offer to show it.
+
+    shown : those of "field" and "surface" that a page shows. latency_ms : from capture; -1 where not known.
+    guide : state of a guided session. max_size : of the longer side of the picture, px.
+    """
+    contact, markers, scale = result.contact, result.markers, result.scale
+    if contact is not None:
+        contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1), separate=())
+    image = result.frame.image if result.image is None else result.image
+    arrows, surface = (b"null" if layer is None else b"true" for layer in (result.field, result.depth))
+    heights = b""
+    if result.field is not None and "field" in shown:
+        spacing = FIELD_ARROWS * max(1.0, max(image.shape) / 400)
+        arrows = compact_markers(field_arrows(result.field, spacing))
+    if result.depth is not None and "surface" in shown:
+        surface, heights = compact_surface(result.depth)
+    parts = {
+        b"latency_ms": b"%.3f" % latency_ms,
+        b"epoch": b"%d" % result.frame.epoch,
+        b"message": encode_message(result.replace(contact=contact, markers=None), detail=True),
+        b"markers": b"null" if markers is None else compact_markers(markers),
+        b"scale": b"null" if scale is None else b"[%.8g,%.8g]" % (scale.x, scale.y),
+        b"field": arrows,
+        b"surface": surface,
+        b"guide": orjson.dumps(guide),
+    }
+    header = b"{" + b",".join(b'"%b":%b' % part for part in parts.items())
+    picture = _reduced(image if valid is None else dimmed(image, valid), max_size)
+    return header, heights + encode_jpeg(picture, quality)
+
+
+def _reduced(image: Image, max_size: int) -> Image:
+    height, width = image.shape[:2]
+    factor = max_size / max(height, width)
+    if factor >= 1:
+        return image
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def compact_markers(markers: Markers) -> bytes:
