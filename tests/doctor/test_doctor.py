@@ -153,7 +153,8 @@ def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
 ) -> None:
     for index, image in enumerate(clean[:4]):
         cv2.imwrite(str(tmp_path / f"{index}.png"), cv2.GaussianBlur(image, (0, 0), 6.0))
-    assert main(["doctor", "--source", str(tmp_path)]) == 3
+    page = tmp_path / "page.html"
+    assert main(["doctor", "--source", str(tmp_path), "--html", str(page)]) == 3
     table = capsys.readouterr().out
     assert "FAULT  focus" in table
     assert "change: focus the lens" in table
@@ -164,6 +165,7 @@ def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
     (focus,) = [check for check in told["checks"] if check["name"] == "focus"]
     assert (focus["verdict"], focus["unit"]) == ("fault", "px")
     assert focus["says"] in table
+    assert focus["says"] in page.read_text()
 
 
 @pytest.mark.parametrize(

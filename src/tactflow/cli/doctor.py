@@ -7,6 +7,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import orjson
@@ -18,12 +19,12 @@ from tactflow.sources import KINDS
 from tactflow.system.signals import ending_handled, interrupt
 
 if TYPE_CHECKING:
-    from tactflow.doctor import Finding
+    from tactflow.doctor import Finding, Observation
 
 LIVE_SECONDS = 10.0
-"""How long a source is looked at unless told otherwise, s. Chosen by hand."""
+"""How long a source is looked at unless told otherwise, s: time for some presses."""
 WIDTH = 100
-"""Characters of a line. Chosen by hand."""
+"""Characters of a line."""
 INDENT = 28
 """Characters before what a fault does and what to change."""
 SIGNS = {"good": "ok", "warning": "WARN", "fault": "FAULT", "unknown": "?"}
@@ -42,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "last, and press it in between",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="also write the table as a page")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,32 +54,30 @@ def run(args: argparse.Namespace) -> int:
     SourceError
         If the source delivers nothing.
     """
-    from tactflow.doctor import examine, observe
-    from tactflow.doctor.checks import worst
+    from tactflow.doctor import examine, observe, worst
 
-    # The first ends only the look at the source.
+    # The first signal ends only the look at the source.
     with ending_handled(interrupt):
         seen = observe(args.source, args.seconds, _progress)
     _progress(0)
     findings = examine(seen)
     verdict = worst(findings)
+    title = f"{seen.description}: {seen.frames} frames looked at"
+    counts = {v: sum(finding.verdict == v for finding in findings) for v in ("fault", "warning")}
+    summary = f"{counts['warning']} to look at"
+    if verdict == "fault":
+        summary = f"{counts['fault']} to change, {summary}"
+    elif verdict == "good":
+        summary = "nothing is wrong with these pictures"
+    if args.html is not None:
+        _write_page(args.html, title, summary, seen, findings)
     if args.json:
-        told = {"source": seen.source, "frames": seen.frames, "verdict": verdict}
-        print(orjson.dumps({**told, "checks": [asdict(finding) for finding in findings]}).decode())
+        facts = {"source": seen.source, "frames": seen.frames, "verdict": verdict}
+        print(orjson.dumps({**facts, "checks": [asdict(finding) for finding in findings]}).decode())
     else:
-        print(printable(f"{seen.description}: {seen.frames} frames looked at"))
-        for finding in findings:
-            print(printable("\n".join(_lines(finding))))
-        print(SUMMARY[verdict].format(*(sum(f.verdict == v for f in findings) for v in ("fault", "warning"))))
+        lines = [line for finding in findings for line in _lines(finding)]
+        print(printable("\n".join([title, *lines, summary])))
     return StageError.exit_code if verdict == "fault" else 0
-
-
-SUMMARY = {
-    "good": "nothing is wrong with these pictures",
-    "warning": "{1} to look at",
-    "fault": "{0} to change, {1} to look at",
-}
-"""Verdict -> the last line."""
 
 
 def _lines(finding: Finding) -> Iterator[str]:
@@ -88,6 +88,17 @@ def _lines(finding: Finding) -> Iterator[str]:
             lines = textwrap.wrap(text, WIDTH - INDENT)
             yield f"{title + ': ':>{INDENT}}{lines[0]}"
             yield from (" " * INDENT + line for line in lines[1:])
+
+
+def _write_page(path: Path, title: str, summary: str, seen: Observation, findings: list[Finding]) -> None:
+    from tactflow.report import Section, Table, mark, picture, write_report
+
+    rows = [
+        [mark(SIGNS[f.verdict], f.verdict in ("good", "unknown")), f.name, f.says, f.effect, f.advice]
+        for f in findings
+    ]
+    table = Table(["", "check", "measured", "effect", "what to change"], rows)
+    write_report(path, title, [Section(summary, pictures=[picture(seen.pairs[0].image)], tables=[table])])
 
 
 def _progress(frames: int) -> None:

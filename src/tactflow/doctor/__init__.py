@@ -1,6 +1,6 @@
-"""What is wrong with a sensor's pictures, told from the pictures alone: `tactflow doctor`."""
+"""What is wrong with a sensor's pictures, from the pictures alone: `tactflow doctor`."""
 
-from tactflow.doctor.checks import Finding, examine
+from tactflow.doctor.checks import CHECKS, Finding, examine, worst
 from tactflow.doctor.observation import Observation, observe
 
-__all__ = ["Finding", "Observation", "examine", "observe"]
+__all__ = ["CHECKS", "Finding", "Observation", "examine", "observe", "worst"]

@@ -1,12 +1,13 @@
-"""What can be told of a sensor's pictures without knowing the truth: pure functions on arrays."""
+"""Measures of a sensor's pictures that need no truth: pure functions on arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from tactflow.vision.markers import Detection
@@ -15,90 +16,20 @@ from tactflow.vision.markers.lattice import corners
 Image = NDArray[np.uint8]
 Gray = NDArray[np.float32]
 
-BRIGHTER: Final = 0.95
-"""Share of the gel that is darker than its brighter parts: a dark gel with bright pins is well exposed."""
 TILE: Final = 16
-"""Side of the tiles that noise is measured in, px. Chosen by hand."""
-CALM: Final = 25.0
-"""Percentile of the tiles that is taken for the noise: what moves or is textured fills the others."""
-NOISE_PAIRS: Final = 8
-"""Pairs of frames that noise is measured in. Chosen by hand: each has hundreds of tiles."""
+"""Side of the tiles that noise is measured in, px: each has 256 samples."""
 BLOCK: Final = 8
 """Side of the blocks of JPEG, px."""
-SATURATED: Final = 254
-"""Grey level from which on a channel is clipped."""
 BLACK: Final = 4
 """Grey level up to which a pixel shows no gel, but a black surround."""
-SCALES: Final = ((1.0, 2.0), (2.0, 4.0))
-"""Standard deviations of pairs of blurs under which edges are compared, px. Chosen by hand."""
-EDGE_SHARE: Final = 98.0
-"""Percentile of the slope from which on a pixel belongs to an edge. Chosen by hand."""
-LEAST_SLOPE: Final = 2.0
-"""Slope of an edge under a blur of 1 px, grey levels a px. Chosen by hand: well above noise of 2 grey levels,
-of which that blur leaves a slope of 0.6."""
-LEAST_EDGES: Final = 30
-"""Edge pixels from which on a blur is told. Chosen by hand."""
-SHARPEST: Final = 25.0
-"""Percentile of the edges' blurs that is taken for the lens's: soft shades are edges, too. Chosen by hand."""
-STRIPS: Final = 4
-"""Strips in which bands are looked for. Chosen by hand."""
-MOST_WAVES: Final = 24
-"""Bands across a picture, at most. Chosen by hand: mains light at 120 Hz on a shutter of 100 ms has 12."""
 DIM: Final = 25
-"""Grey level below which a change of the light is not looked for. Chosen by hand: noise would be 8 %."""
-STEPS: Final = (2.0, 100.0, 0.25)
-"""Steps of JPEG that are tried: from, to, and the distance of two, grey levels."""
-LEAST_WAVES: Final = 100
-"""Coefficients from which on a step is told. Chosen by hand."""
-BEAT: Final = 0.5
-"""How well coefficients keep the beat of a step, to be its multiples: 0 at random, 1 at best. Found by hand:
-0.2 at most without JPEG, 0.8 and more with it."""
-TABLE: Final = 11.5
-"""Step of the coarsest waves at quality 50: the mean of 11 and 12, ITU-T T.81, table K.1."""
+"""Grey level below which no change of the light is measured: noise of 2 grey levels would be 8 %."""
+STRIPS: Final = 4
+"""Strips of a picture, all of which a band of light crosses and no contact does."""
+MOST_WAVES: Final = 24
+"""Bands across a picture, at most: mains light at 120 Hz on a shutter of 100 ms makes 12."""
 REGULAR: Final = 0.7
-"""Share of parallelograms that close from which on a grid is regular; 0.8 and more in grids. By hand."""
-WINDOW: Final = 31
-"""Side of the window in which a point is followed, px. Chosen by hand."""
-RETURN: Final = 0.3
-"""How near a point must come back to where it started, px. Chosen by hand."""
-SMOOTHING: Final = 1.5
-"""Standard deviation of the blur under which points are followed, px. Chosen by hand, against noise."""
-CORNERS: Final = (0.05, 8.0)
-"""Least quality of a point relative to the best one, and least distance of two, px. Chosen by hand."""
-MAD_TO_SIGMA: Final = 1.4826
-"""Standard deviation of a normal variable in units of its median absolute deviation."""
-
-
-def temporal_noise(first: Image, second: Image) -> float:
-    """Standard deviation of one frame's noise, grey levels, from two frames in a row.
-
-    first, second : (H, W, 3) uint8. What moves fills less than three quarters of the picture, or counts.
-
-    >>> rng = np.random.default_rng(0)
-    >>> one, other = (np.uint8(rng.normal(100, 3, (160, 160, 3)).round()) for _ in range(2))
-    >>> round(temporal_noise(one, other))
-    3
-    """
-    difference = first.astype(np.float32) - second
-    return float(_calm_deviation(difference) / np.sqrt(2.0))
-
-
-def spatial_noise(image: Image) -> float:
-    """Standard deviation of a frame's noise, grey levels, from that frame alone; texture adds to it.
-
-    image : (H, W, 3) uint8.
-
-    References
-    ----------
-    J. Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding 64 (1996): the
-    difference of two Laplacians, which is blind to slopes and edges along the axes.
-
-    >>> rng = np.random.default_rng(0)
-    >>> round(spatial_noise(np.uint8(rng.normal(100, 3, (160, 160, 3)).round())))
-    3
-    """
-    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-    return _calm_deviation(np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel), np.float32)) / 6.0
+"""Share of closing parallelograms from which on a grid is regular; 0.8 and more in grids. Chosen by hand."""
 
 
 class Pair(NamedTuple):
@@ -112,31 +43,77 @@ class Pair(NamedTuple):
     after: Image | None
 
 
+class Exposure(NamedTuple):
+    """level : 95th percentile of the gel in its brightest channel, grey levels: a dark gel with bright pins
+    is well exposed. clipped : share of the gel with a channel at its upper end."""
+
+    level: float
+    clipped: float
+
+
+class Lattice(NamedTuple):
+    """found : dots. closed : share of the parallelograms of neighbours that close. missing : share of the
+    places of a regular grid, between the dots found, that are empty. contrast : median difference of a dot to
+    its surroundings, grey levels."""
+
+    found: int
+    closed: float
+    missing: float
+    contrast: float
+
+
+def spread(values: NDArray[Any]) -> float:
+    """Standard deviation of values around 0 without outliers, from the median absolute value."""
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def grey(image: Image) -> Gray:
+    """(H, W, 3) uint8 BGR to (H, W) float32 of whole grey levels."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.float32)
+
+
+def temporal_noise(first: Image, second: Image) -> float:
+    """Standard deviation of one frame's noise, grey levels, from two frames in a row.
+
+    first, second : (H, W, 3) uint8. Motion in less than three quarters of the picture does not count.
+
+    >>> rng = np.random.default_rng(0)
+    >>> one, other = (np.uint8(rng.normal(100, 3, (160, 160, 3)).round()) for _ in range(2))
+    >>> round(temporal_noise(one, other))
+    3
+    """
+    return _calm_deviation(first.astype(np.float32) - second) / 2**0.5
+
+
+def spatial_noise(image: Image) -> float:
+    """Standard deviation of a frame's noise, grey levels, from that frame alone; texture adds to it.
+
+    image : (H, W, 3) uint8. By the difference of two Laplacians, which is blind to slopes and edges along the
+    axes (J. Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding 64, 1996).
+    """
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    return _calm_deviation(np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel), np.float32)) / 6.0
+
+
 def noise_of(pairs: Sequence[Pair]) -> float:
-    """Standard deviation of the noise of a frame, grey levels: the smaller of what is seen within frames and
-    between them, since each has something else on top, texture or motion."""
-    some = pairs[:: max(1, len(pairs) // NOISE_PAIRS)]
-    own = [spatial_noise(pair.image) for pair in some]
-    apart = [temporal_noise(pair.image, pair.after) for pair in some if pair.after is not None]
-    return min(float(np.median(values)) for values in (own, apart) if values)
+    """Standard deviation of a frame's noise, grey levels: the smaller of that within frames, where texture
+    counts too, and that between them, where motion does."""
+    # Eight pairs have thousands of tiles.
+    some = pairs[:: max(1, len(pairs) // 8)]
+    within = [spatial_noise(pair.image) for pair in some]
+    between = [temporal_noise(pair.image, pair.after) for pair in some if pair.after is not None]
+    return min(float(np.median(values)) for values in (within, between) if values)
 
 
 def _calm_deviation(values: NDArray[np.float32]) -> float:
-    """Deviation within the calmer tiles of (H, W, 3) values, RMS over the channels."""
+    """Deviation of (H, W, 3) values within the calmer quarter of the tiles, RMS over the channels: motion and
+    texture fill the others."""
     height, width = (side - side % TILE for side in values.shape[:2])
     if not height or not width:
         return float(values.std())
     tiles = values[:height, :width].reshape(height // TILE, TILE, width // TILE, TILE, -1)
     variance = tiles.var(axis=(1, 3)).mean(axis=-1)
-    return float(np.sqrt(np.percentile(variance, CALM)))
-
-
-class Exposure(NamedTuple):
-    """level : of the brighter parts of the gel, in its brightest channel, grey levels. clipped : share of the
-    gel with a channel at its upper end."""
-
-    level: float
-    clipped: float
+    return float(np.sqrt(np.percentile(variance, 25.0)))
 
 
 def exposure(image: Image) -> Exposure:
@@ -145,48 +122,44 @@ def exposure(image: Image) -> Exposure:
     >>> exposure(np.full((4, 4, 3), 255, np.uint8))
     Exposure(level=255.0, clipped=1.0)
     """
-    blue, green, red = cv2.split(image)
-    levels = np.bincount(cv2.max(cv2.max(blue, green), red).ravel(), minlength=256)
-    levels[: BLACK + 1] = 0
-    gel = int(levels.sum())
-    if not gel:
+    brightest = image.max(axis=2)
+    gel = brightest[brightest > BLACK]
+    if not gel.size:
         return Exposure(0.0, 0.0)
-    level = int(np.searchsorted(np.cumsum(levels), BRIGHTER * gel))
-    return Exposure(float(level), float(levels[SATURATED:].sum() / gel))
+    return Exposure(float(np.percentile(gel, 95.0)), float(np.mean(gel >= 254)))
 
 
 def blur(gray: Gray) -> float | None:
     """Standard deviation of the point spread at the sharper edges of a picture, px; None without edges.
 
-    gray : (H, W) float32, best a mean over frames. The slope of a step that is blurred by s and by a known
-    blur a falls as 1 / sqrt(s^2 + a^2); two known blurs give s.
-
-    References
-    ----------
-    S. Zhuo and T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44 (2011).
+    gray : (H, W) float32, best a median over frames. The slope of a step that is blurred by s and by a known
+    blur a falls as 1 / sqrt(s^2 + a^2); two known blurs give s (S. Zhuo and T. Sim, "Defocus map estimation
+    from a single image", Pattern Recognition 44, 2011).
 
     >>> step = np.repeat([[50.0] * 40 + [150.0] * 40], 80, axis=0).astype(np.float32)
     >>> round(blur(np.asarray(cv2.GaussianBlur(step, (0, 0), 3.0), np.float32)))
     3
     """
-    found = [value for scales in SCALES if (value := _blur_between(gray, *scales)) is not None]
-    # Where the blur is wider than a dot, the coarser pair tells more of it.
-    return max(found, default=None)
+    # Where the blur is wider than a dot, the coarser pair of blurs shows more of it.
+    found = [_blur_between(gray, *scales) for scales in ((1.0, 2.0), (2.0, 4.0))]
+    return max((value for value in found if value is not None), default=None)
 
 
 def _blur_between(gray: Gray, first: float, second: float) -> float | None:
     """The same, from the slopes under two blurs, px."""
     fine, coarse = (
-        _slope(np.asarray(cv2.GaussianBlur(gray, (0, 0), s), np.float32)) for s in (first, second)
+        _slope(np.asarray(cv2.GaussianBlur(gray, (0, 0), sigma), np.float32)) for sigma in (first, second)
     )
-    # The crest of an edge: no neighbour is steeper.
-    crest = (fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))) & (fine >= LEAST_SLOPE / first)
-    crest &= fine >= np.percentile(fine, EDGE_SHARE)
-    if np.count_nonzero(crest) < LEAST_EDGES:
+    # The crest of an edge, where no neighbour is steeper: well above noise, which leaves a slope of 0.6 grey
+    # levels a px of a noise of 2, and among the steepest 2 % of the picture.
+    crest = (fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))) & (fine >= 2.0 / first)
+    crest &= fine >= np.percentile(fine, 98.0)
+    if np.count_nonzero(crest) < 30:
         return None
     ratio = np.square(fine[crest] / np.maximum(coarse[crest], 1e-6))
     squared = (second**2 - ratio * first**2) / np.maximum(ratio - 1.0, 1e-3)
-    return float(np.sqrt(np.percentile(np.maximum(squared, 0.0), SHARPEST)))
+    # The sharper edges show the lens; soft shades are edges, too.
+    return float(np.sqrt(np.percentile(np.maximum(squared, 0.0), 25.0)))
 
 
 def _slope(gray: Gray) -> Gray:
@@ -196,25 +169,20 @@ def _slope(gray: Gray) -> Gray:
 
 
 def jpeg_step(gray: Gray) -> float | None:
-    """Step to which JPEG has rounded the coarsest wave of its blocks, grey levels; None if it has not.
+    """Step to which JPEG has rounded the coarsest wave of its blocks, grey levels; None without JPEG.
 
     gray : (H, W) float32, whole grey levels of one frame. The blocks may begin at any pixel: a picture may
-    have been cut. A standard table of quality 50 has a step of 11, of quality 90 one of 2.
-
-    References
-    ----------
-    Z. Fan and R. L. de Queiroz, "Identification of bitmap compression history: JPEG detection and quantizer
-    estimation", IEEE Trans. Image Processing 12 (2003): a block's coefficients are multiples of the step.
+    have been cut. Their coefficients are multiples of the step (Z. Fan and R. L. de Queiroz, "Identification
+    of bitmap compression history", IEEE Trans. Image Processing 12, 2003).
     """
-    rows, columns = (_phase(side) for side in (gray.T, gray))
-    waves = _coefficients(gray, rows, columns)
+    waves = _coefficients(gray[_phase(gray.T) :, _phase(gray) :])
     found = None
-    for step in np.arange(*STEPS):
-        telling = waves[np.abs(waves) > step / 2]
-        if len(telling) < LEAST_WAVES:
+    for step in np.arange(2.0, 100.0, 0.25):
+        larger = waves[np.abs(waves) > step / 2]
+        if len(larger) < 100:
             break
-        # How well the coefficients keep the beat of the step: 1 for exact multiples, 0 at random.
-        if np.cos(2 * np.pi * telling / step).mean() > BEAT:
+        # 1 for exact multiples, 0 at random; measured: 0.2 at most without JPEG, 0.8 and more with it.
+        if np.cos(2 * np.pi * larger / step).mean() > 0.5:
             found = float(step)
     return found
 
@@ -222,53 +190,53 @@ def jpeg_step(gray: Gray) -> float | None:
 def jpeg_quality(step: float) -> float:
     """Quality, 1 to 100, at which the usual tables have this step in grey levels.
 
+    It is 11.5 at quality 50, the mean of 11 and 12 (ITU-T T.81, table K.1).
+
     >>> jpeg_quality(11.5), jpeg_quality(23.0), jpeg_quality(2.3)
     (50.0, 25.0, 90.0)
     """
-    share = step / TABLE
+    share = step / 11.5
     return 50.0 / share if share > 1 else 100.0 - 50.0 * share
 
 
 def _phase(gray: Gray) -> int:
-    """Column, 0 to 7, at which blocks begin: there the steps are largest."""
+    """Column, 0 to 7, at which blocks begin: there the differences of neighbours are largest."""
     step = np.abs(np.diff(gray, axis=1))
     excess = (step[:, 1:-1] - (step[:, :-2] + step[:, 2:]) / 2).mean(axis=0)
     excess = excess[: len(excess) - len(excess) % BLOCK].reshape(-1, BLOCK)
     return int(np.median(excess, axis=0).argmax() + 2) % BLOCK if len(excess) else 0
 
 
-def _coefficients(gray: Gray, row: int, column: int) -> NDArray[np.float32]:
+def _coefficients(gray: Gray) -> NDArray[np.float32]:
     """The coefficients of the half wave across and of that down of each block, (N,)."""
-    cut = gray[row:, column:]
-    height, width = (side - side % BLOCK for side in cut.shape)
-    blocks = cut[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
-    wave = np.cos((2 * np.arange(BLOCK) + 1) * np.pi / (2 * BLOCK)) / 2
-    flat = np.full(BLOCK, np.sqrt(1 / BLOCK))
-    across = np.einsum("iajb,a,b->ij", blocks, flat, wave)
-    down = np.einsum("iajb,a,b->ij", blocks, wave, flat)
-    return np.concatenate([across.ravel(), down.ravel()]).astype(np.float32)
+    height, width = (side - side % BLOCK for side in gray.shape)
+    blocks = gray[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    waves = scipy.fft.dctn(blocks, axes=(1, 3), norm="ortho")
+    return np.concatenate([waves[:, 0, :, 1].ravel(), waves[:, 1, :, 0].ravel()])
 
 
 def bands(frames: Sequence[Gray]) -> tuple[float, str]:
     """Amplitude of bands of light that roll over the frames, relative, and the axis they are stacked along.
 
-    frames : (H, W) float32 each, at least three. Of each row, in several strips, the median of its ratio to
-    the median frame is taken. A band crosses all strips alike, which no contact does: of a wave that part
-    counts which all strips have in common.
+    frames : (H, W) float32 each, at least three. Each frame is divided by the median frame; the median over a
+    row, in several strips, is the profile of the light.
     """
     middle = np.median(np.stack(frames), axis=0)
     ratios = [np.where(middle > DIM, frame / np.maximum(middle, DIM), 1.0) for frame in frames]
-    rows = _common_wave(
-        [[np.median(part, axis=1) for part in np.array_split(r, STRIPS, axis=1)] for r in ratios]
-    )
-    columns = _common_wave(
-        [[np.median(part, axis=0) for part in np.array_split(r, STRIPS, axis=0)] for r in ratios]
-    )
-    return (rows, "rows") if rows >= columns else (columns, "columns")
+    amplitudes = {
+        axis: _common_wave([_profiles(ratio if axis == "rows" else ratio.T) for ratio in ratios])
+        for axis in ("rows", "columns")
+    }
+    axis = max(amplitudes, key=lambda name: amplitudes[name])
+    return amplitudes[axis], axis
 
 
-def _common_wave(profiles: Sequence[Sequence[NDArray[np.float32]]]) -> float:
-    """Amplitude of the strongest wave that all strips (frames, strips) of (N,) have in common."""
+def _profiles(ratio: NDArray[Any]) -> list[NDArray[Any]]:
+    return [np.median(strip, axis=1) for strip in np.array_split(ratio, STRIPS, axis=1)]
+
+
+def _common_wave(profiles: Sequence[Sequence[NDArray[Any]]]) -> float:
+    """Amplitude of the strongest wave that all strips of the profiles (frames, strips, N) have in common."""
     stack = np.array(profiles)
     length = stack.shape[-1]
     place = np.linspace(-1.0, 1.0, length)
@@ -280,64 +248,52 @@ def _common_wave(profiles: Sequence[Sequence[NDArray[np.float32]]]) -> float:
     return float(np.median(along.min(axis=1), axis=0).max(initial=0.0))
 
 
-class Lattice(NamedTuple):
-    """found : dots. closed : share of the parallelograms of neighbours that close. missing : share of
-    the places of a regular grid, between the dots found, that are empty. contrast : median difference of a
-    dot to its surroundings, grey levels."""
-
-    found: int
-    closed: float
-    missing: float
-    contrast: float
-
-
 def lattice(found: Detection, gray: Gray) -> Lattice:
     """How regular the dots of a detection are, and how clear in the picture (H, W) they were found in."""
-    expected = corners(found.centers, found.edges)
-    closed = 0.0 if found.chosen is None else found.chosen.lattice
-    missing = 0.0
-    # Where the grid is irregular, nobody knows where a dot would be.
-    if len(expected.points) and closed >= REGULAR:
-        hull = cv2.convexHull(found.centers.astype(np.float32))
-        inside = np.array(
-            [cv2.pointPolygonTest(hull, (float(x), float(y)), False) > 0 for x, y in expected.points]
-        )
-        places = expected.points[inside]
-        if len(places):
-            away = np.hypot(*(places[:, None] - found.centers).transpose(2, 0, 1)).min(axis=1)
-            gone = _distinct(places[away > found.pitch / 2], found.pitch / 2)
-            missing = gone / (len(found.centers) + gone)
-    return Lattice(len(found.centers), closed, missing, _contrast(found, gray))
-
-
-def _distinct(points: NDArray[np.float64], reach: float) -> int:
-    """How many places points (N, 2) show that lie closer together than `reach`."""
-    kept: list[NDArray[np.float64]] = []
-    for point in points:
-        if all(np.hypot(*(point - other)) > reach for other in kept):
-            kept.append(point)
-    return len(kept)
-
-
-def _contrast(found: Detection, gray: Gray) -> float:
     height, width = gray.shape
     x, y = np.clip(np.rint(found.centers).astype(int), 0, (width - 1, height - 1)).T
     around = cv2.blur(gray, (round(found.pitch) | 1,) * 2)
-    return float(np.median(np.abs(around[y, x] - gray[y, x])))
+    contrast = float(np.median(np.abs(around[y, x] - gray[y, x])))
+    closed = 0.0 if found.chosen is None else found.chosen.lattice
+    # Where the grid is irregular, nobody knows where a dot would be.
+    empty = len(_empty_places(found)) if closed >= REGULAR else 0
+    return Lattice(len(found.centers), closed, empty / (len(found.centers) + empty), contrast)
+
+
+def _empty_places(found: Detection) -> list[NDArray[np.float64]]:
+    """Places of a regular grid, between the dots found, that have no dot; (x, y) px."""
+    hull = cv2.convexHull(found.centers.astype(np.float32))
+    empty: list[NDArray[np.float64]] = []
+    for place in corners(found.centers, found.edges).points:
+        others = np.array([*found.centers, *empty])
+        inside = cv2.pointPolygonTest(hull, (float(place[0]), float(place[1])), False) > 0
+        if inside and np.hypot(*(others - place).T).min() > found.pitch / 2:
+            empty.append(place)
+    return empty
+
+
+def points(image: Image) -> NDArray[np.float32]:
+    """(N, 2) float32, px: up to 200 points of a picture that can be followed, 8 px apart or more."""
+    found = cv2.goodFeaturesToTrack(smooth(image), 200, 0.05, 8.0)
+    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2), np.float32)
+
+
+def smooth(image: Image) -> Image:
+    """(H, W, 3) uint8 BGR to (H, W) uint8 for `motion`, blurred by 1.5 px against noise."""
+    return np.asarray(cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), 1.5), np.uint8)
 
 
 def motion(reference: Image, now: Image, points: NDArray[np.float32]) -> NDArray[np.float32]:
     """Displacements (N, 2) px of points (N, 2) of a gray picture; NaN where they are not found again.
 
-    reference, now : (H, W) uint8. Each point is followed to `now` and back.
+    reference, now : (H, W) uint8. Each point is followed to `now` and back: it must come back within 0.3 px.
     """
     if not len(points):
         return np.zeros((0, 2), np.float32)
-    there, found = _followed(reference, now, points)
-    back, again = _followed(now, reference, there)
-    found &= again & (np.hypot(*(back - points).T) < RETURN)
-    moved = there - points
-    moved[~found] = np.nan
+    ends, found = _followed(reference, now, points)
+    back, found_back = _followed(now, reference, ends)
+    moved = ends - points
+    moved[~(found & found_back & (np.hypot(*(back - points).T) < 0.3))] = np.nan
     return np.asarray(moved, np.float32)
 
 
@@ -345,22 +301,5 @@ def _followed(
     reference: Image, now: Image, points: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where points (N, 2) went, (N, 2), and whether they were found, (N,)."""
-    size = (WINDOW, WINDOW)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(reference, now, points, points.copy(), winSize=size)
-    return np.asarray(there, np.float32).reshape(-1, 2), np.asarray(found).ravel() == 1
-
-
-def grey(image: Image) -> Gray:
-    """(H, W, 3) uint8 BGR to (H, W) float32 of whole grey levels."""
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.float32)
-
-
-def smooth(image: Image) -> Image:
-    """(H, W, 3) uint8 BGR to (H, W) uint8, blurred, for `motion`."""
-    return np.asarray(cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), SMOOTHING), np.uint8)
-
-
-def points(image: Image, most: int) -> NDArray[np.float32]:
-    """(N, 2) float32, px: at most so many points of a picture that can be followed."""
-    found = cv2.goodFeaturesToTrack(smooth(image), most, *CORNERS)
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2), np.float32)
+    ends, found, _ = cv2.calcOpticalFlowPyrLK(reference, now, points, points.copy(), winSize=(31, 31))
+    return np.asarray(ends, np.float32).reshape(-1, 2), np.asarray(found).ravel() == 1
