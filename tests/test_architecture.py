@@ -51,6 +51,58 @@ def test_a_room_imports_nothing_that_it_must_not_know(room: str) -> None:
     assert not found
 
 
+class Imports(ast.NodeVisitor):
+    """Collects what a file imports when it runs; each import as the names it may stand for, longest first."""
+
+    def __init__(self) -> None:
+        self.found: list[list[str]] = []
+
+    def visit_If(self, node: ast.If) -> None:
+        only_for_types = isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        for statement in node.orelse if only_for_types else [*node.body, *node.orelse]:
+            self.visit(statement)
+
+    def visit_Import(self, node: ast.Import) -> None:
+        self.found += [[alias.name] for alias in node.names]
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        self.found += [[f"{node.module}.{alias.name}", str(node.module)] for alias in node.names]
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Module of the package -> the modules of the package that it imports, at its start or in a function."""
+    packages = {"src/tactflow": "tactflow", "stages": "tactflow.stages", "sinks": "tactflow.sinks"}
+    files = {
+        ".".join([package, *file.relative_to(REPOSITORY / folder).with_suffix("").parts]): file
+        for folder, package in packages.items()
+        for file in (REPOSITORY / folder).rglob("*.py")
+    }
+    modules = {name.removesuffix(".__init__"): file for name, file in files.items()}
+    graph = {}
+    for name, file in modules.items():
+        visitor = Imports()
+        visitor.visit(ast.parse(file.read_text()))
+        imported = {next((one for one in names if one in modules), name) for names in visitor.found}
+        graph[name] = imported - {name}
+    return graph
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    graph = import_graph()
+    assert len(graph) > 100
+
+    def reached(start: str) -> set[str]:
+        found: set[str] = set()
+        pending = [start]
+        while pending:
+            new = graph[pending.pop()] - found
+            found |= new
+            pending += new
+        return found
+
+    assert [name for name in graph if name in reached(name)] == []
+
+
 def anchors(page: Path) -> set[str]:
     """What a link to a heading of a page ends in."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.M)

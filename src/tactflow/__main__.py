@@ -1,32 +1,65 @@
-"""Where the program begins: `tactflow`, and `python -m tactflow`, which is the same."""
+"""The process of the program: `tactflow`, and `python -m tactflow`, which is the same.
+
+It handles signals from the first moment on, and ends with the right exit code whatever happens to its output.
+"""
 
 from __future__ import annotations
 
-import gc
+import io
+import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
 
-from tactflow.system.signals import give_up, leave, on_ending
+from tactflow.system.signals import ENDING, INTERRUPTED, end_at_once, interrupt, on_ending
 
 ENDLESS = ("run", "record", "listen")
-"""Commands that one signal ends well."""
+"""Commands that run until they are told to end: one signal ends them with exit code 0."""
 
 
 def entry() -> None:
-    """Entry point of the console script."""
-    # Before all else is imported, which takes a while. To be ended by a service, by a terminal that is closed
-    # or by Ctrl-C is the same.
-    on_ending(leave if wanted(sys.argv[1:]) in ENDLESS else give_up)
-    # Nothing that is imported becomes garbage: to look for it there takes a twelfth of the start.
-    gc.disable()
-    from tactflow.cli import main
+    """Run the program with the arguments of this process, and end the process with its exit code."""
+    # Before anything else is imported, which takes a while.
+    command = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
+    is_endless = command in ENDLESS
+    end_at_once(0 if is_endless else INTERRUPTED)
+    from tactflow.cli.main import main
+    from tactflow.system.files import LossyStream, discard_output
 
-    main.entry()
-
-
-def wanted(argv: Sequence[str]) -> str | None:
-    """The word of a command line that stands for the command."""
-    return next((word for word in argv if not word.startswith("-")), None)
+    # A service may be started without them.
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
+    sys.stderr = LossyStream(sys.stderr)
+    # File names may have characters that the terminal, or UTF-8, has not.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        # A run handles them itself when it has started.
+        code = main(sys.argv[1:], lambda: is_endless or on_ending(interrupt))
+        sys.stdout.flush()
+    except OSError as error:
+        # The reader of our output has left, or the disk is full.
+        discard_output(sys.stdout)
+        code = 0
+        if not isinstance(error, BrokenPipeError):
+            # Without a name, only the question which folder is the current one fails.
+            unnamed = "the current folder" if isinstance(error, FileNotFoundError) else "standard output"
+            print(f"tactflow: {error.filename or unnamed}: {error.strerror or error}", file=sys.stderr)
+            code = 3
+    except KeyboardInterrupt:
+        # The reader of our output does not read.
+        discard_output(sys.stdout)
+        code = INTERRUPTED
+    # From here on nothing changes the exit code.
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
+    if code != 0 and threading.active_count() > 1:
+        # A run that was not allowed to finish has threads in OpenCV, which would abort the process while
+        # Python ends.
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from tactflow.cli.main import main
-from tactflow.cli.node_summary import share
 
 PARTS = Path(__file__).resolve().parents[1] / "config" / "parts.py"
 TEXT = """\
@@ -130,20 +129,12 @@ def test_statistics_say_how_often_and_what_it_cost(
         "",
         "{",
         "[]",
-        "3",
         "{}",
-        '{"stages": {}}',
-        json.dumps({**STATISTICS, "stages": {"capture": 3}}),
         json.dumps({**STATISTICS, "latency_ms": None}),
-        json.dumps({**STATISTICS, "sinks": {"out": {}}}),
         json.dumps({**STATISTICS, "sinks": 3}),
-        json.dumps({**STATISTICS, "wall_s": "long"}),
-        json.dumps(
-            {**STATISTICS, "sinks": {"a": {"runs": 1, "skips": {"x": "y"}, "p50_ms": 1, "p99_ms": 1}}}
-        ),
     ],
 )
-def test_a_file_that_is_no_statistics_is_refused(
+def test_a_file_without_statistics_is_refused(
     content: str, pipeline: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (pipeline / "run.json").write_text(content)
@@ -200,11 +191,3 @@ def test_statistics_stand_on_the_nodes_of_the_graph(
     (key,) = re.findall(rf'(n\d)\["{label}"\]', out)
     assert re.search(rf"class {key} costly", out)
     assert '["compare"]' in out
-
-
-@pytest.mark.parametrize(
-    ("part", "whole", "text"),
-    [(0, 7, "0 %"), (1, 1000, "<1 %"), (999, 1000, ">99 %"), (7, 7, "100 %"), (0, 0, "0 %")],
-)
-def test_a_share_is_rounded_to_none_or_all_only_if_it_is(part: int, whole: int, text: str) -> None:
-    assert share(part, whole) == text

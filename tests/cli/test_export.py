@@ -19,7 +19,6 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.result import Result
 from tactflow.sources import open_source
-from tactflow.system.files import claim_path
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
 from tests.messages import Results, result_of
 
@@ -220,21 +219,3 @@ def test_a_disk_that_is_full_from_the_first_byte_of_the_video_is_told(tmp_path: 
     command = [sys.executable, "-c", FULL_DISK, str(tmp_path / "press"), f"sim:press?frames={frames}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "No space left on device\n"), done.stderr
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows refuses by itself")
-def test_a_second_export_of_the_same_dataset_is_refused_and_takes_nothing_from_the_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    written = tmp_path / ".unfinished-press" / "data" / "file"
-    written.parent.mkdir(parents=True)
-    written.touch()
-    claim = claim_path(written.parent.parent)
-    command = ["export", "lerobot", "sim:press?frames=2", "--out", str(tmp_path / "press")]
-    assert main(command) == 2
-    assert "another tactflow export makes" in capsys.readouterr().err
-    assert written.exists()
-    assert claim is not None
-    os.close(claim)
-    assert main([*command, "--pipeline", "markerless"]) == 0
-    assert not list(tmp_path.glob("press/data/file"))

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from tactflow.calibration.file import Calibration
 from tactflow.cli import explain, listen
-from tactflow.cli.statistics import read_statistics
+from tactflow.cli.statistics import Statistics
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame, Tick
@@ -289,7 +289,7 @@ def statistics(folder: Path) -> Iterator[Parser]:
 
     def feed(data: bytes) -> None:
         path.write_bytes(data)
-        list(explain.explanation(pipeline, plan, read_statistics(path)))
+        list(explain.explanation(pipeline, plan, Statistics.read(path)))
 
     yield Parser([json.dumps(sample).encode()], feed)
 

@@ -19,7 +19,7 @@ from tactflow.batch.store import Outcome, Store
 from tactflow.batch.work import Request, resolved
 from tactflow.batch.workers import DaskCluster, LocalProcesses
 from tactflow.cli.options import add_overrides, positive
-from tactflow.cli.printable import printable
+from tactflow.cli.terminal import printable
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError

@@ -24,9 +24,8 @@ from tactflow.bench.skipping_table import print_comparisons
 from tactflow.bench.stress import measure_drift
 from tactflow.bench.table import print_result, terminal
 from tactflow.bench.timing import CopyUnit
-from tactflow.cli.notes import without_notes
-from tactflow.cli.options import positive
-from tactflow.cli.outputs import refuse_output
+from tactflow.cli.options import positive, refuse_output
+from tactflow.cli.terminal import notes
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -135,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
         scenes=frozenset(args.scene) if args.scene else None,
         pictures=args.pictures,
     )
-    with without_notes(), _progress_bar() as progress:
+    with notes("ERROR"), _progress_bar() as progress:
         result = run_bench(plan, progress)
     print_result(result, terminal(sys.stdout))
     _write(args, result)
@@ -154,7 +153,7 @@ def _skipping(given: list[str], frames: int, data: Path | None) -> int:
         load_pipeline(find_pipeline("pipelines/wedge.yaml")),
     )
     copies = CopyUnit()
-    with without_notes(), _progress_bar() as progress:
+    with notes("ERROR"), _progress_bar() as progress:
         found = list(compare_all(pipelines, frames, data, copies, progress))
     print_comparisons(found, copies, terminal(sys.stdout))
     for one in found:
@@ -166,7 +165,7 @@ def _skipping(given: list[str], frames: int, data: Path | None) -> int:
 def _stress(given: list[str], frames: int) -> int:
     """Run the long stress, print its blocks and what crept."""
     pipeline = load_pipeline(find_pipeline(given[0] if given else f"pipelines/{DEFAULT}.yaml"))
-    with without_notes(), _progress_bar() as progress:
+    with notes("ERROR"), _progress_bar() as progress:
         drift = measure_drift(pipeline, frames, progress)
     table = Table("frames", "marker error", "lost", "CPU a frame", "memory", box=None)
     for row in drift.rows():

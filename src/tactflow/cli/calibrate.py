@@ -9,8 +9,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from rich.console import Console
-
 from tactflow.api import Settings, load
 from tactflow.calibration.file import UNLIKE, Calibration, PhotometricEntry, raw_corners, small_picture
 from tactflow.calibration.keeping import KeptPresses
@@ -20,9 +18,8 @@ from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
 from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_force
 from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
-from tactflow.cli.notes import notes_on, say
 from tactflow.cli.options import positive
-from tactflow.cli.printable import printable, typed
+from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.view.guided import Guiding
@@ -101,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     TactflowError
         If options are wrong, or what was recorded gives no calibration.
     """
-    with notes_on(Console(stderr=True, highlight=False, soft_wrap=True)):
+    with notes():
         return _run(args, list(args.what))
 
 

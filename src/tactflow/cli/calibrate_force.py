@@ -10,7 +10,7 @@ from tactflow.api import load
 from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry
 from tactflow.calibration.force import Fit, Watched, fit_force, try_force, watch
 from tactflow.calibration.reference import Reference, read_reference
-from tactflow.cli.notes import say
+from tactflow.cli.terminal import say
 from tactflow.engine.errors import ConfigError
 from tactflow.system.files import expanded
 

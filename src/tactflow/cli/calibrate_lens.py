@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactflow.api import load
 from tactflow.calibration.collecting import collect
 from tactflow.calibration.target import BENT, Target, find_target, fit_lens, scale_from_target
-from tactflow.cli.notes import say
+from tactflow.cli.terminal import say
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import orjson
 
-from tactflow.cli.printable import printable
+from tactflow.cli.terminal import printable, say
 from tactflow.sources.cameras import CameraInfo, list_cameras
 
-NONE = """no camera is plugged in ({folder}/video* is empty)
+NO_CAMERA = """no camera is plugged in (/dev/video* is empty)
   plug it in and look at the last lines of: sudo dmesg
   in a virtual machine or a container, pass it through first (docker run --device /dev/video0 ...)
   a network camera is not listed: give its address, --source rtsp://..."""
 
-ELSEWHERE = """on this system cameras have no names, only numbers in the order of plugging in
+NO_NAMES = """on this system cameras have no names, only numbers in the order of plugging in
   try: tactflow run --source 0, then 1, 2, ..."""
 
 
@@ -31,27 +31,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """List the cameras; returns the exit code, 0 also where there is none."""
     if not sys.platform.startswith("linux"):
-        print(ELSEWHERE, file=sys.stderr)
+        say(NO_NAMES)
         return 0
     cameras = list_cameras(args.dev)
     if not cameras:
-        print(NONE.format(folder=args.dev), file=sys.stderr)
+        say(NO_CAMERA)
     for camera in cameras:
         print(orjson.dumps(asdict(camera)).decode() if args.json else printable("\n".join(describe(camera))))
     return 0
 
 
-def describe(camera: CameraInfo) -> Sequence[str]:
+def describe(camera: CameraInfo) -> Iterator[str]:
     """A camera in words: the name to use first, then what else is known."""
     abilities = camera.abilities
     title = f"{abilities.name}: " if abilities and abilities.name else ""
-    lines = [camera.source, f"    {title}{camera.device} (--source {camera.index})"]
-    lines += [f"    also {name}" for name in camera.names[1:]]
+    yield camera.source
+    yield f"    {title}{camera.device} (--source {camera.index})"
+    yield from (f"    also {name}" for name in camera.names[1:])
     if camera.problem:
-        lines.append(f"    cannot be asked: {camera.problem}")
+        yield f"    cannot be asked: {camera.problem}"
     if abilities and not abilities.pictures:
-        lines.append("    carries no pictures, only metadata")
+        yield "    carries no pictures, only metadata"
     for form, sizes in abilities.formats.items() if abilities else ():
         sizes_text = ", ".join(f"{width} x {height}" for width, height in sizes)
-        lines.append(f"    {form}: {sizes_text or 'any size within a range'}")
-    return lines
+        yield f"    {form}: {sizes_text or 'any size within a range'}"

@@ -1,13 +1,15 @@
-"""`tactflow control`: tell a running tactflow what to do."""
+"""`tactflow control`: tell a running tactflow what to do; `tactflow keys`: keys for those who may."""
 
 from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 
-from tactflow.cli.options import seconds
-from tactflow.cli.printable import printable
+from tactflow.cli.options import add_endpoint, seconds
+from tactflow.cli.terminal import printable, typed
 from tactflow.engine.errors import ConfigError, SourceError, StageError
+from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.network.remote_control import DEFAULT_ENDPOINT, RemoteControl
 
 COMMANDS = {
@@ -30,18 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"sinks.zmq.control={DEFAULT_ENDPOINT}"
     )
     parser.add_argument("do", choices=tuple(COMMANDS), metavar="CMD", help="what to do, see below")
-    parser.add_argument(
-        "endpoint",
-        nargs="?",
-        default=DEFAULT_ENDPOINT,
-        metavar="ENDPOINT",
-        help=f"where it takes commands; default: {DEFAULT_ENDPOINT}",
-    )
-    parser.add_argument(
-        "--keys",
-        metavar="FOLDER",
-        help="the subscriber's folder that tactflow keys new makes, where the run asks for keys",
-    )
+    add_endpoint(parser, DEFAULT_ENDPOINT)
     parser.add_argument(
         "--timeout", type=seconds, default=5.0, metavar="S", help="wait S seconds for an answer; default: 5"
     )
@@ -49,22 +40,52 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Send the command, and print what happened."""
+    """Send the command, and print the answer."""
     try:
-        remote = RemoteControl(args.endpoint, args.timeout, args.keys)
+        with RemoteControl(args.endpoint, args.timeout, args.keys) as remote:
+            answer = remote.ask(args.do.replace("-", "_"))
     except ValueError as error:
         raise ConfigError(f"control: {error}") from None
-    with remote:
-        try:
-            answer = remote.ask(args.do.replace("-", "_"))
-        except (TimeoutError, PermissionError) as error:
-            raise SourceError(f"control: {error}") from None
-        except RuntimeError as error:
-            raise StageError(f"control: {error}") from None
+    except (TimeoutError, PermissionError) as error:
+        raise SourceError(f"control: {error}") from None
+    except RuntimeError as error:
+        raise StageError(f"control: {error}") from None
     if args.json:
         print(json.dumps(answer))
     elif "stats" in answer:
         print(json.dumps(answer["stats"], indent=2))
     else:
         print(printable(f"{answer['state']['sensor']}: {answer['message']}"))
+    return 0
+
+
+def add_arguments_keys(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `keys`."""
+    actions = parser.add_subparsers(dest="action", required=True)
+    new = actions.add_parser("new", help="make keys for a subscriber")
+    new.add_argument(
+        "name", nargs="?", default="subscriber", metavar="NAME", help="of the subscriber; default: subscriber"
+    )
+    new.add_argument(
+        "--folder",
+        type=Path,
+        default=Path("keys"),
+        metavar="FOLDER",
+        help="where they go; default: keys. The publisher's, once there, stay",
+    )
+
+
+def run_keys(args: argparse.Namespace) -> int:
+    """Make keys, and print what goes where."""
+    try:
+        publisher, subscriber = make_keys(args.folder, args.name)
+    except WrongKeysError as error:
+        raise ConfigError(f"keys: {error}") from None
+    except OSError as error:
+        raise StageError(f"{args.folder}: keys cannot be written: {error.strerror or error}") from None
+    print(f"{publisher} stays here, for the run: {typed('--set', f'sinks.zmq.keys={publisher}')}")
+    print(
+        f"{subscriber} goes to the subscriber, over a safe way (scp), and to nobody else: "
+        f"tactflow listen tcp://HOST:5556 --keys {subscriber.name}"
+    )
     return 0

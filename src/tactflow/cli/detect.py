@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.cli.outputs import refuse_output
-from tactflow.cli.printable import printable
+from tactflow.cli.options import refuse_output
+from tactflow.cli.terminal import printable
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source

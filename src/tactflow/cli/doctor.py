@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import orjson
 
 from tactflow.cli.options import seconds
-from tactflow.cli.printable import printable
+from tactflow.cli.terminal import printable
 from tactflow.engine.errors import StageError
 from tactflow.sources import KINDS
 from tactflow.system.signals import ending_handled, interrupt

@@ -1,114 +1,120 @@
-"""`tactflow explain`: why each stage runs, is skipped or is left out, and what it cost."""
+"""`tactflow explain`: why each stage runs, is skipped or pruned, and what it cost; `tactflow graph`: the
+pipeline as a Mermaid flowchart."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
+from pathlib import Path
 
-from tactflow.cli.node_summary import NodeSummary, milliseconds, saving
-from tactflow.cli.options import add_pipeline_and_stats, load_with_stats
-from tactflow.cli.printable import printable
+from tactflow.cli.options import add_pipeline, load_plan
+from tactflow.cli.statistics import NodeStatistics, Statistics, milliseconds, saving, share
+from tactflow.cli.terminal import printable
 from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
 
+_COSTLY = 0.1
+"""Share of the total time above which a stage is drawn as a costly one. Chosen by hand."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `explain`."""
-    add_pipeline_and_stats(parser)
+    add_pipeline(parser)
+    parser.add_argument(
+        "--stats",
+        metavar="run.json",
+        help="statistics of a run (tactflow run --stats), to show how often each stage ran and what it cost",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph for each stage and sink."""
-    print(printable("\n".join(explanation(*load_with_stats(args)))))
+    print(printable("\n".join(explanation(*_load(args)))))
     return 0
 
 
-def explanation(pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | None = None) -> Iterator[str]:
-    """Lines of the explanation.
+add_arguments_graph = add_arguments
 
-    statistics : content of a statistics file, or None.
-    """
+
+def run_graph(args: argparse.Namespace) -> int:
+    """Print the flowchart."""
+    print(printable("\n".join(mermaid(*_load(args)))))
+    return 0
+
+
+def _load(args: argparse.Namespace) -> tuple[Pipeline, Plan, Statistics | None]:
+    statistics = None if args.stats is None else Statistics.read(Path(args.stats))
+    return (*load_plan(args), statistics)
+
+
+def explanation(pipeline: Pipeline, plan: Plan, statistics: Statistics | None) -> Iterator[str]:
+    """Lines of the explanation."""
     skipping = "" if pipeline.skipping else ", skipping is off"
     yield f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"
     if statistics is not None:
-        yield _run_line(statistics)
-        yield from _saving(pipeline, statistics)
-    users = _sinks_behind(pipeline)
+        yield from _run_lines(pipeline, statistics)
+    sinks = _sinks_behind(pipeline)
     uncertain = _may_be_absent(pipeline)
-    pruned = {node.id for node in plan.pruned}
     for node in pipeline.nodes.values():
         yield ""
         yield f"{node.id} ({node.mark})"
-        facts = _facts(node, pipeline, plan, users[node.id], uncertain, node.id in pruned)
-        if statistics is not None and node.id not in pruned:
+        is_pruned = node in plan.pruned
+        facts = {"pruned because": "no sink needs what it makes"}
+        if not is_pruned:
+            facts = {"runs because": _reason(node, sinks[node.id])}
+            if skips := _skips(node, pipeline, uncertain):
+                facts["skipped when"] = "; ".join(skips)
+        if node.component.kind == "stage":
+            facts["memory"] = "none (pure): runs only when something wants its result"
+            if node.component.memory == "stateful":
+                facts["memory"] = "stateful: sees every frame that is not dropped"
+        if not is_pruned:
+            facts["segment"] = plan.segment_of(node.id)
+        name, origin = node.component.name, node.component.origin
+        facts["is"] = name if ":" in name or name == origin else f"{name} ({origin})"
+        if statistics is not None and not is_pruned:
             facts["statistics"] = _cost(node, statistics)
         width = max(map(len, facts))
-        for name, text in facts.items():
-            yield f"  {name.ljust(width)}  {text}"
+        yield from (f"  {name.ljust(width)}  {text}" for name, text in facts.items())
 
 
-def _facts(
-    node: Node, pipeline: Pipeline, plan: Plan, users: list[str], uncertain: set[str], pruned: bool
-) -> dict[str, str]:
-    facts: dict[str, str] = {}
-    if pruned:
-        facts["pruned because"] = "no sink needs what it makes"
-    elif node.component.kind == "source":
-        facts["runs because"] = "it captures the frames"
-    elif node.component.kind == "sink":
-        facts["runs because"] = "it is a sink" + _demand(node)
-    else:
-        facts["runs because"] = f"{_listed(users)} {'needs' if len(users) == 1 else 'need'} it"
-    if not pruned:
-        skips = [_gate(gate) for gate in node.gates] if pipeline.skipping else []
-        needed = [
-            f"{ref.node} gives no {ref.port}"
-            for port in node.component.ports.inputs
-            if not port.optional and (ref := node.inputs[port.name]) and ref.node in uncertain
-        ]
-        if skips or needed:
-            facts["skipped when"] = "; ".join(skips + needed)
-    memory = "none (pure): runs only when something wants its result"
-    if node.component.memory == "stateful":
-        memory = "stateful: sees every frame that is not dropped"
-    if node.component.kind == "stage":
-        facts["memory"] = memory
-    if not pruned:
-        facts["segment"] = plan.segment_of(node.id)
-    name, origin = node.component.name, node.component.origin
-    facts["is"] = name if ":" in name or name == origin else f"{name} ({origin})"
-    return facts
+def _reason(node: Node, sinks: list[str]) -> str:
+    """Why a stage or sink runs."""
+    if node.component.kind == "source":
+        return "it captures the frames"
+    if node.component.kind == "sink":
+        rate = "" if node.max_rate is None else f", at most {node.max_rate:g} times a second"
+        cls = node.component.cls
+        decides = issubclass(cls, Sink) and cls.wants is not Sink.wants
+        return f"it is a sink{rate}{'; it says for each frame whether it wants it' if decides else ''}"
+    *others, last = sinks
+    return f"{', '.join(others)} and {last} need it" if others else f"{last} needs it"
 
 
-def _demand(node: Node) -> str:
-    rate = "" if node.max_rate is None else f", at most {node.max_rate:g} times a second"
-    cls = node.component.cls
-    asks = issubclass(cls, Sink) and cls.wants is not Sink.wants
-    own = "; it says for each frame whether it wants it" if asks else ""
-    return rate + own
+def _skips(node: Node, pipeline: Pipeline, uncertain: set[str]) -> list[str]:
+    """When a stage or sink is skipped."""
+    gates = [_gate(gate) for gate in node.gates] if pipeline.skipping else []
+    required = [node.inputs[port.name] for port in node.component.ports.inputs if not port.optional]
+    return gates + [f"{ref.node} gives no {ref.port}" for ref in required if ref and ref.node in uncertain]
 
 
 def _gate(gate: Gate) -> str:
-    text = f"{gate.signal} is false"
     if gate.otherwise == "repeat":
-        text += " (its last outputs are repeated)"
-    else:
-        text += f" (its outputs are absent: {gate.reason})"
-    return text
+        return f"{gate.signal} is false (its last outputs are repeated)"
+    return f"{gate.signal} is false (its outputs are absent: {gate.reason})"
 
 
 def _may_be_absent(pipeline: Pipeline) -> set[str]:
-    """Nodes whose outputs may be missing: gated, by their own word, or for want of an input."""
+    """Nodes whose outputs may be missing: gated, with optional outputs, or for want of an input."""
     found: set[str] = set()
     for node in pipeline.nodes.values():
         ports = node.component.ports
-        needed = [node.inputs[port.name] for port in ports.inputs if not port.optional]
+        required = [node.inputs[port.name] for port in ports.inputs if not port.optional]
         if (
             (node.gates and pipeline.skipping)
             or any(port.optional for port in ports.outputs)
-            or any(ref.node in found for ref in needed if ref is not None)
+            or any(ref.node in found for ref in required if ref is not None)
         ):
             found.add(node.id)
     return found
@@ -118,53 +124,93 @@ def _sinks_behind(pipeline: Pipeline) -> dict[str, list[str]]:
     """Node -> the sinks that need it, directly or not."""
     behind: dict[str, list[str]] = {id_: [] for id_ in pipeline.nodes}
     for sink in pipeline.sinks:
-        pending, seen = [sink.id], {sink.id}
+        pending, visited = [sink.id], {sink.id}
         while pending:
-            for other in dependencies(pipeline.nodes[pending.pop()]) - seen:
-                seen.add(other)
-                pending.append(other)
-                behind[other].append(sink.id)
+            for id_ in dependencies(pipeline.nodes[pending.pop()]) - visited:
+                visited.add(id_)
+                pending.append(id_)
+                behind[id_].append(sink.id)
     return behind
 
 
-def _listed(words: list[str]) -> str:
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
-
-
-def _run_line(statistics: Mapping[str, Any]) -> str:
-    latency = statistics["latency_ms"]
-    return (
-        f"the run: {statistics['frames']} frames in {statistics['wall_s']:.1f} s, "
-        f"{statistics['dropped']} dropped, latency p50 {_ms(latency['p50'])}, p99 {_ms(latency['p99'])}, "
-        f"end: {statistics['end']}"
+def _run_lines(pipeline: Pipeline, statistics: Statistics) -> Iterator[str]:
+    """The run as a whole, and what skipping saved in all stages together."""
+    latency = statistics.latency_ms
+    yield (
+        f"the run: {statistics.frames} frames in {statistics.wall_s:.1f} s, {statistics.dropped} dropped, "
+        f"latency p50 {milliseconds(latency.p50)}, p99 {milliseconds(latency.p99)}, end: {statistics.end}"
     )
-
-
-def _saving(pipeline: Pipeline, statistics: Mapping[str, Any]) -> Iterator[str]:
-    """What skipping saved in all stages together, and how that is counted."""
-    stages = [node.id for node in pipeline.nodes.values() if node.component.kind == "stage"]
-    summaries = [NodeSummary.of(entry) for id_, entry in statistics["stages"].items() if id_ in stages]
-    saved = sum(summary.saved_ms or 0.0 for summary in summaries)
-    spent = sum(summary.spent_ms for summary in summaries)
-    if statistics["frames"] and saved + spent > 0:
-        yield f"all stages: {saving(saved, saved + spent, statistics['frames'])}"
+    kinds = {node.id: node.component.kind for node in pipeline.nodes.values()}
+    stages = [entry for id_, entry in statistics.stages.items() if kinds.get(id_) == "stage"]
+    saved = sum(entry.saved_ms for entry in stages)
+    total = saved + sum(entry.spent_ms for entry in stages)
+    if statistics.frames and total > 0:
+        yield f"all stages: {saving(saved, total, statistics.frames)}"
         yield "            (saved = frames skipped x mean time of a run; of = that + the time spent)"
 
 
-def _cost(node: Node, statistics: Mapping[str, Any]) -> str:
-    entry = {**statistics.get("sinks", {}), **statistics["stages"]}.get(node.id)
+def _cost(node: Node, statistics: Statistics) -> str:
+    entry = statistics.nodes.get(node.id)
     if entry is None:
         return "not part of that run"
-    summary = NodeSummary.of(entry)
     if node.component.kind != "sink":
-        return summary.told()
-    # A sink in its own thread only gets the frames that it asked for.
-    times = "once" if summary.runs == 1 else f"{summary.runs} times"
-    cost = (
-        f", {milliseconds(summary.mean_ms)} each (p99 {milliseconds(summary.p99_ms)})" if summary.runs else ""
-    )
-    return f"written {times} in {statistics['frames']} frames{cost}"
+        return str(entry)
+    # A sink in its own thread gets only the frames that it asked for.
+    times = "once" if entry.runs == 1 else f"{entry.runs} times"
+    cost = f", {milliseconds(entry.mean_ms)} each (p99 {milliseconds(entry.p99_ms)})" if entry.runs else ""
+    return f"written {times} in {statistics.frames} frames{cost}"
 
 
-def _ms(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2f} ms"
+def mermaid(pipeline: Pipeline, plan: Plan, statistics: Statistics | None) -> Iterator[str]:
+    """Lines of a flowchart: segments as boxes, the queues between them as thick arrows, gates dotted.
+
+    Stages that no sink needs stand outside, with a dashed outline. With statistics, nodes show how often they
+    ran, why not and how long a run took, and those that took more than a tenth of the time after the source
+    are filled.
+    """
+    nodes = pipeline.nodes
+    entries = {} if statistics is None else {i: e for i, e in statistics.nodes.items() if i in nodes}
+    spent = {id_: entry.spent_ms for id_, entry in entries.items() if id_ != pipeline.source.id}
+    costly = [id_ for id_, time in spent.items() if time > _COSTLY * sum(spent.values())]
+    names = {id_: f"n{index}" for index, id_ in enumerate(nodes)}
+    boxes = {segment: f"s{index}" for index, segment in enumerate(plan.segments)}
+    yield "flowchart LR"
+    for segment, members in plan.segments.items():
+        yield f'  subgraph {boxes[segment]}["segment {segment}"]'
+        for id_ in members:
+            yield f"    {names[id_]}{_shape(nodes[id_], entries.get(id_))}"
+        yield "  end"
+    for node in plan.pruned:
+        yield f"  {names[node.id]}{_shape(node, None)}:::pruned"
+    for node in nodes.values():
+        ports: dict[str, list[str]] = {}
+        for ref in node.inputs.values():
+            if ref is not None and ref.port not in ports.setdefault(ref.node, []):
+                ports[ref.node].append(ref.port)
+        for giver, labels in ports.items():
+            yield f'  {names[giver]} -->|"{", ".join(labels)}"| {names[node.id]}'
+        for gate in node.gates:
+            yield f'  {names[gate.signal.node]} -.->|"when {gate.signal.port}"| {names[node.id]}'
+    for link in plan.links:
+        queue = f"{link.when_full}, {link.capacity}"
+        yield f'  {boxes[link.producer]} ==>|"queue: {queue}"| {boxes[link.consumer]}'
+    if plan.pruned:
+        yield "  classDef pruned stroke-dasharray: 4"
+    if costly:
+        yield "  classDef costly fill:#fdd0a2,stroke:#d94801,color:#000"
+        yield f"  class {','.join(names[id_] for id_ in costly)} costly"
+
+
+def _shape(node: Node, entry: NodeStatistics | None) -> str:
+    left, right = {"source": ("([", "])"), "stage": ("[", "]"), "sink": ("[/", "/]")}[node.component.kind]
+    lines = [node.id]
+    if entry is not None:
+        if entry.mean_ms is not None:
+            lines.append(milliseconds(entry.mean_ms))
+        if node.component.kind == "sink":
+            lines.append(f"{entry.runs} times")
+        elif entry.frames:
+            lines += [f"ran {share(entry.runs, entry.frames)}", *entry.reasons()]
+    # A quotation mark would end the label, and < begin a tag.
+    label = "<br/>".join(line.replace('"', "'").replace("<", "&lt;") for line in lines)
+    return f'{left}"{label}"{right}'

@@ -11,7 +11,7 @@ from collections import deque
 import numpy as np
 
 from tactflow.cli.options import positive, seconds
-from tactflow.cli.printable import printable
+from tactflow.cli.terminal import printable
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.message.result import Result
 from tactflow.network.subscriber import DEFAULT_ENDPOINT, Subscriber

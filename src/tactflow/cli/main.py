@@ -1,103 +1,68 @@
-"""The program `tactflow`: finds the subcommand, runs it, and turns errors into messages and exit codes."""
+"""The command line of `tactflow`: finds the command, runs it, turns errors into messages and exit codes."""
 
 from __future__ import annotations
 
 import argparse
 import gc
-import importlib
-import io
 import os
 import re
-import signal
 import sys
-import threading
-from collections.abc import Collection, Sequence
-from typing import NoReturn
+from collections.abc import Callable, Collection, Sequence
+from importlib import import_module
+from typing import Final, NoReturn
 
 from tactflow import __version__
-from tactflow.__main__ import wanted
-from tactflow.cli.printable import printable
-from tactflow.engine.errors import StageError, TactflowError
-from tactflow.system.files import Unheard, lead_nowhere
-from tactflow.system.signals import ENDING, INTERRUPTED, interrupt_from_now_on
+from tactflow.cli.terminal import printable
+from tactflow.engine.errors import TactflowError
+from tactflow.system.signals import INTERRUPTED
 from tactflow.system.spelling import closest, did_you_mean
 
-COMMANDS = {
-    "run": "run a pipeline",
-    "check": "validate a pipeline file without running it; prints every mistake at once",
-    "explain": "why each stage runs, is skipped or is left out, and what it cost",
-    "graph": "print a pipeline as a Mermaid flowchart",
-    "pipelines": "list the pipelines that come with tactflow, one for each kind of sensor",
-    "stages": "list the stages and sinks that can be used, their ports and parameters",
-    "listen": "print what a running tactflow publishes",
-    "control": "tell a running tactflow to pause, to take a reference, to record",
-    "keys": "make keys, so that only who has one can read results over a network",
-    "bench": "measure run time against error, per method and for whole pipelines",
-    "warmup": "compile what `run` would compile on its first use",
-    "batch": "run a pipeline over many recordings; a second call does what is missing",
-    "record": "run a pipeline and record its frames and results",
-    "export": "make a LeRobot dataset of recordings",
-    "repair": "give a recording that was cut off its index",
-    "calibrate": "make the calibration file of a sensor, or see whether it still fits",
-    "detect": "find the marks of a gel and show what was found and why, in one picture",
-    "doctor": "what is wrong with a sensor's pictures, what it does to the errors, and what to change",
-    "tune": "find the cheapest pipeline within an error budget, for one sensor, from a recording of it",
-    "cameras": "list the cameras that are plugged in, with names that stay the same",
-    "sim": "write a simulated recording and its ground truth",
-    "schema": "print the JSON Schema of the result message or of a pipeline file",
-    "completion": "print a script that completes commands, options and files in a shell",
+COMMANDS: Final[dict[str, tuple[str, str]]] = {
+    "run": ("run", "run a pipeline"),
+    "check": ("pipelines", "validate a pipeline file without running it; prints every mistake at once"),
+    "explain": ("explain", "why each stage runs, is skipped or is left out, and what it cost"),
+    "graph": ("explain", "print a pipeline as a Mermaid flowchart"),
+    "pipelines": ("pipelines", "list the pipelines that come with tactflow, one for each kind of sensor"),
+    "stages": ("stages", "list the stages and sinks that can be used, their ports and parameters"),
+    "listen": ("listen", "print what a running tactflow publishes"),
+    "control": ("control", "tell a running tactflow to pause, to take a reference, to record"),
+    "keys": ("control", "make keys, so that only those who have one can read results over a network"),
+    "bench": ("bench", "measure run time against error, per method and for whole pipelines"),
+    "warmup": ("pipelines", "compile what `run` would compile on its first use"),
+    "batch": ("batch", "run a pipeline over many recordings; a second call does what is missing"),
+    "record": ("run", "run a pipeline and record its frames and results"),
+    "export": ("recordings", "make a LeRobot dataset of recordings"),
+    "repair": ("recordings", "give a recording that was cut off its index"),
+    "calibrate": ("calibrate", "make the calibration file of a sensor, or see whether it still fits"),
+    "detect": ("detect", "find the marks of a gel and show what was found and why, in one picture"),
+    "doctor": (
+        "doctor",
+        "what is wrong with a sensor's pictures, what it does to the errors, and what to change",
+    ),
+    "tune": (
+        "tune",
+        "find the cheapest pipeline within an error budget, for one sensor, from a recording of it",
+    ),
+    "cameras": ("cameras", "list the cameras that are plugged in, with names that stay the same"),
+    "sim": ("sim", "write a simulated recording and its ground truth"),
+    "schema": ("pipelines", "print the JSON Schema of the result message or of a pipeline file"),
+    "completion": ("completion", "print a script that completes commands, options and files in a shell"),
 }
-"""Subcommand -> what it does.
+"""Command -> module in `tactflow.cli`, and what the command does.
 
-The module of that name in `tactflow.cli` has `add_arguments(parser)` and `run(args) -> int`; it is imported
-only when the command is used.
+The module has `add_arguments(parser)` and `run(args) -> exit code` for the command of its own name, and
+`add_arguments_NAME`, `run_NAME` for every other. It is imported only when one of its commands is used.
 """
 
 
-def entry() -> None:
-    """Run the program with the arguments of this process, and end the process with its exit code."""
-    # A service may be started without them.
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
-    sys.stderr = Unheard(sys.stderr)
-    # Names of files may have letters that the terminal, or UTF-8, has not.
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
-    try:
-        code = main(sys.argv[1:])
-        sys.stdout.flush()
-    except OSError as error:
-        # Whoever read our output has left, or the disk is full.
-        lead_nowhere(sys.stdout)
-        code = 0
-        if not isinstance(error, BrokenPipeError):
-            # Only the question where we are fails so, without a name.
-            unnamed = "the current folder" if isinstance(error, FileNotFoundError) else "standard output"
-            print(f"tactflow: {error.filename or unnamed}: {error.strerror or error}", file=sys.stderr)
-            code = StageError.exit_code
-    except KeyboardInterrupt:
-        # Whoever shall read our output does not.
-        lead_nowhere(sys.stdout)
-        code = INTERRUPTED
-    # The code is known; what comes now shall not change it.
-    for number in ENDING:
-        signal.signal(number, signal.SIG_IGN)
-    if code != 0 and threading.active_count() > 1:
-        # A thread of a run that was not allowed to finish: one that comes out of OpenCV while Python ends
-        # would abort the process. After a run that ended well, what sinks of one's own leave to the end of
-        # Python, such as a pool in which one writes, is done.
-        sys.stderr.flush()
-        os._exit(code)
-    sys.exit(code)
+def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -> int:
+    """Run the program with these arguments; returns its exit code.
 
-
-def main(argv: Sequence[str]) -> int:
-    """Run the program with these arguments; returns its exit code."""
+    before_run : called when the command is imported and its arguments are valid.
+    """
     try:
         args = _parse(argv)
-        _collect_garbage()
-        interrupt_from_now_on()
+        before_run()
         return int(args.run(args))
     except TactflowError as error:
         # Imported here: it reads YAML, which not every command does.
@@ -124,18 +89,24 @@ def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"tactflow {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, summary in COMMANDS.items():
+    for name, (module_name, summary) in COMMANDS.items():
         command = subparsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
         if name in complete:
-            module = importlib.import_module(f"tactflow.cli.{name}")
-            module.add_arguments(command)
-            command.set_defaults(run=module.run, parser=command)
+            module = import_module(f"tactflow.cli.{module_name}")
+            suffix = "" if name == module_name else f"_{name}"
+            getattr(module, f"add_arguments{suffix}")(command)
+            command.set_defaults(run=getattr(module, f"run{suffix}"), parser=command)
     return parser
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    command = wanted(argv)
-    parser = make_parser([command] if command in COMMANDS else [])
+    command = next((word for word in argv if not word.startswith("-")), None)
+    # Nothing that is imported becomes garbage; looking for it takes a twelfth of the start of a run.
+    gc.disable()
+    try:
+        parser = make_parser([command] if command in COMMANDS else [])
+    finally:
+        gc.enable()
     if command is not None and command not in COMMANDS:
         parser.error(f"there is no command {command}{did_you_mean(command, COMMANDS, 'there are ')}")
     args, unknown = parser.parse_known_args(argv)
@@ -144,15 +115,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     return args
 
 
-def _collect_garbage() -> None:
-    """Have Python look for garbage, if `entry` has put that off, but not in what is imported by now."""
-    if not gc.isenabled():
-        gc.freeze()
-        gc.enable()
-
-
 def _refuse(args: argparse.Namespace, unknown: Sequence[str]) -> NoReturn:
-    """End with the usage of a command that was given words it does not know, besides those in `args`."""
+    """End with the usage of a command that does not know some words, and what they probably mean."""
     command: argparse.ArgumentParser = args.parser
     options = re.findall(r"--[a-z][a-z-]*", command.format_usage())
     option = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)

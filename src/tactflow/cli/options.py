@@ -1,17 +1,16 @@
-"""What the commands that read a pipeline file share."""
+"""Options that several commands share, the types of their values, and how they are read."""
 
 from __future__ import annotations
 
 import argparse
+import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from tactflow.cli.notes import say
-from tactflow.cli.statistics import read_statistics
+from tactflow.cli.terminal import say
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
+from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan, make_plan
 
@@ -42,6 +41,28 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_quiet(parser: argparse.ArgumentParser) -> None:
+    """Declare `--quiet`."""
+    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
+
+
+def add_overwrite(parser: argparse._ActionsContainer, what: str = "FILE") -> None:
+    """Declare `--overwrite`."""
+    parser.add_argument("--overwrite", action="store_true", help=f"replace {what} if it is there")
+
+
+def add_endpoint(parser: argparse.ArgumentParser, default: str) -> None:
+    """Declare ENDPOINT and `--keys`."""
+    parser.add_argument(
+        "endpoint", nargs="?", default=default, metavar="ENDPOINT", help="address; default: %(default)s"
+    )
+    parser.add_argument(
+        "--keys",
+        metavar="FOLDER",
+        help="the subscriber's folder made by tactflow keys new, where the run requires keys",
+    )
+
+
 def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipeline, Plan]:
     """Read the pipeline that the arguments name and plan it; warnings go to standard error.
 
@@ -53,22 +74,6 @@ def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipe
     for warning in (*pipeline.warnings, *plan.warnings):
         say(f"tactflow: warning: {warning}")
     return pipeline, plan
-
-
-def add_pipeline_and_stats(parser: argparse.ArgumentParser) -> None:
-    """Declare PIPELINE, `--set` and `--stats`."""
-    add_pipeline(parser)
-    parser.add_argument(
-        "--stats",
-        metavar="run.json",
-        help="statistics of a run (tactflow run --stats), to show how often each stage ran and what it cost",
-    )
-
-
-def load_with_stats(args: argparse.Namespace) -> tuple[Pipeline, Plan, Mapping[str, Any] | None]:
-    """As `load_plan`, and the content of the statistics file, or None."""
-    statistics = None if args.stats is None else read_statistics(Path(args.stats))
-    return (*load_plan(args), statistics)
 
 
 def positive(text: str) -> int:
@@ -85,7 +90,7 @@ def seconds(text: str) -> float:
     Raises
     ------
     argparse.ArgumentTypeError
-        If the text is none.
+        If the text is not a length of time.
 
     >>> seconds("90s"), seconds("1.5min")
     (90.0, 90.0)
@@ -94,3 +99,24 @@ def seconds(text: str) -> float:
     if match is None or match[2] not in UNITS or float(match[1]) <= 0:
         raise argparse.ArgumentTypeError(f"required a time such as 90s, 2min or 1h, got {text!r}")
     return float(match[1]) * UNITS[match[2]]
+
+
+def refuse_output(option: str, path: Path, *, overwrite: bool) -> None:
+    """Find out before the work, not after it, that a file cannot be written.
+
+    option : the option that names the file.
+
+    Raises
+    ------
+    ConfigError : its folder does not exist or is read-only; it is a folder; it exists and `overwrite` is
+        false.
+    """
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise ConfigError(f"{option}: there is no folder {folder}")
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(f"{option}: {folder} cannot be written into")
+    if path.is_dir():
+        raise ConfigError(f"{option}: {path} is a folder; required a file")
+    if path.exists() and not overwrite:
+        raise ConfigError(f"{option}: {path} is already there; give --overwrite to replace it")

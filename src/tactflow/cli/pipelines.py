@@ -1,21 +1,125 @@
-"""`tactflow pipelines`: the pipelines that come with tactflow."""
+"""Commands about pipeline files: `tactflow pipelines`, `check`, `schema` and `warmup`."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import time
 
-from tactflow.config.shipped import described_pipelines
+from tactflow.cli.options import add_pipeline, add_quiet, load_plan
+from tactflow.cli.terminal import printable, progress_bar, say, table
+from tactflow.config.load import load_pipeline, sensor_names
+from tactflow.config.shipped import described_pipelines, find_pipeline
+from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Pipeline
+from tactflow.engine.plan import Plan
+from tactflow.system.extras import opencv_conflict
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare nothing but what follows the options."""
+    """Declare what follows the options of `pipelines`, which has none."""
     parser.epilog = "for your sensor: tactflow run mini --source 0"
 
 
-def run(args: argparse.Namespace) -> int:  # noqa: ARG001 (the same for all commands)
-    """Print the name of each, and what it is for."""
-    found = described_pipelines()
-    width = max(map(len, found))
-    for name, description in found.items():
-        print(f"{name.ljust(width)}  {description}")
+def run(_: argparse.Namespace) -> int:
+    """Print the name of each shipped pipeline, and what it is for."""
+    print("\n".join(table(list(described_pipelines().items()))))
+    return 0
+
+
+def add_arguments_check(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `check`."""
+    add_pipeline(parser)
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Print one line for each sensor; raises ConfigError with every mistake."""
+    from tactflow.fleet.sinks import clash_problems
+
+    warn_of_opencv()
+    names: list[str] = sensor_names(find_pipeline(args.pipeline), args.overrides)
+    valid: dict[str | None, tuple[Pipeline, Plan]] = {}
+    mistakes: list[str] = []
+    for name in names or (None,):
+        try:
+            valid[name] = load_plan(args, name)
+        except ConfigError as error:
+            mistakes += error.mistakes
+    mistakes += clash_problems({name: pipeline for name, (pipeline, _) in valid.items() if name is not None})
+    if mistakes:
+        # A mistake that several sensors share is reported once.
+        raise ConfigError(*dict.fromkeys(mistakes))
+    for name, (pipeline, plan) in valid.items():
+        sinks = len(pipeline.sinks)
+        counts = {"stage": len(pipeline.nodes) - sinks, "sink": sinks, "segment": len(plan.segments)}
+        if warnings := len(pipeline.warnings) + len(plan.warnings):
+            counts["warning"] = warnings
+        words = ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for noun, count in counts.items())
+        print(printable(f"{pipeline.file}: {f'sensor {name} ' if name else ''}OK ({words})"))
+    return 0
+
+
+def warn_of_opencv() -> None:
+    """Warn where several OpenCV packages overwrite each other's files."""
+    conflict = opencv_conflict()
+    if conflict is not None:
+        say(f"tactflow: WARNING: {conflict}")
+
+
+def add_arguments_schema(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `schema`."""
+    parser.add_argument(
+        "what",
+        nargs="?",
+        choices=("message", "pipeline", "foxglove-layout"),
+        default="message",
+        help="message: the result message (default); pipeline: a pipeline file; foxglove-layout: not a "
+        "schema, but a layout of Foxglove that shows recordings, for Layouts > Import from file",
+    )
+    parser.add_argument("--sensor", default="main", metavar="NAME", help="of the layout (default: main)")
+
+
+def run_schema(args: argparse.Namespace) -> int:
+    """Print the schema, or the layout."""
+    if args.what == "message":
+        from tactflow.message.schema import message_schema
+
+        schema = message_schema()
+    elif args.what == "foxglove-layout":
+        from tactflow.recording.layout import layout
+
+        schema = layout(args.sensor)
+    else:
+        from tactflow.config.registry import catalogue
+        from tactflow.config.schema import pipeline_schema
+
+        schema = pipeline_schema(catalogue()[0])
+    print(json.dumps(schema, indent=2))
+    return 0
+
+
+def add_arguments_warmup(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `warmup`."""
+    add_pipeline(parser)
+    add_quiet(parser)
+
+
+def run_warmup(args: argparse.Namespace) -> int:
+    """Compile the kernels of a pipeline; returns the exit code. Raises ConfigError if it is wrong."""
+    from tactflow.vision import compiled
+
+    file = find_pipeline(args.pipeline)
+    # Loading a pipeline imports its stages, and with them their kernels.
+    sensors: list[str | None] = [*sensor_names(file, args.overrides)]
+    for sensor in sensors or [None]:
+        load_pipeline(file, args.overrides, sensor=sensor)
+    begin = time.perf_counter()
+    with (
+        progress_bar("compiling loops for this processor, once", shown=not args.quiet) as update,
+        compiled.reporting(lambda ready, total: update(completed=ready, total=total)),
+    ):
+        count = compiled.warm_up()
+    if not args.quiet:
+        seconds = time.perf_counter() - begin
+        say(f"{len(compiled.known())} loops are ready; {count} of them were compiled, in {seconds:.1f} s")
     return 0

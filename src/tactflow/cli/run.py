@@ -1,4 +1,4 @@
-"""`tactflow run`: run a pipeline to the end of its source."""
+"""`tactflow run`: run a pipeline to the end of its source; `tactflow record`: and record its frames."""
 
 from __future__ import annotations
 
@@ -9,37 +9,33 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from tactflow.api import ended_by_signals, make_runner
-from tactflow.cli.notes import notes_on
-from tactflow.cli.opencv import warn_of_conflict
-from tactflow.cli.options import add_pipeline, positive, seconds
-from tactflow.cli.printable import printable
-from tactflow.cli.progress import progress_display, summary, with_statistics
-from tactflow.config.files_used import files_written
+from tactflow.cli.options import add_overwrite, add_pipeline, add_quiet, positive, seconds
+from tactflow.cli.pipelines import warn_of_opencv
+from tactflow.cli.progress import run_progress, summary
+from tactflow.cli.terminal import notes, say
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.overrides import Override
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.run import Runner, RunResult
+from tactflow.engine.run import Runner
 from tactflow.engine.trace import TRACE_BEGINS, Trace
 from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
-from tactflow.system.files import is_device
+from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.vision import compiled
 
-STATISTICS_BEGIN = '{\n "frames":'
-"""How a file of statistics begins."""
+REPORTS = {"--stats": '{\n "frames":', "--trace": TRACE_BEGINS}
+"""Option that names a file -> how the file begins. A file that begins otherwise is not replaced."""
 
 Sinks = dict[str, dict[str, Any]]
 """Option of the command line -> settings of the sink that it adds."""
@@ -94,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of several sensors, kill and start again one that has given no sign of life for so long "
         "(%(default)g, and to start it has no less); more than the slowest stage may take for a frame",
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
+    add_quiet(parser)
     parser.add_argument(
         "--check", action="store_true", help="check every array against its port type (slower)"
     )
@@ -106,28 +102,34 @@ def run(args: argparse.Namespace, extra_sinks: Callable[[str | None], Sinks] = l
     extra_sinks : gives the sinks that a command adds for one of several sensors, or for None, the only one.
     """
     file = find_pipeline(args.pipeline)
+    sensors: list[str] = []
     if args.sensor is None:
-        # Else it was said already by the process that starts one for each sensor.
-        warn_of_conflict()
-    several = sensor_names(file, args.overrides) if args.sensor is None else []
-    if len(several) > 1:
-        return _run_all(args, file, several, extra_sinks)
-    pipeline = _load(args, file, args.sensor, _added_sinks(args, None) | extra_sinks(None))
-    return _run_one(args, pipeline)
+        # A process that runs one of several sensors need not warn again.
+        warn_of_opencv()
+        sensors = sensor_names(file, args.overrides)
+    if len(sensors) > 1:
+        return _run_all(args, file, sensors, extra_sinks)
+    return _run_one(args, _load(args, file, args.sensor, _added_sinks(args, None) | extra_sinks(None)))
 
 
 def _run_all(
     args: argparse.Namespace, file: Path, sensors: Sequence[str], extra_sinks: Callable[[str | None], Sinks]
 ) -> int:
     """Run every sensor in a process of its own."""
-    problems = _option_problems(args, sensors)
+    problems = []
+    if args.source is not None:
+        problems.append(
+            f"--source: the pipeline has {len(sensors)} sensors, each with its own source; choose one with "
+            f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
+        )
+    reports = _reports(args)
+    files = {"--jsonl": args.jsonl, "--out": getattr(args, "out", None)}
+    named = {option: str(path) for option, path in files.items() if path is not None}
+    problems += name_problems(named | reports, sensors)
     if problems:
         raise ConfigError("\n".join(problems))
     sinks = {sensor: _added_sinks(args, sensor) | extra_sinks(sensor) for sensor in sensors}
     pipelines = {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors}
-    reports = {option: path for option, path in _statistics_files(args).items() if path is not None}
-    for sensor, pipeline in pipelines.items():
-        _refuse_shared({option: with_name(path, sensor) for option, path in reports.items()}, pipeline)
     request = Request(
         file,
         args.overrides,
@@ -140,39 +142,27 @@ def _run_all(
 
 
 def _options(args: argparse.Namespace) -> list[str]:
-    """The options of this run for the process of every sensor, but for those about sinks and files."""
+    """The options of this run for the process of every sensor, except those about sinks and files."""
     words = []
     for option, value in (("--max-frames", args.max_frames), ("--stats-every", args.stats_every)):
         if value is not None:
             words += [option, str(value)]
     flags = (("--realtime", args.realtime), ("--quiet", args.quiet), ("--check", args.check))
-    return words + [flag for flag, given in flags if given]
+    return words + [flag for flag, is_set in flags if is_set]
 
 
-def _statistics_files(args: argparse.Namespace) -> dict[str, str | None]:
-    return {"--stats": args.stats, "--trace": args.trace}
-
-
-def _option_problems(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
-    """What is wrong with the command line of a run of several sensors."""
-    problems = []
-    if args.source is not None:
-        problems.append(
-            f"--source: the pipeline has {len(sensors)} sensors, each with its own source; choose one with "
-            f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
-        )
-    files = {"--jsonl": args.jsonl, **_statistics_files(args), "--out": getattr(args, "out", None)}
-    given = {option: str(path) for option, path in files.items() if path is not None}
-    return problems + name_problems(given, sensors)
+def _reports(args: argparse.Namespace) -> dict[str, str]:
+    """Option -> the file of statistics, or of events, that it names."""
+    paths = {"--stats": args.stats, "--trace": args.trace}
+    return {option: path for option, path in paths.items() if path is not None}
 
 
 def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
     """The sink of `--jsonl`."""
     if args.jsonl is None:
         return {}
-    return {
-        "--jsonl": {"use": "jsonl", "path": args.jsonl if sensor is None else with_name(args.jsonl, sensor)}
-    }
+    path = args.jsonl if sensor is None else with_name(args.jsonl, sensor)
+    return {"--jsonl": {"use": "jsonl", "path": path}}
 
 
 def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks) -> Pipeline:
@@ -189,64 +179,79 @@ def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks
 
 def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     """Run one sensor's pipeline in this process."""
-    _refuse_shared(_statistics_files(args), pipeline)
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
     trace = None if args.trace is None else Trace(f"tactflow {pipeline.sensor}")
     runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
     if args.end_with_stdin:
         threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
     if args.sign_of_life is not None:
         start_beating(args.sign_of_life, Headway(runner.calls))
-    with notes_on(console), ended_by_signals(runner) as caught:
-        _refuse_unwritable("--stats", args.stats, begins=STATISTICS_BEGIN)
-        _refuse_unwritable("--trace", args.trace, begins=TRACE_BEGINS)
+    with notes(), ended_by_signals(runner) as caught:
+        for option, path in _reports(args).items():
+            problem = _report_problem(option, path)
+            if problem is not None:
+                raise ConfigError(f"{option} {path}: {problem}")
         logger = logging.getLogger("tactflow")
         for warning in runner.pipeline.warnings:
             logger.warning("%s", warning)
         if runner.plan.idle:
             logger.info("not run, as no sink needs it: %s", ", ".join(node.id for node in runner.plan.idle))
-        with progress_display(console, runner, shown=not args.quiet) as on_progress:
-            result = runner.run(with_statistics(on_progress, runner, args.stats_every, console))
+        with run_progress(runner, args.stats_every, shown=not args.quiet) as on_progress:
+            result = runner.run(on_progress)
         code = 0 if result.exit_code == INTERRUPTED and len(caught) == 1 else result.exit_code
-        written = _report(args, result, trace)
+        if result.error is not None:
+            say(f"tactflow: {result.error}")
+        contents = {
+            "--trace": trace.lines() if trace else [],
+            "--stats": [json.dumps(result.stats, indent=1)],
+        }
+        written = [_write_report(option, path, contents[option]) for option, path in _reports(args).items()]
         if not args.quiet:
-            console.print(printable(summary(result, runner)), markup=False)
-        return code or (0 if written else StageError.exit_code)
+            say(summary(result, runner))
+        return code or (0 if all(written) else StageError.exit_code)
 
 
-def _report(args: argparse.Namespace, result: RunResult, trace: Trace | None) -> bool:
-    """Say why a run failed, and write what was asked for about it; whether that could be written."""
-    if result.error is not None:
-        print(printable(f"tactflow: {result.error}"), file=sys.stderr)
-    written = [
-        trace is None or _write_report("--trace", args.trace, trace.lines()),
-        args.stats is None or _write_report("--stats", args.stats, [json.dumps(result.stats, indent=1)]),
-    ]
-    return all(written)
+def _report_problem(option: str, path: str) -> str | None:
+    """Why a report cannot be written to a file, or None. Makes the file."""
+    try:
+        with open(path, "ab"):
+            pass
+        if is_device(path):
+            return None
+        with open(path, encoding="utf-8", errors="replace") as file:
+            beginning = file.read(len(REPORTS[option]))
+    except OSError as error:
+        return f"cannot be written: {error.strerror or error}"
+    if beginning not in ("", REPORTS[option]):
+        return "holds something else; choose another file, or delete it"
+    return None
 
 
 def _write_report(option: str, path: str, lines: Iterable[str]) -> bool:
-    """Write a file of statistics or events; whether that went well. Half of one is none: it is emptied."""
-    try:
-        with open(path, "w", encoding="utf-8") as file:
-            file.writelines(f"{line}\n" for line in lines)
-    except OSError as error:
-        print(f"tactflow: {option} {path}: cannot be written: {error.strerror or error}", file=sys.stderr)
-        if not is_device(path):
-            with suppress(OSError):
-                os.truncate(path, 0)
-        return False
-    return True
+    """Write statistics or events; returns whether it was written. A partial file is truncated to zero."""
+    # A sink may have written to it meanwhile.
+    problem = _report_problem(option, path)
+    if problem is None:
+        try:
+            with open(path, "w", encoding="utf-8") as file:
+                file.writelines(f"{line}\n" for line in lines)
+        except OSError as error:
+            problem = f"cannot be written: {error.strerror or error}"
+            if not is_device(path):
+                with suppress(OSError):
+                    os.truncate(path, 0)
+    if problem is not None:
+        say(f"tactflow: {option} {path}: {problem}")
+    return problem is None
 
 
 def _stop_at_end_of_input(runner: Runner) -> None:
-    """Body of a thread: reads until nobody can write any more."""
+    """Body of a thread: stop the run when whoever writes to standard input is gone."""
     with suppress(OSError):
         while os.read(sys.stdin.fileno(), 4096):
             pass
     runner.stop("signal")
     if compiled.is_loading():
-        # This is not waited for after a signal.
+        # It does not look at the runner.
         signal.raise_signal(signal.SIGTERM)
 
 
@@ -257,40 +262,54 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _refuse_unwritable(option: str, path: str | None, begins: str) -> None:
-    """Find out before the run, not after it, that a file cannot be written, or holds something else.
+def add_arguments_record(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `record`: those of `run`, and the file."""
+    add_arguments(parser)
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=Path,
+        metavar="FILE.mcap",
+        help="frames without loss, results, pipeline; tactflow run --source FILE.mcap plays it",
+    )
+    existing = parser.add_mutually_exclusive_group()
+    add_overwrite(existing, "FILE.mcap")
+    existing.add_argument(
+        "--number", action="store_true", help="if it is there, record to FILE-001.mcap, ..."
+    )
+    parser.add_argument(
+        "--rotate-size", type=int, metavar="MB", help="go on in FILE-001.mcap, ... when a file has so many MB"
+    )
+    parser.add_argument("--rotate-after", type=float, metavar="SECONDS", help="... or when it is so long")
 
-    begins : the first characters of what an earlier run has written, which may be replaced.
+
+def run_record(args: argparse.Namespace) -> int:
+    """Run the pipeline with a sink that records; returns the exit code.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be recorded to, or as `tactflow run` does. Nothing was started.
     """
-    if path is None:
-        return
-    try:
-        with open(path, "ab"):
-            pass
-        if is_device(path):
-            return
-        with open(path, "rb") as file:
-            there = file.read(len(begins))
-    except OSError as error:
-        raise ConfigError(f"{option} {path}: cannot be written: {error.strerror}") from None
-    if there not in (b"", begins.encode()):
-        raise ConfigError(f"{option} {path}: holds something else; choose another file, or delete it")
+    from tactflow.recording import missing_packages
+
+    problem = missing_packages()
+    if problem is not None:
+        raise ConfigError(problem)
+    if args.out.suffix != ".mcap":
+        raise ConfigError(f"--out: required a file whose name ends in .mcap, got {args.out}")
+    return run(args, lambda sensor: _recording_sink(args, sensor))
 
 
-def _refuse_shared(reports: Mapping[str, str | None], pipeline: Pipeline) -> None:
-    """Refuse a report into a file that a sink, or another report, writes: it would replace what is there.
-
-    reports : option -> its file.
-    """
-    writers = {
-        place: node.id
-        for node in pipeline.nodes.values()
-        for place in files_written(node.component.cls, node.params)
-    }
-    for option, path in reports.items():
-        if path is None or is_device(path):
-            continue
-        place = os.path.realpath(path)
-        if place in writers:
-            raise ConfigError(f"{option} {path}: {writers[place]} writes it already; choose another file")
-        writers[place] = option
+def _recording_sink(args: argparse.Namespace, sensor: str | None) -> Sinks:
+    """The sink that records one of several sensors, or, for None, the only one."""
+    out = args.out if sensor is None else Path(with_name(str(args.out), sensor))
+    if out.exists() and args.number:
+        out = next_name(out)
+    if out.exists() and not args.overwrite:
+        raise ConfigError(
+            f"--out: {out} is already there; give --overwrite to replace it or --number to record beside it"
+        )
+    settings = {"use": "record", "path": str(out), "overwrite": args.overwrite}
+    rotation = {"rotate_size": args.rotate_size, "rotate_after": args.rotate_after}
+    return {"--record": settings | {key: value for key, value in rotation.items() if value is not None}}

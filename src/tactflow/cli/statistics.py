@@ -1,51 +1,147 @@
-"""The statistics file that `tactflow run --stats` writes, read again."""
+"""The statistics file that `tactflow run --stats` writes, read again, and its numbers in words."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+
+from pydantic import BaseModel, ValidationError
 
 from tactflow.engine.errors import ConfigError
 
+_FAILURES = ("error", "disabled")
+"""Reasons for not running that are failures: what they left out is not saved."""
 
-def read_statistics(path: Path) -> Mapping[str, Any]:
-    """The content of a statistics file; raises ConfigError if it is none."""
-    try:
-        data = json.loads(path.read_bytes())
-    except OSError as error:
-        raise ConfigError(f"--stats {path}: cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"--stats {path}: not JSON: {error}") from None
-    if not _are_statistics(data):
-        raise ConfigError(f"--stats {path}: not a statistics file; tactflow run --stats writes one")
-    return data  # type: ignore[no-any-return]
+_WORDS = {"no_demand": "not wanted"}
 
 
-def _are_statistics(data: Any) -> bool:
-    """True if the parts shown here are there and have the right types."""
-    if not isinstance(data, dict):
-        return False
-    stages, sinks = data.get("stages"), data.get("sinks", {})
-    return (
-        isinstance(stages, dict)
-        and isinstance(sinks, dict)
-        and "end" in data
-        and all(isinstance(data.get(key), int | float) for key in ("frames", "dropped", "wall_s"))
-        and _is_pair(data.get("latency_ms"), "p50", "p99")
-        and all(
-            _is_pair(node, "p50_ms", "p99_ms")
-            and isinstance(node.get("runs"), int)
-            and isinstance(node.get("skips"), dict)
-            and all(isinstance(count, int) for count in node["skips"].values())
-            and isinstance(node.get("total_ms"), int | float | None)
-            for node in (*stages.values(), *sinks.values())
-        )
-    )
+class NodeStatistics(BaseModel):
+    """What one stage or sink did in a run.
+
+    runs : frames it ran on. skips : reason -> frames it did not run on. total_ms : time of all runs.
+    p50_ms, p99_ms : time of a run; None where unknown.
+    """
+
+    runs: int
+    skips: dict[str, int]
+    total_ms: float | None = None
+    p50_ms: float | None
+    p99_ms: float | None
+
+    @property
+    def frames(self) -> int:
+        """Frames that reached it."""
+        return self.runs + sum(self.skips.values())
+
+    @property
+    def mean_ms(self) -> float | None:
+        """Mean time of a run."""
+        return self.total_ms / self.runs if self.runs and self.total_ms is not None else None
+
+    @property
+    def skipped(self) -> int:
+        """Frames that it could skip; those on which it failed do not count."""
+        return sum(count for reason, count in self.skips.items() if reason not in _FAILURES)
+
+    @property
+    def saved_ms(self) -> float:
+        """Time that skipping saved: frames skipped x mean time of a run."""
+        return self.skipped * (self.mean_ms or 0.0)
+
+    @property
+    def spent_ms(self) -> float:
+        """Time of all runs; 0 where unknown."""
+        return self.total_ms or 0.0 if self.runs else 0.0
+
+    def reasons(self) -> list[str]:
+        """Each reason for not running with its share, the most frequent first."""
+        ordered = sorted(((reason, count) for reason, count in self.skips.items() if count), key=_by_count)
+        return [
+            f"{share(count, self.frames)} {_WORDS.get(reason, reason.replace('_', ' '))}"
+            for reason, count in ordered
+        ]
+
+    def __str__(self) -> str:
+        """How often it ran and why not, time of a run, and what skipping saved per frame."""
+        if not self.frames:
+            return "never reached by a frame"
+        reasons = self.reasons()
+        parts = [
+            f"ran {share(self.runs, self.frames)}" + (f", skipped {', '.join(reasons)}" if reasons else "")
+        ]
+        if self.p50_ms is not None:
+            mean = "" if self.mean_ms is None else f"mean {milliseconds(self.mean_ms)}, "
+            parts.append(f"a run: {mean}p50 {milliseconds(self.p50_ms)}, p99 {milliseconds(self.p99_ms)}")
+        if self.skipped and self.mean_ms is not None:
+            parts.append(saving(self.saved_ms, self.saved_ms + self.spent_ms, self.frames))
+        elif self.skipped and not self.runs:
+            parts.append("saved: unknown, as it never ran")
+        return "; ".join(parts)
 
 
-def _is_pair(value: Any, *keys: str) -> bool:
-    return isinstance(value, dict) and all(
-        key in value and isinstance(value[key], int | float | None) for key in keys
-    )
+def _by_count(item: tuple[str, int]) -> int:
+    return -item[1]
+
+
+class Latency(BaseModel):
+    """Time from capture to the end of the last stage, ms."""
+
+    p50: float | None
+    p99: float | None
+
+
+class Statistics(BaseModel):
+    """What a run did, and how long it took."""
+
+    frames: int
+    dropped: int
+    wall_s: float
+    end: str
+    stages: dict[str, NodeStatistics]
+    sinks: dict[str, NodeStatistics] = {}
+    latency_ms: Latency
+
+    @classmethod
+    def read(cls, path: Path) -> Statistics:
+        """Read a statistics file; raises ConfigError if it cannot be read, or is not one."""
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except OSError as error:
+            raise ConfigError(f"--stats {path}: cannot be read: {error.strerror}") from None
+        except ValidationError:
+            raise ConfigError(
+                f"--stats {path}: not a statistics file; tactflow run --stats writes one"
+            ) from None
+
+    @property
+    def nodes(self) -> Mapping[str, NodeStatistics]:
+        """Id of a stage or sink -> its statistics."""
+        return {**self.sinks, **self.stages}
+
+
+def share(part: int, whole: int) -> str:
+    """A share in percent; 0 % and 100 % only where that is exact.
+
+    >>> share(1, 1000), share(0, 7), share(999, 1000)
+    ('<1 %', '0 %', '>99 %')
+    """
+    percent = 100 * part / whole if whole > 0 else 0
+    if 0 < percent < 1:
+        return "<1 %"
+    return ">99 %" if 99 < percent < 100 else f"{percent:.0f} %"
+
+
+def saving(saved_ms: float, all_ms: float, frames: int) -> str:
+    """`saved 38.0 ms of 41.0 ms a frame`."""
+    return f"saved {milliseconds(saved_ms / frames)} of {milliseconds(all_ms / frames)} a frame"
+
+
+def milliseconds(value: float | None) -> str:
+    """A time with three digits.
+
+    >>> milliseconds(0.25), milliseconds(12.3456)
+    ('0.250 ms', '12.3 ms')
+    """
+    if value is None:
+        return "unknown"
+    return f"{value:.{3 if value < 1 else 2 if value < 10 else 1}f} ms"

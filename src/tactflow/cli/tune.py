@@ -11,10 +11,8 @@ from typing import Final
 
 import orjson
 
-from tactflow.cli.notes import say, without_notes
-from tactflow.cli.options import seconds
-from tactflow.cli.outputs import refuse_output
-from tactflow.cli.printable import printable, typed
+from tactflow.cli.options import refuse_output, seconds
+from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.system.files import completed
@@ -77,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     from tactflow.tune.search import DEFAULT, Goal, Search, impossible
     from tactflow.tune.space import Candidate
 
-    with without_notes(), tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
+    with notes("ERROR"), tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
         folder = Path(name)
         file = find_pipeline(args.pipeline)
         recording = take(args.source, Candidate(DEFAULT).load(file, args.sensor), folder)

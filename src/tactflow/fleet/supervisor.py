@@ -15,7 +15,7 @@ from typing import IO, TextIO
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.fleet.heartbeat import SignOfLife
 from tactflow.fleet.sinks import WatchedSink
-from tactflow.system.files import lead_nowhere
+from tactflow.system.files import discard_output
 from tactflow.system.signals import INTERRUPTED
 
 FIRST_PAUSE = 1.0
@@ -224,7 +224,7 @@ class Supervisor:
                 target.buffer.write(line)
                 target.buffer.flush()
             except OSError as error:
-                lead_nowhere(target)
+                discard_output(target)
                 if target is sys.stdout and not isinstance(error, BrokenPipeError | ConnectionResetError):
                     self._unwritten = True
                     sys.stderr.write(f"tactflow: standard output: {error.strerror}; the run ends\n")

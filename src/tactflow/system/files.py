@@ -19,12 +19,12 @@ if sys.platform != "win32":
 
 
 def expanded(text: str) -> Path:
-    """A path with `~` and `~name` replaced. An unknown name stays: that file is not there, and named so."""
+    """A path with `~` and `~name` replaced. An unknown name stays, and is reported as a missing file."""
     return Path(os.path.expanduser(text))
 
 
 def is_utf8(text: str) -> bool:
-    """Whether a text, such as the name of a file, can stand in messages and tables.
+    """Whether a text, such as the name of a file, can be written to messages and tables.
 
     >>> is_utf8("left-ü"), is_utf8("left-\\udcff")
     (True, False)
@@ -33,7 +33,7 @@ def is_utf8(text: str) -> bool:
 
 
 def status(text: str) -> os.stat_result | None:
-    """What the system knows about a path; None if there is nothing."""
+    """The status of a path; None if nothing is there."""
     try:
         return expanded(text).stat()
     except (OSError, ValueError):
@@ -41,13 +41,13 @@ def status(text: str) -> os.stat_result | None:
 
 
 def is_device(text: str) -> bool:
-    """Whether it is there and neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
-    there = status(text)
-    return there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode)
+    """Whether it exists and is neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
+    found = status(text)
+    return found is not None and not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode)
 
 
 def next_name(path: Path) -> Path:
-    """The first numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ...
+    """The numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ...
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -66,11 +66,10 @@ def next_name(path: Path) -> Path:
 
 @contextmanager
 def completed(path: Path) -> Iterator[Path]:
-    """A place to write a file or a folder to, moved to `path` if all went well and removed if not.
+    """A path to write a file or a folder to, renamed to `path` if all went well and removed if not.
 
-    It replaces what is there; but no file replaces a folder.
-
-    Its name begins with a dot and ends as that of `path` does. Folders above are made. Raises OSError.
+    It replaces what is there, but no file replaces a folder. Its name begins with a dot and ends as that of
+    `path` does. Folders above are made. Raises OSError.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
@@ -88,11 +87,11 @@ def completed(path: Path) -> Iterator[Path]:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and all above it, unless it is there.
+    """Make a folder and all above it, unless it exists.
 
     Raises
     ------
-    OSError : that cannot be; where a file stands in its place, `strerror` says which.
+    OSError : it cannot be made; where a file is in its place, `strerror` says which.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -101,51 +100,45 @@ def make_folder(folder: Path) -> None:
         raise NotADirectoryError(errno.ENOTDIR, f"{file} is a file, not a folder") from None
 
 
-if sys.platform == "win32":
+def claim_path(path: Path) -> int | None:
+    """Claim a file or a folder that exists until the descriptor returned is closed.
 
-    def claim_path(_path: Path) -> int | None:
-        """None: Windows itself refuses to replace a file that is open."""
+    The claim binds only those who ask. It ends with the process, however that ends; where the file system
+    knows no locks, everybody gets one. Windows itself refuses to replace a file that is open.
+
+    Raises
+    ------
+    OSError : another run has claimed it (BlockingIOError), or it cannot be opened.
+    """
+    if sys.platform == "win32":
         return None
-
-else:
-
-    def claim_path(path: Path) -> int | None:
-        """Claim a file or a folder that is there, until the descriptor returned is closed.
-
-        The claim binds only those who ask. It ends with the process, however that ends; where the file system
-        knows no claims, everybody gets one.
-
-        Raises
-        ------
-        OSError : another run has claimed it, or it cannot be opened.
-        """
-        number = os.open(path, os.O_RDONLY)
-        try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(number)
-            raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it") from None
-        except OSError:
-            pass
-        return number
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it") from None
+    except OSError:
+        pass
+    return descriptor
 
 
-class Unheard(io.TextIOWrapper):
-    """Standard error that raises nothing when its reader has left: what went wrong shall decide how we end.
+class LossyStream(io.TextIOWrapper):
+    """Standard error that loses its output, instead of raising, once its reader has left.
 
-    stream : the present standard error, which it takes the place of.
+    stream : the present standard error, which it replaces.
     """
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(stream.buffer, stream.encoding, stream.errors, line_buffering=True)
-        # It closes what both write to when nobody holds it any more.
-        self._taken_from = stream
+        # Without a reference, it would close what both write to.
+        self._replaced = stream
 
     def write(self, text: str) -> int:
         """Write, or lose it."""
         with suppress(OSError):
             return super().write(text)
-        lead_nowhere(self)
+        discard_output(self)
         return len(text)
 
     def flush(self) -> None:
@@ -153,13 +146,13 @@ class Unheard(io.TextIOWrapper):
         try:
             super().flush()
         except OSError:
-            lead_nowhere(self)
+            discard_output(self)
 
 
-def lead_nowhere(stream: IO[str]) -> None:
-    """Let what is held back in a stream, and what follows, be lost without complaint.
+def discard_output(stream: IO[str]) -> None:
+    """Lead a stream to the null device: what it has buffered and what follows is lost without an error.
 
-    Python flushes standard output once more at exit: there it must find somebody who listens.
+    Python flushes standard output once more at exit.
     """
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())

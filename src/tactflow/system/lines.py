@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.system.files import expanded, lead_nowhere, make_folder
+from tactflow.system.files import discard_output, expanded, make_folder
 from tactflow.system.outputs import cannot_write, refuse_interference
 
 log = logging.getLogger("tactflow")
@@ -127,7 +127,7 @@ class LineStream:
         except OSError as error:
             if self._file is sys.stdout.buffer and error.errno in (errno.EPIPE, errno.ECONNRESET):
                 self.ended = True
-                lead_nowhere(sys.stdout)
+                discard_output(sys.stdout)
                 return
             kept = f"the {self.delivered} lines written before are complete"
             raise cannot_write(self._name, error, kept) from error

@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from types import FrameType
 
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -19,82 +19,59 @@ Handler = Callable[[int, FrameType | None], object]
 
 
 class Interrupted(KeyboardInterrupt):
-    """What a handler raises in the main thread to end what is under way.
+    """Raised by a handler in the main thread to end what is under way.
 
-    After a KeyboardInterrupt itself, raised within `exec` of a text, as numba does it, `python -m` ends by
-    SIGINT whatever the exit code is, even if it was caught.
+    Not KeyboardInterrupt itself: where that is raised within `exec` of a text, as numba uses it, `python -m`
+    ends by SIGINT whatever the exit code is, even if the exception was caught.
     """
 
 
-def leave(_number: int, _frame: FrameType | None) -> None:
-    """Handler while a run starts: nothing is under way that could be finished, so it ends well, at once.
+def end_at_once(code: int) -> None:
+    """Have the signals end the process with this exit code while it starts and nothing is under way.
 
-    Nothing is raised: what is being imported might swallow it, or show it.
+    Nothing is raised, which an import might swallow, or show.
     """
-    os._exit(0)
-
-
-def give_up(_number: int, _frame: FrameType | None) -> None:
-    """Handler while any other command starts, which has given nothing yet: it ends at once, too."""
-    os._exit(INTERRUPTED)
+    on_ending(lambda _number, _frame: os._exit(code))
 
 
 def interrupt(_number: int, _frame: FrameType | None) -> None:
-    """Handler that ends what is under way; a second signal does not keep it from tidying up.
-
-    A third is not caught.
-    """
+    """Handler that ends what is under way; a second signal does not prevent the clean-up, a third kills."""
     on_ending(lambda _number, _frame: on_ending(signal.SIG_DFL))
     raise Interrupted
 
 
-def interrupt_from_now_on() -> None:
-    """Have each of them interrupt, if so far it would have made the program give up."""
-    for number in ENDING:
-        if signal.getsignal(number) is give_up:
-            signal.signal(number, interrupt)
-
-
 def on_ending(handler: Handler | signal.Handlers) -> dict[int, object]:
-    """Have a handler called for each of them; returns what was called before.
+    """Install a handler for each signal; returns the earlier ones.
 
-    One that is ignored stays so: who started the program with nohup wants it to go on. So does
-    one that a host written in C handles, which Python could not give back.
+    A signal that is ignored stays so: nohup asks a program to go on. So does one handled by a host written in
+    C, whose handler Python could not restore.
     """
-    listened = [number for number in ENDING if signal.getsignal(number) not in (signal.SIG_IGN, None)]
-    return {number: signal.signal(number, handler) for number in listened}
+    handled = [number for number in ENDING if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+    return {number: signal.signal(number, handler) for number in handled}
 
 
 @contextmanager
 def ending_handled(handler: Handler) -> Iterator[None]:
-    """Have a handler called for each of them while a block lasts.
-
-    After a start that `leave` could have ended, the block was the run, whose end no signal changes any more.
-    """
+    """Have a handler called for each signal while a block lasts."""
     before = on_ending(handler)
     try:
         yield
     finally:
         for number, earlier in before.items():
-            signal.signal(number, signal.SIG_IGN if earlier is leave else earlier)  # type: ignore[arg-type]
+            signal.signal(number, earlier)  # type: ignore[arg-type]
 
 
 @contextmanager
 def ending_held_back() -> Iterator[None]:
-    """Handle those that come in a block after it: what the block does is whole, and its result is known."""
+    """Let signals that come during a block be handled after it: what the block does is complete then."""
     if threading.current_thread() is not threading.main_thread():
-        # Handlers are called in the main thread.
+        # Signals are handled in the main thread.
         yield
         return
-    came: list[int] = []
-    handled = [number for number in ENDING if callable(signal.getsignal(number))]
-    before = [signal.signal(number, lambda number, _: came.append(number)) for number in handled]
-    # Each of them, whatever the block raised, and whatever the handler raises for the first.
-    with ExitStack() as afterwards:
-        try:
+    pending: list[int] = []
+    try:
+        with ending_handled(lambda number, _: pending.append(number)):
             yield
-        finally:
-            for number, earlier in zip(handled, before, strict=True):
-                signal.signal(number, earlier)
-            for number in reversed(came):
-                afterwards.callback(signal.raise_signal, number)
+    finally:
+        for number in pending:
+            signal.raise_signal(number)

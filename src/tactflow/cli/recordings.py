@@ -1,0 +1,163 @@
+"""Commands about recordings: `tactflow export`, which makes a dataset of them, and `tactflow repair`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from pathlib import Path
+
+from tactflow.cli.options import add_overwrite, add_quiet
+from tactflow.cli.terminal import notes, progress_bar, say
+from tactflow.engine.errors import ConfigError, SourceError, StageError
+from tactflow.recording import missing_packages
+from tactflow.system.files import completed
+
+FASTEST = 1000
+"""Highest frame rate of a dataset, Hz; cameras of gels are slower. Chosen by hand."""
+
+
+def add_arguments_export(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `export`."""
+    parser.add_argument("format", choices=("lerobot",), help="a LeRobot dataset, layout v3.0")
+    parser.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="RECORDING",
+        help="each becomes an episode: whatever --source of `tactflow run` takes that ends",
+    )
+    parser.add_argument(
+        "--out", required=True, type=Path, metavar="DATASET", help="folder; must not be there"
+    )
+    parser.add_argument(
+        "--pipeline", metavar="PIPELINE", help="what finds contact and flow (default: as `tactflow run`)"
+    )
+    parser.add_argument("--fps", type=int, help="of the dataset (default: that of the first recording)")
+    parser.add_argument(
+        "--task", default="touch", help="what is done, in words: LeRobot keeps it (default: touch)"
+    )
+    parser.add_argument(
+        "--pictures",
+        choices=("video", "png"),
+        default="video",
+        help="video: H.264, small, loses a little (default); png: every bit",
+    )
+
+
+def run_export(args: argparse.Namespace) -> int:
+    """Write the dataset; returns the exit code.
+
+    Raises
+    ------
+    ConfigError : the folder is there already, or the frame rate is invalid. Nothing was written.
+    TactflowError : as `tactflow run`; nothing is left behind.
+    """
+    from tactflow.adapters.lerobot import DatasetWriter
+    from tactflow.streaming import stream
+
+    if args.out.exists():
+        raise ConfigError(f"--out: {args.out} is already there; give another folder")
+    fps = _rate(args.recordings[0]) if args.fps is None else args.fps
+    if not 1 <= fps <= FASTEST:
+        raise ConfigError(f"--fps: required 1 to {FASTEST}, got {fps}")
+    settings: dict[str, object] = {"sinks": {}}
+    recording = ""
+    try:
+        with notes(), completed(args.out) as folder:
+            writer = DatasetWriter(folder, fps, args.task, film=args.pictures == "video")
+            for recording in args.recordings:
+                frames = writer.add(stream(args.pipeline, source=recording, settings=settings, images=True))
+                say(f"{recording}: {frames} frames")
+            writer.finish()
+    except StageError as error:
+        raise StageError(f"{recording}: {error}" if recording else str(error)) from error
+    except OSError as error:
+        raise StageError(f"{args.out}: cannot be written: {error.strerror or error}") from error
+    count = len(args.recordings)
+    say(f"{args.out}: {count} {'episode' if count == 1 else 'episodes'} at {fps} fps")
+    return 0
+
+
+def _rate(recording: str) -> int:
+    """Frame rate of a recording, rounded, Hz."""
+    from tactflow.sources import open_source
+
+    source = open_source(recording)
+    rate, live = source.fps, source.live
+    source.close()
+    if live:
+        raise ConfigError(f"{recording}: required a recording, not a camera or a stream")
+    if rate is None:
+        raise ConfigError(f"{recording}: does not say how many frames come in a second; give --fps")
+    return max(round(rate), 1)
+
+
+def add_arguments_repair(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `repair`."""
+    parser.add_argument(
+        "file",
+        type=Path,
+        metavar="FILE",
+        help="an .mcap file that is damaged, or was not finished; it stays as it is",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="where the copy goes; default: FILE-repaired.mcap, beside it"
+    )
+    add_overwrite(parser, "the copy")
+    add_quiet(parser)
+
+
+def run_repair(args: argparse.Namespace) -> int:
+    """Write a copy of everything intact in a damaged recording; returns the exit code.
+
+    The copy gets its name only when it is complete, so an interrupted repair leaves nothing behind.
+
+    Raises
+    ------
+    ConfigError
+        If a path is wrong (nothing was written). SourceError if the file cannot be read or is not an MCAP
+        file. StageError if the copy cannot be written.
+    """
+    problem = missing_packages()
+    if problem is not None:
+        raise ConfigError(problem)
+    path: Path = args.file
+    if not path.is_file():
+        raise SourceError(f"{path}: no such file")
+    out: Path = args.out or path.with_name(f"{path.stem}-repaired{path.suffix}")
+    if out.is_dir():
+        raise ConfigError(f"--out: {out} is a folder; name a file in it, as in {out / path.name}")
+    if out.exists() and out.samefile(path):
+        raise ConfigError(f"--out: {out} is the file to repair; name another one")
+    if out.exists() and not args.overwrite:
+        raise ConfigError(f"{out} is already there; give --overwrite to replace it, or --out FILE")
+    try:
+        summary = _repair(path, out, shown=not args.quiet)
+    except OSError as error:
+        reason = error.strerror or error
+        raise StageError(f"{out}: cannot be written: {reason}; --out puts it on another disk") from error
+    if not args.quiet:
+        say(summary)
+    return 0
+
+
+def _repair(path: Path, out: Path, *, shown: bool) -> str:
+    """Write the copy, unless the file is whole; says what was done."""
+    from tactflow.recording.records import NotARecordingError
+    from tactflow.recording.repair import repair
+
+    with (
+        tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".tactflow-repair-") as folder,
+        progress_bar(path.name, path.stat().st_size, shown=shown) as update,
+    ):
+        copy = Path(folder, out.name)
+        try:
+            result = repair(path, copy, lambda done: update(completed=done))
+        except NotARecordingError as error:
+            raise SourceError(f"{path}: {error}") from None
+        if result.finished:
+            return f"{path}: is whole already, nothing to repair ({result.messages} messages)"
+        copy.chmod(path.stat().st_mode & 0o777)
+        os.replace(copy, out)
+    lost = f", {result.lost} bytes belonged to nothing intact" if result.lost else ""
+    return f"{out}: {result.messages} messages{lost}; {path} stays as it is"

@@ -1,0 +1,88 @@
+"""What the program shows people on a terminal: text, notes and warnings, tables, progress."""
+
+from __future__ import annotations
+
+import logging
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
+
+def printable(text: str) -> str:
+    """Text from files, cameras and the network without characters that would control the terminal.
+
+    >>> printable("left\\x1b[2J, no\\ttab")
+    'left?[2J, no\\ttab'
+    """
+    return _CONTROL.sub("?", text)
+
+
+def typed(*words: str) -> str:
+    """Words of a command line as a user types them, with quotes where they are needed.
+
+    >>> typed("tactflow", "run", "left.yaml")
+    'tactflow run left.yaml'
+    """
+    return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
+
+
+def say(text: str) -> None:
+    """Print what is not a result: on standard error, safe for a terminal."""
+    print(printable(text), file=sys.stderr)
+
+
+def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines of a table with aligned columns.
+
+    >>> list(table([("hull", "stage"), ("zmq", "sink")]))
+    ['hull  stage', 'zmq   sink']
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+
+
+@contextmanager
+def notes(level: str = "INFO") -> Iterator[None]:
+    """Show the notes of tactflow from this level on, on standard error, while the block lasts."""
+    logger, handler = logging.getLogger("tactflow"), _Notes()
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
+
+
+class _Notes(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        say(f"tactflow: {record.levelname}: {record.getMessage()}")
+
+
+@contextmanager
+def progress_bar(
+    description: str, total: float | None = None, *, shown: bool = True
+) -> Iterator[Callable[..., None]]:
+    """A progress bar on standard error, on a terminal only, removed when the block ends.
+
+    Gives a function that updates it: `update(completed=3, total=10, description="rendering")`.
+    """
+    if not shown or not sys.stderr.isatty():
+        yield lambda **_: None
+        return
+    # Imported here: rich takes a while, and most commands are not watched.
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}", markup=False), BarColumn())
+    times = (TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, *times, console=Console(stderr=True), transient=True) as display:
+        yield partial(display.update, display.add_task(printable(description), total=total))
