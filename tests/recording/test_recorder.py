@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from tactflow.config.load import load_pipeline
-from tactflow.engine.errors import StageError
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
@@ -308,15 +308,10 @@ def test_a_run_loses_no_frame_where_one_file_ends_and_the_next_begins(tmp_path: 
     assert result.stats["sinks"]["record"]["counters"]["files"] == len(files) == 40
 
 
-def test_a_file_that_is_taken_away_is_an_error(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    for what in ("removed", "cut"):
-        sink = opened(path, overwrite=True)
-        write(sink, range(3))
-        if what == "removed":
-            path.unlink()
-        else:
-            path.write_bytes(b"")
-        with pytest.raises(StageError, match=f"was {what} by another program .* its 3 frames are not in it"):
-            write(sink, range(3, 4))
-        sink.close()
+def test_a_contact_that_no_stage_gives_cannot_begin_a_recording(tmp_path: Path) -> None:
+    file = tmp_path / "pipeline.yaml"
+    file.write_text(
+        "stages:\n  capture: {source: 'sim:press'}\nsinks:\n  record: {path: a.mcap, trigger: contact}\n"
+    )
+    with pytest.raises(ConfigError, match=r"sinks.record.trigger: contact needs contact"):
+        load_pipeline(file)

@@ -5,43 +5,21 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-import numpy as np
 import pytest
 import zstandard
 from mcap.reader import make_reader
-from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.engine.frame import Frame
-from tactflow.message.result import Result
 from tactflow.recording.repair import repair
-from tactflow.sinks.record import Record
 from tactflow.sources import open_source
-from tactflow.sources.mcap import Recording
-
-
-def image(seq: int) -> NDArray[np.uint8]:
-    return np.random.default_rng(seq + 1000).integers(0, 256, (12, 17, 3), np.uint8)
+from tests.recording.test_recorder import opened, seqs_in, write
 
 
 def record(path: Path, count: int) -> bytes:
-    sink = Record(Record.Params(path=str(path), preview=0))
-    sink.open()
-    for seq in range(count):
-        sink.write(Result(Frame("main", seq, seq / 10, image(seq), reference=seq == 0)))
+    sink = opened(path, preview=0)
+    write(sink, range(count))
     sink.close()
     return path.read_bytes()
-
-
-def seqs_in(path: Path) -> list[int]:
-    """The frames of a recording, after comparing their pixels with what was written."""
-    source = open_source(str(path))
-    assert isinstance(source, Recording)
-    seqs = []
-    for pixels, _, stamp in iter(source.read_stamped, None):
-        np.testing.assert_array_equal(pixels, image(stamp.seq))
-        seqs.append(stamp.seq)
-    return seqs
 
 
 def test_wherever_a_file_is_cut_whole_frames_come_back(tmp_path: Path) -> None:

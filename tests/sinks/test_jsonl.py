@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame
@@ -63,14 +62,10 @@ def test_lines_wait_for_the_interval_or_the_end(tmp_path: Path) -> None:
     assert seqs_in(path) == []
     sink.close()
     assert seqs_in(path) == [0, 1, 2]
-
-
-def test_an_interval_of_zero_writes_every_line_at_once(tmp_path: Path) -> None:
-    sink = opened(tmp_path / "r.jsonl", flush=0.0)
-    for seq in range(3):
-        write(sink, range(seq, seq + 1))
-        assert seqs_in(tmp_path / "r.jsonl") == list(range(seq + 1))
-    sink.close()
+    at_once = opened(path, append=True, flush=0.0)
+    write(at_once, range(3, 4))
+    assert seqs_in(path) == [0, 1, 2, 3]
+    at_once.close()
 
 
 def test_an_existing_file_is_neither_replaced_nor_touched_unasked(tmp_path: Path) -> None:
@@ -79,66 +74,6 @@ def test_an_existing_file_is_neither_replaced_nor_touched_unasked(tmp_path: Path
     with pytest.raises(StageError, match=r"r\.jsonl: this file exists.*overwrite: true.*append: true"):
         opened(path)
     assert seqs_in(path) == [7]
-
-
-def test_an_empty_file_has_nothing_to_lose(tmp_path: Path) -> None:
-    path = tmp_path / "r.jsonl"
-    path.touch()
-    sink = opened(path)
-    write(sink, range(2))
-    sink.close()
-    assert seqs_in(path) == [0, 1]
-
-
-def test_overwrite_replaces_and_append_continues(tmp_path: Path) -> None:
-    path = tmp_path / "r.jsonl"
-    for params, expected in (
-        ({"append": True}, [0, 1]),
-        ({"append": True}, [0, 1, 0, 1]),
-        ({"overwrite": True}, [0, 1]),
-        ({"append": True}, [0, 1, 0, 1]),
-    ):
-        sink = opened(path, **params)
-        write(sink, range(2))
-        sink.close()
-        assert seqs_in(path) == expected
-
-
-@pytest.mark.parametrize(
-    ("before", "kept", "warns"),
-    [
-        ('{"seq":5}\n{"seq":6}', [5, 6], False),
-        ('{"seq":5}\n{"seq":6, "t"', [5], True),
-        ('{"seq":5, "contact": {"hu', [], True),
-        ('{"seq":5}\n' + '{"seq":6, "x": "' + "y" * 200_000, [5], True),
-        ('{"seq":5}\n' + '{"seq":6, "x": "' + "y" * 200_000 + '"}', [5, 6], False),
-    ],
-    ids=["no line end", "half a line", "only half a line", "long half line", "long line without end"],
-)
-def test_appending_to_a_file_that_ends_within_a_line_starts_a_clean_one(
-    before: str, kept: list[int], warns: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "r.jsonl"
-    path.write_text(before)
-    sink = opened(path, append=True)
-    write(sink, range(2))
-    sink.close()
-    assert seqs_in(path) == [*kept, 0, 1]
-    assert ("has been removed" in caplog.text) == warns
-
-
-@pytest.mark.parametrize("theirs", [b"a letter without a last line end", b"two\nlines", b"\0\0\xff\xd8"])
-def test_append_cuts_nothing_off_a_file_of_others(theirs: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "letter.txt"
-    path.write_bytes(theirs)
-    with pytest.raises(StageError, match="does not end with a result message; give another path"):
-        opened(path, append=True)
-    assert path.read_bytes() == theirs
-
-
-def test_overwrite_and_append_exclude_each_other() -> None:
-    with pytest.raises(ValidationError, match="exclude each other"):
-        Jsonl.Params(overwrite=True, append=True)
 
 
 @pytest.mark.parametrize("flush", [0.0, 60.0])
@@ -223,31 +158,3 @@ print("more text that nobody reads")
     assert child.stderr.read() == b""
     child.stderr.close()
     assert child.wait(PATIENCE) == 0
-
-
-@pytest.mark.parametrize("replaced", [False, True])
-@pytest.mark.parametrize("seqs", [range(5, 5), range(5, 9)], ids=["nothing more", "more"])
-def test_a_file_that_another_program_takes_away_is_an_error(
-    tmp_path: Path, seqs: range, replaced: bool
-) -> None:
-    path = tmp_path / "out.jsonl"
-    sink = opened(path, flush=0)
-    write(sink, range(5))
-    path.rename(tmp_path / "elsewhere.jsonl")
-    if replaced:
-        path.write_text("somebody else's")
-    with pytest.raises(StageError, match="replaced by another" if replaced else "removed by another"):
-        write_and_close(sink, seqs)
-    assert seqs_in(tmp_path / "elsewhere.jsonl")[:5] == [*range(5)]
-
-
-def test_a_file_that_another_program_cuts_goes_on_without_a_gap(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "out.jsonl"
-    sink = opened(path, flush=0)
-    write(sink, range(5))
-    os.truncate(path, 0)
-    write_and_close(sink, range(5, 8))
-    assert seqs_in(path) == [5, 6, 7]
-    assert "was cut by another program" in caplog.text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +43,9 @@ def play(path: Path) -> tuple[list[Pixels], float]:
     return frames, fps
 
 
-@pytest.mark.parametrize("suffix", [".avi", ".mkv", ".mp4", ".m4v", ".mov", ".AVI"])
-@pytest.mark.parametrize("count", [1, 5, 30])
+@pytest.mark.parametrize(
+    ("suffix", "count"), [(".avi", 30), (".mkv", 5), (".mp4", 30), (".m4v", 1), (".mov", 5), (".AVI", 1)]
+)
 def test_every_frame_is_in_the_film(suffix: str, count: int, tmp_path: Path) -> None:
     path = tmp_path / "new" / f"film{suffix}"
     levels = np.linspace(20, 235, count).astype(np.uint8)
@@ -126,31 +126,6 @@ def test_a_picture_of_another_size_is_an_error(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written_is_an_error() -> None:
     with pytest.raises(StageError, match="cannot be written"):
         film(Path("/proc/nowhere/film.avi"), pictures(1))
-
-
-@pytest.mark.parametrize(
-    ("name", "lossless", "limit", "words"),
-    [
-        ("film.avi", True, 100_000, "it ends before its 60 frames"),
-        # What is written last, the header, still says 60.
-        ("film.mkv", False, 50_000, "it ends before its 60 frames"),
-        ("film.mp4", False, 50_000, "it cannot be played"),
-    ],
-)
-def test_a_film_that_did_not_fit_on_the_disk_is_an_error(
-    name: str, lossless: bool, limit: int, words: str, tmp_path: Path
-) -> None:
-    sink = Video(Video.Params(path=str(tmp_path / name), lossless=lossless))
-    sink.open()
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
-    try:
-        for index, picture in enumerate(pictures(60)):
-            sink.write(Tick(Frame("main", index, index * 0.1, picture)), picture)
-        with pytest.raises(StageError, match=f"{words}, as its end could not be written; is the disk full"):
-            sink.close()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_disk_that_is_nearly_full_stops_the_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
