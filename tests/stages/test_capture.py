@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.pace import GRACE, Pace
@@ -104,14 +103,6 @@ def test_retaking_the_reference_starts_a_new_epoch_with_as_many_frames(
     assert [frame.reference for frame in frames[3:]] == [index < reference for index in range(3)]
 
 
-def test_retaking_after_a_reference_image_takes_one_frame(recording: str, tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "gel.png"), np.full((4, 6), 99, np.uint8))
-    stage = capture(recording, reference=str(tmp_path / "gel.png"))
-    stage.retake()
-    frames = list(stage.frames())
-    assert [(frame.epoch, frame.reference) for frame in frames[:3]] == [(0, True), (1, True), (1, False)]
-
-
 def warming_up(path: Path, gains: list[float]) -> list[Any]:
     """Frames of a gel while the camera sets its exposure, as a recording at 10 frames per second."""
     gel = np.linspace(60, 120, 48 * 64 * 3).reshape(48, 64, 3)
@@ -148,21 +139,6 @@ def test_a_gel_of_which_two_states_may_be_the_untouched_one_is_told(
     assert (
         "the reference is frame 0, although the gel came to rest in another state at frame 6" in caplog.text
     )
-
-
-def test_the_reference_is_told_in_one_line_also_where_the_light_was_not_steady_before(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    images = np.stack(warming_up(tmp_path / "r.npy", [0.6, 0.8] + [1.0] * 28))
-    images[:8, 16:32, 8:24] //= 2
-    images[8:, 16:32, 40:56] //= 4
-    np.save(tmp_path / "r.npy", images)
-    with caplog.at_level("INFO", "tactflow"):
-        list(capture("r.npy", tmp_path).frames())
-    assert caplog.messages == [
-        "r.npy: the reference is frame 2, although the gel came to rest in another state at frame 8; if it "
-        "was touched until then, name a picture of the untouched gel: stages.capture.reference"
-    ]
 
 
 def test_the_reference_of_a_folder_of_separate_pictures_is_named(
@@ -287,29 +263,6 @@ def test_a_frame_is_read_just_before_it_is_due(reading: float) -> None:
     np.testing.assert_allclose(early, min(1.25 * reading + 0.001, 1 / 60 - rest), atol=1e-9)
 
 
-def test_a_read_that_suddenly_takes_longer_makes_few_frames_late() -> None:
-    times = [index / 60 for index in range(200)]
-    _, shown = _played(times, [0.002] * 100 + [0.010] * 100)
-    late = np.array(shown) - shown[0] - times
-    # The first was begun 1.25 x 2 + 1 ms before it was due; the next one after a rest.
-    first = 0.010 - 0.0035
-    second = first + GRACE / 60 + 0.010 - 1 / 60
-    np.testing.assert_allclose(late[99:103], [0, first, second, 0], atol=1e-9)
-    assert np.count_nonzero(late > 1e-9) == 2
-
-
-def test_reading_that_cannot_keep_up_is_not_slowed_down() -> None:
-    times = [index / 60 for index in range(100)]
-    begun, shown = _played(times, [0.020] * 100)
-    np.testing.assert_allclose(begun[2:], shown[1:-1], atol=1e-9)
-
-
-def test_behind_a_gap_of_dropped_frames_the_next_one_is_in_time() -> None:
-    times = [*(index / 60 for index in range(30)), *(2 + index / 60 for index in range(30))]
-    _, shown = _played(times, [0.003] * 60)
-    np.testing.assert_allclose(np.array(shown) - shown[0], times, atol=1e-9)
-
-
 def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(recording: str) -> None:
     # At this rate the second frame is due after 1000 s; the test's own time limit is far shorter.
     stage = capture(recording, realtime=True, fps=0.001)
@@ -330,50 +283,5 @@ def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(recording: str) 
     assert len(frames) == 1
 
 
-def test_stopping_ends_a_capture_before_the_next_frame(recording: str) -> None:
-    stage = capture(recording)
-    frames = stage.frames()
-    assert len(list(islice(frames, 2))) == 2
-    stage.stop()
-    assert list(frames) == []
-
-
-def test_simulated_frames_are_described_and_counted() -> None:
-    stage = capture("sim:idle?frames=2")
-    assert stage.total == 2
-    assert stage.description == "sim:idle?frames=2, 2 frames at 60 fps"
-    assert len(list(stage.frames())) == 2
-
-
-@pytest.mark.parametrize(
-    "params",
-    [
-        {"reference": 0},
-        {"reference": -3},
-        {"reference": True},
-        {"reference": ""},
-        {"reference": 1.5},
-        {"reference": None},
-        {"source": None},
-        {"source": True},
-        {"skip": -1},
-        {"width": 0},
-        {"fps": 0.0},
-        {"fps": float("inf")},
-        {"format": "MJPEG"},
-        {"sauce": "sim:press"},
-    ],
-    ids=str,
-)
-def test_wrong_parameters_are_refused(params: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        Capture.Params(**params)
-
-
 def test_a_camera_index_may_be_a_number() -> None:
     assert Capture.Params.model_validate({"source": 0}).source == "0"
-
-
-def test_every_parameter_is_described() -> None:
-    for name, field in Capture.Params.model_fields.items():
-        assert field.description, name

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from tactflow.engine.frame import Frame
 from tactflow.sim import open_scene
@@ -69,32 +68,3 @@ def test_reset_forgets_the_reference() -> None:
     stage.process(untouched, _frame(untouched, 0, reference=True))
     stage.reset()
     assert not stage.process(touched, _frame(touched, 1, reference=True)).touching
-
-
-def test_the_same_frames_give_the_same_masks() -> None:
-    scene = open_scene("unmarked?frames=60")
-    runs = []
-    for _ in range(2):
-        stage = _stage()
-        frames = [scene.frame(index) for index in range(0, 60, 6)]
-        runs.append([stage.process(image, _frame(image, seq)) for seq, image in enumerate(frames)])
-    for (first, touching), (second, again) in zip(*runs, strict=True):
-        assert np.array_equal(first, second)
-        assert touching == again
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"false_alarms": 0},
-        {"repeatability": 2},
-        {"relaxation": 1},
-        {"tint": 2},
-        {"creep": -1},
-        {"method": "magic"},
-        {"edge": 1},
-    ],
-)
-def test_values_out_of_range_and_unknown_ones_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        _stage(**wrong)

@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
-from tactflow.engine.ports import read_ports
 from tactflow.stages.flow_in_mask import FlowInMask
 from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Flow, Markers
@@ -21,18 +19,6 @@ MASK[15:45, 15:40] = 255
 
 def run(**params: Any) -> Flow:
     return FlowInMask(FlowInMask.Params(**params)).process(MARKERS, MASK)
-
-
-def test_it_takes_markers_and_a_contact_mask_and_gives_a_flow() -> None:
-    ports = read_ports(FlowInMask, "process")
-    assert [port.name for port in ports.inputs] == [
-        "markers",
-        "contact_mask",
-        "field",
-        "evidence",
-        "region",
-    ]
-    assert [(port.name, port.optional) for port in ports.outputs] == [("flow", False)]
 
 
 def test_the_mean_is_over_the_markers_inside_the_dilated_contact() -> None:
@@ -74,9 +60,3 @@ def test_where_only_dots_show_a_contact_its_mean_is_as_uncertain_as_the_gel_ther
     assert dots.stderr == pytest.approx((2 / 3**0.5,) * 2, rel=0.03)
     assert light.stderr is not None
     assert max(light.stderr) < 0.1
-
-
-@pytest.mark.parametrize("params", [{"dilate": -1}, {"method": "median"}, {"dilation": 3}], ids=str)
-def test_wrong_parameters_are_refused(params: Any) -> None:
-    with pytest.raises(ValidationError):
-        FlowInMask.Params(**params)

@@ -42,8 +42,3 @@ def test_a_new_reference_forgets_what_was_held_and_what_was_due() -> None:
     assert frames(hold, [True, False]) == [0, 1]
     hold.reset()
     assert frames(hold, [False, False, False, False]) == [1, 3]
-
-
-def test_what_is_held_is_a_plain_bool() -> None:
-    assert Hold(Hold.Params()).process(True) is True
-    assert Hold(Hold.Params(hold=1)).process(False) is False

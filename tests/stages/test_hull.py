@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from tactflow.engine.frame import Absent
-from tactflow.engine.ports import read_ports
 from tactflow.stages.hull import Hull
 from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Contact
@@ -27,16 +25,6 @@ def bar(height: int = 10) -> NDArray[np.uint8]:
     return mask
 
 
-def test_it_takes_a_contact_mask_and_may_give_a_contact() -> None:
-    ports = read_ports(Hull, "process")
-    assert [(port.name, port.optional) for port in ports.inputs] == [
-        ("contact_mask", False),
-        ("evidence", True),
-        ("region", True),
-    ]
-    assert [(port.name, port.optional) for port in ports.outputs] == [("contact", True)]
-
-
 def test_properties_serve_for_the_mask_that_they_are_of_and_for_no_other() -> None:
     mask, other = bar(), bar(30)
     hull = Hull(Hull.Params())
@@ -47,10 +35,6 @@ def test_properties_serve_for_the_mask_that_they_are_of_and_for_no_other() -> No
         assert isinstance(contact, Contact)
         assert contact.region_area == 500
         assert contact.hull.tolist() == alone.hull.tolist()
-
-
-def test_an_empty_mask_is_no_contact() -> None:
-    assert run(np.zeros((60, 90), np.uint8)) == Absent("no_contact")
 
 
 def test_a_bar_is_described() -> None:
@@ -99,12 +83,6 @@ def test_separate_contacts_are_told_whatever_the_contact_is(params: Any, right: 
     assert [part.separate for part in contact.separate] == [(), ()]
 
 
-def test_a_contact_that_is_the_only_one_has_no_parts() -> None:
-    for contact in (run(bar()), run(two(), max_gap=30), run(two(), min_area=100)):
-        assert isinstance(contact, Contact)
-        assert contact.separate == ()
-
-
 def test_a_stubby_contact_has_no_direction_unless_asked_for() -> None:
     stubby = run(bar(height=39))
     assert isinstance(stubby, Contact)
@@ -112,20 +90,3 @@ def test_a_stubby_contact_has_no_direction_unless_asked_for() -> None:
     asked = run(bar(height=39), min_confidence=0)
     assert isinstance(asked, Contact)
     assert asked.angle == 0.0
-
-
-@pytest.mark.parametrize(
-    "params",
-    [
-        {"min_area": -1},
-        {"max_gap": -1},
-        {"method": "x"},
-        {"min_aera": 3},
-        {"merge": "near"},
-        {"merge": "largest", "max_gap": 3},
-    ],
-    ids=str,
-)
-def test_wrong_parameters_are_refused(params: Any) -> None:
-    with pytest.raises(ValidationError):
-        Hull.Params(**params)

@@ -6,7 +6,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from tactflow.stages.inpaint import Inpaint
 from tactflow.vision.markers.inpaint import InpaintMethod, remove_markers
@@ -20,17 +19,3 @@ MASK[10:16, 12:18] = 255
 def test_stage_gives_what_the_function_gives(method: InpaintMethod) -> None:
     stage = Inpaint(Inpaint.Params(method=method, radius=3))
     assert np.array_equal(stage.process(IMAGE, MASK), remove_markers(IMAGE, MASK, method=method, radius=3))
-
-
-def test_default_is_the_fast_method_with_a_radius_of_7_px() -> None:
-    stage = Inpaint(Inpaint.Params())
-    assert np.array_equal(
-        stage.process(IMAGE, MASK), remove_markers(IMAGE, MASK, method="normalized", radius=7)
-    )
-
-
-def test_unknown_methods_and_radii_are_refused() -> None:
-    with pytest.raises(ValidationError, match="method"):
-        Inpaint.Params.model_validate({"method": "magic"})
-    with pytest.raises(ValidationError, match="radius"):
-        Inpaint.Params(radius=0)

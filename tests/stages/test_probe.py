@@ -33,40 +33,6 @@ def test_a_change_keeps_the_stages_at_work_for_a_while() -> None:
     assert [probe.process(brighter).changed for _ in range(6)] == [True] * 4 + [False] * 2
 
 
-def test_frames_that_are_held_are_compared_with_the_one_that_changed() -> None:
-    """Light that grows by 0.06 levels a frame is seen over eight frames, not over one."""
-    random = np.random.default_rng(1)
-
-    def frame(i: int, level: float) -> Frame:
-        noise = random.normal(0, 2, (240, 320, 3))
-        return Frame("s", i, i / 60, np.clip(np.rint(120 + level + noise), 0, 255).astype(np.uint8))
-
-    def share(hold: int) -> float:
-        probe = Probe(Probe.Params(hold=hold))
-        for i in range(60):
-            probe.process(frame(i, 0))
-        return float(np.mean([probe.process(frame(60 + i, 0.06 * i)).changed for i in range(100)][10:]))
-
-    # The window of all tiles: 40 x 320 px in each of three channels, so 2 sqrt(2 / 12800) = 0.025 levels are
-    # one standard deviation of a difference, and the bound of 4.9 is 0.12: two frames' growth.
-    assert share(hold=8) == 1.0
-    assert share(hold=0) < 0.7
-
-
-def test_only_the_last_held_frames_are_looked_at() -> None:
-    """The others are worked on anyway: of a contact that moves, the first of three held frames is."""
-    probe = Probe(Probe.Params(hold=5))
-    changes(probe, 20)
-    assert probe._probe is not None
-    looked = []
-    for i in range(31):
-        before = probe._probe._looks
-        image = np.roll(IMAGE, i + 1, axis=1)
-        assert probe.process(Frame("s", 20 + i, (20 + i) / 60, image)).changed
-        looked.append(probe._probe._looks > before)
-    assert looked == [True] + 10 * [False, False, True]
-
-
 def test_a_slow_motion_is_held_for_longer_each_time() -> None:
     """Light that grows too slowly for four held frames is seen over eight."""
     random = np.random.default_rng(1)
@@ -82,12 +48,6 @@ def test_a_slow_motion_is_held_for_longer_each_time() -> None:
     assert np.mean(found[10:60]) < 0.3, "still"
     assert np.mean(found[110:160]) > 0.8, "moving"
     assert np.mean(found[210:260]) < 0.3, "still again"
-
-
-def test_where_nothing_is_skipped_nothing_is_looked_at() -> None:
-    probe = Probe(Probe.Params(), skipping=False)
-    assert all(changes(probe, 40))
-    assert probe._probe is None
 
 
 @pytest.mark.parametrize("skipping", [True, False])

@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from tactflow.engine.frame import Absent, Frame
-from tactflow.engine.ports import read_ports
 from tactflow.stages.smooth import Smooth
 from tactflow.vision.types import Contact
 
@@ -27,13 +25,6 @@ def contact(x: float) -> Contact:
 def centre(result: Contact | Absent) -> float:
     assert isinstance(result, Contact)
     return result.center[0]
-
-
-def test_it_replaces_the_contact_and_remembers() -> None:
-    ports = read_ports(Smooth, "process")
-    assert [(port.name, port.optional) for port in ports.inputs] == [("contact", True), ("frame", False)]
-    assert [(port.name, port.optional) for port in ports.outputs] == [("contact", True)]
-    assert Smooth.memory == "stateful"
 
 
 @pytest.mark.parametrize("method", ["one_euro", "alpha_beta"])
@@ -55,19 +46,3 @@ def test_reset_forgets() -> None:
     stage.process(contact(0), frame(0.0))
     stage.reset()
     assert centre(stage.process(contact(10), frame(0.02))) == 10
-
-
-@pytest.mark.parametrize(
-    "params",
-    [
-        {"method": "kalman"},
-        {"min_cutoff": 0},
-        {"alpha": 0},
-        {"method": "alpha_beta", "alpha": 1, "beta": 3},
-        {"cutoff": 1},
-    ],
-    ids=str,
-)
-def test_wrong_parameters_are_refused(params: Any) -> None:
-    with pytest.raises(ValidationError):
-        Smooth.Params(**params)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from tactflow.engine.frame import Frame
 from tactflow.stages.tracker import Tracker
@@ -75,11 +74,3 @@ def test_reset_takes_a_new_reference() -> None:
 def test_no_markers_is_an_error_that_names_the_markerless_pipeline() -> None:
     with pytest.raises(ValueError, match=r"0 markers found: .* pipelines/markerless\.yaml"):
         feed(Tracker(Tracker.Params()), np.full((200, 200, 3), 90, np.uint8), 0)
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"dot": 0.2}, {"polarity": "red"}, {"max_displacement": 0}, {"polrity": "dark"}]
-)
-def test_wrong_parameters_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValidationError):
-        Tracker.Params(**wrong)  # type: ignore[arg-type]
