@@ -1,17 +1,23 @@
-"""What `import tactflow` offers: results in this process, single stages, mistakes as a list."""
+"""What `import tactflow` offers: results in this process, single stages, functions for a notebook."""
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable, Iterable
+from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import tactflow
+from tactflow.ports import Image
+from tests.conftest import REPOSITORY
 
 PIPELINE = """
 stages:
@@ -195,23 +201,210 @@ def test_check_lists_every_mistake() -> None:
     assert len(mistakes) == 2
 
 
+OWN = """
+from typing import NamedTuple
+from tactflow import Stage, StageParams
+from tactflow.ports import Image
+
+class Outputs(NamedTuple):
+    brightness: float
+
+class Own(Stage):
+    memory = "pure"
+    class Params(StageParams):
+        gain: float = 1.0
+    def __init__(self, params, sensor):
+        self.sensor = sensor
+    def process(self, image: Image) -> Outputs:
+        return Outputs(self.params.gain * float(image.mean()))
+"""
+
+
+def test_the_output_of_ones_own_stage_is_in_the_result(folder: Path) -> None:
+    (folder / "own.py").write_text(OWN)
+    own = {"stages.own": {"use": "./own.py"}}
+    results = list(tactflow.stream(settings=own, images=True, max_frames=3))
+    assert all(r.image is not None and r["brightness"] == r.image.mean() for r in results)
+    with pytest.raises(KeyError, match=r"no stage gives the port brightnes; there are .*brightness"):
+        results[0]["brightnes"]
+    assert list(tactflow.to_frame(results)["brightness"]) == [r["brightness"] for r in results]
+
+
+def test_outputs_of_one_name_are_told_apart_by_their_stages(folder: Path) -> None:
+    (folder / "own.py").write_text(OWN)
+    both = {"stages.own": {"use": "./own.py"}, "stages.twice": {"use": "./own.py", "gain": 2}}
+    result = next(tactflow.stream(settings=both))
+    assert result["brightness"] == result["twice.brightness"] == 2 * result["own.brightness"]
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("form", [np.asarray, list, iter, lambda frames: frames[..., 1]])
+def test_frames_in_memory_are_a_source(form: Callable[[np.ndarray], Iterable[np.ndarray]]) -> None:
+    scene = tactflow.open_scene("press")
+    frames = np.stack([scene.frame(index) for index in range(40)])
+    results = list(tactflow.stream(source=form(frames), settings={"stages.capture.fps": 10}))
+    assert [result.t for result in results] == [index / 10 for index in range(40)]
+    assert results[0].contact is None
+    assert results[-1].contact is not None
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        (np.zeros((48, 64, 3), np.uint8), r"required N x H x W x 3 .* give array\[None\]"),
+        (["a.png", "b.png"], "picture 0: required an array"),
+    ],
+)
+def test_what_is_no_sequence_of_pictures_is_refused(source: Any, words: str) -> None:
+    with pytest.raises(tactflow.TactflowError, match=f"(?i){words}"):
+        next(tactflow.stream(source=source))
+
+
 def test_a_stage_can_be_called_without_the_engine() -> None:
-    hull = tactflow.stage("hull")
+    hull = tactflow.stage("hull", min_area=3)
+    assert hull.params.min_area == 3
     assert hull.process(np.zeros((40, 40), np.uint8)) == tactflow.Absent("no_contact")
-    with pytest.raises(tactflow.ConfigError, match=r"hull\.min_aera.* did you mean min_area"):
+    with pytest.raises(tactflow.ConfigError, match=r"hull\.min_aera.* did you mean min_area") as caught:
         tactflow.stage("hull", min_aera=3)
+    assert "--set" not in str(caught.value)
     with pytest.raises(tactflow.ConfigError, match="did you mean hull"):
         tactflow.stage("hul")
 
 
-def test_a_stage_that_asks_for_more_than_its_parameters_gets_it(folder: Path) -> None:
-    (folder / "named.py").write_text(
-        "from tactflow import Stage\nfrom tactflow.ports import Image\n"
-        "class Named(Stage):\n    memory = 'pure'\n"
-        "    def __init__(self, params, sensor):\n        self.sensor = sensor\n"
-        "    def process(self, image: Image) -> Image:\n        return image\n"
-    )
-    assert tactflow.stage("./named.py").sensor == "main"
+def test_a_stage_that_compares_with_a_reference_takes_pictures() -> None:
+    scene = tactflow.open_scene("press")
+    difference = tactflow.stage("difference")
+    touching = [difference.process(scene.frame(index)).touching for index in (0, 1, 48)]
+    assert touching == [False, False, True]
+    nowhere = np.zeros((600, 800), np.uint8)
+    assert difference.process(scene.frame(49), marker_mask=nowhere).touching
+    small = tactflow.stage("preprocess", rotate=90, downsample=2).process(scene.frame(0)).image
+    assert small.shape == (400, 300, 3)
+
+
+def test_every_stage_keeps_its_parameters(folder: Path) -> None:
+    (folder / "own.py").write_text(OWN)
+    own = tactflow.stage("./own.py")
+    assert (own.sensor, own.params.gain) == ("main", 1.0)
+    uses = [entry.name for entry in entry_points(group="tactflow.stages")]
+    for use in {*uses, "tracker", "difference", "hull"} - {"capture"}:
+        assert isinstance(tactflow.stage(use).params, tactflow.StageParams), use
+
+
+def test_a_stage_class_can_be_called_too() -> None:
+    class Invert(tactflow.Stage):
+        memory = "pure"
+
+        class Params(tactflow.StageParams):
+            strength: float = 1.0
+
+        def process(self, image: Image) -> Image:
+            return np.rint(image + self.params.strength * (255.0 - 2 * image)).astype(np.uint8)
+
+    assert tactflow.stage(Invert).process(np.zeros((2, 2, 3), np.uint8)).min() == 255
+    with pytest.raises(tactflow.ConfigError, match=r'stage\("Invert"\).*strengh.* did you mean strength'):
+        tactflow.stage(Invert, strengh=0.5)
+
+
+# -- for a notebook ---------------------------------------------------------------------------------------
+
+
+def test_functions_for_a_notebook_take_pictures() -> None:
+    scene = tactflow.open_scene("press")
+    reference, image = scene.frame(0), scene.frame(48)
+    assert len(tactflow.detect_markers(reference).centers) == 80
+    markers = tactflow.MarkerTracker(reference).track(image)
+    assert np.hypot(*markers.displacement.T).max() > 5
+    contact = tactflow.contact(image, reference)
+    assert contact is not None
+    assert contact.area > 1000
+    assert tactflow.contact(scene.frame(1), reference) is None
+    with pytest.raises(ValueError, match="pictures of one shape"):
+        tactflow.contact(image[:100], reference)
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_result_can_be_drawn() -> None:
+    result = next(r for r in tactflow.stream(images=True) if r.contact is not None)
+    picture = tactflow.draw(result, arrow_scale=1)
+    assert result.image is not None
+    assert picture.shape == result.image.shape
+    assert (picture != result.image).any()
+    with pytest.raises(ValueError, match="images=True"):
+        tactflow.draw(next(tactflow.stream()))
+
+
+@pytest.mark.usefixtures("folder")
+def test_results_are_a_table() -> None:
+    results = list(tactflow.stream())
+    table = tactflow.to_frame(results)
+    assert list(table["seq"]) == list(range(60))
+    areas = [result.contact.area for result in results if result.contact is not None]
+    assert list(table["contact_area"].dropna()) == areas
+    assert {"flow_mean_x", "flow_stderr_x", "size_width"} <= set(table.columns)
+
+
+def test_without_pandas_the_table_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"pip install 'tactflow\[pandas\]'"):
+        tactflow.to_frame([])
+
+
+SCRIPT = """
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+import tactflow
+from tactflow.ports import Image
+
+
+class Outputs(NamedTuple):
+    brightness: float
+
+
+class Brightness(tactflow.Stage):
+    memory = "pure"
+
+    class Params(tactflow.StageParams):
+        gain: float = Field(1.0, gt=0)
+
+    def process(self, image: Image) -> Outputs:
+        return Outputs(float(image.mean()) * float(self.params.gain))
+
+
+class Print(tactflow.Sink):
+    def write(self, result: tactflow.Result) -> None:
+        print(result.seq, result.contact and result.contact.area)
+
+
+def largest(frames: list[Image]) -> float:
+    results = tactflow.stream(source=frames, images=True, settings={"stages.hull.min_area": 5})
+    areas = [result.contact.area for result in results if result.contact is not None]
+    return max(areas, default=0.0)
+
+
+stage = tactflow.stage(Brightness, gain=2.0)
+value: float = stage.process(np.zeros((2, 2, 3), np.uint8)).brightness
+contact: tactflow.Contact | None = tactflow.contact(np.zeros((2, 2), np.uint8), np.zeros((2, 2), np.uint8))
+with tactflow.Subscriber(timeout=1) as results:
+    for result in results:
+        print(result.flow and result.flow.mean, tactflow.draw(result).shape, result.to_json())
+tactflow.to_frame(tactflow.stream()).describe()
+"""
+
+
+def test_mypy_is_content_with_a_users_program(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(SCRIPT)
+    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "script.py"]
+    env = os.environ | {"MYPYPATH": str(REPOSITORY / "src")}
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+# -- settings ---------------------------------------------------------------------------------------------
 
 
 def test_settings_may_be_paths_and_any_text(folder: Path) -> None:

@@ -38,8 +38,15 @@ if TYPE_CHECKING:
     from tactflow.message.result import Result as Result
     from tactflow.network.remote_control import RemoteControl as RemoteControl
     from tactflow.network.subscriber import Subscriber as Subscriber
+    from tactflow.notebook import contact as contact
+    from tactflow.notebook import draw as draw
+    from tactflow.notebook import to_frame as to_frame
     from tactflow.sim.scenes import open_scene as open_scene
     from tactflow.streaming import stream as stream
+    from tactflow.vision.contact import ContactDetector as ContactDetector
+    from tactflow.vision.geometry import Preprocessor as Preprocessor
+    from tactflow.vision.markers.detection import detect_markers as detect_markers
+    from tactflow.vision.markers.tracking import MarkerTracker as MarkerTracker
     from tactflow.vision.types import Contact as Contact
     from tactflow.vision.types import Flow as Flow
     from tactflow.vision.types import Markers as Markers
@@ -50,9 +57,14 @@ __version__ = "0.1.0"
 _HOMES = {
     "tactflow.api": ("load", "check", "run", "stage"),
     "tactflow.streaming": ("stream",),
+    "tactflow.notebook": ("contact", "draw", "to_frame"),
     "tactflow.network.subscriber": ("Subscriber",),
     "tactflow.network.remote_control": ("RemoteControl",),
     "tactflow.sim.scenes": ("open_scene",),
+    "tactflow.vision.contact": ("ContactDetector",),
+    "tactflow.vision.geometry": ("Preprocessor",),
+    "tactflow.vision.markers.detection": ("detect_markers",),
+    "tactflow.vision.markers.tracking": ("MarkerTracker",),
     "tactflow.vision.types": ("Contact", "Flow", "Markers", "MarkerStatus"),
     "tactflow.engine.contract": ("Stage", "Sink", "Source", "StageParams"),
     "tactflow.engine.frame": ("Frame", "Tick", "Absent"),
@@ -67,10 +79,13 @@ __all__ = [
     "Absent",
     "ConfigError",
     "Contact",
+    "ContactDetector",
     "Flow",
     "Frame",
     "MarkerStatus",
+    "MarkerTracker",
     "Markers",
+    "Preprocessor",
     "RemoteControl",
     "Result",
     "Sink",
@@ -81,11 +96,15 @@ __all__ = [
     "TactflowError",
     "Tick",
     "check",
+    "contact",
+    "detect_markers",
+    "draw",
     "load",
     "open_scene",
     "run",
     "stage",
     "stream",
+    "to_frame",
 ]
 
 

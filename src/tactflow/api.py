@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
+import inspect
 import signal
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
 from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
 from tactflow.config.validation import validated
-from tactflow.engine.conformance import build
+from tactflow.engine.by_hand import with_frames_made
+from tactflow.engine.conformance import build, component
+from tactflow.engine.contract import Stage
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner, RunResult
+from tactflow.recording import CALIBRATION, missing_packages
+from tactflow.sources.memory import MemoryFrames
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED, Interrupted, ending_handled, on_ending
 from tactflow.vision import compiled
+
+S = TypeVar("S", bound=Stage)
+
+Frames = Iterable[NDArray[np.uint8]]
+"""Pictures in memory: an (N, H, W, 3) BGR or (N, H, W) grey array, a list, or any iterator of pictures."""
 
 Settings = Mapping[str, Any]
 """Values of the pipeline file to replace, as in `{"stages.preprocess.rotate": 0, "sinks.zmq": None}`."""
@@ -32,7 +44,7 @@ Settings = Mapping[str, Any]
 def load(
     pipeline: str | Path | None = None,
     *,
-    source: str | None = None,
+    source: str | Path | Frames | None = None,
     settings: Settings | None = None,
     sensor: str | None = None,
     realtime: bool = False,
@@ -43,7 +55,9 @@ def load(
     ----------
     pipeline : a file, or the name of a shipped pipeline such as "markerless"; None: `./pipeline.yaml`, else
         the shipped default.
-    source : replaces the source of the capture stage, as `--source` does: "video.avi", "sim:press", "0" ...
+    source : replaces the source of the capture stage, as `--source` does: "video.avi", "sim:press", "0" ...;
+        or the frames themselves, (H, W, 3) uint8 BGR or (H, W) grey: an array, a list, any iterator. Their
+        rate is 30 Hz unless settings has another `stages.capture.fps`.
     settings : values to replace, as `--set` does; None for a whole stage or sink removes it.
     sensor : which sensor of a file with `sensors:`; None is the first.
     realtime : play a recording at its own pace, dropping frames like a camera.
@@ -60,12 +74,41 @@ def load(
     ['capture', 'probe', 'preprocess']
     """
     values = []
+    frames = None if source is None or isinstance(source, str | Path) else source
     if source is not None:
-        values.append(Override("source", str(source), f"source {public_address(str(source))}"))
+        text = _MEMORY if frames is not None else str(source)
+        values.append(Override("source", text, f"source {public_address(text)}"))
     if realtime:
         values.append(Override("realtime", value=True, origin="realtime"))
     file = find_pipeline(None if pipeline is None else str(pipeline))
-    return load_pipeline(file, from_settings(settings or {}), source_values=values, sensor=sensor)
+    loaded = load_pipeline(file, from_settings(settings or {}), source_values=values, sensor=sensor)
+    return loaded if frames is None else _with_frames(loaded, frames)
+
+
+_MEMORY = "frames in memory"
+"""What stands in place of the source where the frames came from Python."""
+
+
+def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:
+    """The pipeline with a source that reads these frames."""
+    node = pipeline.source
+    cls: type = node.component.cls
+    takes = inspect.signature(cls)
+    if "opener" not in takes.parameters:
+        raise ConfigError(f"{node.id}: {cls.__name__} cannot take frames from memory; use the stage capture")
+
+    class FromMemory(cls):  # type: ignore[misc]
+        __signature__ = takes
+
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, opener=self._open_frames, **options)
+
+        @staticmethod
+        def _open_frames(_: str, *, fps: float | None = None, **__: Any) -> MemoryFrames:
+            return MemoryFrames(frames, fps)
+
+    component = replace(node.component, cls=FromMemory)
+    return replace(pipeline, nodes={**pipeline.nodes, node.id: replace(node, component=component)})
 
 
 def check(pipeline: str | Path | None = None, *, settings: Settings | None = None) -> list[str]:
@@ -91,7 +134,7 @@ def check(pipeline: str | Path | None = None, *, settings: Settings | None = Non
 def run(
     pipeline: str | Path | Pipeline | None = None,
     *,
-    source: str | None = None,
+    source: str | Path | Frames | None = None,
     settings: Settings | None = None,
     sensor: str | None = None,
     realtime: bool = False,
@@ -167,43 +210,42 @@ def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
 
 def _calibrated(pipeline: Pipeline) -> Pipeline:
     """With the calibration that its recording was made with, unless the pipeline names one, or null."""
-    spec = pipeline.source.params.model_dump().get("source")
-    name = str(spec).partition("?")[0]
+    source = getattr(pipeline.source.params, "source", None)
+    name = source.partition("?")[0] if isinstance(source, str) else ""
     if pipeline.calibration or "calibration" in pipeline.settings or not name.endswith(".mcap"):
         return pipeline
-    from tactflow.calibration.file import is_kept
-    from tactflow.recording import missing_packages
-    from tactflow.sources.base import find_path
-
-    # What is wrong with the file the source will say.
-    with suppress(SourceError, OSError):
-        path = find_path(name, pipeline.directory)
-        if missing_packages() is None and is_kept(_attachments(path)):
-            return replace(pipeline, calibration=path)
-    return pipeline
-
-
-def _attachments(path: Path) -> Collection[str]:
+    if missing_packages() is not None:
+        return pipeline
     from tactflow.recording.reader import attachments
     from tactflow.recording.records import NotARecordingError
+    from tactflow.sources.base import find_path
 
     try:
-        return attachments(path)
-    except NotARecordingError:
-        return ()
+        path = find_path(name, pipeline.directory)
+        attached = attachments(path).keys()
+    except (SourceError, OSError, NotARecordingError):
+        # The source will say what is wrong with the file.
+        return pipeline
+    return replace(pipeline, calibration=path) if attached >= CALIBRATION else pipeline
 
 
-def stage(use: str, /, **params: Any) -> Any:
+@overload
+def stage(use: type[S], /, **params: Any) -> S: ...
+@overload
+def stage(use: str, /, **params: Any) -> Any: ...
+def stage(use: str | type[Stage], /, **params: Any) -> Any:
     """One stage by itself, to be called without the engine: `stage("hull").process(mask)`.
 
     Parameters
     ----------
-    use : what `use:` says in a pipeline file: "hull", "package.module:Class", "./file.py:Class".
-    params : its parameters, as in a pipeline file.
+    use : a stage class, or what `use:` says in a pipeline file: "hull", "package.module:Class",
+        "./file.py:Class".
+    params : its parameters.
 
     Returns
     -------
-    The stage, opened. Its `process` takes and returns what `tactflow stages NAME` says.
+    The stage, opened. Its `process` takes and returns what `tactflow stages NAME` says; where that includes
+    `frame`, it may be left out, and is then made of the picture. The first picture is the reference.
 
     Raises
     ------
@@ -211,17 +253,19 @@ def stage(use: str, /, **params: Any) -> Any:
 
     Examples
     --------
-    >>> import numpy as np
     >>> import tactflow
-    >>> mask = np.zeros((60, 80), np.uint8)
-    >>> mask[20:40, 10:50] = 255
-    >>> contact = tactflow.stage("hull").process(mask)
-    >>> contact.center, contact.angle
-    ((29.5, 29.5), 0.0)
+    >>> scene = tactflow.open_scene("press")
+    >>> difference = tactflow.stage("difference", method="colour")
+    >>> difference.process(scene.frame(0)).touching, difference.process(scene.frame(60)).touching
+    (False, True)
     """
-    component = resolve(use, "stages", Path())
-    checked = validated(component.params, params, use, origin=f'stage("{use}")')
+    if isinstance(use, str):
+        name, found = use, resolve(use, "stages", Path())
+    else:
+        name, found = use.__name__, component(use, use.__name__, use.__module__, ())
+    checked = validated(found.params, params, name, origin=f'stage("{name}")')
     offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None, "calibration": None}
-    instance = build(component.cls, checked, offered)
+    instance: Any = build(found.cls, checked, offered)
     instance.open()
+    instance.process = with_frames_made(instance.process, found.ports.inputs)
     return instance

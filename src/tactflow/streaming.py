@@ -6,7 +6,7 @@ import threading
 from collections.abc import Generator
 from pathlib import Path
 
-from tactflow.api import Settings, load, make_runner
+from tactflow.api import Frames, Settings, load, make_runner
 from tactflow.engine.collect import with_collector
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.link import Link
@@ -17,7 +17,7 @@ from tactflow.message.result import Result
 def stream(
     pipeline: str | Path | Pipeline | None = None,
     *,
-    source: str | None = None,
+    source: str | Path | Frames | None = None,
     settings: Settings | None = None,
     sensor: str | None = None,
     realtime: bool = False,

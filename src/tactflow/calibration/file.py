@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Container
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -344,21 +343,13 @@ def stored_arrays(path: Path) -> bytes:
 
 
 def _recorded(path: Path, name: str) -> bytes:
+    from tactflow.recording import CALIBRATION
     from tactflow.recording.reader import attachments
 
     found = attachments(path)
-    if not is_kept(found):
+    if not found.keys() >= CALIBRATION:
         raise ValueError("the recording was made without a calibration")
     return found[name]
-
-
-def is_kept(attached: Container[str]) -> bool:
-    """Whether a recording with these files attached was made with a calibration.
-
-    >>> is_kept(["pipeline.yaml"])
-    False
-    """
-    return "calibration.yaml" in attached and "calibration.npz" in attached
 
 
 def _arrays(data: bytes) -> dict[str, NDArray[Any]]:

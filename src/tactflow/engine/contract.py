@@ -176,13 +176,14 @@ class Publication:
 class Sink(Part):
     """Takes results out of the run.
 
-    Its inputs are read from the annotations of `write`, which every sink defines and which returns nothing;
-    as for a stage, and a parameter `tick: Tick` is given the frame and the reasons of what is missing.
+    Its inputs are read from the annotations of `write`, which every sink defines and which returns nothing:
+    single ports as for a stage, or a result, which has the frame, the ports that its class names, and the
+    reasons of what is missing; `tick: Tick` is the frame and the ports named beside it.
 
-    >>> from tactflow import Results, Tick
+    >>> from tactflow import Result
     >>> class Print(Sink):
-    ...     def write(self, tick: Tick, results: Results) -> None:
-    ...         print(tick.frame.seq, results.contact)
+    ...     def write(self, result: Result) -> None:
+    ...         print(result.seq, result.contact)
     >>> Print(Print.Params()).observer
     False
     """

@@ -42,6 +42,11 @@ class Frame:
     epoch: int = 0
 
 
+NO_PICTURE = np.zeros((0, 0, 3), np.uint8)
+"""The image of a frame whose pixels were not kept or never sent."""
+NO_PICTURE.flags.writeable = False
+
+
 @dataclass(frozen=True, slots=True)
 class Absent:
     """Stands in the place of a value that this tick does not have; false in a condition.

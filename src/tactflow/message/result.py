@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self, get_type_hints
 import numpy as np
 import orjson
 
-from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.frame import NO_PICTURE, Frame, Tick
 from tactflow.message import encoding
 from tactflow.message.decoding import decode_values
 from tactflow.ports import ContactMask, Image
@@ -26,10 +26,6 @@ SCHEMA = "tactflow.frame/1"
 
 _EXPLAINED = frozenset({"contact", "flow", "markers", "reference"})
 """What `skipped` of a message may name: the ports that every message has, and the reference."""
-
-NO_PICTURE = np.zeros((0, 0, 3), np.uint8)
-"""The image of a frame whose pixels were not kept or never sent."""
-NO_PICTURE.flags.writeable = False
 
 
 class Result(Tick):

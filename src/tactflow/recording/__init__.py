@@ -23,6 +23,10 @@ from tactflow.system.extras import missing
 NEEDED = ("mcap", "zstandard", "mcap_protobuf", "foxglove_schemas_protobuf")
 
 
+CALIBRATION = frozenset({"calibration.yaml", "calibration.npz"})
+"""Attachments of a recording that was made with a calibration."""
+
+
 def missing_packages() -> str | None:
     """Why recordings can be neither written nor read here and what to do about it, or None."""
     return missing("recordings", "record", NEEDED)

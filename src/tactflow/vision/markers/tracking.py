@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.compiled import helper, kernel
-from tactflow.vision.markers.detection import Detection, refine_centers, require_image, to_gray
+from tactflow.vision.markers.detection import (
+    Detection,
+    detect_markers,
+    refine_centers,
+    require_image,
+    to_gray,
+)
 from tactflow.vision.markers.graph import MarkerGraph
 from tactflow.vision.markers.interpolation import Interpolator
 from tactflow.vision.markers.jump import common_displacement
@@ -128,6 +134,7 @@ class MarkerTracker:
     reference : (H, W, 3) uint8 BGR or (H, W) uint8, the untouched gel; or several such frames of one size,
         whose mean has less noise.
     detection : the marks of the reference; with several frames, their centres are taken again from the mean.
+        None: those that `detect_markers` finds in the first frame.
     max_displacement : farthest a mark may go between two frames, or from where its neighbours suggest, px.
         Larger values cost time in the search and admit more confusion. None: 1.3 times the pitch.
 
@@ -142,10 +149,9 @@ class MarkerTracker:
     Examples
     --------
     >>> from tactflow.sim import open_scene
-    >>> from tactflow.vision.markers.detection import detect_markers
     >>> scene = open_scene("press?frames=3")
     >>> reference = scene.frame(0)
-    >>> tracker = MarkerTracker(reference, detect_markers(reference))
+    >>> tracker = MarkerTracker(reference)
     >>> markers = tracker.track(scene.frame(1))
     >>> bool((markers.status == MarkerStatus.TRACKED).all())
     True
@@ -154,7 +160,7 @@ class MarkerTracker:
     def __init__(
         self,
         reference: NDArray[np.uint8] | Sequence[NDArray[np.uint8]],
-        detection: Detection,
+        detection: Detection | None = None,
         *,
         max_displacement: float | None = None,
     ) -> None:
@@ -166,6 +172,7 @@ class MarkerTracker:
             raise ValueError(f"required reference frames of one size, got {[gray.shape for gray in grays]}")
         if max_displacement is not None and not 0 < max_displacement < np.inf:
             raise ValueError(f"required max_displacement > 0 px, got {max_displacement:g}")
+        detection = detection or detect_markers(frames[0])
         mean = np.asarray(np.mean(np.stack(grays), axis=0, dtype=np.float32))
         self._shape = grays[0].shape
         self._shapes = (self._shape, (*self._shape, 3))

@@ -1,0 +1,52 @@
+"""Calling a stage without the engine: a stage that needs a `Frame` gets one made of the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from tactflow.engine.frame import NO_PICTURE, Frame
+from tactflow.engine.ports import Port
+
+FPS = 30.0
+"""Rate of the frames that are made here, Hz: that of recordings which do not say their own."""
+
+
+def with_frames_made(process: Callable[..., Any], inputs: Sequence[Port]) -> Callable[..., Any]:
+    """`process` with its parameter `frame: Frame` optional; the first call is the reference.
+
+    Positional arguments are the other inputs, in order; the frame is made of the first array among them. A
+    stage whose only input is the frame takes the picture in its place.
+
+    process : of a stage. inputs : its ports.
+
+    >>> def process(frame: Frame) -> tuple[int, ...]:
+    ...     return frame.image.shape
+    >>> with_frames_made(process, [Port("frame", Frame)])(np.zeros((4, 6, 3), np.uint8))
+    (4, 6, 3)
+    """
+    names = [port.name for port in inputs if port.annotation is not Frame]
+    frame = next((port.name for port in inputs if port.annotation is Frame), None)
+    if frame is None:
+        return process
+    numbers = count()
+
+    @wraps(process)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if frame in kwargs or any(isinstance(value, Frame) for value in args):
+            return process(*args, **kwargs)
+        pictures = [value for value in (*args, *kwargs.values()) if isinstance(value, np.ndarray)]
+        seq = next(numbers)
+        kwargs[frame] = Frame("main", seq, seq / FPS, pictures[0] if pictures else NO_PICTURE)
+        if names:
+            kwargs |= dict(zip(names, args, strict=False))
+            args = args[len(names) :]
+        else:
+            args = args[1:]
+        return process(*args, **kwargs)
+
+    return call

@@ -1,0 +1,128 @@
+"""Functions for a notebook: one contact from two pictures, a picture of a result, results as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.adapters.tables import frame_columns
+from tactflow.drawing.results import Annotator
+from tactflow.message.result import Result
+from tactflow.streaming import stream
+from tactflow.vision.types import Contact
+
+if TYPE_CHECKING:
+    import pandas as pd  # type: ignore[import-untyped]
+
+_WHOLE = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1, "stages.capture.settle": 0}
+"""Settings of the default pipeline for pictures that are to be taken as they are, in this order."""
+_NO_COLUMN = frozenset({"changed", "evidence", "touching"})
+"""Ports of built-in stages that tell nothing the other columns do not."""
+
+
+def contact(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> Contact | None:
+    """Find what touches the gel in one picture, with the default pipeline.
+
+    For many pictures of one sensor, `tactflow.stream(source=pictures)` prepares the reference only once.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8 BGR or (H, W) uint8 grey.
+    reference : of the same shape: the gel at rest, under the same light.
+
+    Returns
+    -------
+    The contact, in pixels of `image`; None where nothing touches.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> found = tactflow.contact(scene.frame(60), reference=scene.frame(0))
+    >>> found is not None, tactflow.contact(scene.frame(1), reference=scene.frame(0))
+    (True, None)
+    """
+    if image.shape != reference.shape:
+        raise ValueError(f"required pictures of one shape, got {image.shape} and {reference.shape}")
+    *_, result = stream("default", source=[reference, image], settings=_WHOLE)
+    return result.contact
+
+
+def draw(result: Result, image: NDArray[np.uint8] | None = None, **options: Any) -> NDArray[np.uint8]:
+    """Draw what was found on the processed frame: outline and axis of the contact, arrows of the markers.
+
+    Parameters
+    ----------
+    result : from `tactflow.stream(..., images=True)`.
+    image : (H, W, 3) uint8 BGR to draw on; None: that of the result.
+    options : of the stage `visualize`: `arrow_scale`, `view` ("frame", "contact" or "depth"), `ellipse`,
+        `text`, `dilate`, `deepest`.
+
+    Returns
+    -------
+    (H, W, 3) uint8 BGR, a new picture.
+
+    Raises
+    ------
+    ValueError : the result has no picture, or an option is out of range.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> result = next(tactflow.stream(source="sim:press", images=True, max_frames=1))
+    >>> tactflow.draw(result, text=False).shape
+    (400, 300, 3)
+    """
+    image = result.image if image is None else image
+    if image is None:
+        raise ValueError("the result has no picture: use tactflow.stream(..., images=True), or give an image")
+    return Annotator(**options)(
+        image,
+        contact=result.contact,
+        flow=result.flow,
+        markers=result.markers,
+        contact_mask=result.contact_mask,
+        valid=result.value("valid"),
+        field=result.field,
+        depth=result.depth,
+        scale=result.scale,
+    )
+
+
+def to_frame(results: Iterable[Result]) -> pd.DataFrame:
+    """Results as a pandas DataFrame, one row per frame.
+
+    Columns are the numbers of the result message with its standard errors (`contact_area`, `flow_mean_x`,
+    `flow_stderr_x`, ...), then the outputs of your own stages that are numbers, truth values or texts. A
+    column in which nothing is known is left out.
+
+    Raises
+    ------
+    ImportError : pandas is not installed.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> table = tactflow.to_frame(tactflow.stream(source="sim:press", max_frames=60))
+    >>> len(table), bool(table["contact_area"].max() > 0)
+    (60, True)
+    """
+    try:
+        import pandas as pd
+    except ImportError:
+        raise ImportError("tactflow.to_frame needs pandas: pip install 'tactflow[pandas]'") from None
+    columns = [column for column in frame_columns() if column.kind not in ("points", "words")]
+    rows = []
+    for result in results:
+        message = result.to_dict(detail=True)
+        row = {column.name: column.value(message) for column in columns}
+        rows.append(row | {port: value for port, value in result.items() if _is_cell(port, value)})
+    return pd.DataFrame(rows).dropna(axis="columns", how="all")
+
+
+def _is_cell(port: str, value: object) -> bool:
+    is_scalar = isinstance(value, bool | int | float | str | np.generic)
+    return is_scalar and port not in _NO_COLUMN and "." not in port
