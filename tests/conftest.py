@@ -33,7 +33,6 @@ LONG_FILES = (
     "test_main_job.py",
     "sources/test_streams.py",
     "test_install.py",
-    "bench/test_skipping.py",
     "cli/test_calibrate.py",
     "cli/test_record.py",
     "vision/test_compiled.py",

@@ -32,7 +32,7 @@ SIZE = (200, 150)
 LOOK_EVERY = 5.0
 """Time between two looks, s."""
 LARGEST_GROWTH = 16.0
-"""Memory by which the run may grow after its first tenth, MB; as in tactflow.bench.stress."""
+"""Memory by which the run may grow after its first tenth, MB."""
 PICTURE = REPOSITORY / "docs" / "soak.svg"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import mmap
 import re
 import shutil
 import struct
@@ -23,7 +24,6 @@ import zmq
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from tactflow.bench.stress import memory_of
 from tactflow.sim import open_scene
 from tests.conftest import REPOSITORY
 
@@ -48,7 +48,7 @@ def sample(pid: int) -> Sample | None:
     folder = Path(f"/proc/{pid}")
     try:
         return Sample(
-            memory_of((folder / "statm").read_text()),
+            int((folder / "statm").read_text().split()[1]) * mmap.PAGESIZE / 2**20,
             len(list((folder / "fd").iterdir())),
             len(list((folder / "task").iterdir())),
         )

@@ -7,8 +7,17 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.bench.gel_labels import DotMotion, Label, labels_of, outlines_by_eye
-from tactflow.bench.gels import GELS, GelTally, left_out, measure_gels
+from tactflow.bench.gels import GELS, left_out, measure_gels
+from tactflow.bench.labels import (
+    DotMotion,
+    Label,
+    compare_decisions,
+    compare_first_contact,
+    labels_of,
+    outlines_by_eye,
+)
+from tactflow.bench.quantities import Tally
+from tactflow.bench.results import BenchResult
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
@@ -25,10 +34,17 @@ def contact(hull: np.ndarray, angle: float | None = None) -> Contact:
 
 
 def test_the_overlap_is_that_of_the_filled_outline_and_the_hull() -> None:
-    label = Label((SQUARE,))
-    assert label.overlap(contact(SQUARE), (60, 80)) == 1
-    assert label.overlap(contact(SQUARE + np.array((10, 0))), (60, 80)) == pytest.approx(1 / 3)
-    assert label.overlap(None, (60, 80)) == 0
+    label, tally = Label((SQUARE,), center=(19.5, 19.5), angle=80.0), Tally()
+    assert label.compare(tally, contact(SQUARE, -85.0), (60, 80)) == 1
+    assert label.compare(tally, contact(SQUARE + np.array((10, 0))), (60, 80)) == pytest.approx(1 / 3)
+    assert label.compare(tally, None, (60, 80)) == 0
+    assert tally.errors() == {
+        "outline_iou_p50": pytest.approx(1 / 3),
+        "outline_iou_min": 0,
+        "label_distance_p50": 5,
+        "line_angle_p50": 15,
+        "line_angle_max": 15,
+    }
 
 
 def test_outlines_are_scaled_to_the_frame_that_is_judged(tmp_path: Path) -> None:
@@ -73,17 +89,15 @@ def test_rest_and_touch_are_told_by_the_dots_whatever_the_light_does() -> None:
 
 
 def test_decisions_count_only_where_something_is_known_and_an_early_contact_must_be_seen_in_time() -> None:
-    known = np.array([1, 0, 0, -1, 1, 1, 1, 1, 1, 1], np.int8)
+    touched = np.array([1, 0, 0, -1, 1, 1, 1, 1, 1, 1], np.int8)
     late = np.array([0, 1, 0, 1, 0, 0, 0, 0, 1, 1], np.bool_)
-    tally = GelTally()
-    tally.decisions(known, late)
-    tally.first(known, late)
-    assert tally.errors() == {
-        "false_contacts": 50.0,
-        "missed_contacts": pytest.approx(100 * 5 / 7),
-        "early_found": 0.0,
-    }
-    tally.first(known, known == 1)
+    tally = Tally()
+    compare_decisions(tally, touched, late)
+    compare_first_contact(tally, touched, late)
+    errors = tally.errors()
+    assert errors.pop("missed_contacts") == pytest.approx(100 * 5 / 7)
+    assert errors == {"false_contacts": 50.0, "early_found": 0.0}
+    compare_first_contact(tally, touched, touched == 1)
     assert tally.errors()["early_found"] == 50
 
 
@@ -113,22 +127,17 @@ def test_simulated_balls_in_the_place_of_real_ones_are_measured_against_their_ci
             radius = float(np.sqrt(truth.contact_mask.sum() / np.pi))
             labels[f"{number:03d}"] = {"center": truth.center, "radius": radius}
     (folder / "labels.json").write_text(json.dumps(labels))
-    pipelines = {name: load_pipeline(find_pipeline(name)) for name in ("default", "markerless")}
+    marked, bare = ((name, load_pipeline(find_pipeline(name))) for name in ("default", "markerless"))
     steps: list[int] = []
-    (found,) = measure_gels(
-        ("default", pipelines["default"]),
-        ("markerless", pipelines["markerless"]),
-        tmp_path,
-        tmp_path,
-        CopyUnit(),
-        steps.append,
-        tmp_path / "pictures",
-    )
-    assert found.failure is None
-    assert (found.scene, found.method, found.frames) == ("data:mini_ball", "default", 3)
+    result, pictures = BenchResult(quick=True), tmp_path / "pictures"
+    measure_gels(result, marked, bare, tmp_path, CopyUnit(), steps.append, pictures)
+    assert not result.failures
+    (found,) = result.measurements()
+    assert found.key == "pipeline/default/data:mini_ball"
+    assert found.values["frames"] == 3
     assert found.errors["false_contacts"] == found.errors["missed_contacts"] == 0
     assert found.errors["outline_iou_min"] > 0.85
     assert found.errors["label_distance_p50"] < 1
     assert found.errors["dots_found"] == 100
     assert sum(steps) > 0
-    assert [path.name for path in (tmp_path / "pictures").iterdir()] == ["mini_ball-mini_ball-default.png"]
+    assert [path.name for path in pictures.iterdir()] == ["mini_ball-mini_ball-default.png"]

@@ -1,53 +1,29 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tactflow.bench.recordings import (
-    IdentityTally,
-    judged_by_force,
-    label_errors,
-    measure_recordings,
-    rectified,
-    without_markers,
-)
+from tactflow.bench.quantities import Tally
+from tactflow.bench.recordings import Bench, add_identity_signs, check, judged_by_force, measure_recordings
+from tactflow.bench.results import BenchResult
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Pipeline
+from tactflow.vision.types import Markers, MarkerStatus
 
 GRID = np.array([(x, y) for y in range(0, 280, 20) for x in range(0, 200, 20)], dtype=np.float64)
-NONE_LOST = np.zeros(len(GRID), dtype=bool)
 
 
-@pytest.fixture
-def default() -> Pipeline:
-    return load_pipeline(find_pipeline("default"))
-
-
-def test_a_constant_offset_of_the_labels_is_taken_out() -> None:
-    random = np.random.default_rng(2)
-    labels = random.uniform(0, 200, (100, 2))
-    errors = label_errors(labels + np.array((5, -3)), labels)
-    assert errors == {
-        "found_percent": 100,
-        "label_center_p50": pytest.approx(0),
-        "label_center_p95": pytest.approx(0),
-    }
-
-
-def test_contacts_that_were_not_found_lower_the_share_and_nothing_else() -> None:
-    labels = np.zeros((10, 2))
-    centers = np.tile((1.0, 1.0), (10, 1))
-    centers[:3] = np.nan
-    errors = label_errors(centers, labels)
-    assert errors["found_percent"] == 70
-    assert errors["label_center_p95"] == 0
-    assert label_errors(np.full((4, 2), np.nan), np.zeros((4, 2))) == {"found_percent": 0}
+def identity_signs(*frames: np.ndarray, lost: int = 0) -> dict[str, float]:
+    """What is counted of markers at these positions, the first of them lost."""
+    tally = Tally()
+    status = np.where(np.arange(len(GRID)) < lost, MarkerStatus.LOST, MarkerStatus.TRACKED).astype(np.uint8)
+    for position in frames:
+        add_identity_signs(tally, Markers(GRID, position, status, np.zeros(len(GRID))))
+    return tally.errors()
 
 
 def test_a_step_of_the_force_stays_where_it_is_and_a_stray_sample_is_not_trusted() -> None:
@@ -58,65 +34,31 @@ def test_a_step_of_the_force_stays_where_it_is_and_a_stray_sample_is_not_trusted
 
 
 def test_a_gel_that_moves_as_one_has_kept_its_identities() -> None:
-    tally = IdentityTally()
-    tally.add(GRID, GRID + np.array((13, 4)), NONE_LOST)
-    assert set(tally.errors().values()) == {0.0}
+    assert set(identity_signs(GRID + np.array((13, 4))).values()) == {0.0}
 
 
 def test_two_markers_that_swapped_tear_the_gel() -> None:
     position = GRID.copy()
     position[[55, 56]] = position[[56, 55]]
-    tally = IdentityTally()
-    tally.add(GRID, GRID, NONE_LOST)
-    tally.add(GRID, position, NONE_LOST)
-    errors = tally.errors()
+    errors = identity_signs(GRID, position)
     assert errors["flow_jumps"] == 1  # two in one of two frames
     assert errors["frames_with_jumps"] == 50
     assert errors["shared_dots"] == 0
 
 
-def test_two_markers_on_one_dot_share_it() -> None:
+def test_two_markers_on_one_dot_share_it_and_giving_markers_up_is_counted() -> None:
     position = GRID.copy()
     position[55] = position[56]
-    tally = IdentityTally()
-    tally.add(GRID, position, NONE_LOST)
-    assert tally.errors()["shared_dots"] == 2
+    assert identity_signs(position)["shared_dots"] == 2
+    assert identity_signs(GRID, lost=14)["lost_share"] == 10
 
 
-def test_giving_markers_up_is_counted() -> None:
-    lost = NONE_LOST.copy()
-    lost[:14] = True
-    tally = IdentityTally()
-    tally.add(GRID, GRID, lost)
-    assert tally.errors()["lost_share"] == 10
-
-
-def test_a_tracker_that_never_answers_is_short_of_all_markers() -> None:
-    assert IdentityTally().errors() == {"markers_short": 140.0}
-
-
-def test_rectifying_replaces_the_preprocessing_only(default: Pipeline) -> None:
-    changed = rectified(default)
-    assert changed.nodes["preprocess"].params.homography is not None  # type: ignore[attr-defined]
-    assert changed.nodes["preprocess"].params.rotate == 0  # type: ignore[attr-defined]
-    for name, node in default.nodes.items():
-        assert name == "preprocess" or changed.nodes[name] == node
-
-
-def test_the_script_is_given_no_tracker_for_a_sensor_without_markers() -> None:
-    left = without_markers(load_pipeline(find_pipeline("classic")))
-    assert "tracker" not in left.nodes
-    assert "hull" in left.nodes
-
-
-def test_a_folder_without_known_recordings_is_refused(default: Pipeline, tmp_path: Path) -> None:
+def test_a_folder_without_known_recordings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="wedge_ball"):
-        list(measure_recordings({"default": default}, {}, tmp_path, tmp_path, CopyUnit(), lambda: None))
+        check(tmp_path)
 
 
-def test_real_presses_are_measured_against_their_labels(
-    default: Pipeline, shared_data: Path, tmp_path: Path
-) -> None:
+def test_real_presses_are_measured_against_their_labels(shared_data: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     (data / "wedge_ball").mkdir(parents=True)
     source = shared_data / "wedge_ball"
@@ -124,10 +66,15 @@ def test_real_presses_are_measured_against_their_labels(
     for name in ["reference.jpg", *(line.split(",")[0] for line in lines[1:])]:
         (data / "wedge_ball" / name).write_bytes((source / name).read_bytes())
     (data / "wedge_ball" / "labels.csv").write_text("\n".join(lines) + "\n")
-    pipelines = {"default": default, "again": replace(default, sensor="again")}
-    ((first, second),) = measure_recordings(pipelines, {}, data, tmp_path, CopyUnit(), lambda: None)
-    assert first.failure is None
-    assert first.scene == "data:wedge_ball"
-    assert first.frames == 3
+    default = load_pipeline(find_pipeline("default"))
+    result, steps = BenchResult(quick=False), list[int]()
+    bench = Bench(result, CopyUnit(), steps.append, tmp_path)
+    measure_recordings(bench, {"default": default, "again": default}, {}, data)
+    assert not result.failures
+    first, second = result.measurements()
+    assert first.key == "pipeline/default/data:wedge_ball"
     assert first.errors == second.errors
     assert first.errors["found_percent"] == 100
+    # Three labelled presses; the label's own offset is taken out.
+    assert first.errors["label_center_p50"] < 5
+    assert sum(steps) == 4

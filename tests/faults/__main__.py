@@ -9,9 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.load.workload import write_section
+from tests.conftest import REPOSITORY
 from tests.faults.rig import Seen
 from tests.faults.table import CASES, SECTIONS, Case
+
+PAGE = REPOSITORY / "docs" / "reliability.md"
+BEGIN, END = "<!-- faults -->", "<!-- end of faults -->"
 
 LONGEST = 150
 """Letters of what was said that the page shows."""
@@ -58,7 +61,9 @@ def main() -> int:
             differences = case.differences(seen)
             wrong += bool(differences)
             print(case.name, *differences, sep="\n    ", file=sys.stderr)
-    write_section("faults", text)
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    _, _, after = rest.partition(END)
+    PAGE.write_text(f"{before}{BEGIN}\n\n{text.strip()}\n\n{END}{after}", encoding="utf-8")
     print(f"{len(CASES)} cases, {wrong} not as promised", file=sys.stderr)
     return 1 if wrong else 0
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.load.workload import PAGE
-from tests.faults.__main__ import row
+from tests.faults.__main__ import END, PAGE, row
 from tests.faults.table import CASES, Case
 
 
@@ -21,7 +20,7 @@ def test_what_is_promised_is_seen(case: Case, tmp_path: Path) -> None:
 
 def test_the_page_has_every_case_and_no_other() -> None:
     """`make reliability` writes it."""
-    page, _, _ = PAGE.read_text().partition("<!-- end of faults -->")
+    page, _, _ = PAGE.read_text().partition(END)
     assert [case.name for case in CASES if row(case) not in page] == []
     sections = page.count("\n### ")
     assert page.count("\n| ") == len(CASES) + 2 * sections

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactflow.bench.lockstep import LockstepPipeline, Outcome
-from tactflow.bench.pipelines import on_recording
+from tactflow.bench.lockstep import LockstepPipeline, TimedResult, on_recording
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.sim import open_scene
@@ -16,7 +15,7 @@ from tactflow.sim import open_scene
 FRAMES = 20
 
 
-def arrays(outcome: Outcome) -> list[np.ndarray]:
+def arrays(outcome: TimedResult) -> list[np.ndarray]:
     """All arrays that a frame's results hold."""
     assert outcome.image is not None
     assert outcome.contact_mask is not None
@@ -35,7 +34,7 @@ def test_no_later_frame_changes_the_results_of_an_earlier_one(
     # Untouched, and from the first touch on.
     order = [*[0] * 5, *range(FRAMES, 2 * FRAMES)]
     np.save(path, np.stack([sensor.frame(index) for index in order]))
-    run = LockstepPipeline(on_recording(load_pipeline(find_pipeline(pipeline)), path), None)
+    run = LockstepPipeline(on_recording(load_pipeline(find_pipeline(pipeline)), path))
     outcomes, copies = [], []
     while outcome := run.block(1):
         outcomes += outcome

@@ -70,7 +70,6 @@ def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     truth = judge(
         {one.name: on_sensor(one.load(file)) for one in many},
         [Fitted(SMALL, Case("press", 24), tmp_path, 50)],
-        tmp_path,
         CopyUnit(),
         0,
     )
@@ -117,7 +116,7 @@ def test_errors_are_the_same_with_the_same_seed(tmp_path: Path) -> None:
     errors = []
     for _ in range(2):
         rendered = [Fitted(SMALL, Case("press", 16), tmp_path, 5)]
-        errors.append(judge({"one": pipeline}, rendered, tmp_path, CopyUnit(), 5)["one"].error)
+        errors.append(judge({"one": pipeline}, rendered, CopyUnit(), 5)["one"].error)
     assert errors[0] == errors[1]
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-from functools import partial
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench.pipelines import on_recording
-from tactflow.bench.recordings import stack
-from tactflow.bench.results import RECORDING, Measurement
-from tactflow.bench.timing import CopyUnit, Samples, timed
+from tactflow.bench.lockstep import on_recording
+from tactflow.bench.quantities import Tally
+from tactflow.bench.recordings import labelled_presses, stack
+from tactflow.bench.results import RECORDING, BenchResult
 from tactflow.calibration.photometric import Photometry, fit_photometry
 from tactflow.calibration.presses import Press, Session, find_presses
 from tactflow.calibration.scale import centre
@@ -24,6 +24,8 @@ from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Scale
 
+DEPTH: Final = "depth"
+"""Group of the rows about heights; the method is the light."""
 RAW_MM: Final = MM
 """Millimetres per raw pixel that the simulated gel is given."""
 BALL: Final = 95 * RAW_MM
@@ -33,35 +35,21 @@ LIGHTS: Final = ("photometric", "mixed", "dark_channel")
 SCENES: Final = ("press", "cable", "long_edge", "coin")
 """What presses: like the ball of the calibration, longer, sharper, and with steep steps."""
 WEDGE_SCALE: Final = Scale(0.1, 0.1, (0.0, 0.0), centre((240, 320)))
-"""What wedge_ball's readme says: about 0.1 mm a pixel."""
+"""About 0.1 mm a pixel, as the readme of wedge_ball states."""
 WEDGE_BALL: Final = 1.98
 """Radius of its ball, mm."""
 
 
-def measure_simulated(unit: CopyUnit) -> list[Measurement]:
-    """Calibrate on each light, and compare height maps with the surface that the simulator knows.
-
-    unit : measured along the way.
-    """
-    made = []
+def measure_simulated(result: BenchResult) -> None:
+    """Calibrate on each light, and compare height maps with the surface that the simulator knows."""
     for light in LIGHTS:
-        known = learn(f"ball?frames=600&light={light}")
-        ratios: list[float] = []
+        photometry = fit_photometry(session_of(open_scene(f"ball?frames=600&light={light}")), scale(), BALL)
+        honest = Tally()
         for name in SCENES:
-            scene = open_scene(f"{name}?seed=11&light={light}")
-            made.append(_tried(known, scene, Measurement("depth", light, name), unit, ratios))
-        within = {f"depth_within_{name}": _share(ratios, bound) for name, bound in (("one", 1), ("two", 2))}
-        made.append(Measurement("depth", light, "all", frames=len(ratios), errors=within))
-    return made
-
-
-def _share(ratios: list[float], bound: float) -> float:
-    return 100 * float(np.mean(np.array(ratios) < bound))
-
-
-def learn(spec: str) -> Photometry:
-    """What a calibration learns from a simulated session."""
-    return fit_photometry(session_of(open_scene(spec)), scale(), BALL)
+            tally = Tally()
+            times = list(_compare(photometry, open_scene(f"{name}?seed=11&light={light}"), tally, honest))
+            result.add(DEPTH, light, name, tally.errors(), times={"contact": times}, frames=len(times))
+        result.add(DEPTH, light, "all", honest.errors())
 
 
 def scale() -> Scale:
@@ -101,46 +89,40 @@ def noisy(image: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
     return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
 
 
-def _tried(
-    known: Photometry, scene: Scene, measurement: Measurement, unit: CopyUnit, ratios: list[float]
-) -> Measurement:
+def _compare(photometry: Photometry, scene: Scene, tally: Tally, honest: Tally) -> Iterator[float]:
+    """Compare the height map of each press; gives the CPU time of each, s.
+
+    honest : gets the errors of the greatest depth against their standard errors.
+    """
     preprocess = _preprocessor()
     rest = Rest(scene.truth(0, preprocess).unmarked)
-    surface = Surface(known.model, scale(), known.found.errors())
-    rms, volumes, samples = [], [], Samples()
+    surface = Surface(photometry.model, scale(), photometry.found.errors())
     for index in deepest(scene):
-        truth = scene.truth(index, preprocess)
         press = _press(scene, index, preprocess)
-        unit.take()
-        found = timed(partial(surface.depth, press.image, rest, press.mask), samples)
-        sunk = truth.sunk * RAW_MM
+        began = time.thread_time()
+        depth = surface.depth(press.image, rest, press.mask)
+        cpu_s = time.thread_time() - began
+        sunk = scene.truth(index, preprocess).sunk * RAW_MM
         around = sunk > 0.02 * sunk.max()
-        rms.append(float(np.sqrt(np.mean((found.heights - sunk)[around] ** 2)) / sunk.max()))
-        assert found.greatest_stderr is not None
-        ratios.append(abs(found.greatest - float(sunk.max())) / found.greatest_stderr)
-        volumes.append(abs(found.volume / (float(sunk.sum()) * scale().area(1.0)) - 1))
-    measurement.frames = len(rms)
-    measurement.errors = {
-        "depth_rms": 100 * float(np.mean(rms)),
-        "volume_error": 100 * float(np.mean(volumes)),
-    }
-    measurement.copies = {"contact": 1e3 * float(np.median(samples.cpu)) / unit.copy_ms}
-    return measurement
+        rms = np.sqrt(np.mean((depth.heights - sunk)[around] ** 2))
+        volume = float(sunk.sum()) * scale().area(1.0)
+        tally.add(depth_rms=100 * rms / sunk.max(), volume_error=100 * abs(depth.volume / volume - 1))
+        assert depth.greatest_stderr is not None
+        honest.within("depth", depth.greatest - float(sunk.max()), depth.greatest_stderr)
+        yield cpu_s
 
 
-def measure_ball(wedge: Pipeline, folder: Path, scratch: Path) -> Measurement:
+def measure_ball(result: BenchResult, wedge: Pipeline, folder: Path, scratch: Path) -> None:
     """Errors of a calibration on the presses of wedge_ball, each half learned from the other.
 
     wedge : the pipeline of this sensor. folder : with `labels.csv`. scratch : for temporary files.
     """
-    with (folder / "labels.csv").open(newline="", encoding="utf-8") as file:
-        names = [row["file"] for row in csv.DictReader(file)]
-    recording = stack([folder / "reference.jpg", *(folder / name for name in names)], scratch)
-    found = fit_photometry(find_presses(on_recording(wedge, recording)), WEDGE_SCALE, WEDGE_BALL).found
-    measurement = Measurement("depth", "wedge", f"{RECORDING}wedge_ball", frames=len(names))
-    measurement.errors = {
+    files, _ = labelled_presses(folder)
+    session = find_presses(on_recording(wedge, stack(files, scratch)))
+    found = fit_photometry(session, WEDGE_SCALE, WEDGE_BALL).found
+    errors = {
         "normal_error": found.normal_error,
         "ball_radius_error": 100 * abs(found.radius_error),
         "sphere_rms": found.sphere_rms,
     }
-    return measurement
+    result.add(DEPTH, "wedge", f"{RECORDING}wedge_ball", errors, frames=len(files) - 1)

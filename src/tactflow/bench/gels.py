@@ -6,41 +6,38 @@ Every recording runs through the default pipeline, or through the one for gels w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
-from dataclasses import dataclass, field, replace
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench import metrics
-from tactflow.bench.gel_labels import DotMotion, Label, labels_of, outlines_by_eye
-from tactflow.bench.lockstep import LockstepPipeline, Outcome
-from tactflow.bench.methods import fill_times
-from tactflow.bench.pictures import draw
-from tactflow.bench.pipelines import measure_refusal, on_recording
-from tactflow.bench.results import RECORDING, Measurement
-from tactflow.bench.timing import BLOCK, CopyUnit, Samples, quiet
-from tactflow.engine.errors import TactflowError
+from tactflow.bench.labels import (
+    DotMotion,
+    Polygons,
+    compare_decisions,
+    compare_first_contact,
+    labels_of,
+    outlines_by_eye,
+)
+from tactflow.bench.lockstep import TimedResult, on_recording, take_turns
+from tactflow.bench.pictures import WorstFrame
+from tactflow.bench.pipelines import PIPELINE, measure_refusal
+from tactflow.bench.quantities import Tally
+from tactflow.bench.results import RECORDING, BenchResult
+from tactflow.bench.timing import CopyUnit, Times
 from tactflow.engine.graph import Pipeline
-from tactflow.vision.types import Contact
 
 FOLDER = "gels"
 """Where the recordings of gels are, in the folder of recordings."""
 
 OUTLINES = "outlines by eye"
-"""Name under which the outlines of all gels together are told."""
+"""Name of the recording that stands for the outlines of all gels together."""
 
 STEPS = 100
-"""Steps of the progress display for one recording; chosen by hand, some are longer."""
-
-PROMPT = 4
-"""Frames within which a first contact has to be seen; chosen by hand, 0.16 s at 25 frames a second."""
-EARLY = 25
-"""Frames within which a first contact is an early one: 1 s at 25 frames a second."""
+"""Steps of the progress display for one recording. Chosen by hand: some are longer."""
 
 _VIDEOS = (".avi", ".mp4", ".m4v", ".gif")
 _PICTURES = (".png", ".jpg")
@@ -50,13 +47,12 @@ _PICTURES = (".png", ".jpg")
 class Gel:
     """Recordings of one sensor, and what is known of them.
 
-    folder : a video, several, or a folder of pictures. sensor : what it is. dots : how many are seen by eye;
-    0 for a gel without, None where nobody counted.
+    folder : a video, several, or a folder of pictures. sensor : what it is. dots : counted by eye; 0 for a
+    gel without, None where nobody counted.
     rest : so many first frames show the untouched gel. touched : from this frame on it is touched, or None.
-    moves : rest and touch are told by the motion of the dots against this frame, or None.
-    frames : only so many first frames are looked at, or None for all. every : one recording of so many is
-    looked at.
-    chosen : whether constants were chosen on it; what comes of the others is the test.
+    moves : rest and touch follow from the motion of the dots against this frame, or None.
+    frames : only so many first frames are used, or None for all. every : one recording of so many is used.
+    chosen : whether constants were chosen on it; the others are the test.
     """
 
     folder: str
@@ -78,7 +74,7 @@ class Gel:
         return videos[:: self.every] or ([gels / self.folder] if pictures else [])
 
     def known(self, frames: int) -> NDArray[np.int8]:
-        """(frames,): 1 touched, 0 at rest, -1 unknown, as far as `rest` and `touched` tell."""
+        """(frames,): 1 touched, 0 at rest, -1 unknown, by `rest` and `touched`."""
         known = np.full(frames, -1, np.int8)
         known[: self.rest] = 0
         if self.touched is not None:
@@ -120,7 +116,7 @@ def present(data: Path) -> list[Gel]:
 
 
 def left_out(data: Path) -> list[str]:
-    """A line that names the recordings that are missing, and one the folders that nothing is known of."""
+    """In words: which recordings are missing from a folder of recordings, and which are unknown."""
     if not (data / FOLDER).is_dir():
         return [f"{FOLDER}: not in {data}, left out"]
     here, known = {gel.folder for gel in present(data)}, {gel.folder for gel in GELS}
@@ -147,223 +143,114 @@ def prepared(pipeline: Pipeline, downsample: int) -> Pipeline:
     return replace(pipeline, nodes={**pipeline.nodes, "preprocess": replace(node, params=params)})
 
 
-@dataclass(slots=True)
-class GelTally:
-    """Counts what a pipeline says about the recordings of one sensor.
+def measure_gels(
+    result: BenchResult,
+    marked: tuple[str, Pipeline],
+    bare: tuple[str, Pipeline],
+    data: Path,
+    unit: CopyUnit,
+    step: Callable[[int], None],
+    pictures: Path | None = None,
+) -> None:
+    """Measure every recording of a gel that is known here and in the folder.
 
-    rest, touched : frames known to be so; false, missed : those of them in which the pipeline disagrees.
-    early, prompt : recordings whose first contact comes within a second, and those of them in which it was
-    seen in time. overlaps, centers, angles : one for each labelled frame in which there is something to
-    compare. missing, beyond : dots not found, and found beyond those seen, %.
+    For a gel without dots, also what the pipeline for dots takes for such; and all outlines together.
+
+    Parameters
+    ----------
+    result : what is measured is added to it.
+    marked, bare : name and pipeline for gels with dots, and for gels without.
+    data : folder of recordings. unit : measured along the way. step : called with steps, see `step_count`.
+    pictures : folder for a picture of the worst labelled frame of each recording, or None.
     """
-
-    rest: int = 0
-    false: int = 0
-    touched: int = 0
-    missed: int = 0
-    early: int = 0
-    prompt: int = 0
-    overlaps: list[float] = field(default_factory=list[float])
-    centers: list[float] = field(default_factory=list[float])
-    angles: list[float] = field(default_factory=list[float])
-    dots: dict[str, float] = field(default_factory=dict[str, float])
-
-    def decisions(self, known: NDArray[np.int8], said: NDArray[np.bool_]) -> None:
-        """Compare the decisions on a recording, (N,), with what `Gel.known` or the dots say."""
-        self.rest += int(np.count_nonzero(known == 0))
-        self.false += int(np.count_nonzero((known == 0) & said))
-        self.touched += int(np.count_nonzero(known == 1))
-        self.missed += int(np.count_nonzero((known == 1) & ~said))
-
-    def first(self, known: NDArray[np.int8], said: NDArray[np.bool_]) -> None:
-        """Judge when the first contact of a recording was seen, if it begins early; as `decisions`."""
-        resting = np.flatnonzero(known == 0)
-        begun = np.flatnonzero(known[resting[0] :] == 1) + resting[0] if len(resting) else resting
-        if len(begun) and begun[0] <= EARLY:
-            self.early += 1
-            self.prompt += bool(said[begun[0] : begun[0] + PROMPT].any())
-
-    def compare(self, label: Label, contact: Contact | None, shape: tuple[int, int]) -> float:
-        """Compare a labelled frame; returns the overlap, 0 where no contact was found."""
-        overlap = label.overlap(contact, shape)
-        self.overlaps.append(overlap)
-        if contact is not None and label.center is not None:
-            self.centers.append(float(np.hypot(*np.subtract(contact.center, label.center))))
-        if contact is not None and contact.angle is not None and label.angle is not None:
-            self.angles.append(metrics.angle_error(contact.angle, label.angle))
-        return overlap
-
-    def counted(self, found: int, seen: int) -> None:
-        """Compare the number of dots with what is seen by eye."""
-        self.dots = {
-            "dots_found": 100.0 * min(found, seen) / seen,
-            "dots_beyond": 100.0 * max(found - seen, 0) / seen,
-        }
-
-    def errors(self) -> dict[str, float]:
-        """Quantity -> value."""
-        errors = dict(self.dots)
-        if self.rest:
-            errors["false_contacts"] = 100.0 * self.false / self.rest
-        if self.touched:
-            errors["missed_contacts"] = 100.0 * self.missed / self.touched
-        if self.early:
-            errors["early_found"] = 100.0 * self.prompt / self.early
-        errors.update(outline_errors(self.overlaps))
-        if self.centers:
-            errors["label_distance_p50"] = float(np.median(self.centers))
-        if self.angles:
-            errors["line_angle_p50"] = float(np.median(self.angles))
-            errors["line_angle_max"] = max(self.angles)
-        return errors
-
-
-def outline_errors(overlaps: list[float]) -> dict[str, float]:
-    """Median and worst overlap with outlines drawn by eye; nothing where there is none."""
-    if not overlaps:
-        return {}
-    return {"outline_iou_p50": float(np.median(overlaps)), "outline_iou_min": min(overlaps)}
-
-
-@dataclass(slots=True)
-class _Watch:
-    """One pipeline on one recording, frame by frame.
-
-    said : whether it saw a contact. dots : markers in its first answer. worst : the frame that disagrees most
-    with a label, or the first one that disagrees with what is known, and how much, 0 to 1.
-    """
-
-    labels: Mapping[int, Label]
-    tally: GelTally
-    motion: DotMotion | None
-    said: list[bool] = field(default_factory=list[bool])
-    dots: int | None = None
-    worst: Outcome | None = None
-    badness: float = 0.0
-
-    def see(self, outcome: Outcome) -> None:
-        """Take one frame's answer."""
-        index = outcome.frame.seq
-        if index < 0:  # the reference, handed over in front of the recording
-            return
-        contact = outcome.contact
-        self.said.append(contact is not None)
-        if self.motion is not None:
-            self.motion.add(outcome.frame.image)
-        if self.dots is None and outcome.markers is not None:
-            self.dots = len(outcome.markers.position)
-        if index in self.labels and outcome.image is not None:
-            overlap = self.tally.compare(self.labels[index], contact, outcome.image.shape[:2])
-            if self.worst is None or 1 - overlap > self.badness:
-                self.worst, self.badness = outcome, 1 - overlap
-
-    def label(self) -> Label | None:
-        """Of the worst frame."""
-        return None if self.worst is None else self.labels.get(self.worst.frame.seq)
-
-
-def _answers(pipeline: Pipeline, scratch: Path, frames: int | None) -> Iterator[Outcome]:
-    """What a pipeline says about each frame of its recording, in turns of some frames."""
-    with quiet(), closing(LockstepPipeline(pipeline, scratch / "gel.jsonl")) as running:
-        left = frames or _ALWAYS
-        while left > 0 and (outcomes := running.block(min(BLOCK, left))):
-            yield from outcomes
-            left -= len(outcomes)
+    drawn = outlines_by_eye(data / FOLDER)
+    together = Tally()
+    for gel in present(data):
+        name, pipeline = bare if gel.dots == 0 else marked
+        ready = prepared(pipeline, gel.downsample)
+        tally = _measure(result, gel, name, ready, data / FOLDER, drawn, unit, step, pictures)
+        if not {"label_distance_p50", "line_angle_p50"} & set(tally.values):
+            for key in ("outline_iou_p50", "outline_iou_min"):
+                together.values[key] += tally.values[key]
+        if gel.dots == 0:
+            source = on_recording(prepared(marked[1], gel.downsample), gel.sources(data / FOLDER)[0])
+            measure_refusal(result, marked[0], source, RECORDING + gel.folder)
+    if errors := together.errors():
+        count = len(together.values["outline_iou_p50"])
+        result.add(PIPELINE, marked[0], RECORDING + OUTLINES, errors, frames=count)
 
 
 def _measure(
+    result: BenchResult,
     gel: Gel,
     name: str,
     pipeline: Pipeline,
     gels: Path,
-    scratch: Path,
+    drawn: Polygons,
     unit: CopyUnit,
     step: Callable[[int], None],
     pictures: Path | None,
-) -> tuple[Measurement, GelTally]:
-    """One pipeline on all recordings of one sensor."""
-    made, tally = Measurement("pipeline", name, RECORDING + gel.folder), GelTally()
-    drawn = outlines_by_eye(gels)
-    samples: dict[Any, Samples] = {}
+) -> Tally:
+    """Measure one pipeline on all recordings of one sensor."""
+    tally, scene, frames = Tally(), RECORDING + gel.folder, 0
+    times: Times = defaultdict(list)
     for source in gel.sources(gels):
-        unit.take(BLOCK)
-        motion = None if gel.moves is None else DotMotion(gel.moves)
-        watch = _Watch(labels_of(source, gels, gel.downsample, drawn), tally, motion)
-        try:
-            for outcome in _answers(on_recording(pipeline, source), scratch, gel.frames):
-                watch.see(outcome)
-                kind = (
-                    "reference"
-                    if outcome.frame.reference
-                    else "idle"
-                    if outcome.contact is None
-                    else "contact"
-                )
-                samples.setdefault(kind, Samples()).add(outcome.cpu, outcome.wall)
-        except TactflowError as error:
-            made.failure = made.failure or f"{source.name}: {error}"
-        said = np.array(watch.said, np.bool_)
-        known = gel.known(len(said)) if motion is None else motion.touched()
-        tally.decisions(known, said)
-        if motion is not None:
-            tally.first(known, said)
-        made.frames += len(said)
-        if gel.dots and watch.dots is not None:
-            tally.counted(watch.dots, gel.dots)
-        if pictures is not None:
-            _keep(watch, pictures / f"{gel.folder}-{source.stem}-{name}.png")
+        watch = _Watch(gel, source, gels, drawn, tally)
+        ready = {name: on_recording(pipeline, source)}
+        found, failures = take_turns(ready, watch.see, unit=unit, late=watch.is_over)
+        for kind, samples in found[name].items():
+            times[kind] += samples
+        if name in failures:
+            result.failures[f"{PIPELINE}/{name}/{scene}"] = f"{source.name}: {failures[name]}"
+        watch.judge()
+        watch.worst.write(pictures, f"{gel.folder}-{source.stem}-{name}")
+        frames += len(watch.found)
         step(STEPS)
-    fill_times(made, samples, unit, None)
-    made.errors = tally.errors()
-    return made, tally
+    result.add(PIPELINE, name, scene, tally.errors(), times=times, frames=frames)
+    return tally
 
 
-def _keep(watch: _Watch, path: Path) -> None:
-    """Write a picture of the worst frame, if there is one."""
-    label = watch.label()
-    if watch.worst is None or watch.worst.image is None or label is None:
-        return
-    caption = f"{path.stem}, frame {watch.worst.frame.seq}: IoU {1 - watch.badness:.2f}"
-    picture = draw(watch.worst, label.mask(watch.worst.image.shape[:2]), label.center, caption)
-    if picture is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), picture)
+class _Watch:
+    """One pipeline on one recording. found : frame by frame, whether a contact was seen."""
 
+    def __init__(self, gel: Gel, source: Path, gels: Path, drawn: Polygons, tally: Tally) -> None:
+        self.found: list[bool] = []
+        self.worst = WorstFrame()
+        self._gel = gel
+        self._tally = tally
+        self._labels = labels_of(source, gels, gel.downsample, drawn)
+        self._motion = None if gel.moves is None else DotMotion(gel.moves)
+        self._dots: int | None = None
 
-def measure_gels(
-    marked: tuple[str, Pipeline],
-    bare: tuple[str, Pipeline],
-    data: Path,
-    scratch: Path,
-    unit: CopyUnit,
-    step: Callable[[int], None],
-    pictures: Path | None = None,
-) -> Iterator[Measurement]:
-    """Run on every recording of a gel that is known here and there.
+    def see(self, _: str, result: TimedResult) -> str:
+        """Take one frame's answer; returns the kind of frame."""
+        contact, index = result.contact, result.frame.seq
+        self.found.append(contact is not None)
+        if self._motion is not None:
+            self._motion.add(result.frame.image)
+        if self._dots is None and result.markers is not None:
+            self._dots = len(result.markers.position)
+        if index in self._labels and result.image is not None:
+            label, shape = self._labels[index], result.image.shape[:2]
+            overlap = label.compare(self._tally, contact, shape)
+            self.worst.see(overlap, result, label.mask(shape), label.center)
+        return "idle" if contact is None else "contact"
 
-    Parameters
-    ----------
-    marked, bare : name and pipeline for gels with dots, and for gels without.
-    data : folder of recordings. scratch : for temporary files. step : called with the steps done, see
-        `step_count`. pictures : folder for a picture of the worst labelled frame of each recording, or None.
+    def is_over(self) -> bool:
+        """Whether enough frames were seen."""
+        return self._gel.frames is not None and len(self.found) >= self._gel.frames
 
-    Returns
-    -------
-    One measurement for each sensor; for one without dots another one, of what the pipeline for dots takes for
-    such; and one of all outlines together.
-    """
-    overlaps: list[float] = []
-    for gel in present(data):
-        name, pipeline = bare if gel.dots == 0 else marked
-        ready = prepared(pipeline, gel.downsample)
-        made, tally = _measure(gel, name, ready, data / FOLDER, scratch, unit, step, pictures)
-        yield made
-        if not tally.centers and not tally.angles:
-            overlaps += tally.overlaps
-        if gel.dots == 0:
-            source = on_recording(prepared(marked[1], gel.downsample), gel.sources(data / FOLDER)[0])
-            yield measure_refusal(marked[0], source, made.scene, scratch)
-    together = Measurement("pipeline", marked[0], RECORDING + OUTLINES, frames=len(overlaps))
-    together.errors = outline_errors(overlaps)
-    if overlaps:
-        yield together
+    def judge(self) -> None:
+        """Compare the decisions and the number of dots with what is known of the whole recording."""
+        found, counted = np.array(self.found, np.bool_), self._gel.dots
+        if self._motion is None:
+            compare_decisions(self._tally, self._gel.known(len(found)), found)
+        else:
+            touched = self._motion.touched()
+            compare_decisions(self._tally, touched, found)
+            compare_first_contact(self._tally, touched, found)
+        if counted and self._dots is not None:
+            self._tally.add(
+                dots_found=100.0 * min(self._dots, counted) / counted,
+                dots_beyond=100.0 * max(self._dots - counted, 0) / counted,
+            )

@@ -6,129 +6,90 @@ measured is the field and the test for slip alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import partial
+import time
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench import metrics
-from tactflow.bench.results import Measurement
-from tactflow.bench.timing import CopyUnit, Samples, timed
-from tactflow.sim import Scene, Truth, open_scene
+from tactflow.bench.quantities import Tally
+from tactflow.bench.results import BenchResult
+from tactflow.sim import Truth, open_scene
 from tactflow.vision.flow import DisplacementField, FieldModel, SlipTest
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Markers, MarkerStatus
 
+MOTION: Final = "motion"
+"""Group of the rows about the motion of the gel."""
 SCENES: Final = ("press", "cable", "box", "slide", "twist", "dense", "stick_slip")
 """What moves the gel: apart, along, around, and past its limit of friction."""
 NOISE: Final = 0.02
 """Standard deviation of a dot's coordinate, px: that of the default tracker on `press`."""
 EVERY: Final = 4
-"""The field of every so many frames is compared: neighbouring ones tell the same."""
+"""The field of every so many frames is compared: those between say the same. Chosen by hand."""
 
 
-@dataclass(slots=True)
-class FieldScore:
-    """off, stated : px, error of each component in the contact, and its standard error."""
-
-    off: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
-    stated: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
-
-    def add(self, found: DisplacementField, truth: Truth) -> None:
-        """Compare one frame, on the gel that is in contact now."""
-        points = found.grid.points.reshape(-1, 2)
-        true = truth.displacement(points)
-        now = np.rint(points + true).astype(int)
-        height, width = truth.contact_mask.shape
-        inside = np.all((now >= 0) & (now < (width, height)), axis=1)
-        inside[inside] = truth.contact_mask[now[inside, 1], now[inside, 0]]
-        off = found.displacement.reshape(-1, 2)[inside] - true[inside]
-        self.off.append(off.ravel())
-        self.stated.append(np.repeat(found.stderr.reshape(-1)[inside], 2))
-
-    def errors(self) -> dict[str, float]:
-        """Quantity -> value."""
-        off, stated = np.concatenate(self.off), np.concatenate(self.stated)
-        ratio = np.abs(off) / np.maximum(stated, 1e-9)
-        return {
-            "field_rms": metrics.rms(np.abs(off).tolist()) or 0.0,
-            "field_within_one": 100.0 * float(np.mean(ratio < 1)),
-            "field_within_two": 100.0 * float(np.mean(ratio < 2)),
-        }
+def measure_motion(result: BenchResult) -> None:
+    """Measure field and slip on each scene."""
+    for name in SCENES:
+        _measure(result, name)
 
 
-@dataclass(slots=True)
-class SlipScore:
-    """late : frames from the true onset of each slip to the one that was said; None where none was said.
-    false : frames of a contact that does not slip in which slip was said. touched : frames with contact."""
-
-    late: list[int | None] = field(default_factory=list[int | None])
-    false: int = 0
-    touched: int = 0
-
-    def add(self, true: list[bool], said: list[bool]) -> None:
-        """One contact, frame by frame."""
-        self.touched += len(true)
-        if True not in true:
-            self.false += sum(said)
-            return
-        self.late.append(said.index(True) - true.index(True) if True in said else None)
-
-    def errors(self) -> dict[str, float]:
-        """Quantity -> value."""
-        found = {"slip_false": 100.0 * self.false / max(self.touched, 1)}
-        if self.late:
-            told = [abs(late) for late in self.late if late is not None]
-            found["slip_missed"] = 100.0 * self.late.count(None) / len(self.late)
-            found |= {"slip_onset": float(max(told))} if told else {}
-        return found
-
-
-def measure(unit: CopyUnit) -> list[Measurement]:
-    """Field and slip on each scene. unit : measured along the way."""
-    return [
-        _measured(open_scene(f"{name}?seed=11"), Measurement("motion", "field", name), unit)
-        for name in SCENES
-    ]
-
-
-def _measured(scene: Scene, measurement: Measurement, unit: CopyUnit) -> Measurement:
-    preprocess = Preprocessor((800, 600), rotate=90, downsample=2)
-    rest = scene.truth(0, preprocess)
-    size = (rest.contact_mask.shape[1], rest.contact_mask.shape[0])
-    model, rng = FieldModel(rest.origin, size), np.random.default_rng(1)
-    field_score, slip_score, samples, test = FieldScore(), SlipScore(), Samples(), SlipTest()
-    true: list[bool] = []
-    said: list[bool] = []
+def _measure(result: BenchResult, name: str) -> None:
+    scene, preprocess = open_scene(f"{name}?seed=11"), Preprocessor((800, 600), rotate=90, downsample=2)
+    truth = scene.truth(0, preprocess)
+    height, width = truth.contact_mask.shape
+    model, rng, slip_test = FieldModel(truth.origin, (width, height)), np.random.default_rng(1), SlipTest()
+    tally, times = Tally(), []
+    slips: list[tuple[bool, bool]] = []
+    """Frame by frame of this contact: whether it truly slips, and whether the test says so."""
     for index in range(len(scene)):
         truth = scene.truth(index, preprocess)
         if not truth.touching:
-            if true:
-                slip_score.add(true, said)
-                true, said = [], []
-            test.reset()
+            _compare_slip(tally, slips)
+            slips = []
+            slip_test.reset()
             continue
-        markers = seen_markers(truth, rng)
-        unit.take()
-        found = timed(partial(model, markers), samples)
-        if found is None:
+        markers = visible_markers(truth, rng)
+        began = time.thread_time()
+        field = model(markers)
+        times.append(time.thread_time() - began)
+        if field is None:
             continue
-        mask = np.uint8(255) * truth.contact_mask
-        slip = test(found, mask)
-        true.append(truth.slipping)
-        said.append(slip is not None and slip.slipping)
+        slip = slip_test(field, np.uint8(255) * truth.contact_mask)
+        slips.append((truth.slipping, slip is not None and slip.slipping))
         if index % EVERY == 0:
-            field_score.add(found, truth)
-    measurement.frames = slip_score.touched
-    measurement.errors = {**field_score.errors(), **slip_score.errors()}
-    measurement.copies = {"contact": 1e3 * float(np.median(samples.cpu)) / unit.copy_ms}
-    return measurement
+            _compare_field(tally, field, truth)
+    result.add(MOTION, "field", name, tally.errors(), times={"contact": times}, frames=len(times))
 
 
-def seen_markers(truth: Truth, rng: np.random.Generator) -> Markers:
-    """The dots that can be seen, as a good tracker would tell them."""
+def _compare_field(tally: Tally, field: DisplacementField, truth: Truth) -> None:
+    """Compare both components of the displacement, on the gel that is in contact now."""
+    points = field.grid.points.reshape(-1, 2)
+    displacement = truth.displacement(points)
+    now = np.rint(points + displacement).astype(int)
+    height, width = truth.contact_mask.shape
+    inside = np.all((now >= 0) & (now < (width, height)), axis=1)
+    inside[inside] = truth.contact_mask[now[inside, 1], now[inside, 0]]
+    error = field.displacement.reshape(-1, 2)[inside] - displacement[inside]
+    stderr = field.stderr.reshape(-1, 1)[inside]
+    tally.add(field_rms=error)
+    tally.within("field", error, np.maximum(stderr, 1e-9))
+
+
+def _compare_slip(tally: Tally, slips: list[tuple[bool, bool]]) -> None:
+    """Compare the onset of slip in one contact, or count false alarms in one that sticks."""
+    true, found = ([pair[k] for pair in slips] for k in (0, 1))
+    if True not in true:
+        tally.percent(slip_false=found)
+        return
+    tally.percent(slip_missed=True not in found)
+    if True in found:
+        tally.add(slip_onset=abs(found.index(True) - true.index(True)))
+
+
+def visible_markers(truth: Truth, rng: np.random.Generator) -> Markers:
+    """The dots that can be seen, as a good tracker would find them."""
     status = np.where(truth.visible, MarkerStatus.TRACKED, MarkerStatus.LOST).astype(np.uint8)
-    position = truth.position + rng.normal(0, NOISE, truth.position.shape)
+    position: NDArray[np.float64] = truth.position + rng.normal(0, NOISE, truth.position.shape)
     return Markers(truth.origin, position, status, np.full(len(status), NOISE))

@@ -1,20 +1,46 @@
-"""The quantities the bench measures: name, unit, which way is better, and how far a rerun may stray."""
+"""The quantities that the bench measures, and how their values from many frames become one number."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tactflow.bench.metrics import distances_without_offset
+
+Summary = Callable[[NDArray[np.float64]], Any]
+
+
+def rms(values: NDArray[np.float64]) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def beyond_offset(values: NDArray[np.float64], q: float) -> float:
+    """The q-th percentile of distances, px, after the median offset is taken out. values : x, y, x, y, ..."""
+    offsets = values.reshape(-1, 2)
+    return float(np.percentile(distances_without_offset(offsets, np.zeros_like(offsets)), q))
+
+
+P99 = partial(np.percentile, q=99)
+P50_OF_OFFSETS, P95_OF_OFFSETS = partial(beyond_offset, q=50), partial(beyond_offset, q=95)
+MEAN, MEDIAN, MOST, LEAST = np.mean, np.median, np.max, np.min
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
     """One measured error.
 
-    key : name in bench.json. title : for people. unit : "" for none.
-    better : which direction is better. best : the perfect value, from which plots measure the error.
-    slack, share : a stored result may be exceeded by slack + share * |stored| before `--against` calls it
+    key : name in results. title : for people. unit : "" for none.
+    summary : makes one number of the values (N,) of all frames, N > 0.
+    best : the perfect value. better : which direction is better.
+    slack, share : a stored result may be exceeded by slack + share * |stored - best| before it counts as
         worse. Slack covers what other CPUs change in the last bits of floating-point sums (a marker or a
         pixel at a threshold falls to the other side); share keeps the rule sensible for large errors. For
         shares of frames, slack is a little more than one frame of the quick run's 30.
@@ -23,13 +49,19 @@ class Quantity:
     key: str
     title: str
     unit: str
+    summary: Summary = MEAN
     better: Literal["lower", "higher"] = "lower"
     best: float = 0.0
     slack: float = 0.0
     share: float = 0.1
 
+    @property
+    def heading(self) -> str:
+        """Title and unit."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
+
     def distance(self, value: float) -> float:
-        """Distance from the perfect value, >= 0; what plots show."""
+        """Distance from the perfect value, >= 0."""
         return abs(value - self.best)
 
     def allowed(self, stored: float) -> float:
@@ -43,67 +75,113 @@ class Quantity:
         return value > allowed if self.better == "lower" else value < allowed
 
 
+def _percent_right(key: str, title: str, slack: float = 0.0, **options: Any) -> Quantity:
+    return Quantity(key, title, "%", better="higher", best=100.0, slack=slack, **options)
+
+
+def _within(key: str, title: str) -> tuple[Quantity, Quantity]:
+    """Shares of errors within one and two of their stated standard errors."""
+    kind = partial(Quantity, unit="%", better="higher")
+    return (
+        kind(f"{key}_within_one", f"{title} within one stderr", best=68.0, slack=15.0),
+        kind(f"{key}_within_two", f"{title} within two stderr", best=95.0, slack=5.0),
+    )
+
+
 _ALL = [
-    Quantity("displacement_rms", "marker displacement error, RMS", "px", slack=0.004),
-    Quantity("displacement_p99", "marker displacement error, 99th percentile", "px", slack=0.02),
+    Quantity("displacement_rms", "marker displacement error, RMS", "px", rms, slack=0.004),
+    Quantity("displacement_p99", "marker displacement error, 99th percentile", "px", P99, slack=0.02),
     Quantity("wrong_percent", "markers with a wrong identity", "%", slack=0.05),
     Quantity("lost_percent", "visible markers declared lost", "%", slack=0.1),
     Quantity("markers_missed", "markers never found", "", slack=0.5),
-    Quantity("markers_false", "what was taken for a marker and is none", "", slack=0.5),
+    Quantity("markers_false", "false markers", "", slack=0.5),
     Quantity("marker_recall", "markers found (recall)", "", better="higher", best=1.0, slack=0.005),
-    Quantity("marker_precision", "detections that are markers (precision)", "", "higher", 1.0, slack=0.005),
-    Quantity("localisation_rms", "detected centre against true centre, RMS", "px", slack=0.01),
-    Quantity("contact_iou", "contact mask, IoU with the truth", "", "higher", 1.0, slack=0.01),
-    Quantity("hull_iou", "contact hull, IoU with the true hull", "", "higher", 1.0, slack=0.01),
+    Quantity("marker_precision", "detections that are markers (precision)", "", MEAN, "higher", 1.0, 0.005),
+    Quantity("localisation_rms", "detected centre against true centre, RMS", "px", rms, slack=0.01),
+    Quantity("contact_iou", "contact mask, IoU with the truth", "", MEAN, "higher", 1.0, slack=0.01),
+    Quantity("hull_iou", "contact hull, IoU with the true hull", "", MEAN, "higher", 1.0, slack=0.01),
     Quantity("area_error", "hull area error, mean", "%", slack=0.5),
     Quantity("center_error", "contact centre error, mean", "px", slack=0.05),
     Quantity("angle_mean", "direction error, mean", "deg", slack=0.05),
-    Quantity("angle_max", "direction error, maximum", "deg", slack=0.3),
-    Quantity("angle_missing", "frames with a direction where none was given", "%", slack=4.0),
-    Quantity("angle_invented", "round contacts that were given a direction", "%", slack=4.0),
+    Quantity("angle_max", "direction error, maximum", "deg", MOST, slack=0.3),
+    Quantity("angle_missing", "long contacts without a direction", "%", slack=4.0),
+    Quantity("angle_invented", "round contacts with a direction", "%", slack=4.0),
     Quantity("flow_error", "mean flow of the gel in contact, error, mean", "px", slack=0.02),
-    Quantity("flow_rms", "mean flow of the gel in contact, error, RMS", "px", slack=0.02),
-    Quantity("flow_within_one", "mean-flow errors within one stderr", "%", "higher", 68.0, slack=15.0),
-    Quantity("flow_within_two", "mean-flow errors within two stderr", "%", "higher", 95.0, slack=5.0),
+    Quantity("flow_rms", "mean flow of the gel in contact, error, RMS", "px", rms, slack=0.02),
+    *_within("flow", "mean-flow errors"),
+    Quantity("false_contacts", "idle frames called contact", "%"),
+    Quantity("missed_contacts", "frames with contact missed", "%", slack=4.0),
+    Quantity("missed_half_depth", "contact at half depth or more missed", "%"),
+    Quantity("inpaint_mae", "marker removal, mean absolute error in the mask", "grey levels", slack=0.1),
+    Quantity("inpaint_psnr", "marker removal, PSNR in the mask", "dB", MEAN, "higher", 100.0, 0.3, share=0.0),
     Quantity("depth_rms", "heights, RMS error over the greatest depth", "%", slack=0.3),
-    Quantity("depth_within_one", "greatest-depth errors within one stderr", "%", "higher", 68.0, slack=15.0),
-    Quantity("depth_within_two", "greatest-depth errors within two stderr", "%", "higher", 95.0, slack=5.0),
-    Quantity("field_rms", "displacement of the gel in contact, error of a component, RMS", "px", slack=0.05),
-    Quantity("field_within_one", "displacement errors within one stderr", "%", "higher", 68.0, slack=15.0),
-    Quantity("field_within_two", "displacement errors within two stderr", "%", "higher", 95.0, slack=5.0),
-    Quantity("slip_onset", "slip said too late or too early, worst", "frames", slack=1.0),
-    Quantity("slip_missed", "slips that were not said", "%", slack=0.0),
-    Quantity("slip_false", "frames called slip of contacts that stick", "%", slack=0.0),
+    *_within("depth", "greatest-depth errors"),
     Quantity("volume_error", "indented volume, error, mean", "%", slack=1.0),
     Quantity("normal_error", "normals of a ball, mean angle", "deg", slack=0.3),
     Quantity("ball_radius_error", "radius of a ball from its heights, median", "%", slack=0.5),
     Quantity("sphere_rms", "heights of a ball, RMS from a sphere", "mm", slack=0.003),
-    Quantity("false_contacts", "idle frames called contact", "%", slack=0.0),
-    Quantity("missed_contacts", "frames with contact missed", "%", slack=4.0),
-    Quantity("missed_half_depth", "contact at half depth or more missed", "%", slack=0.0),
-    Quantity("inpaint_mae", "marker removal, mean absolute error in the mask", "grey levels", slack=0.1),
-    Quantity("inpaint_psnr", "marker removal, PSNR in the mask", "dB", "higher", 100.0, slack=0.3, share=0.0),
-    Quantity("found_percent", "labelled contacts found", "%", "higher", 100.0),
-    Quantity("label_center_p50", "centre against hand label, median", "px", slack=0.1),
-    Quantity("label_center_p95", "centre against hand label, 95th percentile", "px", slack=0.3),
-    Quantity("outline_iou_p50", "outline by eye, IoU, median", "", "higher", 1.0, slack=0.02),
-    Quantity("outline_iou_min", "outline by eye, IoU, worst", "", "higher", 1.0, slack=0.05),
-    Quantity("label_distance_p50", "centre against labelled circle, median", "px", slack=0.1),
-    Quantity("line_angle_p50", "direction against labelled line, median", "deg", slack=0.1),
-    Quantity("line_angle_max", "direction against labelled line, maximum", "deg", slack=0.3),
-    Quantity("early_found", "first contacts within a second that were seen in time", "%", "higher", 100.0),
-    Quantity("dots_found", "dots found, of those seen by eye", "%", "higher", 100.0, slack=1.0),
-    Quantity("dots_beyond", "dots found beyond those seen by eye", "%", slack=1.0),
-    Quantity("force_right", "contact agrees with force >= 0.75 N", "%", "higher", 100.0, slack=0.3),
-    Quantity("shared_dots", "markers that share a dot with another", "per frame", slack=0.0),
-    Quantity("flow_jumps", "flow jumps over half a pitch against neighbours", "per frame", slack=0.0),
-    Quantity("frames_with_jumps", "frames with at least one flow jump", "%", slack=0.0),
-    Quantity("lost_share", "markers declared lost on a real roll", "%", slack=0.2),
-    Quantity("markers_short", "markers missing from the known grid", "", slack=0.0),
+    Quantity("field_rms", "displacement of the gel in contact, error of a component", "px", rms, slack=0.05),
+    *_within("field", "displacement errors"),
+    Quantity("slip_onset", "onset of slip, error, largest", "frames", MOST, slack=1.0),
+    Quantity("slip_missed", "slips missed", "%"),
+    Quantity("slip_false", "frames of sticking contacts called slip", "%"),
+    _percent_right("found_percent", "labelled contacts found"),
+    Quantity("label_center_p50", "centre against hand label, median", "px", P50_OF_OFFSETS, slack=0.1),
+    Quantity(
+        "label_center_p95", "centre against hand label, 95th percentile", "px", P95_OF_OFFSETS, slack=0.3
+    ),
+    Quantity("outline_iou_p50", "outline by eye, IoU, median", "", MEDIAN, "higher", 1.0, slack=0.02),
+    Quantity("outline_iou_min", "outline by eye, IoU, worst", "", LEAST, "higher", 1.0, slack=0.05),
+    Quantity("label_distance_p50", "centre against labelled circle, median", "px", MEDIAN, slack=0.1),
+    Quantity("line_angle_p50", "direction against labelled line, median", "deg", MEDIAN, slack=0.1),
+    Quantity("line_angle_max", "direction against labelled line, maximum", "deg", MOST, slack=0.3),
+    _percent_right("early_found", "first contacts within a second that were seen in time"),
+    _percent_right("dots_found", "dots found, of those counted by eye", slack=1.0),
+    Quantity("dots_beyond", "dots found beyond those counted by eye", "%", slack=1.0),
+    _percent_right("force_right", "contact agrees with force >= 0.75 N", slack=0.3),
+    Quantity("shared_dots", "markers that share a dot with another", "per frame"),
+    Quantity("flow_jumps", "flow jumps over half a pitch against neighbours", "per frame"),
+    Quantity("frames_with_jumps", "frames with at least one flow jump", "%"),
+    Quantity("lost_share", "markers declared lost", "%", slack=0.2),
+    Quantity("markers_short", "markers missing from the known grid", ""),
 ]
 
 QUANTITIES: Mapping[str, Quantity] = {quantity.key: quantity for quantity in _ALL}
 """Every quantity by its key."""
+
+
+class Tally:
+    """Values of quantities, frame by frame.
+
+    values : key of `QUANTITIES` -> one array (N,) float64 for each frame that has something to say.
+    """
+
+    def __init__(self) -> None:
+        self.values: defaultdict[str, list[NDArray[np.float64]]] = defaultdict(list)
+
+    def add(self, **values: ArrayLike) -> None:
+        """Add one or several values to each of these quantities."""
+        for key, value in values.items():
+            self.values[key].append(np.ravel(np.asarray(value, dtype=np.float64)))
+
+    def percent(self, **flags: ArrayLike) -> None:
+        """Add truth values, whose mean is a share in percent."""
+        self.add(**{key: 100.0 * np.asarray(flag, dtype=np.float64) for key, flag in flags.items()})
+
+    def within(self, key: str, error: ArrayLike, stderr: ArrayLike) -> None:
+        """Add errors to the shares KEY_within_one and KEY_within_two of their standard errors."""
+        ratio = np.abs(np.asarray(error)) / np.asarray(stderr)
+        self.percent(**{f"{key}_within_one": ratio < 1, f"{key}_within_two": ratio < 2})
+
+    def errors(self) -> dict[str, float]:
+        """Quantity -> its one number, for those that have values."""
+        joined = {key: np.concatenate(arrays) for key, arrays in self.values.items()}
+        # What is left of floating-point rounding in a perfect result is no error.
+        return {
+            key: round(float(quantity.summary(joined[key])), 9)
+            for key, quantity in QUANTITIES.items()
+            if key in joined and joined[key].size
+        }
 
 
 def format_number(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Real recordings with labels: what can be said without knowing the whole truth.
+"""Real recordings of one sensor with labels: what can be said without knowing the whole truth.
 
 `wedge_ball` has hand-labelled centres, `wedge_grasp` the grip's force, `wedge_roll` only the knowledge that
 its 140 dots are printed on one continuous gel.
@@ -7,8 +7,9 @@ its 140 dots are printed on one continuous gel.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -16,17 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import gels, metrics
-from tactflow.bench.lockstep import Outcome
-from tactflow.bench.methods import CLASSIC, fill_times
-from tactflow.bench.pipelines import on_recording, take_turns
-from tactflow.bench.results import RECORDING, Measurement
-from tactflow.bench.timing import CopyUnit
+from tactflow.bench.lockstep import TimedResult, on_recording, take_turns
+from tactflow.bench.pipelines import PIPELINE
+from tactflow.bench.quantities import Tally
+from tactflow.bench.results import RECORDING, BenchResult
+from tactflow.bench.timing import CopyUnit, Times
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
-from tactflow.vision.types import MarkerStatus
+from tactflow.vision.types import Markers, MarkerStatus
 
 CONTACT_FORCE = 0.75
-"""Grip force from which on there is contact, N; docs/contact-limits.md shows what hangs on it."""
+"""Grip force from which on there is contact, N; docs/contact-limits.md shows what depends on it."""
 
 WEDGE_DOTS = 140
 """Dots printed on the Wedge's gel: 10 x 14."""
@@ -41,38 +42,66 @@ RECTIFY = {
 _MARKER_STAGES = frozenset({"tracker", "flow_in_mask", "visualize"})
 """Ids of the stages that need markers."""
 
-Step = Callable[[], None]
+Judge = Callable[[Tally, TimedResult], str]
+"""Adds the errors of one frame to a tally; returns the kind of frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """What measurements share. result : rows are added to it. unit : measured along the way.
+
+    step : called with the number of frames that all pipelines have done. scratch : for temporary files.
+    """
+
+    result: BenchResult
+    unit: CopyUnit
+    step: Callable[[int], None]
+    scratch: Path
+
+    def run(self, pipelines: Mapping[str, Pipeline], scene: str, parts: Sequence[tuple[Path, Judge]]) -> None:
+        """Run pipelines, in turns, on the parts of a recording, each with the function that judges it."""
+        tallies = {name: Tally() for name in pipelines}
+        times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
+        frames: dict[str, int] = dict.fromkeys(pipelines, 0)
+        for path, judge in parts:
+
+            def see(name: str, found: TimedResult, judge: Judge = judge) -> str:
+                frames[name] += 1
+                return judge(tallies[name], found)
+
+            ready = {name: on_recording(pipeline, path) for name, pipeline in pipelines.items()}
+            measured, failures = take_turns(ready, see, unit=self.unit, step=self.step)
+            for name, kinds in measured.items():
+                for kind, samples in kinds.items():
+                    times[name][kind] += samples
+            self.result.failures |= {f"{PIPELINE}/{n}/{RECORDING}{scene}": why for n, why in failures.items()}
+        for name, tally in tallies.items():
+            errors = tally.errors()
+            self.result.add(PIPELINE, name, RECORDING + scene, errors, times=times[name], frames=frames[name])
 
 
 def measure_recordings(
-    pipelines: Mapping[str, Pipeline],
-    markerless: Mapping[str, Pipeline],
-    data: Path,
-    scratch: Path,
-    unit: CopyUnit,
-    step: Step,
-) -> Iterator[list[Measurement]]:
+    bench: Bench, marked: Mapping[str, Pipeline], bare: Mapping[str, Pipeline], data: Path
+) -> None:
     """Run on every recording of a folder that is known here; unknown ones are left alone.
 
-    Parameters
-    ----------
-    pipelines : for sensors with markers; their preprocessing is replaced by the Wedge's rectification.
-    markerless : for sensors without. `CLASSIC` is the yardstick in both.
-    data : folder of recordings. scratch : for temporary files. step : called after each frame.
-
-    Raises
-    ------
-    ConfigError
-        If the folder holds none of the known recordings.
+    marked : for sensors with markers; their preprocessing is replaced by the Wedge's rectification.
+    bare : for sensors without. data : folder of recordings.
     """
-    check(data)
+    ready = {name: rectified(pipeline) for name, pipeline in marked.items()}
     if (data / "wedge_ball" / "labels.csv").exists():
-        yield _ball(pipelines, data / "wedge_ball", scratch, unit, step)
+        files, labels = labelled_presses(data / "wedge_ball")
+        path = stack(files, bench.scratch)
+        bench.run(ready, "wedge_ball", [(path, lambda t, r: _press(t, r, labels))])
     if (data / "wedge_roll").is_dir():
-        yield _roll(pipelines, data / "wedge_roll", scratch, unit, step)
-    grasps = sorted((data / "wedge_grasp").glob("*.csv"))
-    if grasps:
-        yield _grasps(markerless, grasps, scratch, unit, step)
+        path = stack(sorted((data / "wedge_roll").glob("*.jpg")), bench.scratch)
+        bench.run(ready, "wedge_roll", [(path, _roll)])
+    parts = []
+    for path in sorted((data / "wedge_grasp").glob("*.csv")):
+        contact, trusted = judged_by_force(_forces(path))
+        parts.append((path.with_suffix(".avi"), _grasp_judge(contact, trusted)))
+    if parts:
+        bench.run(bare, "wedge_grasp", parts)
 
 
 def check(data: Path) -> None:
@@ -96,22 +125,19 @@ def frame_count(data: Path) -> int:
 
 def rectified(pipeline: Pipeline) -> Pipeline:
     """The same pipeline with the Wedge's rectification as its only preprocessing."""
-    nodes = {}
-    for node in pipeline.nodes.values():
-        if node.id == "preprocess":
-            node = replace(node, params=node.component.params.model_validate({"homography": RECTIFY}))
-        nodes[node.id] = node
-    return replace(pipeline, nodes=nodes)
+    node = pipeline.nodes["preprocess"]
+    changed = replace(node, params=node.component.params.model_validate({"homography": RECTIFY}))
+    return replace(pipeline, nodes={**pipeline.nodes, "preprocess": changed})
 
 
 def without_markers(pipeline: Pipeline) -> Pipeline:
     """The same pipeline without the stages that need markers to be there."""
-    gone = {node.id for node in pipeline.nodes.values() if node.id in _MARKER_STAGES}
-    return replace(pipeline, nodes={i: node for i, node in pipeline.nodes.items() if i not in gone})
+    nodes = {name: node for name, node in pipeline.nodes.items() if name not in _MARKER_STAGES}
+    return replace(pipeline, nodes=nodes)
 
 
-def stack(files: list[Path], scratch: Path) -> Path:
-    """Images as one `.npy` recording, so that decoding is not part of the time."""
+def stack(files: Sequence[Path], scratch: Path) -> Path:
+    """Images as one `.npy` recording."""
     path = scratch / "recording.npy"
     images = [cv2.imread(str(file), cv2.IMREAD_COLOR) for file in files]
     missing = [file.name for file, image in zip(files, images, strict=True) if image is None]
@@ -121,136 +147,41 @@ def stack(files: list[Path], scratch: Path) -> Path:
     return path
 
 
-def _run(
-    pipelines: Mapping[str, Pipeline],
-    scene: str,
-    recording: Path,
-    scratch: Path,
-    unit: CopyUnit,
-    step: Step,
-    see: Callable[[str, Outcome], str],
-    frames: int,
-) -> dict[str, Measurement]:
-    ready = {name: on_recording(pipeline, recording) for name, pipeline in pipelines.items()}
-    times, failures = take_turns(ready, scratch, unit, see, step)
-    made = {}
-    for name in pipelines:
-        made[name] = Measurement("pipeline", name, RECORDING + scene, frames=frames)
-        made[name].failure = failures.get(name)
-        if name not in failures:
-            fill_times(made[name], times.samples[name], unit, times.samples.get(CLASSIC))
-            made[name].stages_ms = times.stages.get(name, {})
-    return made
-
-
-def _ball(
-    pipelines: Mapping[str, Pipeline], folder: Path, scratch: Path, unit: CopyUnit, step: Step
-) -> list[Measurement]:
+def labelled_presses(folder: Path) -> tuple[list[Path], NDArray[np.float64]]:
+    """Pictures of a ball's presses, the untouched gel first, and the hand-labelled centres (N, 2) px."""
     with (folder / "labels.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     labels = np.array([(float(row["x"]), float(row["y"])) for row in rows])
-    recording = stack([folder / "reference.jpg", *(folder / row["file"] for row in rows)], scratch)
-    centers: dict[str, NDArray[np.float64]] = {name: np.full((len(rows), 2), np.nan) for name in pipelines}
-
-    def see(name: str, outcome: Outcome) -> str:
-        if outcome.contact is not None and outcome.frame.seq > 0:
-            centers[name][outcome.frame.seq - 1] = outcome.contact.center
-        return "contact"
-
-    ready = {name: rectified(pipeline) for name, pipeline in pipelines.items()}
-    made = _run(ready, "wedge_ball", recording, scratch, unit, step, see, len(rows))
-    for name, measurement in made.items():
-        if measurement.failure is None:
-            measurement.errors = label_errors(centers[name], labels)
-    return list(made.values())
+    return [folder / "reference.jpg", *(folder / row["file"] for row in rows)], labels
 
 
-def label_errors(centers: NDArray[np.float64], labels: NDArray[np.float64]) -> dict[str, float]:
-    """Found centres against hand labels.
-
-    Parameters
-    ----------
-    centers : (N, 2) float64, px; NaN where no contact was found. labels : (N, 2) float64, px.
-
-    Returns
-    -------
-    Quantities; distances are taken after the median offset, which depends on what the labeller took for the
-    contact outline's middle.
-    """
-    found = np.isfinite(centers).all(axis=1)
-    errors = {"found_percent": 100.0 * float(np.mean(found))}
-    if found.any():
-        offset = centers[found] - labels[found]
-        offset -= np.median(offset, axis=0)
-        distance = np.hypot(offset[:, 0], offset[:, 1])
-        errors["label_center_p50"] = float(np.median(distance))
-        errors["label_center_p95"] = float(np.percentile(distance, 95))
-    return errors
+def _press(tally: Tally, result: TimedResult, labels: NDArray[np.float64]) -> str:
+    """Compare a centre with its label, (N, 2) px for the frames from 1 on."""
+    if result.frame.seq > 0:
+        tally.percent(found_percent=result.contact is not None)
+        if result.contact is not None:
+            offset = np.subtract(result.contact.center, labels[result.frame.seq - 1])
+            tally.add(label_center_p50=offset, label_center_p95=offset)
+    return "contact"
 
 
-def _roll(
-    pipelines: Mapping[str, Pipeline], folder: Path, scratch: Path, unit: CopyUnit, step: Step
-) -> list[Measurement]:
-    files = sorted(folder.glob("*.jpg"))
-    recording = stack(files, scratch)
-    tallies = {name: IdentityTally() for name in pipelines}
-
-    def see(name: str, outcome: Outcome) -> str:
-        if outcome.markers is not None and outcome.frame.seq > 0:
-            markers = outcome.markers
-            tallies[name].add(markers.origin, markers.position, markers.status == MarkerStatus.LOST)
-        return "contact"
-
-    ready = {name: rectified(pipeline) for name, pipeline in pipelines.items()}
-    made = _run(ready, "wedge_roll", recording, scratch, unit, step, see, len(files))
-    for name, measurement in made.items():
-        if measurement.failure is None:
-            measurement.errors = tallies[name].errors()
-    return list(made.values())
+def _roll(tally: Tally, result: TimedResult) -> str:
+    if result.frame.seq > 0 and result.markers is not None:
+        add_identity_signs(tally, result.markers)
+    return "contact"
 
 
-class IdentityTally:
-    """Signs of wrong identities that need no truth: shared dots, and flow that tears the gel."""
-
-    def __init__(self) -> None:
-        self._pairs: NDArray[np.int64] | None = None
-        self._pitch = 0.0
-        self._count = 0
-        self._frames = 0
-        self._shared = 0
-        self._jumps = 0
-        self._torn = 0
-        self._lost = 0
-
-    def add(
-        self, origin: NDArray[np.float64], position: NDArray[np.float64], lost: NDArray[np.bool_]
-    ) -> None:
-        """Count one frame: (N, 2), (N, 2) px, (N,)."""
-        self._frames += 1
-        self._count = len(origin)
-        if len(origin) < 2:
-            return
-        if self._pairs is None:
-            self._pitch = metrics.grid_pitch(origin)
-            # Not the diagonal ones: with them, a steep but smooth edge of a moving region looks torn.
-            self._pairs = metrics.neighbours(origin)
-        jumps = metrics.flow_jumps(position - origin, ~lost, self._pairs, self._pitch)
-        self._shared += metrics.shared_dots(position, ~lost, self._pitch)
-        self._jumps += jumps
-        self._torn += jumps > 0
-        self._lost += int(np.count_nonzero(lost))
-
-    def errors(self) -> dict[str, float]:
-        """Quantity -> value."""
-        if not self._frames:
-            return {"markers_short": float(WEDGE_DOTS)}
-        return {
-            "markers_short": float(abs(WEDGE_DOTS - self._count)),
-            "shared_dots": self._shared / self._frames,
-            "flow_jumps": self._jumps / self._frames,
-            "frames_with_jumps": 100.0 * self._torn / self._frames,
-            "lost_share": 100.0 * self._lost / max(1, self._count * self._frames),
-        }
+def add_identity_signs(tally: Tally, markers: Markers) -> None:
+    """Count signs of wrong identities that need no truth: shared dots, and flow that tears the gel."""
+    lost = markers.status == MarkerStatus.LOST
+    tally.percent(lost_share=lost)
+    tally.add(markers_short=abs(WEDGE_DOTS - len(lost)))
+    if len(lost) < 2:
+        return
+    jumps = metrics.flow_jumps(markers.origin, markers.displacement, ~lost)
+    shared = metrics.shared_dots(markers.position, ~lost, metrics.dot_pitch(markers.origin))
+    tally.add(shared_dots=shared, flow_jumps=jumps)
+    tally.percent(frames_with_jumps=jumps > 0)
 
 
 def _forces(path: Path) -> NDArray[np.float64]:
@@ -276,38 +207,13 @@ def judged_by_force(force: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDAr
     return contact, contact == (force >= CONTACT_FORCE)
 
 
-def _grasps(
-    pipelines: Mapping[str, Pipeline], files: list[Path], scratch: Path, unit: CopyUnit, step: Step
-) -> list[Measurement]:
-    total: dict[str, Measurement] = {}
-    right = dict.fromkeys(pipelines, 0)
-    judged = dict.fromkeys(pipelines, 0)
-    for path in files:
-        contact, trusted = judged_by_force(_forces(path))
+def _grasp_judge(contact: NDArray[np.bool_], trusted: NDArray[np.bool_]) -> Judge:
+    def judge(tally: Tally, result: TimedResult) -> str:
+        index = result.frame.seq
+        if index >= len(contact):
+            return "idle"
+        if trusted[index]:
+            tally.percent(force_right=(result.contact is not None) == bool(contact[index]))
+        return "contact" if contact[index] else "idle"
 
-        def see(
-            name: str,
-            outcome: Outcome,
-            contact: NDArray[np.bool_] = contact,
-            trusted: NDArray[np.bool_] = trusted,
-        ) -> str:
-            index = outcome.frame.seq
-            if not 0 <= index < len(contact):
-                return "idle"
-            if trusted[index]:
-                judged[name] += 1
-                right[name] += (outcome.contact is not None) == bool(contact[index])
-            return "contact" if contact[index] else "idle"
-
-        made = _run(
-            pipelines, "wedge_grasp", path.with_suffix(".avi"), scratch, unit, step, see, len(contact)
-        )
-        for name, measurement in made.items():
-            before = total.setdefault(name, measurement)
-            if before is not measurement:
-                before.frames += measurement.frames
-                before.failure = before.failure or measurement.failure
-    for name, measurement in total.items():
-        if measurement.failure is None and judged[name]:
-            measurement.errors = {"force_right": 100.0 * right[name] / judged[name]}
-    return list(total.values())
+    return judge

@@ -1,14 +1,16 @@
-"""What a run of the bench found, and how it is stored (`bench.json`)."""
+"""What a run of the bench measured: rows of numbers, their JSON, and the comparison with a stored run."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
+from tactflow.bench.quantities import QUANTITIES
 from tactflow.engine.errors import ConfigError
 
 SCHEMA = "tactflow.bench/1"
@@ -16,127 +18,124 @@ SCHEMA = "tactflow.bench/1"
 RECORDING = "data:"
 """What the scene name of a real recording starts with."""
 
+TIMES = {"contact": "contact_ms", "idle": "idle_ms"}
+"""Kind of frame -> quantity of the rows that hold its median CPU time, ms."""
 
-@dataclass(slots=True)
-class Measurement:
-    """One method on one scene.
 
-    group : what is compared ("pipeline", "marker_mask", "inpaint", "difference", "hull", "tracker", ...).
-    method : the alternative's name. scene : what it was run on. frames : how many.
-    time : kind ("contact", "idle", or "all") -> percentiles in ms; see `timing.Samples.summary`.
-    copies : kind -> median CPU time in copies of a raw frame.
-    faster : kind -> how many times faster than the original script in the same group in the same run.
-    errors : quantity -> value; only what the scene can tell.
-    limits : quantity -> the smallest value that physics allows.
-    stages_ms : stage -> median time of a call, ms; whole pipelines only.
-    peak_mb : peak memory of the process, MB; whole pipelines only.
-    failure : why there is no result, or None.
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One number.
+
+    group : what is compared: "pipeline", or the id of a stage. method : name of the pipeline, or of the way
+    to do the stage's work. scene : simulated scene, or `RECORDING` and the name of a recording.
+    quantity : key of `QUANTITIES`, or one of `TIMES`, or "frames" for the number of frames.
+    value : finite. unit : "" for none.
     """
 
     group: str
     method: str
     scene: str
-    frames: int = 0
-    time: dict[str, dict[str, float]] = field(default_factory=dict)
-    copies: dict[str, float] = field(default_factory=dict)
-    faster: dict[str, float] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-    limits: dict[str, float] = field(default_factory=dict)
-    stages_ms: dict[str, float] = field(default_factory=dict)
-    peak_mb: float | None = None
-    failure: str | None = None
+    quantity: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """The numbers of one method on one scene. values : quantity -> value."""
+
+    group: str
+    method: str
+    scene: str
+    values: Mapping[str, float]
 
     @property
     def key(self) -> str:
-        """Name of the measurement: group/method/scene."""
+        """group/method/scene."""
         return f"{self.group}/{self.method}/{self.scene}"
 
+    @property
+    def errors(self) -> dict[str, float]:
+        """The values that are errors, not times or counts."""
+        return {key: value for key, value in self.values.items() if key in QUANTITIES}
 
-@dataclass(slots=True)
-class Target:
-    """A promise and what became of it.
-
-    quantity : what was promised. target : the promise in words. result : what was measured, in words.
-    met : True, False, or None where it was not measured. on : scenes and method behind the result.
-    """
-
-    quantity: str
-    target: str
-    result: str
-    met: bool | None
-    on: str = ""
+    @property
+    def time_ms(self) -> float | None:
+        """Median CPU time of a frame with contact, ms; of one without where no frame had contact."""
+        return self.values.get(TIMES["contact"], self.values.get(TIMES["idle"]))
 
 
 @dataclass(slots=True)
-class Result:
+class BenchResult:
     """A whole run of the bench.
 
-    quick : whether it was the short one. machine : what it ran on. copy_ms, touch_ms : the unit of time and
-    the cost of touching every byte of a raw frame once, ms. fault_us : the cost of a page of fresh memory,
-    us. wall_s : how long the run took.
+    quick : whether it was the short one. machine : what it ran on. copy_ms : time of one copy of a raw
+    frame, ms. wall_s : how long the run took, s. failures : group/method/scene -> why there are no numbers.
     """
 
     quick: bool
-    machine: dict[str, str] = field(default_factory=dict)
+    machine: dict[str, str] = field(default_factory=dict[str, str])
     copy_ms: float = math.nan
-    touch_ms: float = math.nan
-    fault_us: float = math.nan
     wall_s: float = 0.0
-    measurements: list[Measurement] = field(default_factory=list)
-    targets: list[Target] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list[Row])
+    failures: dict[str, str] = field(default_factory=dict[str, str])
 
-    def groups(self) -> list[str]:
-        """The groups in the order in which they were measured."""
-        return list(dict.fromkeys(m.group for m in self.measurements))
+    def add(
+        self,
+        group: str,
+        method: str,
+        scene: str,
+        errors: Mapping[str, float],
+        *,
+        times: Mapping[str, Collection[float]] | None = None,
+        frames: int | None = None,
+    ) -> None:
+        """Add the errors of a method on a scene, and the median of CPU times, s, of each kind of frame."""
+        values = {key: (value, QUANTITIES[key].unit) for key, value in errors.items()}
+        for kind, quantity in TIMES.items():
+            if samples := (times or {}).get(kind):
+                values[quantity] = 1e3 * median(samples), "ms"
+        if frames is not None:
+            values["frames"] = float(frames), ""
+        self.rows += [Row(group, method, scene, key, *value) for key, value in values.items()]
 
-    def of(self, group: str, method: str | None = None) -> list[Measurement]:
-        """The measurements of a group, or of one method in it."""
-        return [m for m in self.measurements if m.group == group and method in (None, m.method)]
+    def measurements(self, group: str | None = None) -> list[Measurement]:
+        """The numbers by method and scene, in the order in which they were measured; of one group, or all."""
+        found: dict[tuple[str, str, str], dict[str, float]] = {}
+        for row in self.rows:
+            if group in (None, row.group):
+                found.setdefault((row.group, row.method, row.scene), {})[row.quantity] = row.value
+        return [Measurement(*key, values) for key, values in found.items()]
 
-    def methods(self, group: str) -> list[str]:
-        """The methods of a group in the order in which they were measured."""
-        return list(dict.fromkeys(m.method for m in self.of(group)))
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain data; numbers that are not finite become null."""
-        return {"schema": SCHEMA, **_finite(asdict(self))}
+    def errors(self) -> dict[str, dict[str, float]]:
+        """group/method/scene -> quantity -> error."""
+        return {m.key: m.errors for m in self.measurements() if m.errors}
 
     def save(self, path: Path) -> None:
-        """Write as JSON."""
-        path.write_text(json.dumps(self.to_json(), indent=1) + "\n", encoding="utf-8")
+        """Write everything as JSON."""
+        _write(path, {"schema": SCHEMA, **asdict(self)})
 
     def save_errors(self, path: Path) -> None:
-        """Write only what does not depend on the machine: the errors, to compare a later run with."""
+        """Write only the errors, which do not depend on the machine, to compare a later run with."""
         errors = {
-            m.key: {name: float(f"{value:.6g}") for name, value in sorted(m.errors.items())}
-            for m in self.measurements
-            if m.errors
+            key: {name: float(f"{value:.6g}") for name, value in sorted(values.items())}
+            for key, values in self.errors().items()
         }
-        stored = {"schema": SCHEMA, "quick": self.quick, "errors": errors}
-        path.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")
+        _write(path, {"schema": SCHEMA, "quick": self.quick, "errors": errors})
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return value
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def load_errors(path: Path) -> tuple[bool, dict[str, dict[str, float]]]:
-    """Read a stored result, whole or errors only.
-
-    Returns
-    -------
-    (quick, errors) : whether it was a quick run, and measurement key -> quantity -> value.
+def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
+    """Errors of a stored run, whole or errors only: group/method/scene -> quantity -> error.
 
     Raises
     ------
     ConfigError
-        If the file cannot be read or is not a result of the bench.
+        If the file cannot be read, is not a result of the bench, or one run is quick and the other is not:
+        they differ in their scenes.
     """
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
@@ -144,13 +143,46 @@ def load_errors(path: Path) -> tuple[bool, dict[str, dict[str, float]]]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise ConfigError(f"{path}: not JSON: {error}") from error
-    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA:
+    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or not {"errors", "rows"} & set(stored):
         raise ConfigError(f'{path}: not a result of `tactflow bench` (required "schema": "{SCHEMA}")')
-    errors: dict[str, dict[str, float]] = {}
+    if stored["quick"] != quick:
+        kind = "quick" if stored["quick"] else "full"
+        raise ConfigError(f"{path}: is the result of a {kind} run; compare it with a {kind} run")
     if "errors" in stored:
-        errors = stored["errors"]
-    else:
-        for m in stored["measurements"]:
-            if m["errors"]:
-                errors[f"{m['group']}/{m['method']}/{m['scene']}"] = m["errors"]
-    return bool(stored.get("quick")), errors
+        errors: dict[str, dict[str, float]] = stored["errors"]
+        return errors
+    return BenchResult(quick, rows=[Row(**row) for row in stored["rows"]]).errors()
+
+
+def regressions(
+    result: BenchResult,
+    stored: Mapping[str, Mapping[str, float]],
+    scenes: Collection[str] | None = None,
+) -> list[str]:
+    """In words, every error that is worse than in a stored run by more than its tolerance, or missing.
+
+    stored : of `load_errors`. scenes : the simulated scenes that were chosen, or None for all.
+    """
+    now = result.errors()
+    here = {key.rpartition("/")[2] for key in now}
+    return [line for key, errors in stored.items() for line in _worse(key, errors, now, here, scenes)]
+
+
+def _worse(
+    key: str,
+    stored: Mapping[str, float],
+    now: Mapping[str, Mapping[str, float]],
+    here: Collection[str],
+    chosen: Collection[str] | None,
+) -> Iterable[str]:
+    """What is worse in one measurement. here : scenes that were measured. chosen : as `scenes` above."""
+    scene = key.rpartition("/")[2]
+    # Recordings are not everywhere; simulated scenes are, so a missing one is a regression.
+    if scene not in here and (scene.startswith(RECORDING) or (chosen is not None and scene not in chosen)):
+        return
+    for name, value in stored.items():
+        quantity, current = QUANTITIES.get(name), now.get(key, {}).get(name)
+        if quantity is not None and (current is None or quantity.is_worse(current, value)):
+            measured = "no longer measured" if current is None else f"now {current:.4g}"
+            allowed = quantity.allowed(value)
+            yield f"{key}: {quantity.title}: was {value:.4g}, allowed {allowed:.4g}, {measured}"

@@ -1,9 +1,8 @@
-"""The scenes that everything is measured on, rendered once per run."""
+"""The simulated scenes that everything is measured on, rendered once per run."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench import limit
 from tactflow.sim import Scene, Truth, open_scene
-from tactflow.sim.markers import DARK_MARKER, EDGE
 from tactflow.vision.geometry import PixelMapping
 
 
@@ -22,7 +19,7 @@ class Case:
     """A scene and how much of it is used.
 
     name : of the scene. frames : of its recording, all of which are used. query : further settings.
-    suffix : tells it from the same scene with other settings.
+    suffix : distinguishes it from the same scene with other settings.
     """
 
     name: str
@@ -32,7 +29,7 @@ class Case:
 
     @property
     def label(self) -> str:
-        """What results call it."""
+        """Its name in results."""
         return self.name + self.suffix
 
     @property
@@ -41,85 +38,37 @@ class Case:
         return f"{self.name}?frames={self.frames}" + (f"&{self.query}" if self.query else "")
 
 
-QUICK = (Case("press", 44), Case("bright_cable", 40), Case("jumps", 30))
+def _cases(text: str) -> tuple[Case, ...]:
+    """Cases written as NAME:FRAMES."""
+    pairs = (word.split(":") for word in text.split())
+    return tuple(Case(name, int(frames)) for name, frames in pairs)
+
+
+QUICK = _cases("press:44 bright_cable:40 jumps:30")
 """One contact with each kind of light, and the hardest motion."""
 
 FULL = (
-    Case("press", 150),
-    Case("bright", 150),
-    Case("mixed", 100),
-    Case("cable", 280),
-    Case("bright_cable", 220),
-    Case("bent_cable", 100),
-    Case("edge", 150),
-    Case("box", 150),
-    Case("ring", 80),
-    Case("screw", 80),
-    Case("two", 80),
-    Case("border", 150),
-    Case("slide", 140),
-    Case("twist", 140),
-    Case("strong_shear", 140),
-    Case("jumps", 160),
-    Case("worn", 150),
+    *_cases("press:150 bright:150 mixed:100 cable:280 bright_cable:220 bent_cable:100 edge:150 box:150"),
+    *_cases("ring:80 screw:80 two:80 border:150 slide:140 twist:140 strong_shear:140 jumps:160 worn:150"),
     Case("jumps", 160, "worn=0.05&missing=0.05&vanish=0.05", "_worn"),
-    Case("dense", 100),
-    Case("sparse", 80),
-    Case("bright_dots", 80),
-    Case("square_dots", 80),
-    Case("doubled_dots", 80),
-    Case("irregular", 80),
-    Case("tilted", 80),
-    Case("glossy", 100),
-    Case("noisy", 100),
-    Case("drift", 150),
-    Case("flicker", 150),
-    Case("idle", 100),
-    Case("tap", 100),
-    Case("unmarked", 100),
+    *_cases("dense:100 sparse:80 bright_dots:80 square_dots:80 doubled_dots:80 irregular:80 tilted:80"),
+    *_cases("glossy:100 noisy:100 drift:150 flicker:150 idle:100 tap:100 unmarked:100"),
 )
 """Every kind of contact, light, marker and camera trouble."""
 
 TROUBLES = (
-    Case("warm_up", 140),
-    Case("stale", 100),
-    Case("lamp", 100),
-    Case("round_gel", 56),
-    Case("block", 56),
-    Case("coin", 56),
-    Case("key", 56),
-    Case("long_edge", 56),
-    Case("finger", 56),
-    Case("dark_channel", 56),
-    Case("halo", 56),
-    Case("painted", 56),
-    Case("speckle", 56),
-    Case("leds", 56),
-    Case("stray", 56),
+    *_cases("warm_up:140 stale:100 lamp:100 round_gel:56 block:56 coin:56 key:56 long_edge:56 finger:56"),
+    *_cases("dark_channel:56 halo:56 painted:56 speckle:56 leds:56 stray:56"),
 )
 """What went wrong on recordings of real gels, one trouble in each scene."""
 
-QUICK_STAGES = (Case("press", 20), Case("bright_cable", 20), Case("jumps", 16))
+QUICK_STAGES = _cases("press:20 bright_cable:20 jumps:16")
 """For methods alone; short, because OpenCV's inpainting is slow."""
 
-FULL_STAGES = (
-    Case("press", 60),
-    Case("bright", 60),
-    Case("cable", 60),
-    Case("bright_cable", 60),
-    Case("twist", 60),
-    Case("strong_shear", 60),
-    Case("jumps", 60),
-    Case("worn", 60),
-    Case("dense", 60),
-    Case("noisy", 60),
-    Case("drift", 60),
+FULL_STAGES = _cases(
+    "press:60 bright:60 cable:60 bright_cable:60 twist:60 strong_shear:60 jumps:60 worn:60 dense:60 noisy:60 "
+    "drift:60"
 )
-
-NOMINAL = frozenset(
-    {"press", "bright", "mixed", "cable", "bright_cable", "box", "slide", "twist", "border", "two", "dense"}
-)
-"""Scenes at noise 2 with a sound gel and steady light: what the targets speak of."""
 
 
 class Rendered:
@@ -157,32 +106,8 @@ class Rendered:
         # The smooth ramp passes through half depth; a hair of tolerance keeps that frame on one side.
         return any(press.depth >= 0.5 * press.shape.depth - 1e-9 for press in self.scene.presses(index))
 
-    def displacement_limit(self, mapping: PixelMapping) -> float | None:
-        """Cramer-Rao bound of a displacement's RMS length in processed px; None where it does not apply.
 
-        For round dark dots of a camera whose only trouble is noise. The bound belongs to the raw frame: no
-        processing can add information.
-        """
-        settings = self.scene.settings
-        plain = settings.shape == "round" and settings.polarity == "dark" and self.scene.camera.identity
-        plain = plain and not settings.sizes and not settings.aperture
-        if not plain or settings.noise <= 0 or settings.blur or settings.jpeg or settings.shot:
-            return None
-        layout = self.scene.layout
-        inside = np.all((layout.rest >= 0) & (layout.rest < self.scene.size), axis=1)
-        if not inside.any():
-            return None
-        x, y = np.rint(layout.rest[inside]).astype(int).T
-        light = self.scene.clean(0)[np.minimum(y, 599), np.minimum(x, 799)].astype(np.float64)
-        contrast = DARK_MARKER * light * layout.contrast[inside, None]
-        noise = limit.rounded(settings.noise)
-        variance = [limit.position_bound(layout.radius, EDGE, row, noise) ** 2 for row in contrast]
-        raw = limit.displacement_bound(math.sqrt(float(np.mean(variance))))
-        scale = math.sqrt(abs(float(np.linalg.det(mapping.matrix[:2, :2]))))
-        return raw * scale
-
-
-def render_all(cases: tuple[Case, ...], folder: Path) -> Iterator[Rendered]:
+def render_all(cases: Iterable[Case], folder: Path) -> Iterator[Rendered]:
     """Render one scene after the other; each file is removed when the next one is asked for."""
     for case in cases:
         rendered = Rendered(case, folder)

@@ -10,9 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench.lockstep import Outcome
-from tactflow.bench.pipelines import on_recording, take_turns
-from tactflow.bench.timing import CopyUnit, Samples
+from tactflow.bench.lockstep import TimedResult, on_recording, take_turns
+from tactflow.bench.timing import CopyUnit, Times
 from tactflow.doctor.checks import STEADY
 from tactflow.engine.graph import Pipeline
 from tactflow.tune.recording import HEAD, Recording
@@ -35,9 +34,8 @@ class _Seen:
 
     centers: dict[int, NDArray[np.float64] | None] = field(default_factory=dict)
     dots: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
-    times: dict[str, Samples] = field(default_factory=dict)
 
-    def add(self, number: int, outcome: Outcome) -> str:
+    def add(self, number: int, outcome: TimedResult) -> str:
         """Keep one frame's answers; returns the kind of frame."""
         mapping = outcome.mapping
         to_raw = np.asarray if mapping is None else mapping.to_raw
@@ -68,7 +66,7 @@ def run(
     folder: Path,
     unit: CopyUnit,
     late: Callable[[], bool] = lambda: False,
-) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, Samples]], dict[str, str]]:
+) -> tuple[dict[str, dict[str, float]], dict[str, Times], dict[str, str]]:
     """Show the recording to pipelines in several orders.
 
     Parameters
@@ -84,7 +82,7 @@ def run(
     """
     frames = np.load(recording.path, mmap_mode="r")
     seen: dict[str, dict[str, _Seen]] = {name: {} for name in pipelines}
-    times: dict[str, dict[str, Samples]] = {}
+    times: dict[str, Times] = {}
     failures: dict[str, str] = {}
     for order, numbers in orders(recording.frames).items():
         if late():
@@ -93,17 +91,17 @@ def run(
         if order != "forward":
             np.save(path, frames[numbers])
 
-        def see(name: str, outcome: Outcome, order: str = order, numbers: list[int] = numbers) -> str:
+        def see(name: str, outcome: TimedResult, order: str = order, numbers: list[int] = numbers) -> str:
             if not 0 <= outcome.frame.seq < len(numbers):
                 return "reference"
             return seen[name].setdefault(order, _Seen()).add(numbers[outcome.frame.seq], outcome)
 
         ready = {n: on_recording(p, path) for n, p in pipelines.items() if n not in failures}
-        found, failed = take_turns(ready, folder, unit, see, lambda: None, late=late)
+        found, failed = take_turns(ready, see, unit=unit, late=late)
         failures.update(failed)
         if order == "forward":
             whole = any(len(one["forward"].centers) == len(numbers) for one in seen.values() if one)
-            times = found.samples if whole else {}
+            times = found if whole else {}
         else:
             path.unlink()
     good = [name for name in pipelines if name not in failures]

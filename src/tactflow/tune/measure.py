@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench.lockstep import Outcome
-from tactflow.bench.pipelines import PipelineScore, on_recording, take_turns
+from tactflow.bench.lockstep import TimedResult, on_recording, take_turns
+from tactflow.bench.quantities import Tally, rms
 from tactflow.bench.scenes import Rendered
-from tactflow.bench.timing import CopyUnit, Samples
+from tactflow.bench.score import PipelineScore
+from tactflow.bench.timing import CopyUnit, Times
 from tactflow.engine.graph import Pipeline
-from tactflow.vision.geometry import PixelMapping
 
 ANY: Final = "any"
 ERRORS: Final = {
@@ -89,9 +88,9 @@ class Found:
 class _Kept:
     """Errors of one candidate, one number a frame, px of the camera's picture."""
 
-    score: PipelineScore = field(default_factory=PipelineScore)
+    tally: Tally = field(default_factory=Tally)
     scale: float = 1.0
-    times: dict[str, Samples] = field(default_factory=dict[str, Samples])
+    times: Times = field(default_factory=Times)
 
 
 def on_sensor(pipeline: Pipeline) -> Pipeline:
@@ -108,7 +107,6 @@ def on_sensor(pipeline: Pipeline) -> Pipeline:
 def judge(
     pipelines: Mapping[str, Pipeline],
     recordings: Sequence[Rendered],
-    folder: Path,
     unit: CopyUnit,
     seed: int,
     late: Callable[[], bool] = lambda: False,
@@ -124,45 +122,41 @@ def judge(
             break
         ends = late if number else lambda: False
 
-        def see(name: str, outcome: Outcome, rendered: Rendered = rendered) -> str:
-            height, width = outcome.frame.image.shape[:2]
-            mapping = outcome.mapping or PixelMapping.identity((width, height))
-            kept[name].scale = 1.0 / math.sqrt(abs(float(np.linalg.det(mapping.matrix[:2, :2]))))
-            # Identities are matched anew in each recording.
-            if outcome.frame.seq == 0:
-                kept[name].score.markers.index = None
-            return kept[name].score.add(outcome, rendered)
+        scores = {name: PipelineScore(rendered, kept[name].tally) for name in pipelines}
+
+        def see(name: str, result: TimedResult, scores: Mapping[str, PipelineScore] = scores) -> str:
+            if result.mapping is not None:
+                kept[name].scale = 1.0 / math.sqrt(abs(float(np.linalg.det(result.mapping.matrix[:2, :2]))))
+            return scores[name].add(result)
 
         ready = {
             name: on_recording(pipeline, rendered.path)
             for name, pipeline in pipelines.items()
             if name not in failures
         }
-        times, failed = take_turns(ready, folder, unit, see, lambda: None, late=ends)
+        times, failed = take_turns(ready, see, unit=unit, late=ends)
         failures.update(failed)
-        for name, samples in times.samples.items():
+        for name, samples in times.items():
             _add(kept[name].times, samples)
     return {name: _found(name, kept[name], failures.get(name), seed) for name in pipelines}
 
 
-def _add(times: dict[str, Samples], more: Mapping[str, Samples]) -> None:
+def _add(times: Times, more: Times) -> None:
     for kind, samples in more.items():
-        own = times.setdefault(kind, Samples())
-        own.cpu += samples.cpu
-        own.wall += samples.wall
+        times[kind] = times.get(kind, []) + samples
 
 
 def _found(name: str, kept: _Kept, failure: str | None, seed: int) -> Found:
-    score, scale = kept.score, kept.scale
+    tally, scale = kept.tally, kept.scale
     found = Found(name, failure=failure)
     if failure is not None:
         return found
-    found.quantities = score.errors()
-    found.frames = score.contact.idle + score.contact.touched
+    found.quantities = tally.errors()
+    found.frames = len(tally.values["false_contacts"]) + len(tally.values["missed_contacts"])
     per_frame = {
-        "center": np.array(score.contact.center),
-        "dots": np.sqrt([float(np.mean(e**2)) for e in score.markers.right if len(e)]),
-        "flow": np.array(score.flow.error),
+        "center": np.array(tally.values["center_error"]).ravel(),
+        "dots": np.array([rms(errors) for errors in tally.values["displacement_rms"] if len(errors)]),
+        "flow": np.array(tally.values["flow_error"]).ravel(),
     }
     for kind, values in per_frame.items():
         if len(values):
@@ -174,9 +168,9 @@ def _found(name: str, kept: _Kept, failure: str | None, seed: int) -> Found:
     return found
 
 
-def set_time(found: Found, times: Mapping[str, Samples], seed: int) -> None:
+def set_time(found: Found, times: Times, seed: int) -> None:
     """Time of a frame with contact, or of any but references where none has one."""
-    counted = {kind: np.array(samples.cpu) * 1e3 for kind, samples in times.items() if kind != "reference"}
+    counted = {kind: np.array(samples) * 1e3 for kind, samples in times.items() if kind != "reference"}
     if not counted:
         return
     busy = counted.get("contact", np.concatenate(list(counted.values())))

@@ -10,10 +10,10 @@ from typing import Any, Final
 
 import yaml
 
-from tactflow.bench.log_axis import LogAxis
 from tactflow.bench.quantities import format_number
 from tactflow.engine.errors import ConfigError
 from tactflow.tune.checks import WORDS
+from tactflow.tune.log_axis import LogAxis
 from tactflow.tune.measure import ANY, ERRORS, Found, Interval
 from tactflow.tune.search import DEFAULT, ORIGINAL, Tuned
 

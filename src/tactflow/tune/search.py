@@ -245,7 +245,7 @@ class Search:
                 failed.append(Found(candidate.name, failure=str(error)))
         rendered = [Fitted(look, case, folder, seed + index) for index, case in enumerate(cases)]
         try:
-            made = judge(pipelines, rendered, folder, self._unit, self._seed, self._late)
+            made = judge(pipelines, rendered, self._unit, self._seed, self._late)
         finally:
             for one in rendered:
                 one.path.unlink(missing_ok=True)
@@ -300,7 +300,7 @@ class Search:
         pipeline = Candidate(ORIGINAL, (("stages.preprocess.rotate", 0),)).load(self._original)
         rendered = Fitted(look, ROUNDS[0][0], folder, self._seed)
         try:
-            made = judge({ORIGINAL: on_sensor(pipeline)}, [rendered], folder, self._unit, self._seed)
+            made = judge({ORIGINAL: on_sensor(pipeline)}, [rendered], self._unit, self._seed)
         finally:
             rendered.path.unlink(missing_ok=True)
         return list(made.values())

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tactflow.bench.quantities import QUANTITIES, Tally, format_number
+from tactflow.bench.results import BenchResult, load_errors, regressions
+from tactflow.engine.errors import ConfigError
+
+
+def run(scene: str = "press", quick: bool = True, **errors: float) -> BenchResult:
+    result = BenchResult(quick, copy_ms=0.1)
+    result.add("tracker", "pattern", scene, errors, times={"contact": [0.003, 0.001, 0.002]}, frames=3)
+    return result
+
+
+def worse(result: BenchResult, stored: BenchResult, scenes: set[str] | None = None) -> list[str]:
+    return regressions(result, stored.errors(), scenes)
+
+
+def test_times_and_errors_are_rows_with_units() -> None:
+    (measurement,) = run(displacement_rms=0.02).measurements("tracker")
+    assert measurement.values == {"displacement_rms": 0.02, "contact_ms": 2.0, "frames": 3}
+    assert measurement.errors == {"displacement_rms": 0.02}
+    assert [(row.quantity, row.unit) for row in run(displacement_rms=0.02).rows] == [
+        ("displacement_rms", "px"),
+        ("contact_ms", "ms"),
+        ("frames", ""),
+    ]
+
+
+def test_values_of_many_frames_become_one_number() -> None:
+    tally = Tally()
+    for value in ([3.0, 4.0], [0.0], []):
+        tally.add(displacement_rms=value)
+    tally.percent(wrong_percent=[True, False, False, False])
+    tally.within("flow", [0.5, -1.5], [1.0, 1.0])
+    # Offsets from hand labels: all are one pixel to the right, one is another two away.
+    tally.add(label_center_p50=[(1, 0), (1, 0), (1, 2)], label_center_p95=[(1, 0), (1, 0), (1, 2)])
+    assert tally.errors() == {
+        "displacement_rms": pytest.approx((25 / 3) ** 0.5),
+        "wrong_percent": 25,
+        "flow_within_one": 50,
+        "flow_within_two": 100,
+        "label_center_p50": 0,
+        "label_center_p95": pytest.approx(1.8),
+    }
+
+
+@pytest.mark.parametrize("write", [BenchResult.save, BenchResult.save_errors])
+def test_a_stored_run_is_read_back(tmp_path: Path, write: object) -> None:
+    path = tmp_path / "stored.json"
+    write(run(displacement_rms=0.02, marker_recall=0.99), path)  # type: ignore[operator]
+    assert load_errors(path, quick=True) == {
+        "tracker/pattern/press": {"displacement_rms": 0.02, "marker_recall": 0.99}
+    }
+    with pytest.raises(ConfigError, match="result of a quick run; compare it with a quick run"):
+        load_errors(path, quick=False)
+
+
+def test_what_got_worse_by_more_than_its_tolerance_is_named() -> None:
+    stored = run(displacement_rms=0.02)
+    within = QUANTITIES["displacement_rms"].allowed(0.02)
+    assert worse(run(displacement_rms=within), stored) == []
+    (line,) = worse(run(displacement_rms=within + 1e-6), stored)
+    assert line.startswith("tracker/pattern/press: marker displacement error, RMS: was 0.02, allowed 0.026")
+
+
+def test_a_recall_that_falls_is_worse_and_one_that_rises_is_not() -> None:
+    stored = run(marker_recall=0.9)
+    assert worse(run(marker_recall=1.0), stored) == []
+    assert len(worse(run(marker_recall=0.8), stored)) == 1
+
+
+def test_a_quantity_that_is_no_longer_measured_is_a_regression_unless_its_scene_was_not_chosen() -> None:
+    stored = run(displacement_rms=0.02)
+    (line,) = worse(run(wrong_percent=0.0), stored)
+    assert line.endswith("no longer measured")
+    assert len(worse(run(scene="cable", displacement_rms=0.02), stored)) == 1
+    assert worse(run(scene="cable", displacement_rms=0.02), stored, {"cable"}) == []
+
+
+def test_recordings_that_are_not_here_are_not_missed() -> None:
+    stored = run(scene="data:wedge_ball", found_percent=100.0)
+    assert worse(run(), stored) == []
+    assert len(worse(run(scene="data:wedge_ball", found_percent=90.0), stored)) == 1
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '{"schema": "other/1"}', '{"schema": "tactflow.bench/1"}'])
+def test_a_file_that_is_not_a_result_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"x\.json"):
+        load_errors(path, quick=True)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0"), (0.0123456, "0.0123"), (12.34, "12.3"), (1234.5, "1234"), (1e-6, "1.0e-06"), (10, "10")],
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert format_number(value) == text

@@ -1,0 +1,110 @@
+"""The same tables in the terminal, in Markdown and in the report."""
+
+from __future__ import annotations
+
+import io
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from tactflow.bench.quantities import QUANTITIES
+from tactflow.bench.report import pareto, points, write_bench_report
+from tactflow.bench.results import BenchResult
+from tactflow.bench.tables import BEGIN, END, markdown, print_sections, sections, write_markdown
+
+RMS = QUANTITIES["displacement_rms"]
+
+
+@pytest.fixture
+def result() -> BenchResult:
+    """Methods for trackers, one of which has nothing to say about a scene; whole pipelines; recordings."""
+    made = BenchResult(quick=True, copy_ms=0.1)
+    for method, scene, ms, rms, wrong in (
+        ("slow & <exact>", "press", 5.0, 0.01, 0),
+        ("slow & <exact>", "cable", 6.0, 0.02, 0),
+        ("fast", "press", 0.5, 0.1, 1),
+        ("fast", "cable", 0.6, 0.3, 3),
+        ("bad", "press", 7.0, 0.5, 9),
+        ("bad", "cable", 7.0, 0.5, 9),
+        ("only easy scenes", "press", 0.1, 0.001, 0),
+    ):
+        errors = {"displacement_rms": rms, "wrong_percent": wrong}
+        made.add("tracker", method, scene, errors, times={"contact": [ms / 1e3]}, frames=1)
+    scored = {"displacement_rms": 0.01, "hull_iou": 0.97, "false_contacts": 0, "missed_contacts": 4}
+    made.add("pipeline", "default", "press", scored, times={"contact": [0.0015], "idle": [0.0001]})
+    gel = {"dots_found": 97.6, "dots_beyond": 0.0}
+    made.add("pipeline", "default", "data:sts_640", gel, frames=296)
+    made.add("pipeline", "markerless", "data:mini_box", {"line_angle_p50": 0.5}, frames=14)
+    made.add("pipeline", "default", "data:mini_box", {"markers_false": 0.0}, frames=1)
+    made.add("pipeline", "default", "data:wedge_grasp", {"force_right": 95.0}, frames=300)
+    made.failures["pipeline/classic/press"] = "no markers\nmore"
+    return made
+
+
+def test_a_point_is_the_median_over_scenes_and_a_method_without_answers_has_none(result: BenchResult) -> None:
+    found = {point.method: point for point in points(result, "tracker", RMS)}
+    fast = found["fast"]
+    assert (fast.cost, fast.error, fast.least, fast.worst) == (5.5, 0.2, 0.1, 0.3)
+    assert "only easy scenes" not in found
+
+
+def test_the_front_holds_what_nothing_beats_in_both(result: BenchResult) -> None:
+    assert [point.method for point in pareto(points(result, "tracker", RMS))] == ["fast", "slow & <exact>"]
+
+
+def test_every_kind_of_measurement_has_its_row(result: BenchResult) -> None:
+    text = markdown(sections(result))
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert "| fast | 0.55 | 5.5 | - | - | 0.2 (0.3) | - | 2 (3) |" in rows
+    assert "| press | default | 1.5 | -, - | 0.01 | -, - | 0, 4, - | 0.97 | - | - | - |" in rows
+    assert "| wedge_grasp | default | - | contact agrees with force >= 0.75 N, %: 95 |" in rows
+    (gel,) = [row for row in rows if row.startswith("| sts_640 |")]
+    assert "| chosen on | 296 | 165 | 97.6, 0 | - | - |" in gel
+    (bare,) = [row for row in rows if row.startswith("| mini_box |")]
+    assert "| test | 14 | 0, refused |" in bare
+    assert "| pipeline/classic/press | no markers more |" in rows
+    for above, below in pairwise(text.splitlines()):
+        if above.startswith("|") and below.startswith("|"):
+            assert above.count("|") == below.count("|")
+
+
+def test_an_existing_page_keeps_its_own_text(result: BenchResult, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"# Title\n\n{BEGIN}\nstale words\n{END}\n\nmore text\n", encoding="utf-8")
+    for _ in range(2):
+        write_markdown(sections(result), page)
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("# Title\n\n")
+    assert text.endswith(f"{END}\n\nmore text\n")
+    assert "stale words" not in text
+    assert text.count("### Marker tracking") == 1
+    write_markdown(sections(result), tmp_path / "new.md")
+    assert "| press |" in (tmp_path / "new.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("width", [100, 200])
+def test_nothing_in_the_terminal_is_cut(result: BenchResult, width: int) -> None:
+    out = io.StringIO()
+    print_sections(sections(result), Console(file=out, width=width))
+    text = out.getvalue()
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= width
+    assert "<exact>" in text
+
+
+def test_the_report_has_tables_and_a_plot_for_each_quantity_of_several_methods(
+    result: BenchResult, tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib")
+    write_bench_report(result, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert re.findall(r"<figcaption>(.*?)</figcaption>", page) == [
+        "marker displacement error, RMS",
+        "markers with a wrong identity",
+    ]
+    assert page.count("<svg") == 2
+    assert "<exact>" not in page
+    assert "Whole pipelines, scene by scene" in page
