@@ -75,15 +75,16 @@ def test_a_block_is_so_many_frames_and_the_last_one_is_what_is_left(
     assert not (tmp_path / "never_written.jsonl").exists()
 
 
-def test_a_frames_time_is_its_own(pipeline: Pipeline, tmp_path: Path) -> None:
-    slow = load_pipeline(pipeline.file, overrides=["stages.mean.use=./stages.py:Works"])
+@pytest.mark.usefixtures("pipeline")
+def test_a_frames_time_is_its_own(tmp_path: Path) -> None:
+    slow = load_pipeline(tmp_path / "pipeline.yaml", ["stages.mean.use=./stages.py:Works"])
     lockstep = LockstepPipeline(recorded(slow, tmp_path, 0, 60, 0, 30))
     times = [result.cpu_s for result in lockstep.block(4)]
     lockstep.close()
     # Its own thread's time: what others take on a busy machine does not count.
     assert times[1] >= 0.06
     assert times[3] >= 0.03
-    assert times[1] > times[0] + times[2]
+    assert times[2] < times[3] < times[1]
 
 
 def test_what_came_before_a_failure_is_kept_and_then_it_is_raised(pipeline: Pipeline, tmp_path: Path) -> None:

@@ -29,8 +29,10 @@ def beyond_offset(values: NDArray[np.float64], q: float) -> float:
 
 
 P99 = partial(np.percentile, q=99)
+"""99th percentile."""
 P50_OF_OFFSETS, P95_OF_OFFSETS = partial(beyond_offset, q=50), partial(beyond_offset, q=95)
 MEAN, MEDIAN, MOST, LEAST = np.mean, np.median, np.max, np.min
+"""How values become one number."""
 
 
 @dataclass(frozen=True, slots=True)
