@@ -158,7 +158,7 @@ class Record(Recorder):
 
     def counters(self) -> dict[str, int]:
         """frames, files : written so far. bytes : of the finished files. ring_frames, ring_bytes : kept."""
-        return {} if self._recorder is None else self._recorder.counts | self._recorder.kept
+        return {} if self._recorder is None else self._recorder.counters()
 
     def write(self, result: Result) -> None:
         """Record one frame, or keep it for later.

@@ -30,7 +30,7 @@ from tactflow.network.control_socket import ControlSocket
 from tactflow.recording.frames import FrameCoder, RawFrame
 from tactflow.recording.records import NotARecordingError
 from tactflow.recording.repair import repair
-from tactflow.recording.schemas import protobuf_type
+from tactflow.recording.schemas import channel_type
 from tactflow.recording.writer import Entry, RecordingWriter
 from tactflow.sinks.zmq import Zmq
 from tactflow.sources.bags import Bag
@@ -130,7 +130,8 @@ def _recording(path: Path, *, finished: bool) -> bytes:
     writer = RecordingWriter(path, "main", overwrite=True)
     for seq in range(4):
         frame = Frame("main", seq, seq / 10, IMAGE, reference=seq == 0)
-        writer.write(Entry(round(seq * 1e8), seq, seq == 0, 0, coder.encode(frame), b"{}"))
+        data = {"frames": coder.encode(frame), "results": b"{}"}
+        writer.write(Entry(round(seq * 1e8), seq, seq == 0, 0, data))
     if finished:
         writer.finish()
     else:
@@ -143,7 +144,7 @@ def _other_recording(packing: CompressionType) -> bytes:
     file = io.BytesIO()
     writer = Writer(file, chunk_size=1024, compression=packing)
     writer.start()
-    kind = protobuf_type(RawFrame)
+    kind = channel_type(RawFrame)
     schema = writer.register_schema(kind.name, *kind.schema)
     channel = writer.register_channel("/main/frames", "protobuf", schema)
     coder = FrameCoder()

@@ -155,7 +155,7 @@ def test_the_ring_never_takes_more_memory_than_allowed(
         sink.write(Result(Frame("main", seq, seq / FPS, noise)))
         assert sink.counters()["ring_bytes"] <= 16_000_000
     assert 10 <= sink.counters()["ring_frames"] < 30
-    assert caplog.text.count("because memory is limited to 16 MB") == 1
+    assert caplog.text.count("as memory is limited to 16 MB") == 1
     sink.close()
 
 

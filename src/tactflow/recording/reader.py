@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.records import Attachment, Channel, Chunk, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Attachment, Channel, Message, Schema
+from mcap.summary import Summary
 
 from tactflow.recording.frames import TYPE_NAME
-from tactflow.recording.records import (
-    DAMAGE,
-    MAGIC,
-    Damage,
-    NotARecordingError,
-    intact_records,
-    read_summary,
-)
+from tactflow.recording.records import Damage, NotARecordingError, intact_records, read_summary
 
 MOST_NAMED = 20
 """Topics that a message lists at most. Chosen by hand."""
@@ -51,39 +43,33 @@ def look_into(path: Path) -> Contents:
     with path.open("rb") as file:
         summary = read_summary(file)
         if summary is None:
-            return _look_at_beginning(file)
-    frames, references = _frame_topics(summary.channels.values(), summary.schemas)
+            # Its channels are described before its first message.
+            found = Summary()
+            for record in intact_records(file):
+                if isinstance(record, Schema):
+                    found.schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    found.channels[record.id] = record
+                elif isinstance(record, Message):
+                    return Contents(False, *_frame_topics(found), None, record.log_time, None)
+            return Contents(False, *_frame_topics(found), 0, None, None)
+    topics = _frame_topics(summary)
     statistics = summary.statistics
     if statistics is None:
-        return Contents(True, frames, references, None, None, None)
+        return Contents(True, *topics, None, None, None)
     counts = statistics.channel_message_counts
-    count = sum(counts.get(c.id, 0) for c in summary.channels.values() if c.topic in (frames, references))
-    return Contents(
-        True, frames, references, count, statistics.message_start_time, statistics.message_end_time
-    )
+    count = sum(counts.get(channel.id, 0) for channel in summary.channels.values() if channel.topic in topics)
+    return Contents(True, *topics, count, statistics.message_start_time, statistics.message_end_time)
 
 
-def _look_at_beginning(file: io.BufferedReader) -> Contents:
-    """What a file without an index holds: its channels are described before the first message."""
-    schemas: dict[int, Schema] = {}
-    channels: list[Channel] = []
-    for record in intact_records(file):
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            channels.append(record)
-        elif isinstance(record, Message):
-            return Contents(False, *_frame_topics(channels, schemas), None, record.log_time, None)
-    return Contents(False, *_frame_topics(channels, schemas), 0, None, None)
-
-
-def _frame_topics(channels: Collection[Channel], schemas: dict[int, Schema]) -> tuple[str, str]:
+def _frame_topics(found: Summary) -> tuple[str, str]:
     """The topics of the frames and of the references."""
-    for channel in sorted(channels, key=lambda channel: channel.topic):
-        schema = schemas.get(channel.schema_id)
+    channels = sorted(found.channels.values(), key=lambda channel: channel.topic)
+    for channel in channels:
+        schema = found.schemas.get(channel.schema_id)
         if schema is not None and schema.name == TYPE_NAME and channel.topic.endswith("/frames"):
             return channel.topic, channel.topic.removesuffix("frames") + "references"
-    topics = sorted({channel.topic for channel in channels})
+    topics = list(dict.fromkeys(channel.topic for channel in channels))
     there = f"to play one of its topics, add ?topic={topics[0]}" if topics else "it is empty"
     others = f" or {', '.join(topics[1:MOST_NAMED])}" if len(topics) > 1 else ""
     raise NotARecordingError(f"holds no frames that tactflow recorded; {there}{others}")
@@ -96,19 +82,11 @@ def attachments(path: Path) -> dict[str, bytes]:
     """
     found: dict[str, bytes] = {}
     with path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise NotARecordingError("is not an MCAP file")
-        limit = path.stat().st_size
-        reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=limit)
-        try:
-            for record in reader.records:
-                if isinstance(record, Attachment):
-                    found[record.name] = record.data
-                elif isinstance(record, Chunk | Message):
-                    break
-        except DAMAGE:
-            # It was cut off before its first frame.
-            pass
+        for record in intact_records(file):
+            if isinstance(record, Attachment):
+                found[record.name] = record.data
+            elif isinstance(record, Message):
+                break
     return found
 
 
@@ -124,9 +102,8 @@ def messages(
     ValueError : the file is damaged here, and not only cut off. OSError : it cannot be read.
     """
     with path.open("rb") as file:
-        summary = read_summary(file)
-        channels = {} if summary is None else summary.channels
-        wanted = {channel.id for channel in channels.values() if channel.topic in topics}
+        summary = read_summary(file) or Summary()
+        wanted = {channel.id for channel in summary.channels.values() if channel.topic in topics}
         size = path.stat().st_size
         for record in intact_records(file):
             if isinstance(record, Damage):

@@ -20,6 +20,8 @@ from tactflow.system.files import next_name
 
 log = logging.getLogger("tactflow")
 
+_OVERHEAD = 200
+"""Memory of an entry beside its data, bytes: the object and its fields. Chosen by hand."""
 BACKLOG_SHARE = 4
 """Frames from memory that are written per new frame, so that saving them never holds up the run."""
 
@@ -41,7 +43,7 @@ class FrameRecorder:
 
     Attributes
     ----------
-    path : of the file that was opened last. counts : frames, files and bytes (of finished files) so far.
+    path : of the file that was opened last.
     """
 
     def __init__(
@@ -60,7 +62,7 @@ class FrameRecorder:
         quality: int = 80,
     ) -> None:
         self.path = path
-        self.counts = {"frames": 0, "files": 0, "bytes": 0}
+        self._counts = {"frames": 0, "files": 0, "bytes": 0}
         self._name = path
         self._sensor = sensor
         self._control = control
@@ -93,10 +95,9 @@ class FrameRecorder:
         """Whether frames are written or kept."""
         return self.recording or self._ring_ns > 0 or self._trigger == "contact"
 
-    @property
-    def kept(self) -> dict[str, int]:
-        """ring_frames, ring_bytes : in memory now."""
-        return {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
+    def counters(self) -> dict[str, int]:
+        """frames, files : written so far. bytes : of the finished files. ring_frames, ring_bytes : kept."""
+        return self._counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
 
     def start(self, *, numbered: bool = True, overwrite: bool = False) -> None:
         """Begin a file with what the ring holds, which then is all of it. Nothing while recording.
@@ -153,16 +154,15 @@ class FrameRecorder:
     def _entry(self, result: Result) -> Entry:
         frame = result.frame
         time = nanoseconds(frame.t)
-        entry = Entry(time, frame.seq, frame.reference, frame.epoch, self._coder.encode(frame))
-        if frame.seq < 0:
-            # A reference image that is not part of the source has no result.
-            return entry
-        entry = replace(entry, message=encode_message(result, detail=True))
-        if self._previews is None or not self._previews.due(frame.t):
-            return entry
-        jpeg = encode_jpeg(frame.image if result.image is None else result.image, self._quality)
-        picture = encode_picture(jpeg, self._sensor, time)
-        return replace(entry, picture=picture, annotations=encode_annotations(result, time))
+        data = {"frames": self._coder.encode(frame)}
+        # A reference image that is not part of the source has no results.
+        if frame.seq >= 0:
+            data["results"] = encode_message(result, detail=True)
+            if self._previews is not None and self._previews.due(frame.t):
+                jpeg = encode_jpeg(frame.image if result.image is None else result.image, self._quality)
+                data["image"] = encode_picture(jpeg, self._sensor, time)
+                data["annotations"] = encode_annotations(result, time)
+        return Entry(time, frame.seq, frame.reference, frame.epoch, data)
 
     def _follow(self, touching: bool, t: float) -> None:
         """Begin a file when a contact begins; it ends some time after the contact."""
@@ -181,25 +181,22 @@ class FrameRecorder:
         ring = self._ring
         if self._ring_ns:
             ring.append(entry)
-            self._ring_bytes += entry.size
-            while ring and ring[0].time < entry.time - self._ring_ns:
-                self._ring_bytes -= ring.popleft().size
-            while ring and self._ring_bytes > self._memory:
-                self._ring_bytes -= ring.popleft().size
-                self._warn_of_memory()
+            self._ring_bytes += _size(entry)
+            while ring[0].time < entry.time - self._ring_ns:
+                self._ring_bytes -= _size(ring.popleft())
+            while self._ring_bytes > self._memory and ring:
+                self._ring_bytes -= _size(ring.popleft())
+                if not self._warned:
+                    self._warned = True
+                    log.warning(
+                        "record: the ring holds only %.1f s, as memory is limited to %d MB; raise memory",
+                        (entry.time - ring[0].time) / 1e9 if ring else 0,
+                        self._memory // 1_000_000,
+                    )
         if entry.reference:
             self._references.append(entry)
         oldest = min(waiting[0].epoch for waiting in (ring, self._backlog, [entry]) if waiting)
         self._references = [reference for reference in self._references if reference.epoch >= oldest]
-
-    def _warn_of_memory(self) -> None:
-        if not self._warned:
-            self._warned = True
-            log.warning(
-                "record: the ring holds only %.1f s, because memory is limited to %d MB; raise memory",
-                (self._ring[-1].time - self._ring[0].time) / 1e9 if self._ring else 0,
-                self._memory // 1_000_000,
-            )
 
     def _open(self, path: Path, *, overwrite: bool = False) -> RecordingWriter:
         self._file = RecordingWriter(path, self._sensor, self._control, overwrite=overwrite)
@@ -217,18 +214,15 @@ class FrameRecorder:
                 file = self._open(next_name(self._name))
                 log.info("record: %s", self.path)
             if file.frames == 0:
-                for reference in self._references:
-                    if reference.epoch == entry.epoch and reference.seq < entry.seq:
-                        # At the beginning of the file's time line, without results of that time.
-                        file.write(
-                            replace(reference, message=None, picture=None, annotations=None), entry.time
-                        )
+                for reference in self._references_of(entry):
+                    # At the beginning of the file's time line, without results of that time.
+                    file.write(replace(reference, data={"frames": reference.data["frames"]}), entry.time)
             file.write(entry)
         except BaseException:
             self._file = None
             self._backlog.clear()
             raise
-        self.counts["frames"] += 1
+        self._counts["frames"] += 1
 
     def _references_of(self, entry: Entry) -> list[Entry]:
         """The references before an entry that it is compared with."""
@@ -249,5 +243,10 @@ class FrameRecorder:
 
     def _finish_file(self, file: RecordingWriter) -> None:
         file.finish()
-        self.counts["files"] += 1
-        self.counts["bytes"] += file.bytes
+        self._counts["files"] += 1
+        self._counts["bytes"] += file.bytes
+
+
+def _size(entry: Entry) -> int:
+    """Approximate memory, bytes."""
+    return sum(map(len, entry.data.values())) + _OVERHEAD

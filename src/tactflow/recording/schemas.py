@@ -51,7 +51,7 @@ class ChannelType(NamedTuple):
     packing: str
 
 
-def protobuf_type(message: type[Message]) -> ChannelType:
+def channel_type(message: type[Message]) -> ChannelType:
     """The channel type for a protobuf class."""
     schema = build_file_descriptor_set(message).SerializeToString()
     return ChannelType(message.DESCRIPTOR.full_name, ("protobuf", schema), "protobuf")
@@ -62,8 +62,8 @@ def channel_types() -> dict[str, ChannelType]:
     """The channels for people: `image`, `annotations` and `results`."""
     results = json.dumps(plain_schema(message_schema())).encode()
     return {
-        "image": protobuf_type(CompressedImage),
-        "annotations": protobuf_type(ImageAnnotations),
+        "image": channel_type(CompressedImage),
+        "annotations": channel_type(ImageAnnotations),
         "results": ChannelType(RESULT_TYPE, ("jsonschema", results), "json"),
     }
 

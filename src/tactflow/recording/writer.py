@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BufferedWriter, FileIO
@@ -17,39 +17,27 @@ from mcap.writer import CompressionType, Writer
 from tactflow.engine.control import Control
 from tactflow.message.schema import message_schema
 from tactflow.recording.frames import RawFrame
-from tactflow.recording.schemas import channel_types, protobuf_type
+from tactflow.recording.schemas import channel_type, channel_types
 from tactflow.system import provenance
 from tactflow.system.outputs import cannot_write, create, refuse_interference
 
 NEVER = 1 << 62
 """Size at which a chunk would end by itself, bytes: each ends with a frame."""
-_OVERHEAD = 200
-"""Memory of an entry beside its data, bytes: the object and its fields. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
     """What is recorded about one frame, ready to be written.
 
-    time : of the frame, ns. seq, reference, epoch : as in `Frame`.
-    frame : `tactflow.RawFrame`. message : the result message, or None. picture, annotations : of Foxglove, a
-    `CompressedImage` and the `ImageAnnotations` on it, or None.
+    time : of the frame, ns. seq, reference, epoch : as in `Frame`. data : channel -> message; "frames" holds
+    the frame itself.
     """
 
     time: int
     seq: int
     reference: bool
     epoch: int
-    frame: bytes
-    message: bytes | None = None
-    picture: bytes | None = None
-    annotations: bytes | None = None
-
-    @property
-    def size(self) -> int:
-        """Approximate memory, bytes."""
-        parts = (self.frame, self.message, self.picture, self.annotations)
-        return sum(len(part or b"") for part in parts) + _OVERHEAD
+    data: Mapping[str, bytes]
 
 
 class RecordingWriter:
@@ -71,22 +59,6 @@ class RecordingWriter:
     StageError
         If the file is there already or cannot be written; from every method. After an error, the frames
         written before can be played.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from tempfile import TemporaryDirectory
-    >>> from tactflow.engine.frame import Frame
-    >>> from tactflow.recording.frames import FrameCoder
-    >>> from tactflow.recording.reader import look_into
-    >>> packed = FrameCoder().encode(Frame("main", 0, 0.0, np.zeros((6, 8, 3), np.uint8)))
-    >>> with TemporaryDirectory() as folder:
-    ...     writer = RecordingWriter(Path(folder, "press.mcap"), "main")
-    ...     writer.write(Entry(time=0, seq=0, reference=True, epoch=0, frame=packed))
-    ...     writer.finish()
-    ...     contents = look_into(Path(folder, "press.mcap"))
-    >>> contents.finished, contents.frames, contents.frame_topic
-    (True, 1, '/main/frames')
     """
 
     def __init__(
@@ -104,23 +76,20 @@ class RecordingWriter:
 
     def _describe(self, sensor: str, control: Control | None) -> None:
         writer = self._writer
-        types = channel_types()
-        raw = protobuf_type(RawFrame)
-        schema = writer.register_schema(raw.name, *raw.schema)
+        raw = channel_type(RawFrame)
+        frames = writer.register_schema(raw.name, *raw.schema)
         self._channels = {
-            name: writer.register_channel(f"/{sensor}/{name}", raw.packing, schema)
+            name: writer.register_channel(f"/{sensor}/{name}", raw.packing, frames)
             for name in ("frames", "references")
-        } | {
-            name: writer.register_channel(
-                f"/{sensor}/{name}", kind.packing, writer.register_schema(kind.name, *kind.schema)
-            )
-            for name, kind in types.items()
         }
+        for name, kind in channel_types().items():
+            schema = writer.register_schema(kind.name, *kind.schema)
+            self._channels[name] = writer.register_channel(f"/{sensor}/{name}", kind.packing, schema)
         writer.add_metadata("tactflow", provenance.facts(sensor, control))
         texts = {"message.schema.json": json.dumps(message_schema(), indent=1)} | provenance.texts(control)
         for name, text in texts.items():
-            kind = "application/json" if name.endswith(".json") else "application/yaml"
-            writer.add_attachment(0, 0, name, kind, text.encode())
+            media_type = "application/json" if name.endswith(".json") else "application/yaml"
+            writer.add_attachment(0, 0, name, media_type, text.encode())
         for name, data in provenance.arrays(control).items():
             writer.add_attachment(0, 0, name, "application/octet-stream", data)
 
@@ -130,22 +99,16 @@ class RecordingWriter:
         time : on the file's time line, ns, if it is not the frame's own.
         """
         at = max(entry.time if time is None else time, 0)
-        parts = {
-            "references" if entry.reference else "frames": entry.frame,
-            "results": entry.message,
-            "image": entry.picture,
-            "annotations": entry.annotations,
-        }
         with self._errors():
-            for channel, data in parts.items():
-                if data is not None:
-                    self._writer.add_message(
-                        self._channels[channel],
-                        log_time=at,
-                        publish_time=at,
-                        sequence=max(entry.seq, 0) & 0xFFFFFFFF,
-                        data=data,
-                    )
+            for name, data in entry.data.items():
+                channel = "references" if name == "frames" and entry.reference else name
+                self._writer.add_message(
+                    self._channels[channel],
+                    log_time=at,
+                    publish_time=at,
+                    sequence=max(entry.seq, 0) & 0xFFFFFFFF,
+                    data=data,
+                )
             self._flush()
         self.begins = at if self.frames == 0 else self.begins
         self.frames += 1
