@@ -15,10 +15,11 @@ from tactflow.cli.options import refuse_output, seconds
 from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
+from tactflow.system.extras import missing
 from tactflow.system.files import completed
 
 LARGEST_SEED: Final = 1_000_000
-"""The simulator takes seeds up to 2**31 - 1, and a search some hundreds from the given one on."""
+"""The simulator takes seeds up to 2**31 - 1, and a search uses some hundreds from the given one on."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,8 +68,7 @@ def run(args: argparse.Namespace) -> int:
         If the options are wrong, or the recording cannot be used.
     """
     began = time.monotonic()
-    page: Path = args.html or args.out.with_suffix(".html")
-    _check_files(args.out, page, args.overwrite)
+    page = _page(args)
     # Imported here: the simulator and the bench take their time.
     from tactflow.tune import report
     from tactflow.tune.recording import take
@@ -85,8 +85,7 @@ def run(args: argparse.Namespace) -> int:
         search = Search(
             file,
             Goal(args.error, args.max_error, args.max_ms),
-            sensor=args.sensor,
-            original=find_pipeline("classic"),
+            args.sensor,
             seconds=args.budget - (time.monotonic() - began),
             seed=args.seed,
             say=say,
@@ -96,30 +95,37 @@ def run(args: argparse.Namespace) -> int:
         print(orjson.dumps(report.as_json(tuned), option=orjson.OPT_NON_STR_KEYS).decode())
     else:
         print(printable("\n".join(report.lines(tuned))))
-    _write(page, report.html(tuned))
+    if page is not None:
+        report.write_page(page, tuned)
     if tuned.chosen is None:
         say(impossible(tuned))
         return StageError.exit_code
     # YAML takes no control characters, which a name in a comment may have.
-    _write(args.out, printable(report.pipeline_text(tuned, file, args.out)))
-    command = typed("tactflow", "run", str(args.out), "--source", args.source)
-    say(f"{args.out} and {page} are written; try: {command}")
+    text = printable(report.pipeline_text(tuned, file, args.out))
+    try:
+        with completed(args.out) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StageError(f"{args.out}: {error.strerror or error}") from error
+    written = f"{args.out} is" if page is None else f"{args.out} and {page} are"
+    say(f"{written} written; try: {typed('tactflow', 'run', str(args.out), '--source', args.source)}")
     return 0
 
 
-def _check_files(out: Path, page: Path, overwrite: bool) -> None:
-    if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"--out: required a file whose name ends in .yaml, got {out}")
-    for option, path in (("--out", out), ("--html", page)):
-        refuse_output(option, path, overwrite=overwrite)
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        with completed(path) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StageError(f"{path}: {error.strerror or error}") from error
+def _page(args: argparse.Namespace) -> Path | None:
+    """Where the page goes; None without matplotlib, unless the page was asked for. Refuses wrong files."""
+    if args.out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"--out: required a file whose name ends in .yaml, got {args.out}")
+    refuse_output("--out", args.out, overwrite=args.overwrite)
+    problem = missing("plots", "plot", ["matplotlib"])
+    if problem and args.html is None:
+        say(f"no page: {problem}")
+        return None
+    if problem:
+        raise ConfigError(f"--html: {problem}")
+    page: Path = args.html or args.out.with_suffix(".html")
+    refuse_output("--html", page, overwrite=args.overwrite)
+    return page
 
 
 def _seed(text: str) -> int:

@@ -14,8 +14,9 @@ from tactflow.bench.lockstep import TimedResult, on_recording, take_turns
 from tactflow.bench.quantities import Tally, rms
 from tactflow.bench.scenes import Rendered
 from tactflow.bench.score import PipelineScore
-from tactflow.bench.timing import CopyUnit, Times
+from tactflow.bench.timing import Times
 from tactflow.engine.graph import Pipeline
+from tactflow.tune.recording import Recording
 
 ANY: Final = "any"
 ERRORS: Final = {
@@ -27,20 +28,23 @@ ERRORS: Final = {
 """Errors that can be asked for, px of the camera's picture before it shrinks. `ANY` is the largest that a
 pipeline has."""
 SOUND: Final = {
-    "missed_half_depth": 3.0,
-    "false_contacts": 2.0,
-    "wrong_percent": 0.5,
-    "lost_percent": 2.0,
-    "hull_iou": -0.15,
+    "missed_half_depth": (3.0, "% of contacts at half depth missed:"),
+    "false_contacts": (2.0, "% of idle frames called contact:"),
+    "wrong_percent": (0.5, "% of dots mistaken for others:"),
+    "lost_percent": (2.0, "% of dots lost:"),
+    "hull_iou": (-0.15, "overlap of the outline with the truth:"),
 }
-"""By how much a pipeline may be worse than the best candidate in this and still be sound: percent of frames
-or of dots; and for the outline, in overlap with the truth. Chosen by hand."""
+"""By how much a pipeline may be worse than the best candidate in a quantity of the bench and still be sound,
+and how that is called. Chosen by hand."""
+CHECKS: Final = {
+    "agreement": "contact or not, as the most expensive says, %",
+    "distance": "centre, distance from the most expensive, median px",
+}
+"""What the recording itself says of a pipeline, without truth."""
 BLOCK: Final = 10
 """Frames in a row that are drawn together for an interval: neighbours share a contact. Chosen by hand."""
-LEAST_BLOCKS: Final = 5
-"""Blocks that an interval is drawn from, at least, where there are so many frames. Chosen by hand."""
 DRAWS: Final = 200
-"""Draws of the bootstrap. Chosen by hand: ends of a 90 % interval are then right to a tenth of its width."""
+"""Draws of the bootstrap: the ends of a 90 % interval are then right to a tenth of its width."""
 INTERVAL: Final = (5.0, 95.0)
 """Percentiles between which an interval lies."""
 
@@ -58,25 +62,23 @@ class Interval:
 class Found:
     """What is known of a candidate.
 
-    error : of each of `ERRORS` that it has, px of the camera's picture. quantities : what the bench's scores
-    say, processed pixels. ms : CPU time of a frame with contact, median.
-    frames : simulated ones that it was judged on. failure : why it has none. unsound : what it gets wrong.
-    checks : what the recording itself says, see `tactflow.tune.checks`.
+    error : of each of `ERRORS` that it has, px of the camera's picture. quantities : errors by the names of
+    the bench, processed pixels. ms : CPU time of a frame with contact, median. failure : why it does not run.
+    unsound : what it gets wrong. checks : of `CHECKS`.
     """
 
     name: str
     error: dict[str, Interval] = field(default_factory=dict[str, Interval])
     quantities: dict[str, float] = field(default_factory=dict[str, float])
     ms: Interval = field(default_factory=Interval)
-    frames: int = 0
     failure: str | None = None
     unsound: str = ""
     checks: dict[str, float] = field(default_factory=dict[str, float])
 
     def of(self, kind: str) -> float:
         """The error of a kind, inf where there is none."""
-        found = self.error.get(kind)
-        return math.inf if found is None or self.failure else found.value
+        known = self.error.get(kind)
+        return math.inf if known is None or self.failure else known.value
 
     @property
     def usable(self) -> bool:
@@ -84,16 +86,47 @@ class Found:
         return self.failure is None and not self.unsound
 
 
-@dataclass
-class _Kept:
-    """Errors of one candidate, one number a frame, px of the camera's picture."""
+def judge(
+    pipelines: Mapping[str, Pipeline],
+    recordings: Sequence[Rendered],
+    seed: int,
+    late: Callable[[], bool] = lambda: False,
+) -> list[Found]:
+    """Errors and times of pipelines on simulated recordings, in turns.
 
-    tally: Tally = field(default_factory=Tally)
-    scale: float = 1.0
-    times: Times = field(default_factory=Times)
+    late : whether it is time to stop. The first recording is shown in any case, and to its end.
+    """
+    tallies = {name: Tally() for name in pipelines}
+    times: dict[str, Times] = {name: {} for name in pipelines}
+    scales = dict.fromkeys(pipelines, 1.0)
+    failures: dict[str, str] = {}
+    for number, rendered in enumerate(recordings):
+        if number and late():
+            break
+        scores = {name: PipelineScore(rendered, tally) for name, tally in tallies.items()}
+
+        def see(name: str, result: TimedResult, scores: Mapping[str, PipelineScore] = scores) -> str:
+            if result.mapping is not None:
+                scales[name] = 1.0 / math.sqrt(abs(float(np.linalg.det(result.mapping.matrix[:2, :2]))))
+            return scores[name].add(result)
+
+        ready = {
+            n: on_recording(_on_sensor(p), rendered.path) for n, p in pipelines.items() if n not in failures
+        }
+        took, failed = take_turns(ready, see, late=late if number else lambda: False)
+        failures |= failed
+        for name, kinds in took.items():
+            for kind, samples in kinds.items():
+                times[name].setdefault(kind, []).extend(samples)
+    return [
+        Found(name, failure=failures[name])
+        if name in failures
+        else _found(name, tallies[name], scales[name], times[name], seed)
+        for name in pipelines
+    ]
 
 
-def on_sensor(pipeline: Pipeline) -> Pipeline:
+def _on_sensor(pipeline: Pipeline) -> Pipeline:
     """The same pipeline for frames that went through its geometry before: it only shrinks them."""
     node = pipeline.nodes.get("preprocess")
     if node is None:
@@ -104,86 +137,38 @@ def on_sensor(pipeline: Pipeline) -> Pipeline:
     return replace(pipeline, nodes={**pipeline.nodes, node.id: changed})
 
 
-def judge(
-    pipelines: Mapping[str, Pipeline],
-    recordings: Sequence[Rendered],
-    unit: CopyUnit,
-    seed: int,
-    late: Callable[[], bool] = lambda: False,
-) -> dict[str, Found]:
-    """Errors, and times, of pipelines on simulated recordings, in turns.
-
-    late : whether it is time to stop. The first recording is judged in any case, and to its end.
-    """
-    kept = {name: _Kept() for name in pipelines}
-    failures: dict[str, str] = {}
-    for number, rendered in enumerate(recordings):
-        if number and late():
-            break
-        ends = late if number else lambda: False
-
-        scores = {name: PipelineScore(rendered, kept[name].tally) for name in pipelines}
-
-        def see(name: str, result: TimedResult, scores: Mapping[str, PipelineScore] = scores) -> str:
-            if result.mapping is not None:
-                kept[name].scale = 1.0 / math.sqrt(abs(float(np.linalg.det(result.mapping.matrix[:2, :2]))))
-            return scores[name].add(result)
-
-        ready = {
-            name: on_recording(pipeline, rendered.path)
-            for name, pipeline in pipelines.items()
-            if name not in failures
-        }
-        times, failed = take_turns(ready, see, unit=unit, late=ends)
-        failures.update(failed)
-        for name, samples in times.items():
-            _add(kept[name].times, samples)
-    return {name: _found(name, kept[name], failures.get(name), seed) for name in pipelines}
-
-
-def _add(times: Times, more: Times) -> None:
-    for kind, samples in more.items():
-        times[kind] = times.get(kind, []) + samples
-
-
-def _found(name: str, kept: _Kept, failure: str | None, seed: int) -> Found:
-    tally, scale = kept.tally, kept.scale
-    found = Found(name, failure=failure)
-    if failure is not None:
-        return found
-    found.quantities = tally.errors()
-    found.frames = len(tally.values["false_contacts"]) + len(tally.values["missed_contacts"])
+def _found(name: str, tally: Tally, scale: float, times: Times, seed: int) -> Found:
+    found = Found(name, quantities=tally.errors())
+    values = tally.values
     per_frame = {
-        "center": np.array(tally.values["center_error"]).ravel(),
-        "dots": np.array([rms(errors) for errors in tally.values["displacement_rms"] if len(errors)]),
-        "flow": np.array(tally.values["flow_error"]).ravel(),
+        "center": np.array(values["center_error"]).ravel(),
+        "dots": np.array([rms(errors) for errors in values["displacement_rms"] if len(errors)]),
+        "flow": np.array(values["flow_error"]).ravel(),
     }
-    for kind, values in per_frame.items():
-        if len(values):
-            power = 2.0 if kind == "dots" else 1.0
-            found.error[kind] = _interval(scale * values, seed, power)
+    for kind, errors in per_frame.items():
+        if len(errors):
+            found.error[kind] = _interval(scale * errors, seed, 2.0 if kind == "dots" else 1.0)
     if found.error:
-        found.error[ANY] = max(found.error.values(), key=lambda one: one.value)
-    set_time(found, kept.times, seed)
+        found.error[ANY] = max(found.error.values(), key=lambda interval: interval.value)
+    set_time(found, times, seed)
     return found
 
 
 def set_time(found: Found, times: Times, seed: int) -> None:
-    """Time of a frame with contact, or of any but references where none has one."""
+    """Time of a frame with contact, or of any but references where no frame has one."""
     counted = {kind: np.array(samples) * 1e3 for kind, samples in times.items() if kind != "reference"}
     if not counted:
         return
     busy = counted.get("contact", np.concatenate(list(counted.values())))
-    rng = np.random.default_rng([seed, 0x6D73])
-    draws = np.median(rng.choice(busy, (DRAWS, len(busy))), axis=1)
+    draws = np.median(np.random.default_rng([seed, 0x6D73]).choice(busy, (DRAWS, len(busy))), axis=1)
     low, high = np.percentile(draws, INTERVAL)
     found.ms = Interval(float(np.median(busy)), float(low), float(high))
 
 
 def _interval(values: NDArray[np.float64], seed: int, power: float) -> Interval:
-    """Mean of values (N,) to a power, rooted, and its interval by a bootstrap of blocks of frames."""
+    """Power mean of values (N,), and its interval by a bootstrap of blocks of frames; of five, at least."""
     raised = values**power
-    blocks = np.array_split(raised, min(len(raised), max(LEAST_BLOCKS, len(raised) // BLOCK)))
+    blocks = np.array_split(raised, min(len(raised), max(5, len(raised) // BLOCK)))
     sums, counts = np.array([block.sum() for block in blocks]), np.array([len(block) for block in blocks])
     drawn = np.random.default_rng([seed, 0x6572]).integers(0, len(blocks), (DRAWS, len(blocks)))
     means = (sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)) ** (1 / power)
@@ -193,24 +178,59 @@ def _interval(values: NDArray[np.float64], seed: int, power: float) -> Interval:
 
 def mark_unsound(found: Sequence[Found]) -> None:
     """Write down what candidates get wrong that others get right."""
-    for key, slack in SOUND.items():
-        values = [f.quantities[key] for f in found if f.failure is None and key in f.quantities]
-        if not values:
-            continue
-        best = min(values) if slack > 0 else max(values)
-        for one in found:
-            value = one.quantities.get(key)
-            if value is None or one.failure or one.unsound:
-                continue
-            if (value - best) * math.copysign(1.0, slack) > abs(slack):
-                one.unsound = f"{WORDS[key]} {value:.3g} (best {best:.3g})"
+    for key, (slack, words) in SOUND.items():
+        known = [one for one in found if one.failure is None and key in one.quantities]
+        sign = math.copysign(1.0, slack)
+        best = min((sign * one.quantities[key] for one in known), default=0.0)
+        for one in known:
+            value = one.quantities[key]
+            if not one.unsound and sign * value - best > abs(slack):
+                one.unsound = f"{words} {value:.3g} (best {sign * best:.3g})"
 
 
-WORDS: Final = {
-    "missed_half_depth": "% of contacts at half depth missed:",
-    "false_contacts": "% of idle frames called contact:",
-    "wrong_percent": "% of dots mistaken for others:",
-    "lost_percent": "% of dots lost:",
-    "hull_iou": "overlap of the outline with the truth:",
-}
-"""Quantity of `SOUND` -> how it is told."""
+def show_recording(
+    pipelines: Mapping[str, Pipeline], recording: Recording, late: Callable[[], bool] = lambda: False
+) -> tuple[dict[str, Times], dict[str, dict[str, float]], dict[str, str]]:
+    """Show the recording to pipelines, in turns.
+
+    Parameters
+    ----------
+    pipelines : name -> pipeline; the first is the most expensive one, from which distances are taken.
+    late : whether it is time to stop; what was shown until then is compared.
+
+    Returns
+    -------
+    times : name -> times; empty if the recording was not shown to its end. checks : name -> check of `CHECKS`
+    -> value. failures : name -> why.
+    """
+    centers: dict[str, dict[int, NDArray[np.float64] | None]] = {name: {} for name in pipelines}
+
+    def see(name: str, result: TimedResult) -> str:
+        contact, mapping = result.contact, result.mapping
+        center = None if contact is None else np.array(contact.center, np.float64)
+        if center is not None and mapping is not None:
+            center = np.array(mapping.to_raw(center))
+        centers[name][result.frame.seq] = center
+        return "idle" if contact is None else "contact"
+
+    ready = {name: on_recording(pipeline, recording.path) for name, pipeline in pipelines.items()}
+    times, failures = take_turns(ready, see, late=late)
+    good = [name for name in pipelines if name not in failures]
+    if not good or len(centers[good[0]]) < recording.frames:
+        times = {}
+    return times, {name: _compared(centers[name], centers[good[0]]) for name in good}, failures
+
+
+def _compared(
+    centers: Mapping[int, NDArray[np.float64] | None], dearest: Mapping[int, NDArray[np.float64] | None]
+) -> dict[str, float]:
+    """The checks of one pipeline, as far as they can be made. centers : of contacts, by frame, px."""
+    pairs = [(centers[seq], dearest[seq]) for seq in centers.keys() & dearest.keys()]
+    away = [math.dist(here, there) for here, there in pairs if here is not None and there is not None]
+    found: dict[str, float] = {}
+    if pairs:
+        same = [(here is None) == (there is None) for here, there in pairs]
+        found["agreement"] = 100.0 * float(np.mean(same))
+    if away:
+        found["distance"] = float(np.median(away))
+    return found

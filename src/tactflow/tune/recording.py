@@ -1,10 +1,11 @@
-"""The recording that is tuned for: a part of it with a contact, as an array on disk."""
+"""The recording that is tuned for: the part of it with a contact, as an array on disk."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -20,27 +21,25 @@ from tactflow.sources import open_source
 Image = NDArray[np.uint8]
 
 MOST_READ: Final = 1800
-"""Frames of a recording that are looked at, at most: 30 s at 60 a second. Chosen by hand."""
+"""Frames of a recording that are looked at, at most: 30 s at 60 a second."""
 MOST_USED: Final = 160
-"""Frames that pipelines run on, at most. Chosen by hand: 230 MB at 800 x 600 in a temporary file."""
+"""Frames that pipelines run on, at most: 230 MB at 800 x 600 in a temporary file."""
 LEAST: Final = 20
 """Frames without which nothing is measured. Chosen by hand."""
 HEAD: Final = 8
 """First frames that are always used: references are taken from them."""
-THUMB: Final = 96
-"""Width of the small pictures in which the contact is looked for, px. Chosen by hand."""
 CHANGE: Final = 0.04
-"""Change of the light, relative, in some place of the small pictures, from which on there is a contact. By
-hand: 1.6 times what `difference` takes for the gel's own (repeatability)."""
+"""Relative change of the light somewhere in the small picture from which on there is a contact. By hand: 1.6
+times what `difference` takes for the gel's own (repeatability)."""
 
 
 @dataclass
 class Recording:
     """Part of a recording.
 
-    source : how it was named. path : its frames, a `.npy` file. frames : how many. seen : what the doctor's
-    measures need, of the pictures before they shrink. size : (width, height) of those, px. changes : how far
-    the light of each kept frame is from the first, relative.
+    source : how it was named. path : its frames, a `.npy` file. frames : how many. size : (width, height),
+    px, before the pipeline shrinks them. seen : some of these frames, for the doctor's measures. changes :
+    how far the light of each frame is from the first, relative.
     """
 
     source: str
@@ -48,7 +47,7 @@ class Recording:
     frames: int
     size: tuple[int, int]
     seen: Observation
-    changes: list[float] = field(default_factory=list[float])
+    changes: list[float]
 
 
 def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
@@ -73,7 +72,16 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
         )
     start = max(HEAD, min(touched - MOST_USED // 2, len(changes) - MOST_USED + HEAD))
     wanted = [*range(HEAD), *range(start, min(len(changes), start + MOST_USED - HEAD))]
-    return _copy(source, wanted, changes, pipeline, folder)
+    frames = _copy(source, wanted, folder / "recording.npy")
+    straight = _geometry(pipeline)
+    pairs = [
+        Pair(n, straight(frames[n]), straight(frames[n + 1]))
+        for n in range(0, len(frames) - 1, max(1, len(frames) // KEPT))
+    ]
+    seen = Observation(source, source, False, frames=len(frames), pairs=pairs)
+    height, width = pairs[0].image.shape[:2]
+    used = [changes[index] for index in wanted]
+    return Recording(source, folder / "recording.npy", len(frames), (width, height), seen, used)
 
 
 def _changes(source: str) -> list[float]:
@@ -99,8 +107,8 @@ def change_between(first: Image, now: Image) -> float:
 
 
 def _small(image: Image) -> NDArray[np.float32]:
-    height, width = image.shape[:2]
-    size = (THUMB, max(1, round(THUMB * height / width)))
+    # A contact fills several pixels of a picture that is 96 px wide.
+    size = (96, max(1, round(96 * image.shape[0] / image.shape[1])))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
@@ -111,53 +119,39 @@ def _change(first: NDArray[np.float32], now: NDArray[np.float32]) -> float:
     return float(smooth.max())
 
 
-def _copy(
-    source: str, wanted: list[int], changes: list[float], pipeline: Pipeline, folder: Path
-) -> Recording:
-    path = folder / "recording.npy"
-    straight = geometry(pipeline)
-    pairs: list[Pair] = []
-    times: list[float] = []
-    every = max(1, len(wanted) // KEPT)
+def _copy(source: str, wanted: list[int], path: Path) -> NDArray[np.uint8]:
+    """The wanted frames of a source, (N, H, W, 3), in a file."""
     reader = open_source(source)
-    frames: np.memmap[Any, np.dtype[np.uint8]] | None = None
+    frames: NDArray[np.uint8] | None = None
+    places = {index: place for place, index in enumerate(wanted)}
     try:
-        place = 0
         for index in range(wanted[-1] + 1):
             frame = reader.read()
             if frame is None:
                 raise SourceError(f"{source}: ended sooner when it was read again")
-            if wanted[place] != index:
-                continue
             if frames is None:
-                frames = np.lib.format.open_memmap(
-                    path, mode="w+", dtype=np.uint8, shape=(len(wanted), *frame[0].shape)
-                )
-            frames[place] = frame[0]
-            times.append(frame[1])
-            if place % every == 0:
-                pairs.append(Pair(place, straight(frame[0]), None))
-            elif place % every == 1:
-                pairs[-1] = pairs[-1]._replace(after=straight(frame[0]))
-            place += 1
-        assert frames is not None
-        frames.flush()
+                shape = (len(wanted), *frame[0].shape)
+                frames = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
+            if index in places:
+                frames[places[index]] = frame[0]
     finally:
         reader.close()
-    seen = Observation(source, reader.description, False, times=np.array(times), frames=place, pairs=pairs)
-    height, width = pairs[0].image.shape[:2]
-    used = [changes[index] for index in wanted]
-    return Recording(source, path, len(wanted), (width, height), seen, used)
+    assert frames is not None
+    return frames
 
 
-def geometry(pipeline: Pipeline) -> Any:
+def _geometry(pipeline: Pipeline) -> Callable[[Image], Image]:
     """What the pipeline's `preprocess` does to a picture, (H, W, 3) uint8, without shrinking it."""
     node = pipeline.nodes.get("preprocess")
     if node is None:
-        return lambda image: image
+        return np.array
     params = {**node.params.model_dump(exclude_unset=True, by_alias=True), "downsample": 1}
     try:
         stage = node.component.cls(node.component.params.model_validate(params))
     except ValueError as error:
         raise ConfigError(f"stages.preprocess: {error}") from None
-    return lambda image: stage.process(Frame("tune", 0, 0.0, image)).image
+
+    def straight(image: Image) -> Image:
+        return np.array(stage.process(Frame("tune", 0, 0.0, np.array(image))).image)
+
+    return straight

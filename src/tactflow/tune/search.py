@@ -1,16 +1,10 @@
-"""Successive halving: many candidates on a few frames, fewer on more, the last ones on the recording, too.
-
-References
-----------
-K. Jamieson and A. Talwalkar, "Non-stochastic best arm identification and hyperparameter optimization",
-AISTATS 2016.
-"""
+"""Try all candidates on a few simulated frames, the best on more, and on the recording."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -18,32 +12,22 @@ from typing import Final
 import numpy as np
 
 from tactflow.bench.scenes import Case
-from tactflow.bench.timing import CopyUnit
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.engine.graph import Pipeline
-from tactflow.tune import checks
-from tactflow.tune.measure import ANY, ERRORS, Found, Interval, judge, mark_unsound, on_sensor, set_time
+from tactflow.tune.measure import ANY, ERRORS, Found, judge, mark_unsound, set_time, show_recording
 from tactflow.tune.recording import Recording
 from tactflow.tune.sensor import Fitted, Look, fit
 from tactflow.tune.space import Candidate, candidates, with_more_references
 
-ROUNDS: Final = (
-    (Case("press", 24),),
-    (Case("press", 48), Case("slide", 40)),
-    (Case("press", 140), Case("slide", 80)),
-)
-"""Simulated recordings of each round; every round has another seed. By hand: a contact; a press and a drag;
-several depths and places. No cable: lightly pressed, its ends are seen or not, whatever the pipeline."""
-KEPT: Final = (1.0, 0.4, 0.4)
-"""Share of the candidates of a round that goes on to the next but one. The front goes on in any case."""
-FINALISTS: Final = 6
-"""Candidates of the last round, at most. Chosen by hand."""
-REFINED: Final = (Case("press", 140),)
-"""Simulated recording for more references: untouched for 14 frames."""
+FIRST: Final = (Case("press", 24),)
+"""Simulated recordings that all candidates see: a contact."""
+LAST: Final = (Case("press", 140), Case("slide", 80))
+"""Simulated recordings that the finalists see: several depths and places, and a drag. No cable: lightly
+pressed, its ends are seen or not, whatever the pipeline."""
 GROUP: Final = 6
-"""Candidates of the first round that take turns; between groups the budget may end it. Chosen by hand."""
-FEWEST: Final = 3
-"""Candidates with which a round is begun, at least. Chosen by hand."""
+"""Candidates that take turns in the first round; between groups the budget may end it."""
+FINALISTS: Final = 6
+"""Candidates of the last round, besides the pipeline as given, the most expensive one and the front."""
 ALLOWED: Final = 1.5
 """Without a budget: the cheapest whose error is at most so many times the least. Chosen by hand."""
 LIKELY: Final = 0.5
@@ -51,8 +35,6 @@ LIKELY: Final = 0.5
 five draws do. All of the way is dear: on a gel without dots it chose a pipeline of 2.3 times the time."""
 DEFAULT: Final = "as given"
 """Name of the pipeline as the user gave it."""
-ORIGINAL: Final = "original script"
-"""Name of the original script's pipeline."""
 
 
 @dataclass(frozen=True)
@@ -67,39 +49,38 @@ class Goal:
     max_ms: float | None = None
 
     def order(self, found: Sequence[Found]) -> list[Found]:
-        """The best first: what keeps the budgets before what does not; then time, or error if it is limited
-        by time; then the other one."""
+        """The best first: what keeps the budgets, by time, or by error if only the time is limited."""
+        by_error = self.max_ms is not None and self.max_error is None
         bound = self.bound(found)
 
         def key(one: Found) -> tuple[float, ...]:
             error, ms = one.of(self.kind), one.ms.value
-            if not one.usable or not math.isfinite(error):
-                return (3.0, error, ms)
-            if self.max_ms is not None and self.max_error is None:
-                return (0.0, error, ms) if ms <= self.max_ms else (1.0, ms, error)
-            if error > bound:
-                return (1.0, error, ms)
-            slow = self.max_ms is not None and ms > self.max_ms
-            return (0.5 if slow else 0.0, ms, error)
+            rank = (not one.usable, not self.is_kept(one, bound))
+            return (*rank, error, ms) if by_error else (*rank, ms, error)
 
         return sorted(found, key=key)
+
+    def is_kept(self, one: Found, bound: float) -> bool:
+        """Whether a candidate keeps the budgets. bound : of the error, px."""
+        error = one.of(self.kind)
+        return math.isfinite(error) and error <= bound and one.ms.value <= (self.max_ms or math.inf)
 
     def bound(self, found: Sequence[Found]) -> float:
         """The error that is allowed, px."""
         if self.max_error is not None:
             return self.max_error
-        known = [one.of(self.kind) for one in found if one.usable]
-        return ALLOWED * min(known, default=math.inf)
+        if self.max_ms is not None:
+            return math.inf
+        return ALLOWED * min((one.of(self.kind) for one in found if one.usable), default=math.inf)
 
 
 @dataclass
 class Tuned:
     """The outcome.
 
-    recording, look, goal : what was tuned for. found : everything of the last rounds, the best first, with
-    the pipeline as given and the original script. front : names of those that no other beats in both time
-    and error. chosen : the candidate, or None where none keeps the budgets. tried : how many candidates.
-    words : what was decided on the way. rounds : candidates, frames of each round.
+    recording, look, goal : what was tuned for. found : candidates of the last round, the best first. front :
+    names of those that no other beats in both time and error. chosen : None where no candidate keeps the
+    budgets. notes : what the budget left undone. rounds : candidates and simulated frames of each round.
     timed_on_recording : whether times are of the recording, else of the simulated one.
     """
 
@@ -109,258 +90,167 @@ class Tuned:
     found: list[Found]
     front: list[str]
     chosen: Candidate | None
-    tried: int
-    words: list[str] = field(default_factory=list[str])
+    notes: list[str] = field(default_factory=list[str])
     rounds: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
     timed_on_recording: bool = False
 
 
+@dataclass
 class Search:
     """One search.
 
-    Parameters
-    ----------
-    file : the user's pipeline. sensor : which of several, or None. original : the
-    original script's pipeline, for comparison. goal : what is asked for.
-    seconds : the budget. Finished in any case are a group of the first round, a simulated recording that is
-    under way, and a turn of all candidates on the recording. seed : of the simulated recordings and the
-    intervals. refine : whether more references are tried. say : told what happens.
+    file : the user's pipeline. sensor : which of several, or None. seconds : the budget; what is under way
+    when it is over is finished: a group of the first round, a simulated recording, or 20 frames of the
+    recording. seed : of the simulated recordings and the intervals. say : called with what happens.
     """
 
-    def __init__(
-        self,
-        file: Path,
-        goal: Goal,
-        *,
-        sensor: str | None = None,
-        original: Path | None = None,
-        seconds: float = 120.0,
-        seed: int = 0,
-        refine: bool = True,
-        say: Callable[[str], None] = lambda _: None,
-    ) -> None:
-        self._file, self._sensor, self._goal, self._original = file, sensor, goal, original
-        self._end = time.monotonic() + seconds
-        self._seed, self._refine, self._say = seed, refine, say
-        self._unit = CopyUnit()
-        self._words: list[str] = []
-        self._timed_on_recording = False
-        self._rounds: list[tuple[int, int]] = []
-        self._known: dict[str, Candidate] = {}
-        self._pace = 0.0
+    file: Path
+    goal: Goal
+    sensor: str | None = None
+    seconds: float = 120.0
+    seed: int = 0
+    say: Callable[[str], None] = lambda _: None
 
     def run(self, recording: Recording, folder: Path) -> Tuned:
-        """Search.
-
-        recording : what is tuned for. folder : for temporary files.
+        """Search. folder : for temporary files.
 
         Raises
         ------
         SourceError
             If no candidate finds the contacts of the simulated sensor.
         """
-        base = Candidate(DEFAULT).load(self._file, self._sensor)
+        self._began, self._folder = time.monotonic(), folder
+        self._refined = ("", "")
         look = fit(recording)
-        self._say(f"simulated sensor: {look.words()}")
+        self.say(f"simulated sensor: {look}")
+        base = Candidate(DEFAULT).load(self.file, self.sensor)
         dots = recording.seen.dots
-        many = candidates(base, recording.size, None if dots is None else dots.pitch)
-        self._known = {candidate.name: candidate for candidate in (Candidate(DEFAULT), *many)}
-        script = self._script(look, folder)
-        found = self._halve(list(self._known.values()), look, folder)
-        if not any(one.usable and math.isfinite(one.of(self._goal.kind)) for one in found):
-            raise SourceError(_nothing(found, self._goal))
-        found = self._on_recording(found, recording, folder)
-        chosen = self._choice(found)
-        if chosen is not None and self._refine:
-            chosen, found = self._refined(chosen, base, found, recording, look, folder)
-        names = front(found, self._goal.kind)
-        found += script
-        return Tuned(
-            *(recording, look, self._goal, self._goal.order(found), names, chosen, len(many)),
-            words=self._words,
-            rounds=self._rounds,
-            timed_on_recording=self._timed_on_recording,
-        )
+        known = [Candidate(DEFAULT), *candidates(base, recording.size, None if dots is None else dots.pitch)]
+        tuned = Tuned(recording, look, self.goal, [], [], None)
+        tuned.found = self._first_round(known, tuned)
+        finalists = self._finalists(known, tuned.found, base)
+        if self._late(0.5):
+            tuned.notes.append("the budget was over after the first round")
+            names = {candidate.name for candidate in finalists}
+            tuned.found = [one for one in tuned.found if one.name in names]
+        else:
+            tuned.found = self._last_round(finalists, tuned)
+        if not any(math.isfinite(one.of(self.goal.kind)) for one in tuned.found if one.usable):
+            raise SourceError(_nothing(tuned.found, self.goal))
+        self._show_recording(finalists, tuned)
+        name = self._choice(tuned)
+        tuned.chosen = next((candidate for candidate in finalists if candidate.name == name), None)
+        tuned.front = front(tuned.found, self.goal.kind)
+        tuned.found = self.goal.order(tuned.found)
+        return tuned
 
-    @property
-    def _left(self) -> float:
-        """Seconds of the budget that are left, 0 when it is over."""
-        return max(0.0, self._end - time.monotonic())
+    def _late(self, share: float = 1.0) -> bool:
+        """Whether a share of the budget is over."""
+        return time.monotonic() - self._began > share * self.seconds
 
-    def _late(self) -> bool:
-        return not self._left
-
-    def _room(self, frames: int, share: float) -> int:
-        """How many candidates can see so many frames in a share of the time that is left."""
-        return int(share * self._left / max(self._pace * frames, 1e-6))
-
-    def _halve(self, running: list[Candidate], look: Look, folder: Path) -> list[Found]:
-        """All rounds on the simulator; what is known of the last one's candidates."""
+    def _first_round(self, known: Sequence[Candidate], tuned: Tuned) -> list[Found]:
+        """All candidates, in groups from all over the list, until half of the budget is over."""
+        self.say(f"round 1: {len(known)} candidates, {_frames(FIRST)} frames")
+        # The pipeline as given, and the most expensive one, which others are compared with, come first.
+        order = [0, 1, *(2 + np.random.default_rng(self.seed).permutation(len(known) - 2))]
         found: list[Found] = []
-        for number, cases in enumerate(ROUNDS):
-            started = time.monotonic()
-            frames = sum(case.frames for case in cases)
-            self._say(f"round {number + 1}: {len(running)} candidates, {frames} frames")
-            if number:
-                found = self._judged(running, cases, look, folder, self._seed + 100 * number)
-            else:
-                found = self._first_round(running, look, folder)
-            mark_unsound(found)
-            seen = max((one.frames for one in found), default=0)
-            self._rounds.append((len(found), seen))
-            self._pace = (time.monotonic() - started) / max(1, len(found) * seen)
-            if number + 1 == len(ROUNDS):
+        for start in range(0, len(order), GROUP):
+            if found and self._late(0.5):
+                tuned.notes.append(f"the budget was over after {len(found)} of {len(known)} candidates")
                 break
-            # Half of the time is for what comes after the next round.
-            room = self._room(sum(case.frames for case in ROUNDS[number + 1]), 0.5)
-            if room < FEWEST:
-                self._words.append(f"the budget was over after round {number + 1} of {len(ROUNDS)}")
-                names = {candidate.name for candidate in self._kept(found, number, FINALISTS)}
-                return [one for one in found if one.name in names]
-            running = self._kept(found, number, room)
+            group = [known[index] for index in order[start : start + GROUP]]
+            found += self._judge(group, FIRST, tuned.look, self.seed)
+        mark_unsound(found)
+        tuned.rounds.append((len(found), _frames(FIRST)))
         return found
 
-    def _first_round(self, running: Sequence[Candidate], look: Look, folder: Path) -> list[Found]:
-        """All of them, a group at a time and the groups from all over the list, until the budget is over."""
-        order = [0, *(1 + np.random.default_rng(self._seed).permutation(len(running) - 1))]
-        groups = max(1, round(len(running) / GROUP))
-        found: list[Found] = []
-        for start in range(groups):
-            if found and self._late():
-                self._words.append(f"the budget was over after {len(found)} of {len(running)} candidates")
-                break
-            group = [running[index] for index in order[start::groups]]
-            found += self._judged(group, ROUNDS[0], look, folder, self._seed)
+    def _finalists(
+        self, known: Sequence[Candidate], found: Sequence[Found], base: Pipeline
+    ) -> list[Candidate]:
+        """The pipeline as given, the most expensive one, the best by the goal, and the front; of the best one
+        also with more frames of the reference."""
+        runs = {one.name for one in found if one.failure is None}
+        best = [one.name for one in self.goal.order(found) if one.usable][:FINALISTS]
+        names = [*(candidate.name for candidate in known[:2]), *best, *front(found, self.goal.kind)]
+        by_name = {candidate.name: candidate for candidate in known}
+        finalists = [by_name[name] for name in dict.fromkeys(names) if name in runs]
+        more = with_more_references(base, by_name[best[0]]) if best else None
+        if more is None:
+            return finalists
+        self._refined = (best[0], more.name)
+        return [*finalists, more]
+
+    def _last_round(self, finalists: Sequence[Candidate], tuned: Tuned) -> list[Found]:
+        self.say(f"round 2: {len(finalists)} candidates, {_frames(LAST)} frames")
+        found = self._judge(finalists, LAST, tuned.look, self.seed + 100)
+        mark_unsound(found)
+        tuned.rounds.append((len(found), _frames(LAST)))
         return found
 
-    def _judged(
-        self, running: Iterable[Candidate], cases: Sequence[Case], look: Look, folder: Path, seed: int
-    ) -> list[Found]:
+    def _judge(self, group: Sequence[Candidate], cases: Sequence[Case], look: Look, seed: int) -> list[Found]:
         pipelines: dict[str, Pipeline] = {}
         failed: list[Found] = []
-        for candidate in running:
+        for candidate in group:
             try:
-                pipelines[candidate.name] = on_sensor(candidate.load(self._file, self._sensor))
+                pipelines[candidate.name] = candidate.load(self.file, self.sensor)
             except ConfigError as error:
                 failed.append(Found(candidate.name, failure=str(error)))
-        rendered = [Fitted(look, case, folder, seed + index) for index, case in enumerate(cases)]
+        rendered = [Fitted(look, case, self._folder, seed + index) for index, case in enumerate(cases)]
         try:
-            made = judge(pipelines, rendered, self._unit, self._seed, self._late)
+            return [*judge(pipelines, rendered, self.seed, self._late), *failed]
         finally:
-            for one in rendered:
-                one.path.unlink(missing_ok=True)
-        return [*made.values(), *failed]
+            for recording in rendered:
+                recording.path.unlink(missing_ok=True)
 
-    def _kept(self, found: list[Found], number: int, room: int) -> list[Candidate]:
-        """Who goes on, `room` at most: the pipeline as given, the best by the goal, and the front."""
-        want = max(FEWEST, math.ceil(KEPT[number + 1] * len(found)))
-        if number + 2 == len(ROUNDS):
-            want = min(want, FINALISTS)
-        ordered = [one for one in self._goal.order(found) if one.failure is None]
-        best = [one.name for one in ordered if one.usable][:want]
-        best += [name for name in front(found, self._goal.kind) if name not in best][: FINALISTS // 2]
-        first = next(iter(self._known))
-        # The most expensive one is what the others are compared with.
-        dearest = next(
-            (name for name in list(self._known)[1:] if any(o.name == name for o in ordered)), first
-        )
-        names = dict.fromkeys([first, dearest, *best])
-        there = {one.name for one in ordered}
-        return [self._known[name] for name in names if name in there][:room]
-
-    def _on_recording(self, found: list[Found], recording: Recording, folder: Path) -> list[Found]:
-        """Times on the recording instead of the simulator's, and the checks without truth."""
-        good = [one for one in found if one.failure is None]
-        if self._room(recording.frames, 1.0) < len(good):
-            self._words.append("no time was left for the recording: times are of the simulated one")
-            return found
-        dearest = list(self._known)[1:]
-        good.sort(key=lambda one: dearest.index(one.name) if one.name in dearest else len(dearest))
-        self._say(f"the recording: {len(good)} candidates, {recording.frames} frames, forward and backward")
-        pipelines = {one.name: self._known[one.name].load(self._file, self._sensor) for one in good}
-        compared, times, failures = checks.run(pipelines, recording, folder, self._unit, self._late)
-        self._timed_on_recording = self._timed_on_recording or bool(times)
+    def _show_recording(self, finalists: Sequence[Candidate], tuned: Tuned) -> None:
+        """Take times on the recording instead of the simulator's, and the checks without truth."""
         if self._late():
-            told = "some checks on the recording are missing"
-            if not self._timed_on_recording:
-                told = "times are of the simulated one"
-            self._words.append(f"the budget was over while the recording was shown: {told}")
-        for one in good:
-            one.failure = failures.get(one.name)
-            one.checks = compared.get(one.name, {})
-            if one.name in times and one.failure is None:
-                set_time(one, times[one.name], self._seed)
-        return found
+            tuned.notes.append("no time was left for the recording: times are of the simulated one")
+            return
+        by_name = {one.name: one for one in tuned.found if one.failure is None}
+        # The most expensive one comes first.
+        good = [candidate for candidate in (*finalists[1:], finalists[0]) if candidate.name in by_name]
+        self.say(f"the recording: {len(good)} candidates, {tuned.recording.frames} frames")
+        pipelines = {candidate.name: candidate.load(self.file, self.sensor) for candidate in good}
+        times, checks, failures = show_recording(pipelines, tuned.recording, self._late)
+        tuned.timed_on_recording = bool(times)
+        if self._late():
+            missing = "some checks are missing" if times else "times are of the simulated one"
+            tuned.notes.append(f"the budget was over while the recording was shown: {missing}")
+        for name, one in by_name.items():
+            one.failure = failures.get(name)
+            one.checks = checks.get(name, {})
+            if name in times and one.failure is None:
+                set_time(one, times[name], self.seed)
 
-    def _script(self, look: Look, folder: Path) -> list[Found]:
-        """The original script, for comparison: its time and error on one simulated press."""
-        if self._original is None:
-            return []
-        self._say("the original script")
-        pipeline = Candidate(ORIGINAL, (("stages.preprocess.rotate", 0),)).load(self._original)
-        rendered = Fitted(look, ROUNDS[0][0], folder, self._seed)
-        try:
-            made = judge({ORIGINAL: on_sensor(pipeline)}, [rendered], self._unit, self._seed)
-        finally:
-            rendered.path.unlink(missing_ok=True)
-        return list(made.values())
-
-    def _choice(self, found: list[Found]) -> Candidate | None:
-        """The best that most likely keeps the budgets, else the best that seems to."""
-        goal = self._goal
-        bound = goal.bound(found)
-        ordered = [one for one in goal.order(found) if one.usable and math.isfinite(one.of(goal.kind))]
-        fits = [
-            one
-            for one in ordered
-            if (goal.max_ms is None or one.ms.value <= goal.max_ms)
-            and ((goal.max_ms is not None and goal.max_error is None) or one.of(goal.kind) <= bound)
-        ]
-        sure = [one for one in fits if _likely(one.error[goal.kind]) <= bound]
+    def _choice(self, tuned: Tuned) -> str | None:
+        """Name of the best that most likely keeps the budgets, else of the best that seems to."""
+        goal, kind = self.goal, self.goal.kind
+        bound = goal.bound(tuned.found)
+        fits = [one for one in goal.order(tuned.found) if one.usable and goal.is_kept(one, bound)]
+        sure = [one for one in fits if _likely(one, kind) <= bound]
         if fits and not sure and goal.max_error is not None:
-            self._words.append("the budget lies within the interval of the chosen pipeline's error")
-        picked = sure if sure and goal.max_error is not None else fits
-        # A change that gains nothing is none.
+            tuned.notes.append("the budget lies within the interval of the chosen pipeline's error")
+        picked = (sure or fits) if goal.max_error is not None else fits
+        # Change nothing that gains nothing.
         same = [one for one in picked if one.name == DEFAULT and one.ms.value <= picked[0].ms.high]
-        return self._known[[*same, *picked][0].name] if picked else None
-
-    def _refined(
-        self,
-        chosen: Candidate,
-        base: Pipeline,
-        found: list[Found],
-        recording: Recording,
-        look: Look,
-        folder: Path,
-    ) -> tuple[Candidate, list[Found]]:
-        """The chosen one with more frames of the reference, where these make it more exact."""
-        more = with_more_references(base, chosen)
-        if more is None:
-            return chosen, found
-        shown = sum(len(order) for order in checks.orders(recording.frames).values())
-        if self._room(sum(case.frames for case in REFINED) + shown, 1.0) < 2:
-            self._words.append("no time was left to try more frames of the reference")
-            return chosen, found
-        self._known[more.name] = more
-        self._say(more.name.removeprefix(f"{chosen.name}, "))
-        again = self._judged([chosen, more], REFINED, look, folder, self._seed + 500)
-        mark_unsound(again)
-        again = self._on_recording(again, recording, folder)
-        before, one = (next(f for f in again if f.name == name) for name in (chosen.name, more.name))
-        if self._late() or not one.usable or not _better(one, before, self._goal):
-            return chosen, found
-        self._words.append(f"refined: {more.name.removeprefix(f'{chosen.name}, ')}")
-        return more, [*found, one]
+        chosen = [*same, *picked][0].name if picked else None
+        # More references cost no time a frame: take them if they lower the error by a tenth.
+        errors = {one.name: one.of(kind) for one in fits}
+        plain, more = self._refined
+        if chosen in (plain, more) and errors.keys() >= {plain, more}:
+            chosen = more if errors[more] < 0.9 * errors[plain] else plain
+        return chosen
 
 
-def _likely(error: Interval) -> float:
+def _frames(cases: Sequence[Case]) -> int:
+    return sum(case.frames for case in cases)
+
+
+def _likely(one: Found, kind: str) -> float:
     """What an error most likely stays below, px."""
+    error = one.error[kind]
     return error.value + LIKELY * (error.high - error.value)
-
-
-def _better(one: Found, before: Found, goal: Goal) -> bool:
-    """Whether a refinement is worth it: a tenth less error at no more time."""
-    return one.of(goal.kind) < 0.9 * before.of(goal.kind) and one.ms.value <= before.ms.high
 
 
 def front(found: Sequence[Found], kind: str) -> list[str]:
@@ -375,9 +265,9 @@ def front(found: Sequence[Found], kind: str) -> list[str]:
 
 
 def _nothing(found: Sequence[Found], goal: Goal) -> str:
-    reasons = [one.failure or one.unsound for one in found if one.failure or one.unsound]
-    why = f": {reasons[0]}" if reasons else f": none has a {ERRORS[goal.kind]}"
-    return f"no pipeline works on the simulated sensor{why}; see tactflow doctor, and tactflow detect"
+    reasons: Iterator[str] = (one.failure or one.unsound for one in found if one.failure or one.unsound)
+    why = next(reasons, f"none has a {ERRORS[goal.kind]}")
+    return f"no pipeline works on the simulated sensor: {why}; see tactflow doctor, and tactflow detect"
 
 
 def impossible(tuned: Tuned) -> str:

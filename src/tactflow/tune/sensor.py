@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from tactflow.bench.scenes import Case, Rendered
 from tactflow.doctor import measures
+from tactflow.doctor.observation import Observation
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.sim import Truth, open_scene
 from tactflow.sim.scenes import SIZE
 from tactflow.tune.recording import Recording, change_between
 from tactflow.vision.geometry import PixelMapping
-from tactflow.vision.markers import detect_markers
+from tactflow.vision.markers import NoMarkersError, detect_markers
 
 Image = NDArray[np.uint8]
 
@@ -40,7 +41,7 @@ FAINT: Final = 0.06
 
 @dataclass(frozen=True)
 class Look:
-    """What the simulator is told of a sensor.
+    """How the simulator is set to look like a sensor.
 
     size : (width, height) of its frames, px. query : settings of the scene, as `open_scene` takes them.
     noise : grey levels. blur : px of its frames, on top of the simulator's own. jpeg : quality, 0 for none.
@@ -49,23 +50,21 @@ class Look:
 
     size: tuple[int, int]
     query: str
-    noise: float
-    blur: float
-    jpeg: int
-    levels: tuple[float, float, float]
-    contrast: float
+    noise: float = 0.0
+    blur: float = 0.0
+    jpeg: int = 0
+    levels: tuple[float, ...] = (1.0, 1.0, 1.0)
+    contrast: float = 1.0
 
-    def words(self) -> str:
-        """In one line for people."""
-        told = f"{self.size[0]} x {self.size[1]} px, noise {self.noise:.1f} grey levels, {self.query}"
+    def __str__(self) -> str:
+        parts = [f"{self.size[0]} x {self.size[1]} px", f"noise {self.noise:.1f} grey levels", self.query]
         if self.contrast != 1.0:
-            told += f", dots of {100 * self.contrast:.0f} % contrast"
-        told += f", blur {self.blur:.1f} px" if self.blur else ""
-        return told + (f", JPEG of quality {self.jpeg}" if self.jpeg else "")
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
+            parts.append(f"dots of {100 * self.contrast:.0f} % contrast")
+        if self.blur:
+            parts.append(f"blur {self.blur:.1f} px")
+        if self.jpeg:
+            parts.append(f"JPEG of quality {self.jpeg}")
+        return ", ".join(parts)
 
 
 def fit(recording: Recording) -> Look:
@@ -75,31 +74,36 @@ def fit(recording: Recording) -> Look:
     noise have the size, in pixels, that they have there.
     """
     seen = recording.seen
-    area = recording.size[0] * recording.size[1]
-    scale = math.sqrt(area / (SIZE[0] * SIZE[1]))
+    scale = math.sqrt(recording.size[0] * recording.size[1] / (SIZE[0] * SIZE[1]))
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
-    dots = seen.dots
-    contrast, grid = 1.0, "markers=none"
-    if dots is not None:
-        lattice = measures.lattice(dots, seen.typical)
-        pitch = min(dots.pitch / scale, 400.0)
-        radius = float(np.clip(min(dots.dot_radius / scale, 0.4 * pitch), *DOT_LIMITS))
-        columns, rows = (int(np.clip(side // pitch, 1, COLUMNS)) for side in SIZE)
-        grid = f"markers={columns}x{rows}&pitch={pitch:.2f}&dot={radius:.2f}&polarity={dots.polarity}"
-        grid += f"&missing={min(lattice.missing, 0.5):.3f}"
-    light = _light(recording)
-    plain = Look(size, f"{grid}&light={light}", 0.0, 0.0, 0, (1.0, 1.0, 1.0), 1.0)
-    own = Fitted.draw(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0)
+    plain = Look(size, f"{_dots(seen, scale)}&light={_light_of(recording)}")
+    own = compressed(light(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0), 0)
     levels = tuple(float(v) for v in _levels(seen.pairs[0].image) / np.maximum(_levels(own), 1.0))
-    if dots is not None:
-        contrast = _contrast_ratio(recording, own, levels)
     jpeg = 0 if seen.jpeg_step is None else round(measures.jpeg_quality(seen.jpeg_step))
-    blur = measures.blur(seen.typical) or 0.0
-    extra = math.sqrt(max(blur**2 - (OWN_BLUR * scale) ** 2, 0.0))
-    query = f"{plain.query}&depth={_depth(recording, plain, own)}"
     noise = _noise_before(recording, jpeg) if jpeg else measures.noise_of(seen.pairs)
-    found = levels[0], levels[1], levels[2]
-    return Look(size, query, round(noise, 2), round(extra, 2), jpeg, found, round(contrast, 2))
+    blur = measures.blur(seen.typical) or 0.0
+    return Look(
+        size,
+        f"{plain.query}&depth={_depth(recording, plain, own)}",
+        round(noise, 2),
+        round(math.sqrt(max(blur**2 - (OWN_BLUR * scale) ** 2, 0.0)), 2),
+        jpeg,
+        levels,
+        round(_contrast_ratio(seen, own, levels), 2),
+    )
+
+
+def _dots(seen: Observation, scale: float) -> str:
+    """The settings of the simulator's dots. scale : px of the sensor for one of the simulator."""
+    dots = seen.dots
+    if dots is None:
+        return "markers=none"
+    missing = measures.lattice(dots, seen.typical).missing
+    pitch = min(dots.pitch / scale, 400.0)
+    radius = float(np.clip(min(dots.dot_radius / scale, 0.4 * pitch), *DOT_LIMITS))
+    columns, rows = (int(np.clip(side // pitch, 1, COLUMNS)) for side in SIZE)
+    grid = f"markers={columns}x{rows}&pitch={pitch:.2f}&dot={radius:.2f}&polarity={dots.polarity}"
+    return f"{grid}&missing={min(missing, 0.5):.3f}"
 
 
 def _noise_before(recording: Recording, jpeg: int) -> float:
@@ -132,20 +136,20 @@ def _levels(image: Image) -> NDArray[np.float64]:
     return np.asarray(np.median(gel, axis=0) if len(gel) else np.ones(3), np.float64)
 
 
-def _contrast_ratio(recording: Recording, own: Image, levels: tuple[float, ...]) -> float:
+def _contrast_ratio(seen: Observation, own: Image, levels: tuple[float, ...]) -> float:
     """Contrast of the dots, relative to that of the simulator's dots (`own`) under as much light."""
-    seen = recording.seen
-    assert seen.dots is not None
+    if seen.dots is None:
+        return 1.0
     own = np.clip(own * np.array(levels), 0, 255).astype(np.uint8)
     try:
         dots = detect_markers(own)
-    except ValueError:
+    except NoMarkersError:
         return 1.0
     theirs = measures.lattice(seen.dots, seen.grays[0]).contrast
     return float(np.clip(theirs / max(measures.lattice(dots, measures.grey(own)).contrast, 1.0), 0.1, 1.1))
 
 
-def _light(recording: Recording) -> str:
+def _light_of(recording: Recording) -> str:
     """Which of the simulator's lights answers to a contact as the recording does."""
     untouched, touched = _extremes(recording)
     ratio = (touched / np.maximum(untouched, 25.0)).reshape(-1, 3)
@@ -180,8 +184,24 @@ def _depth(recording: Recording, plain: Look, own: Image) -> float:
     for depth in DEPTHS:
         scene = open_scene(f"press?{plain.query}&frames=60&noise=0&depth={depth}")
         deepest = max(range(60), key=lambda index: max((p.depth for p in scene.presses(index)), default=0.0))
-        found[depth] = change_between(own, Fitted.draw(plain, scene, deepest))
+        found[depth] = change_between(own, compressed(light(plain, scene, deepest), 0))
     return min(found, key=lambda depth: abs(math.log(max(found[depth], 1e-3) / wanted)))
+
+
+def light(look: Look, scene: Any, index: int) -> NDArray[np.float32]:
+    """A frame of the sensor's size, light and contrast of dots, in grey levels (H, W, 3).
+
+    They are not rounded: rounded before the noise is added, they have steps in which nothing changes, and the
+    contact's centre is off by half as much again.
+    """
+    image = scene.frame(index).astype(np.float32)
+    if look.contrast != 1.0:
+        clean = scene.clean(index).astype(np.float32)
+        image = cv2.addWeighted(image, look.contrast, clean, 1.0 - look.contrast, 0.0)
+    if look.size != SIZE:
+        shrinks = look.size[0] < SIZE[0]
+        image = cv2.resize(image, look.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    return np.asarray(image * np.array(look.levels, np.float32), np.float32)
 
 
 class Fitted(Rendered):
@@ -201,44 +221,17 @@ class Fitted(Rendered):
         self.frames = np.lib.format.open_memmap(self.path, mode="w+", dtype=np.uint8, shape=shape)
         rng = np.random.default_rng([seed, 0x7475])
         for index in range(case.frames):
-            self.frames[index] = self._spoilt(look, self._light(look, self.scene, index), rng)
+            frame = light(look, self.scene, index)
+            if look.blur:
+                frame = np.asarray(cv2.GaussianBlur(frame, (0, 0), look.blur), np.float32)
+            frame += np.float32(look.noise) * rng.standard_normal(frame.shape, dtype=np.float32)
+            self.frames[index] = compressed(frame, look.jpeg)
         self.frames.flush()
         self._truths: dict[Any, list[Truth]] = {}
         self._scale = width / SIZE[0], height / SIZE[1]
-
-    @staticmethod
-    def draw(look: Look, scene: Any, index: int) -> Image:
-        """A frame without noise, of the sensor's size, light and contrast of dots."""
-        return compressed(Fitted._light(look, scene, index), 0)
-
-    @staticmethod
-    def _light(look: Look, scene: Any, index: int) -> NDArray[np.float32]:
-        """The same in grey levels that are not rounded: rounded before the noise is added, they have steps in
-        which nothing changes, and the contact's centre is off by half as much again.
-        """
-        image = scene.frame(index).astype(np.float32)
-        if look.contrast != 1.0:
-            clean = scene.clean(index).astype(np.float32)
-            image = cv2.addWeighted(image, look.contrast, clean, 1.0 - look.contrast, 0.0)
-        if look.size != SIZE:
-            shrinks = look.size[0] < SIZE[0]
-            image = cv2.resize(image, look.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-        return np.asarray(image * np.array(look.levels, np.float32), np.float32)
-
-    @staticmethod
-    def _spoilt(look: Look, light: NDArray[np.float32], rng: np.random.Generator) -> Image:
-        """The same as the camera gives it."""
-        if look.blur:
-            light = np.asarray(cv2.GaussianBlur(light, (0, 0), look.blur), np.float32)
-        light += np.float32(look.noise) * rng.standard_normal(light.shape, dtype=np.float32)
-        return compressed(light, look.jpeg)
 
     def truths(self, mapping: PixelMapping) -> list[Truth]:
         """As `Rendered.truths`, in the coordinates of a mapping from the sensor's frames."""
         sx, sy = self._scale
         shrink = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
         return super().truths(PixelMapping(SIZE, mapping.size, mapping.matrix @ shrink))
-
-    def displacement_limit(self, _: PixelMapping) -> float | None:
-        """None: the bound is not worked out for such frames."""
-        return None
