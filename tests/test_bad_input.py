@@ -18,11 +18,11 @@ pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
 pytest.importorskip("av", reason="the extra av is not installed")
 
 from tactflow.cli.main import main
+from tests.adapters.bags import TOPIC, write_bag
+from tests.adapters.test_bags import pictures
+from tests.adapters.test_datasets import KEY, write_hdf5, write_lerobot, write_zarr
 from tests.conftest import REPOSITORY
 from tests.faults.rig import array, run
-from tests.sources.bags import TOPIC, write_bag
-from tests.sources.test_bags import pictures
-from tests.sources.test_datasets import KEY, write_hdf5, write_lerobot, write_zarr
 
 PAGE = (REPOSITORY / "docs" / "bad-input.md").read_text()
 IMAGES = np.stack(pictures(5))
@@ -209,7 +209,7 @@ ROWS = [
         "",
         "not a dataset",
         4,
-        "this LeRobot dataset: is damaged or cut off",
+        "this LeRobot dataset: cannot be read",
         lambda f: episode(without_info(f)),
     ),
     Row("", "a video that was cut off", 4, "is damaged or cut off", lambda f: episode(cut_film(f))),

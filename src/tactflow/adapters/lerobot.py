@@ -1,5 +1,5 @@
-"""Writes LeRobot datasets (layout v3.0): pictures, contact and flow at a constant rate; of a calibrated
-sensor also in mm and N.
+"""`tactflow export lerobot`: datasets of LeRobot (layout v3.0) with pictures, contact and flow at a constant
+rate; of a calibrated sensor also in mm and N.
 
 The layout is described at https://huggingface.co/docs/lerobot/lerobot-dataset-v3. Each recording is an
 episode, in files of its own.
@@ -8,6 +8,7 @@ episode, in files of its own.
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,12 +20,15 @@ from numpy.typing import NDArray
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError
-from tactflow.message.result import Result
 from tactflow.system.extras import missing
 from tactflow.vision.types import Scale
 
 if TYPE_CHECKING:
     import av
+
+    from tactflow.message.result import Result
+
+log = logging.getLogger("tactflow")
 
 VERSION = "v3.0"
 """Of the layout, as LeRobot compares it."""
@@ -41,34 +45,56 @@ CALIBRATED = {
     f"{TACTILE}.force": ["known", "z_N", "in_range"],
     f"{TACTILE}.drag": ["known", "x_N", "y_N"],
 }
-"""The same of recordings that are worked on with a calibration, whatever it knows."""
-WHOLE = ("frame_index", "episode_index", "index", "task_index")
-"""Columns of whole numbers that every dataset has, beside `timestamp`."""
+"""The same for recordings with a calibration, whatever parts it has."""
+INTEGERS = ("frame_index", "episode_index", "index", "task_index")
+"""Integer columns that every dataset has, besides `timestamp`."""
 CHUNK = 1000
 """Files in one folder, as LeRobot has it."""
 QUALITY = {"crf": "18", "g": "2", "preset": "veryfast"}
-"""Of the video: nearly nothing is lost to see, and every other picture stands alone, for reading at random.
-Chosen by hand."""
+"""Of the video: hardly any visible loss, and every other picture is a key frame, for random access. Chosen by
+hand."""
 SAMPLED = 10
-"""Every so many pictures are looked at for their statistics. Chosen by hand."""
+"""Every so many pictures are used for their statistics. Chosen by hand."""
 
 
-class DatasetWriter:
-    """Writes one dataset.
+def export(
+    folder: Path,
+    episodes: Iterable[tuple[str, Iterable[Result]]],
+    *,
+    fps: int,
+    task: str = "touch",
+    pictures: str = "video",
+    **_: object,
+) -> None:
+    """Write a dataset; an exporter of `tactflow export`.
 
-    folder : empty, or not there. fps : of the dataset, frames per second. task : what is done, in words.
-    film : whether pictures are kept as H.264 video, which loses a little; else as PNG, without loss.
+    Parameters
+    ----------
+    folder : empty.
+    episodes : the name of each recording, and its results with pictures.
+    fps : of the dataset, frames per second.
+    task : what is done, in words.
+    pictures : "video" (H.264, lossy) or "png" (lossless).
 
     Raises
     ------
-    StageError : a package is missing.
+    StageError : a package is missing, or a recording does not go with those before. OSError : the files
+        cannot be written.
     """
+    writer = DatasetWriter(folder, fps, task, video=pictures == "video")
+    for name, results in episodes:
+        log.info("%s: %d frames", name, writer.add(results))
+    writer.finish()
 
-    def __init__(self, folder: Path, fps: int, task: str, *, film: bool = True) -> None:
+
+class DatasetWriter:
+    """Writes one dataset. Parameters as for `export`; video : whether pictures are kept as a video."""
+
+    def __init__(self, folder: Path, fps: int, task: str, *, video: bool = True) -> None:
         problem = missing("LeRobot datasets", "lerobot", ["pyarrow", "av"])
         if problem is not None:
             raise StageError(problem)
-        self._folder, self._fps, self._task, self._film = folder, fps, task, film
+        self._folder, self._fps, self._task, self._is_video = folder, fps, task, video
         self._episodes: list[dict[str, Any]] = []
         self._frames = 0
         self._camera = ""
@@ -78,41 +104,41 @@ class DatasetWriter:
         self._pixels: list[NDArray[np.float64]] = []
 
     def add(self, results: Iterable[Result]) -> int:
-        """Write one episode; the number of its frames.
+        """Write one episode; returns the number of its frames.
 
         results : of one sensor, with pictures.
 
         Raises
         ------
-        StageError : the sensor or the size of its pictures is not that of the episodes before, one has a
-            calibration and the other none, or there is no picture. OSError : the files cannot be written.
+        StageError : the sensor or the size of its pictures differs from the episodes before, only some have a
+            calibration, or there is no picture. OSError : the files cannot be written.
         """
         episode = len(self._episodes)
-        place = f"chunk-{episode // CHUNK:03d}/file-{episode % CHUNK:03d}"
+        file = f"chunk-{episode // CHUNK:03d}/file-{episode % CHUNK:03d}"
         rows: list[dict[str, Any]] = []
-        film: _Film | None = None
+        video: _Video | None = None
         try:
             for index, result in enumerate(at_rate(results, self._fps)):
-                image = self._checked(result)
-                if self._film and film is None:
-                    film = _Film(self._folder / "videos" / self._camera / f"{place}.mp4", self._fps, image)
+                image = self._check(result)
+                if self._is_video and video is None:
+                    video = _Video(self._folder / "videos" / self._camera / f"{file}.mp4", self._fps, image)
                 rows.append(self._row(result, image, index, episode))
-                if film is not None:
-                    film.write(image)
-            if film is not None:
-                film.finish()
+                if video is not None:
+                    video.write(image)
+            if video is not None:
+                video.finish()
         finally:
-            if film is not None:
-                film.close()
+            if video is not None:
+                video.close()
         if not rows:
             raise StageError("there is no frame in it")
-        self._write_rows(rows, self._folder / "data" / f"{place}.parquet")
+        self._write_rows(rows, self._folder / "data" / f"{file}.parquet")
         self._episodes.append(self._episode(episode, len(rows)))
         self._frames += len(rows)
         return len(rows)
 
     def finish(self) -> None:
-        """Write what the dataset says about itself."""
+        """Write the description of the dataset."""
         import pyarrow as pa  # type: ignore[import-untyped]
 
         meta = self._folder / "meta"
@@ -129,19 +155,20 @@ class DatasetWriter:
         (meta / "info.json").write_text(json.dumps(self._info(), indent=4))
         (meta / "stats.json").write_text(json.dumps(self._statistics(), indent=4))
 
-    def _checked(self, result: Result) -> NDArray[np.uint8]:
-        """The picture, if it goes with the others."""
+    def _check(self, result: Result) -> NDArray[np.uint8]:
+        """The picture of a result, if it goes with those before."""
         image = result.image
         if image is None:
             raise StageError("the pipeline makes no picture: it needs a stage preprocess")
         camera = f"observation.images.{result.sensor}"
         features = PIXELS if result.scale is None else PIXELS | CALIBRATED
+        size = f"{image.shape[1]} x {image.shape[0]}"
         if not self._camera:
             self._camera, self._shape, self._features = camera, image.shape, features
             self._numbers = {name: [] for name in features}
         if (camera, image.shape) != (self._camera, self._shape):
             raise StageError(
-                f"{camera} with pictures of {image.shape[1]} x {image.shape[0]} pixels; those before are "
+                f"{camera} with pictures of {size} pixels; those before are "
                 f"{self._camera}, {self._shape[1]} x {self._shape[0]}: make two datasets"
             )
         if features != self._features:
@@ -150,11 +177,8 @@ class DatasetWriter:
                 f"has {own} calibration, those before have {before}: name one in the pipeline file, or make "
                 "two datasets"
             )
-        if self._film and (image.shape[0] % 2 or image.shape[1] % 2):
-            raise StageError(
-                f"pictures of {image.shape[1]} x {image.shape[0]} pixels: a video needs even numbers; "
-                "give --pictures png"
-            )
+        if self._is_video and (image.shape[0] % 2 or image.shape[1] % 2):
+            raise StageError(f"pictures of {size} pixels: a video needs even numbers; give --pictures png")
         return image
 
     def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
@@ -164,26 +188,22 @@ class DatasetWriter:
         for name, values in self._numbers.items():
             values.append(np.array(row[name]))
         if index % SAMPLED == 0:
-            # Mean, mean square, least and largest of blue, green, red.
-            pixels = image.reshape(-1, 3) / 255.0
-            self._pixels.append(
-                np.array([pixels.mean(0), (pixels**2).mean(0), pixels.min(0), pixels.max(0)])[:, ::-1]
-            )
-        if not self._film:
+            # Mean, mean square, minimum and maximum of red, green, blue.
+            rgb = image.reshape(-1, 3)[:, ::-1] / 255.0
+            self._pixels.append(np.array([rgb.mean(0), (rgb**2).mean(0), rgb.min(0), rgb.max(0)]))
+        if not self._is_video:
             row[self._camera] = {"bytes": cv2.imencode(".png", image)[1].tobytes(), "path": None}
-        whole = (index, episode, self._frames + index, 0)
-        return row | {"timestamp": index / self._fps} | dict(zip(WHOLE, whole, strict=True))
+        integers = (index, episode, self._frames + index, 0)
+        return row | {"timestamp": index / self._fps} | dict(zip(INTEGERS, integers, strict=True))
 
     def _write_rows(self, rows: list[dict[str, Any]], path: Path) -> None:
         import pyarrow as pa
 
-        fields = [
-            pa.field(name, pa.list_(pa.float32(), len(names))) for name, names in self._features.items()
-        ]
-        if not self._film:
-            fields.append(pa.field(self._camera, pa.struct([("bytes", pa.binary()), ("path", pa.string())])))
-        fields += [pa.field("timestamp", pa.float32()), *(pa.field(name, pa.int64()) for name in WHOLE)]
-        _write(pa.Table.from_pylist(rows, pa.schema(fields)), path)
+        types = {name: pa.list_(pa.float32(), len(names)) for name, names in self._features.items()}
+        if not self._is_video:
+            types[self._camera] = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        types |= {"timestamp": pa.float32(), **dict.fromkeys(INTEGERS, pa.int64())}
+        _write(pa.Table.from_pylist(rows, pa.schema(types)), path)
 
     def _episode(self, episode: int, frames: int) -> dict[str, Any]:
         place = {"chunk_index": episode // CHUNK, "file_index": episode % CHUNK}
@@ -197,18 +217,18 @@ class DatasetWriter:
             "meta/episodes/file_index": 0,
         }
         row |= {f"data/{key}": value for key, value in place.items()}
-        if self._film:
+        if self._is_video:
             video = place | {"from_timestamp": 0.0, "to_timestamp": frames / self._fps}
             row |= {f"videos/{self._camera}/{key}": value for key, value in video.items()}
         return row
 
     def _info(self) -> dict[str, Any]:
         camera: dict[str, Any] = {
-            "dtype": "video" if self._film else "image",
+            "dtype": "video" if self._is_video else "image",
             "shape": list(self._shape),
             "names": ["height", "width", "channels"],
         }
-        if self._film:
+        if self._is_video:
             camera["info"] = {
                 "video.height": self._shape[0],
                 "video.width": self._shape[1],
@@ -223,7 +243,8 @@ class DatasetWriter:
         for name, names in self._features.items():
             features[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
-        features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in WHOLE}
+        features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INTEGERS}
+        video_path = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
         return {
             "codebase_version": VERSION,
             "robot_type": None,
@@ -237,31 +258,24 @@ class DatasetWriter:
             "fps": self._fps,
             "splits": {"train": f"0:{len(self._episodes)}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-            "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-            if self._film
-            else None,
+            "video_path": video_path if self._is_video else None,
             "features": features,
         }
 
     def _statistics(self) -> Mapping[str, Any]:
-        """What training normalises by: of each number, and of each colour (in [0, 1], red first)."""
-        found: dict[str, Any] = {}
+        """What training normalises by: of each number, and of each color (in [0, 1], red first)."""
+        statistics: dict[str, Any] = {}
         for name, rows in self._numbers.items():
             values = np.array(rows)
-            moments = {
-                "min": values.min(0),
-                "max": values.max(0),
-                "mean": values.mean(0),
-                "std": values.std(0),
-            }
-            found[name] = {key: one.tolist() for key, one in moments.items()} | {"count": [len(values)]}
-        pixels = np.array(self._pixels)
-        mean = pixels[:, 0].mean(0)
-        spread = np.sqrt(np.maximum(pixels[:, 1].mean(0) - mean**2, 0))
-        colours = {"min": pixels[:, 2].min(0), "max": pixels[:, 3].max(0), "mean": mean, "std": spread}
-        found[self._camera] = {key: one.reshape(3, 1, 1).tolist() for key, one in colours.items()}
-        found[self._camera]["count"] = [len(pixels)]
-        return found
+            moments = {key: getattr(values, key)(0).tolist() for key in ("min", "max", "mean", "std")}
+            statistics[name] = moments | {"count": [len(values)]}
+        means, squares, lowest, highest = np.array(self._pixels).transpose(1, 0, 2)
+        mean = means.mean(0)
+        std = np.sqrt(np.maximum(squares.mean(0) - mean**2, 0))
+        colors = {"min": lowest.min(0), "max": highest.max(0), "mean": mean, "std": std}
+        statistics[self._camera] = {key: value.reshape(3, 1, 1).tolist() for key, value in colors.items()}
+        statistics[self._camera]["count"] = [len(means)]
+        return statistics
 
 
 def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
@@ -269,7 +283,7 @@ def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
 
     >>> from types import SimpleNamespace
     >>> times = [5.0, 5.02, 5.21, 5.3]
-    >>> [one.t for one in at_rate((SimpleNamespace(t=t) for t in times), 10)]
+    >>> [result.t for result in at_rate((SimpleNamespace(t=t) for t in times), 10)]
     [5.0, 5.02, 5.21, 5.3]
     """
     before: Result | None = None
@@ -290,8 +304,7 @@ def _in_pixels(result: Result) -> dict[str, list[float]]:
     """The numbers of `PIXELS`."""
     contact, mean = result.contact, None if result.flow is None else result.flow.mean
     angle = 0.0 if contact is None or contact.angle is None else math.radians(contact.angle)
-    touched = None if contact is None else [*contact.center, contact.area, angle]
-    return _filled(PIXELS, [touched, mean])
+    return _zero_filled(PIXELS, [None if contact is None else [*contact.center, contact.area, angle], mean])
 
 
 def _calibrated(result: Result, scale: Scale) -> dict[str, list[float]]:
@@ -299,29 +312,28 @@ def _calibrated(result: Result, scale: Scale) -> dict[str, list[float]]:
     contact, depth, force = result.contact, result.depth, result.force
     mean = None if result.flow is None else result.flow.mean
     drag = [] if force is None else [part for part in force.value[:2] if part is not None]
-    found = [
+    values = [
         None if contact is None else [*scale.point(contact.center), scale.area(contact.area)],
         None if mean is None else scale.vector(mean),
         None if depth is None else [depth.greatest, depth.volume],
         None if force is None else [force.value[2], force.in_range],
         drag if len(drag) == 2 else None,
     ]
-    return _filled(CALIBRATED, found)
+    return _zero_filled(CALIBRATED, values)
 
 
-def _filled(
-    features: Mapping[str, Sequence[str]], found: Iterable[Sequence[float] | None]
+def _zero_filled(
+    features: Mapping[str, Sequence[str]], values: Iterable[Sequence[float] | None]
 ) -> dict[str, list[float]]:
-    """1 and what was found, or zeros, for each feature."""
-    pairs = zip(features.items(), found, strict=True)
+    """For each feature 1 and its values, or zeros where there are none."""
     return {
         name: [0.0] * len(names) if numbers is None else [1.0, *map(float, numbers)]
-        for (name, names), numbers in pairs
+        for (name, names), numbers in zip(features.items(), values, strict=True)
     }
 
 
-class _Film:
-    """A video that grows picture by picture."""
+class _Video:
+    """An H.264 video that grows picture by picture."""
 
     def __init__(self, path: Path, fps: int, image: NDArray[np.uint8]) -> None:
         import av
@@ -343,7 +355,7 @@ class _Film:
         self._file.mux(self._stream.encode(None))
 
     def close(self) -> None:
-        """Let go of the file, finished or not."""
+        """Close the file, finished or not."""
         self._file.close()
 
 

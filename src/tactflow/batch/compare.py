@@ -11,7 +11,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from tactflow.adapters.tables import frame_columns
+from tactflow.message.columns import frame_columns
 from tactflow.report import Table
 
 QUANTITIES = {

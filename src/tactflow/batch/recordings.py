@@ -12,9 +12,8 @@ from itertools import count
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError, SourceError
-from tactflow.sources.base import find_path
 from tactflow.sources.files import IMAGE_SUFFIXES, matching, natural_key
-from tactflow.sources.lerobot import SCHEME
+from tactflow.sources.paths import find_path, split_prefix
 from tactflow.system.files import expanded, is_utf8
 
 FILE_SUFFIXES = frozenset(
@@ -48,7 +47,7 @@ class Recording:
         """The file, or the folder, also of a pattern; None for the simulated sensor."""
         if self.source.startswith("sim:"):
             return None
-        whole = self.source.removeprefix(SCHEME)
+        _, whole = split_prefix(self.source, None)
         # A file may be named like a pattern, or as if options followed.
         path = Path(whole) if os.path.exists(whole) else Path(whole.partition("?")[0])
         while glob.has_magic(path.name) and not path.exists():
@@ -114,7 +113,7 @@ def _sources(word: str, directory: Path | None) -> Iterator[str]:
         return
     if word.isdecimal() or word.startswith("/dev/") or re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", word):
         raise SourceError(f"{word}: is live; a batch takes recordings. `tactflow record` makes one")
-    scheme, word = (SCHEME, word.removeprefix(SCHEME)) if word.startswith(SCHEME) else ("", word)
+    scheme, word = split_prefix(word, directory)
     exists = any((base / expanded(word)).exists() for base in (Path(), directory or Path()))
     # A file may be named like a pattern, or as if options followed.
     plain, mark, options = (word, "", "") if exists else word.partition("?")

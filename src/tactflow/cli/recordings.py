@@ -5,21 +5,31 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 from tactflow.cli.options import add_overwrite, add_quiet
 from tactflow.cli.terminal import notes, progress_bar, say
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.recording import missing_packages
 from tactflow.system.files import completed
+from tactflow.system.plugins import plugins
+from tactflow.system.spelling import did_you_mean
 
+if TYPE_CHECKING:
+    from tactflow.message.result import Result
+
+EXPORTS = "tactflow.exports"
+"""Group of entry points: name of a format -> function that writes a dataset. It is called with a folder to
+fill, `(name, results)` of each recording, and `fps`, `task` and `pictures` as keywords."""
 FASTEST = 1000
 """Highest frame rate of a dataset, Hz; cameras of gels are slower. Chosen by hand."""
 
 
 def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `export`."""
-    parser.add_argument("format", choices=("lerobot",), help="a LeRobot dataset, layout v3.0")
+    parser.add_argument("format", help="lerobot (a LeRobot dataset, layout v3.0), or that of a plug-in")
     parser.add_argument(
         "recordings",
         nargs="+",
@@ -34,7 +44,7 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--fps", type=int, help="of the dataset (default: that of the first recording)")
     parser.add_argument(
-        "--task", default="touch", help="what is done, in words: LeRobot keeps it (default: touch)"
+        "--task", default="touch", help="what is done, in words: the dataset keeps it (default: touch)"
     )
     parser.add_argument(
         "--pictures",
@@ -49,33 +59,49 @@ def run_export(args: argparse.Namespace) -> int:
 
     Raises
     ------
-    ConfigError : the folder is there already, or the frame rate is invalid. Nothing was written.
+    ConfigError : there is no such format, the folder is there already, or the frame rate is invalid. Nothing
+        was written.
     TactflowError : as `tactflow run`; nothing is left behind.
     """
-    from tactflow.adapters.lerobot import DatasetWriter
-    from tactflow.streaming import stream
-
+    exporter = _exporter(args.format)
     if args.out.exists():
         raise ConfigError(f"--out: {args.out} is already there; give another folder")
     fps = _rate(args.recordings[0]) if args.fps is None else args.fps
     if not 1 <= fps <= FASTEST:
         raise ConfigError(f"--fps: required 1 to {FASTEST}, got {fps}")
-    settings: dict[str, object] = {"sinks": {}}
-    recording = ""
+    started: list[str] = []
     try:
         with notes(), completed(args.out) as folder:
-            writer = DatasetWriter(folder, fps, args.task, film=args.pictures == "video")
-            for recording in args.recordings:
-                frames = writer.add(stream(args.pipeline, source=recording, settings=settings, images=True))
-                say(f"{recording}: {frames} frames")
-            writer.finish()
+            episodes = _episodes(args.recordings, args.pipeline, started)
+            exporter(folder, episodes, fps=fps, task=args.task, pictures=args.pictures)
     except StageError as error:
-        raise StageError(f"{recording}: {error}" if recording else str(error)) from error
+        raise StageError(f"{started[-1]}: {error}" if started else str(error)) from error
     except OSError as error:
         raise StageError(f"{args.out}: cannot be written: {error.strerror or error}") from error
     count = len(args.recordings)
     say(f"{args.out}: {count} {'episode' if count == 1 else 'episodes'} at {fps} fps")
     return 0
+
+
+def _exporter(name: str) -> Callable[..., None]:
+    formats = {entry.name: entry for entry in plugins(EXPORTS)}
+    if name not in formats:
+        raise ConfigError(f"there is no format {name}{did_you_mean(name, formats)}")
+    try:
+        return cast(Callable[..., None], formats[name].load())
+    except Exception as error:
+        raise ConfigError(f"{name}: {formats[name].value} cannot be loaded: {error}") from error
+
+
+def _episodes(
+    recordings: Sequence[str], pipeline: str | None, started: list[str]
+) -> Iterator[tuple[str, Iterable[Result]]]:
+    """The name and the results of each recording; `started` grows by each that is begun."""
+    from tactflow.streaming import stream
+
+    for recording in recordings:
+        started.append(recording)
+        yield recording, stream(pipeline, source=recording, settings={"sinks": {}}, images=True)
 
 
 def _rate(recording: str) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import importlib
 import inspect
@@ -20,6 +19,7 @@ from tactflow.config.models import RESERVED
 from tactflow.engine.conformance import component, kind_of
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
+from tactflow.system.plugins import plugins
 from tactflow.system.spelling import closest, did_you_mean
 
 Section = Literal["stages", "sinks"]
@@ -68,12 +68,18 @@ def catalogue() -> tuple[list[Component], list[str]]:
                 components.append(_named(name, section))
             except ConfigError as error:
                 problems.append(str(error))
+        problems += [
+            f"{entry.name} of {_plugin_origin(entry)} is not used, as a built-in has that name; name its "
+            f"class instead (use: {entry.value})"
+            for entry in plugins(f"tactflow.{section}")
+            if entry.name in _builtins(section)
+        ]
     return components, problems
 
 
 def names(section: Section) -> list[str]:
     """Names of the built-ins and plug-ins of a section; nothing is imported for it."""
-    return sorted({*_builtins(section), *(entry.name for entry in _entry_points(section))})
+    return sorted({*_builtins(section), *(entry.name for entry in plugins(f"tactflow.{section}"))})
 
 
 def _is_file(text: str) -> bool:
@@ -85,36 +91,22 @@ def _builtins(section: Section) -> list[str]:
     return [module.name for module in pkgutil.iter_modules(package.__path__) if module.name[0] != "_"]
 
 
-def _entry_points(section: Section) -> Sequence[metadata.EntryPoint]:
-    return _installed(section, tuple(sys.path))
-
-
-@functools.cache
-def _installed(section: Section, path: tuple[str, ...]) -> Sequence[metadata.EntryPoint]:
-    """Entry points of the distributions on a module path; reading them takes longer than all the rest."""
-    points = metadata.entry_points(group=f"tactflow.{section}") if path else ()
-    # A distribution found twice (an editable install and its build folder) is one plug-in.
-    return list({(point.name, point.value): point for point in points}.values())
-
-
 def _named(name: str, section: Section) -> Component:
-    builtin = name in _builtins(section)
-    plugins = [entry for entry in _entry_points(section) if entry.name == name]
-    if builtin + len(plugins) > 1:
-        claims = ["the built-in"] * builtin + [_plugin_origin(entry) for entry in plugins]
-        values = " or ".join(entry.value for entry in plugins)
-        raise ConfigError(
-            f"{name} is claimed by {' and by '.join(claims)}; "
-            f"name the class instead (use: {values}) or uninstall one of them"
-        )
-    if plugins:
-        module, _, attribute = plugins[0].value.partition(":")
-        origin = _plugin_origin(plugins[0])
-        cls = _find_class(_load_module(module.strip(), origin), attribute.strip(), section)
-        return component(cls, name, origin, RESERVED)
-    if builtin:
+    # First, as looking for plug-ins takes some milliseconds.
+    if name in _builtins(section):
         module = f"tactflow.{section}.{name}"
         return component(_find_class(_load_module(module), "", section), name, "built-in", RESERVED)
+    found = [entry for entry in plugins(f"tactflow.{section}") if entry.name == name]
+    if len(found) > 1:
+        raise ConfigError(
+            f"{name} is claimed by {' and by '.join(map(_plugin_origin, found))}; name the class instead "
+            f"(use: {' or '.join(entry.value for entry in found)}) or uninstall one of them"
+        )
+    if found:
+        module, _, attribute = found[0].value.partition(":")
+        origin = _plugin_origin(found[0])
+        cls = _find_class(_load_module(module.strip(), origin), attribute.strip(), section)
+        return component(cls, name, origin, RESERVED)
     other: Section = "sinks" if section == "stages" else "stages"
     if name in names(other):
         raise ConfigError(f"{name} is under {section}: but belongs under {other}:")

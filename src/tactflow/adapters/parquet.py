@@ -1,4 +1,4 @@
-"""Parquet: results as tables for pandas, Polars, DuckDB and all else that reads Parquet."""
+"""Parquet: results as tables for pandas, Polars, DuckDB and everything else that reads Parquet."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from itertools import chain
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import orjson
 from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
+from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
 from tactflow.message.result import SCHEMA, Result, encode_message
 from tactflow.system.extras import missing
 from tactflow.system.files import claim_path, expanded, make_folder
@@ -24,15 +27,14 @@ from tactflow.system.provenance import facts, texts
 if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]
 
-    from tactflow.adapters.tables import Tables
-
 log = logging.getLogger("tactflow")
 
+SEQ = Column("seq", ("seq",), "integer", "the frame's seq in the table frames")
+CONTACT = Column("contact", (), "integer", "0 is the contact with the most pixels")
 TABLES = ("markers", "contacts", "frames")
 """In the order in which they are written: what belongs to a frame of `frames` is there before it."""
 UNFINISHED = ".unfinished"
-"""Beginning of the name of a part that is being written: what begins with a dot, readers of folders leave
-out."""
+"""Prefix of a part that is being written: readers of folders leave out names that begin with a dot."""
 PART_BYTES = 64_000_000
 """A part is written early when its messages take so much memory, bytes: some ten thousand frames."""
 
@@ -43,26 +45,26 @@ class Parquet(Sink):
     `frames` has a row for each frame, `contacts` one for each separate contact, `markers` one for each dot of
     each frame. Each table is a folder of parts, `part-00000.parquet`, as pandas, pyarrow, Polars and DuckDB
     read it. A part is written every `flush` seconds and at the end, and gets its name when it is complete:
-    what ends the process takes at most the rows since the last part.
+    if the process ends abruptly, at most the rows since the last part are lost.
     """
 
     threaded = True
     queue_capacity = 16
 
     class Params(StageParams):
-        """Where to write, and what to do with tables that are there already."""
+        """Where to write, and what to do with existing tables."""
 
         path: str = Field(
             "results", min_length=1, description="folder, relative to the current directory; created"
         )
-        overwrite: bool = Field(False, description="remove the tables that are there")
-        append: bool = Field(False, description="add parts to the tables that are there")
+        overwrite: bool = Field(False, description="remove existing tables")
+        append: bool = Field(False, description="add parts to existing tables")
         flush: float = Field(
             10.0, gt=0, description="longest time that rows wait before they are written as a part, s"
         )
 
         @model_validator(mode="after")
-        def _one_of_both(self) -> Parquet.Params:
+        def _exclusive(self) -> Parquet.Params:
             if self.overwrite and self.append:
                 raise ValueError("overwrite and append exclude each other")
             return self
@@ -78,7 +80,7 @@ class Parquet(Sink):
         self._sensor = sensor
         self._control = control
         self._claim: int | None = None
-        self._tables: Tables | None = None
+        self._schemas: dict[str, pa.Schema] = {}
         self._pending: list[bytes] = []
         self._bytes = 0
         self._flushed = 0.0
@@ -93,7 +95,7 @@ class Parquet(Sink):
 
     @classmethod
     def on_restart(cls, params: Parquet.Params) -> Parquet.Params:
-        """It adds to its tables."""
+        """It appends to its tables."""
         return params.changed(overwrite=False, append=True)
 
     def open(self) -> None:
@@ -111,17 +113,16 @@ class Parquet(Sink):
         # Now, and not in the middle of the run, when the first part is written.
         import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
 
-        from tactflow.adapters.tables import Tables
-
         try:
             for name in TABLES:
                 make_folder(self._folder / name)
             self._claim = claim_path(self._folder)
-            self._take_over()
+            self._check_existing()
         except OSError as error:
             raise StageError(f"{self._folder}: cannot be written into: {error.strerror or error}") from error
-        about = {"schema": SCHEMA, **facts(self._sensor, self._control), **texts(self._control)}
-        self._tables = Tables(about)
+        self._schemas = schemas(
+            {"schema": SCHEMA, **facts(self._sensor, self._control), **texts(self._control)}
+        )
         self._flushed = time.monotonic()
 
     def counters(self) -> Mapping[str, int]:
@@ -143,23 +144,17 @@ class Parquet(Sink):
             self._flush()
 
     def close(self) -> None:
-        """Write the last part, and let others write into the folder.
-
-        Raises
-        ------
-        StageError
-            As `write`.
-        """
+        """Write the last part, and let others write into the folder. Raises as `write`."""
         try:
             self._flush()
         finally:
-            self._tables = None
+            self._schemas = {}
             if self._claim is not None:
                 os.close(self._claim)
                 self._claim = None
 
-    def _take_over(self) -> None:
-        """See what is there: refuse it, remove it, or go on behind it."""
+    def _check_existing(self) -> None:
+        """Refuse existing tables, remove them, or continue behind them."""
         present = [part for name in TABLES for part in (self._folder / name).glob("part-*.parquet")]
         if present and not (self.params.overwrite or self.params.append):
             raise StageError(
@@ -177,9 +172,9 @@ class Parquet(Sink):
     def _flush(self) -> None:
         messages, self._pending, self._bytes = self._pending, [], 0
         self._flushed = time.monotonic()
-        if not messages or self._tables is None:
+        if not messages or not self._schemas:
             return
-        tables = self._tables.build([orjson.loads(message) for message in messages])
+        tables = build_tables([orjson.loads(message) for message in messages], self._schemas)
         try:
             for name in TABLES:
                 self._write_part(name, tables[name])
@@ -209,3 +204,81 @@ class Parquet(Sink):
             with suppress(OSError):
                 unfinished.unlink()
             raise
+
+
+def schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
+    """The Arrow schema of each table. metadata : of every table.
+
+    >>> schemas({})["markers"].names[:4]
+    ['seq', 'marker', 'x', 'y']
+    """
+    import pyarrow as pa
+
+    types = {
+        "number": pa.float64(),
+        "integer": pa.int64(),
+        "boolean": pa.bool_(),
+        "string": pa.string(),
+        "points": pa.list_(pa.list_(pa.float64())),
+        "words": pa.map_(pa.string(), pa.string()),
+    }
+    columns = {
+        "frames": frame_columns(),
+        "contacts": (SEQ, CONTACT, *contact_columns()),
+        "markers": (SEQ, *MARKER_COLUMNS),
+    }
+    return {
+        name: pa.schema(
+            [pa.field(c.name, types[c.kind], metadata={"description": c.description}) for c in table],
+            metadata=dict(metadata),
+        )
+        for name, table in columns.items()
+    }
+
+
+def build_tables(
+    messages: Sequence[Mapping[str, Any]], schemas: Mapping[str, pa.Schema]
+) -> dict[str, pa.Table]:
+    """The tables `frames`, `contacts` and `markers` of parsed result messages."""
+    import pyarrow as pa
+
+    frames = [{column.name: column.value(message) for column in frame_columns()} for message in messages]
+    contacts = [
+        {"seq": message["seq"], "contact": index}
+        | {column.name: column.value(contact) for column in contact_columns()}
+        for message in messages
+        for index, contact in enumerate(message["contacts"])
+    ]
+    return {
+        "frames": pa.Table.from_pylist(frames, schemas["frames"]),
+        "contacts": pa.Table.from_pylist(contacts, schemas["contacts"]),
+        "markers": _markers(messages, schemas["markers"]),
+    }
+
+
+def _markers(messages: Sequence[Mapping[str, Any]], schema: pa.Schema) -> pa.Table:
+    """A row for each dot of each frame; by columns, as there are thousands of rows a second."""
+    import pyarrow as pa
+
+    seen = [(m["seq"], m["markers"]) for m in messages if m["markers"] and m["markers"]["position"]]
+    counts = [len(markers["position"]) for _, markers in seen]
+    position, origin = (
+        np.concatenate([np.empty((0, 2)), *(np.array(markers[key]) for _, markers in seen)])
+        for key in ("position", "origin")
+    )
+    columns = [
+        np.repeat(np.array([seq for seq, _ in seen], np.int64), counts),
+        list(chain.from_iterable(map(range, counts))),
+        *position.T,
+        *(position - origin).T,
+        *origin.T,
+        list(chain.from_iterable(markers["status"] for _, markers in seen)),
+        list(
+            chain.from_iterable(
+                markers.get("stderr", [None] * count)
+                for (_, markers), count in zip(seen, counts, strict=True)
+            )
+        ),
+    ]
+    arrays = [pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)]
+    return pa.Table.from_arrays(arrays, schema=schema)

@@ -17,9 +17,9 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from websockets.sync.client import connect
 
+from tactflow.adapters.foxglove import Foxglove
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.sinks.foxglove import Foxglove
 from tests.clock import PATIENCE, until
 from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, Results, result_of
 

@@ -11,8 +11,8 @@ import pytest
 import zmq
 from pydantic import ValidationError
 
+from tactflow.adapters.lerobot_camera import LerobotCamera
 from tactflow.engine.frame import Frame, Tick
-from tactflow.sinks.lerobot_camera import LerobotCamera
 from tests.clock import until
 
 IMAGE = np.full((48, 64, 3), (200, 100, 20), np.uint8)

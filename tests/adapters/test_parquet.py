@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tactflow.adapters import parquet as parquet_module
+from tactflow.adapters.parquet import TABLES, Parquet
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.schema import message_schema
-from tactflow.sinks import parquet as parquet_module
-from tactflow.sinks.parquet import TABLES, Parquet
 from tactflow.vision.types import Depth, Force, Scale, Slip
 from tests.clock import PATIENCE, until
 from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, Results, build_message, result_of
@@ -204,7 +204,7 @@ KILLED = """
 import os, sys
 from pathlib import Path
 import pyarrow.parquet
-from tests.sinks.test_parquet import *
+from tests.adapters.test_parquet import *
 
 def endless(folder):
     sink = opened(folder, flush=0.005)

@@ -1,0 +1,183 @@
+"""Frames in arrays of HDF5 and Zarr files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources.base import FrameReader, check_pixel_count, damaged
+from tactflow.sources.files import DEFAULT_FPS, decode_image, holds_frames
+from tactflow.sources.paths import find_path, refuse_devices, split_query
+from tactflow.system.extras import missing
+
+SETTINGS = {
+    "dataset": "name of the frames",
+    "times": "name of their times (numbers with a point are s, whole ones ns)",
+    "order": "rgb (bgr if not given)",
+}
+MOST_NAMED = 30
+"""Arrays that a message lists at most. Chosen by hand."""
+BLOCK = 64 << 20
+"""Frames are read chunk by chunk, but not more than so many bytes together. Chosen by hand."""
+LARGEST_CHUNK = 1 << 30
+"""Bytes of an uncompressed chunk at most, so that a damaged file does not take all memory. Chosen by hand."""
+REQUIRED = "required uint8 or uint16 of N x H x W x 3 (BGR) or N x H x W (gray), or N JPEG or PNG files"
+"""What an array of frames is, for messages."""
+
+
+class ArrayDataset(FrameReader):
+    """Frames of one array of an HDF5 file or a Zarr folder.
+
+    Parameters
+    ----------
+    spec : `file.h5?dataset=/frames`; `times=/t` names their times, else frame i is taken at i / fps;
+        `order=rgb` if the colors are in that order.
+    directory : where a relative path is looked for if it is not in the current directory.
+    fps : frames per second if there are no times; 30 if not given.
+
+    Raises
+    ------
+    SourceError
+        If there is no such file or array (it lists those that are there), the array holds no frames, or a
+        package is missing.
+    """
+
+    # HDF5 and the codecs of both formats raise all kinds of errors.
+    parser_errors = (Exception,)
+
+    def __init__(self, spec: str, directory: Path | None = None, fps: float | None = None) -> None:
+        name, settings = split_query(spec, directory, SETTINGS)
+        if settings.get("order", "bgr") not in ("bgr", "rgb"):
+            raise SourceError(f"{spec}: order={settings['order']}: required bgr or rgb")
+        path = find_path(name, directory)
+        super().__init__(f"{path}, {settings.get('dataset', '')}")
+        self._swapped = settings.get("order") == "rgb"
+        arrays, self._release = _open(path)
+        try:
+            self._array = _choose(spec, settings.get("dataset"), arrays, "dataset")
+            self.total = _count(self._array, self.name)
+            if "times" in settings:
+                self._times = self._seconds(_choose(spec, settings["times"], arrays, "times"))
+            else:
+                self.fps = fps or DEFAULT_FPS
+                self._times = np.arange(self.total) / self.fps
+            self._read_first()
+        except BaseException:
+            self.close()
+            raise
+        self.description = f"{spec}, {self.total} frames"
+
+    def close(self) -> None:
+        """Close the file."""
+        super().close()
+        self._release()
+
+    def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
+        for index, (frame, t) in enumerate(zip(_read_chunks(self._array), self._times, strict=True)):
+            if frame.ndim == 1:
+                frame = decode_image(frame.tobytes(), f"{self.name}, frame {index}")
+            if self._swapped and frame.ndim == 3:
+                frame = frame[..., [2, 1, 0, 3][: frame.shape[2]]] if frame.shape[2] > 1 else frame
+            yield frame, float(t)
+
+    def _seconds(self, array: Any) -> NDArray[np.float64]:
+        """Times from 0 at the first frame, s; where they would go back, they stay."""
+        if array.shape != (self.total,) or array.dtype.kind not in "fiu":
+            raise SourceError(
+                f"{self.name}: times are {array.dtype} of shape {array.shape}; required {self.total} numbers"
+            )
+        times = np.asarray(array[:])
+        # Whole numbers are subtracted before they are rounded: Unix time in ns has 19 digits.
+        seconds = (times - times[:1]) / (1e9 if array.dtype.kind in "iu" else 1.0)
+        if not np.isfinite(seconds).all():
+            raise SourceError(f"{self.name}: required finite times")
+        return np.maximum.accumulate(seconds)
+
+
+def _open(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
+    """The arrays of a file by name, and what closes it."""
+    what, extra, package, opener = (
+        ("Zarr files", "zarr", "zarr", _open_zarr)
+        if path.suffix.lower() == ".zarr"
+        else ("HDF5 files", "hdf5", "h5py", _open_hdf5)
+    )
+    problem = missing(what, extra, [package])
+    if problem is not None:
+        raise SourceError(f"{path}: {problem}")
+    refuse_devices(path)
+    try:
+        return opener(path)
+    except Exception as error:
+        raise damaged(str(path), error) from error
+
+
+def _open_hdf5(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
+    import h5py  # type: ignore[import-untyped]
+
+    file = h5py.File(path, "r")
+    arrays: dict[str, Any] = {}
+
+    def visit(name: str, item: Any) -> None:
+        # Not those whose pixels lie in other files, which may be any file of this machine.
+        if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
+            arrays[f"/{name}"] = item
+
+    file.visititems(visit)
+    return arrays, file.close
+
+
+def _open_zarr(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
+    import zarr
+
+    root = zarr.open(str(path), mode="r")
+    members = [("", root)] if isinstance(root, zarr.Array) else root.members(max_depth=None)
+    arrays = {f"/{name}": item for name, item in members if isinstance(item, zarr.Array)}
+    return {name: array for name, array in arrays.items() if not _is_pickled(array)}, lambda: None
+
+
+def _is_pickled(array: Any) -> bool:
+    """Whether reading a Zarr array may execute code in it: only new versions of numcodecs refuse to."""
+    codecs = (*(array.filters or ()), *(array.compressors or ()))
+    return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
+
+
+def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:
+    if name is not None and f"/{name.strip('/')}" in arrays:
+        return arrays[f"/{name.strip('/')}"]
+    listed = [
+        f"{key} ({array.dtype} {' x '.join(map(str, array.shape))})" for key, array in sorted(arrays.items())
+    ]
+    more = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+    problem = f"add ?{setting}=" if name is None else f"there is no {name}; required"
+    raise SourceError(
+        f"{spec}: {problem} one of: {', '.join(listed[:MOST_NAMED]) or 'nothing: it is empty'}{more}"
+    )
+
+
+def _count(array: Any, name: str) -> int:
+    """The number of frames of an array. Raises SourceError if it holds none, or too large ones."""
+    shape, dtype = array.shape, array.dtype
+    encoded = (len(shape) == 1 and dtype.kind == "O") or (len(shape) == 2 and dtype == np.uint8)
+    if 0 in shape or not (encoded or holds_frames(array)):
+        raise SourceError(f"{name}: {REQUIRED}; got {dtype} of shape {' x '.join(map(str, shape)) or '()'}")
+    if not encoded:
+        check_pixel_count(name, shape[2], shape[1])
+    chunk = math.prod(array.chunks or (1,)) * dtype.itemsize
+    if chunk > LARGEST_CHUNK:
+        raise SourceError(f"{name}: has chunks of {chunk} bytes; required at most {LARGEST_CHUNK}")
+    return int(shape[0])
+
+
+def _read_chunks(array: Any) -> Iterator[NDArray[Any]]:
+    """One frame after the other; the file is read by whole chunks, as they are compressed."""
+    frame_bytes = max(math.prod(array.shape[1:]) * array.dtype.itemsize, 1)
+    together = max(1, min(array.chunks[0] if array.chunks else 1, BLOCK // frame_bytes))
+    for begin in range(0, array.shape[0], together):
+        for frame in array[begin : begin + together]:
+            yield np.frombuffer(frame, np.uint8) if isinstance(frame, bytes) else np.asarray(frame)

@@ -1,0 +1,416 @@
+"""Recordings of ROS and Foxglove: the pictures of one topic of an MCAP file, a rosbag2 or a ROS 1 bag."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources.base import FrameReader, check_pixel_count, damaged, log
+from tactflow.sources.files import decode_image
+from tactflow.sources.paths import find_path, refuse_devices, split_query
+from tactflow.system.extras import missing
+
+if TYPE_CHECKING:
+    import av
+    from mcap.records import Channel, McapRecord, Schema
+
+SETTINGS = {"topic": "name of a topic with pictures"}
+MOST_NAMED = 20
+"""Topics that a message lists at most. Chosen by hand."""
+MAGIC = b"\x89MCAP0\r\n"
+"""First bytes of an MCAP file."""
+LARGEST_CHUNK = 1 << 30
+"""Bytes of an uncompressed chunk at most: a thousand times what writers make, and less than memory."""
+
+DECODERS = {"cdr": "rosbags", "ros1": "rosbags", "protobuf": "mcap_protobuf", "json": "json"}
+"""Encoding of the messages in an MCAP file -> package that decodes them."""
+KINDS = {"Image": "raw", "RawImage": "raw", "CompressedImage": "file", "CompressedVideo": "video"}
+"""Message type -> how it holds a picture: as pixels, an image file, or a piece of a video."""
+PACKAGES = ("sensor_msgs/msg", "sensor_msgs", "foxglove", "foxglove_msgs/msg", "foxglove_msgs")
+"""Where those types are defined."""
+CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
+"""Format of a `CompressedVideo` -> FFmpeg's decoder."""
+ENCODINGS: dict[str, tuple[int, int | None]] = {
+    **dict.fromkeys(("bgr8", "8UC3", "bgr16", "16UC3"), (3, None)),
+    **dict.fromkeys(("rgb8", "rgb16"), (3, cv2.COLOR_RGB2BGR)),
+    **dict.fromkeys(("bgra8", "8UC4"), (4, cv2.COLOR_BGRA2BGR)),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    **dict.fromkeys(("mono8", "8UC1", "mono16", "16UC1"), (1, None)),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2BGR_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2BGR_YUY2)),
+    **dict.fromkeys(("bayer_rggb8", "bayer_rggb16"), (1, cv2.COLOR_BayerRGGB2BGR)),
+    **dict.fromkeys(("bayer_bggr8", "bayer_bggr16"), (1, cv2.COLOR_BayerBGGR2BGR)),
+    **dict.fromkeys(("bayer_gbrg8", "bayer_gbrg16"), (1, cv2.COLOR_BayerGBRG2BGR)),
+    **dict.fromkeys(("bayer_grbg8", "bayer_grbg16"), (1, cv2.COLOR_BayerGRBG2BGR)),
+}
+"""Encoding -> channels, and the conversion to BGR; named as in `sensor_msgs/image_encodings.hpp` and by
+Foxglove. Those with 16 in their name have 16-bit pixels."""
+
+
+class Topic(NamedTuple):
+    """type : of its messages. number : of them; None if unknown."""
+
+    type: str
+    number: int | None
+
+    @property
+    def kind(self) -> str | None:
+        """How its messages hold a picture; None if they do not.
+
+        >>> Topic("foxglove.RawImage", 3).kind, Topic("std_msgs/msg/String", 3).kind
+        ('raw', None)
+        """
+        package, _, name = self.type.replace(".", "/").rpartition("/")
+        return KINDS.get(name) if package in PACKAGES else None
+
+
+class Bag(FrameReader):
+    """The pictures of one topic.
+
+    A frame's time is the stamp in its message, or, where that is 0, when it was recorded; from 0 at the first
+    frame. Where it would go back, it stays.
+
+    Parameters
+    ----------
+    spec : `file.mcap?topic=/name`, and so for a `.bag` or `.db3` file or a rosbag2 folder.
+    directory : where a relative path is looked for if it is not in the current directory.
+
+    Raises
+    ------
+    SourceError
+        If there is no such file or topic (it lists those that are there), or a package is missing.
+    """
+
+    parser_errors = (Exception,)
+
+    def __init__(self, spec: str, directory: Path | None = None, _fps: float | None = None) -> None:
+        name, settings = split_query(spec, directory, SETTINGS)
+        path = find_path(name, directory)
+        refuse_devices(path)
+        self._store = McapFile(path) if path.suffix.lower() == ".mcap" else RosBag(path)
+        super().__init__(str(path))
+        try:
+            self._topic = _choose(spec, settings.get("topic"), self._store.topics)
+            self.name = self._normalise.name = f"{path}, {self._topic}"
+            self.total = self._store.topics[self._topic].number
+            self._read_first()
+        except SourceError:
+            self.close()
+            raise
+        count = "an unknown number of" if self.total is None else self.total
+        self.description = f"{spec}, {count} messages"
+
+    def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
+        to_image = self._converter(self._store.topics[self._topic].kind)
+        first: int | None = None
+        t, went_back = 0.0, False
+        for written, message in self._store.messages(self._topic):
+            image = to_image(message)
+            if image is None:
+                continue
+            taken = _stamp(message) or written
+            first = taken if first is None else first
+            seconds = (taken - first) / 1e9
+            if seconds < t and not went_back:
+                went_back = True
+                log.warning("%s: time goes back %.3f s after the beginning; it is held there", self.name, t)
+            t = max(t, seconds)
+            yield image, t
+
+    def _converter(self, kind: str | None) -> Callable[[Any], NDArray[Any] | None]:
+        """What takes the picture out of a message; None where a video has not begun."""
+        if kind == "video":
+            return VideoDecoder(self.name)
+        return lambda message: (raw_image if kind == "raw" else compressed_image)(message, self.name)
+
+    def close(self) -> None:
+        """Close the file."""
+        super().close()
+        self._store.close()
+
+
+def _choose(spec: str, topic: str | None, topics: Mapping[str, Topic]) -> str:
+    """The requested topic, if it is there and has pictures."""
+    if topic is not None and topic in topics and topics[topic].kind:
+        return topic
+    if topic is None:
+        problem = "add ?topic="
+    elif topic in topics:
+        problem = f"{topic} has messages of type {topics[topic].type}, which hold no picture; required"
+    else:
+        problem = f"there is no topic {topic}; required"
+
+    def listed(with_pictures: bool) -> str:
+        found = [
+            f"{name} ({of.type}{'' if of.number is None else f', {of.number}'})"
+            for name, of in sorted(topics.items())
+            if bool(of.kind) == with_pictures
+        ]
+        more = [f"and {len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else []
+        return ", ".join(found[:MOST_NAMED] + more) or "none"
+
+    raise SourceError(f"{spec}: {problem} one of: {listed(True)}; topics without pictures: {listed(False)}")
+
+
+# -- files with messages ------------------------------------------------------------------------------------
+
+
+class RosBag:
+    """A rosbag2 folder (sqlite3 or MCAP), a .db3 file, or a ROS 1 .bag, read by rosbags."""
+
+    def __init__(self, path: Path) -> None:
+        problem = missing("ROS bags", "bags", ["rosbags"])
+        if problem is not None:
+            raise SourceError(f"{path}: {problem}")
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        try:
+            # Bags from before 2023 do not contain their types; those of pictures have never changed.
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+            self._reader.open()
+        except Exception as error:
+            raise damaged(str(path), error) from error
+        self.topics: Mapping[str, Topic] = {
+            name: Topic(info.msgtype or "several types", info.msgcount)
+            for name, info in self._reader.topics.items()
+        }
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """When each message of a topic was written, ns, and the message, whose fields are attributes."""
+        connections = [connection for connection in self._reader.connections if connection.topic == topic]
+        for connection, written, data in self._reader.messages(connections):
+            yield written, self._reader.deserialize(data, connection.msgtype)
+
+    def close(self) -> None:
+        """Close the files; may be called twice."""
+        if self._reader.stack is not None:
+            self._reader.close()
+
+
+class McapFile:
+    """An .mcap file, whoever wrote it, also one that was cut off."""
+
+    def __init__(self, path: Path) -> None:
+        problem = missing("MCAP files", "bags", ["mcap"])
+        if problem is not None:
+            raise SourceError(f"{path}: {problem}")
+        from mcap.records import Channel, Schema
+
+        self._path = path
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        try:
+            counts = self._read_summary()
+            for record in self._records() if counts is None else ():
+                if isinstance(record, Schema):
+                    self._schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    self._channels[record.id] = record
+        except SourceError:
+            raise
+        except Exception as error:
+            raise damaged(str(path), error) from error
+        self.topics: dict[str, Topic] = {}
+        for channel in self._channels.values():
+            schema = self._schemas.get(channel.schema_id)
+            # A topic may have several channels, one for each of its writers.
+            before = self.topics[channel.topic].number or 0 if channel.topic in self.topics else 0
+            count = before + counts.get(channel.id, 0) if counts else None
+            self.topics[channel.topic] = Topic(schema.name if schema else "no type", count)
+
+    def _read_summary(self) -> dict[int, int] | None:
+        """Channel -> number of its messages, from the index at the end; None if the file was cut off."""
+        from mcap.reader import SeekingReader
+
+        with self._path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise SourceError(f"{self._path}: is not an MCAP file")
+            file.seek(0)
+            try:
+                summary = SeekingReader(file, record_size_limit=self._path.stat().st_size).get_summary()
+            except Exception:
+                summary = None
+        if summary is None or summary.statistics is None:
+            return None
+        self._schemas, self._channels = summary.schemas, summary.channels
+        return summary.statistics.channel_message_counts
+
+    def _records(self) -> Iterator[McapRecord]:
+        """Every record; a file that was cut off ends at its last whole chunk."""
+        from mcap.records import Chunk
+        from mcap.stream_reader import StreamReader, breakup_chunk
+
+        size = self._path.stat().st_size
+        with self._path.open("rb") as file:
+            reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
+            try:
+                for record in reader.records:
+                    if not isinstance(record, Chunk):
+                        yield record
+                    elif record.uncompressed_size > LARGEST_CHUNK:
+                        raise ValueError(f"a chunk of {record.uncompressed_size} bytes")
+                    else:
+                        yield from breakup_chunk(record, validate_crc=True)
+            except Exception:
+                if file.tell() < size:
+                    raise
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """As `RosBag.messages`."""
+        from mcap.records import Message
+
+        decoders = {
+            channel.id: self._decoder(channel)
+            for channel in self._channels.values()
+            if channel.topic == topic
+        }
+        for record in self._records():
+            if isinstance(record, Message) and record.channel_id in decoders:
+                yield record.log_time, decoders[record.channel_id](record.data)
+
+    def _decoder(self, channel: Channel) -> Callable[[bytes], Any]:
+        """What decodes the messages of a channel."""
+        schema, encoding = self._schemas[channel.schema_id], channel.message_encoding
+        if encoding not in DECODERS:
+            raise SourceError(
+                f"{self._path}, {channel.topic}: messages are encoded as {encoding!r}; required one of: "
+                + ", ".join(DECODERS)
+            )
+        problem = missing(f"messages encoded as {encoding}", "bags", [DECODERS[encoding]])
+        if problem is not None:
+            raise SourceError(f"{self._path}: {problem}")
+        if encoding == "json":
+            return _from_json
+        if encoding == "protobuf":
+            from mcap_protobuf.decoder import DecoderFactory
+
+            decoder = DecoderFactory().decoder_for(encoding, schema)
+            if decoder is None:
+                raise ValueError(f"the schema of {channel.topic} is written as {schema.encoding!r}")
+            return decoder
+        return _from_ros(schema, encoding)
+
+    def close(self) -> None:
+        """Nothing stays open between two reads."""
+
+
+def _from_ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    text = schema.data.decode()
+    name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/")
+    store.register(get_types_from_idl(text) if "idl" in schema.encoding else get_types_from_msg(text, name))
+    if encoding == "ros1":
+        return lambda data: store.deserialize_ros1(data, name)
+    return lambda data: store.deserialize_cdr(data, name)
+
+
+def _from_json(data: bytes) -> Any:
+    """A message of Foxglove's JSON schemas, whose bytes are written in base64."""
+    message = json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+    message.data = base64.b64decode(message.data)
+    return message
+
+
+# -- pictures in messages -----------------------------------------------------------------------------------
+
+
+def _stamp(message: Any) -> int:
+    """When the picture of a message was taken, ns; 0 where it does not say."""
+    time = message.header.stamp if hasattr(message, "header") else message.timestamp
+    names = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
+    seconds, rest = next(pair for pair in names if all(hasattr(time, name) for name in pair))
+    return int(getattr(time, seconds)) * 1_000_000_000 + int(getattr(time, rest))
+
+
+def raw_image(message: Any, name: str) -> NDArray[Any]:
+    """The pixels of an `Image` or `RawImage`.
+
+    Returns
+    -------
+    image : (H, W) or (H, W, 3) uint8 or uint16, in the order BGR.
+
+    Raises
+    ------
+    SourceError
+        If the encoding is unknown, or there are fewer bytes than the message promises.
+    """
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    check_pixel_count(name, width, height)
+    encoding = message.encoding if message.encoding in ENCODINGS else message.encoding.lower()
+    if encoding not in ENCODINGS:
+        raise SourceError(
+            f"{name}: pictures are encoded as {message.encoding!r}; required one of: {', '.join(ENCODINGS)}"
+        )
+    channels, conversion = ENCODINGS[encoding]
+    order = ">" if getattr(message, "is_bigendian", 0) else "<"
+    dtype = np.dtype(order + ("u2" if "16" in encoding else "u1"))
+    row = width * channels * dtype.itemsize
+    data = np.frombuffer(message.data, np.uint8)
+    if not (width and height and step >= row and data.size >= step * (height - 1) + row):
+        raise SourceError(
+            f"{name}: {width} x {height} pixels as {message.encoding} need rows of {row} bytes; got "
+            f"{data.size} bytes in rows of {step}"
+        )
+    rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    image = np.ascontiguousarray(rows).view(dtype).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
+    return image if conversion is None else cv2.cvtColor(image, conversion)
+
+
+def compressed_image(message: Any, name: str) -> NDArray[Any]:
+    """The pixels of a `CompressedImage`, as `decode_image` gives them. Raises SourceError."""
+    if "compressedDepth" in getattr(message, "format", ""):
+        raise SourceError(f"{name}: compressed depth, not a picture")
+    return decode_image(bytes(message.data), name)
+
+
+class VideoDecoder:
+    """Decodes a video that comes in pieces, one picture each.
+
+    name : of the topic, for messages. Raises SourceError if PyAV is not installed.
+    """
+
+    def __init__(self, name: str) -> None:
+        problem = missing("videos in messages", "av", ["av"])
+        if problem is not None:
+            raise SourceError(f"{name}: {problem}")
+        self._name = name
+        self._codec: av.VideoCodecContext | None = None
+        self._begun = False
+
+    def __call__(self, message: Any) -> NDArray[np.uint8] | None:
+        """The picture of one piece, (H, W, 3) uint8 BGR; None as long as the video has not begun."""
+        import av
+
+        if self._codec is None:
+            codec = CODECS.get(message.format)
+            if codec is None:
+                known = ", ".join(CODECS)
+                raise SourceError(f"{self._name}: a video as {message.format!r}; required one of: {known}")
+            self._codec = cast("av.VideoCodecContext", av.CodecContext.create(codec, "r"))
+            # With threads of its own, FFmpeg returns a picture only several pictures later.
+            self._codec.thread_type = "NONE"
+        try:
+            frames = self._codec.decode(av.Packet(bytes(message.data)))
+        except av.error.InvalidDataError:
+            # A recording may begin between two key frames.
+            if self._begun:
+                raise
+            return None
+        for frame in frames:
+            self._begun = True
+            check_pixel_count(self._name, frame.width, frame.height)
+            return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+        return None

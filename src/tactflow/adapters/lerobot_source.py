@@ -1,0 +1,151 @@
+"""One camera of one episode of a LeRobot dataset (layouts v2 and v3), as a source."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources.base import FrameReader, check_pixel_count, damaged
+from tactflow.sources.files import decode_image, refuse_playlist
+from tactflow.sources.paths import find_path, refuse_devices, split_query
+from tactflow.system.extras import missing
+
+SCHEME = "lerobot:"
+SETTINGS = {"camera": "key of a camera", "episode": "number of an episode"}
+CHUNK = 1000
+"""Episodes in one folder of layout v2, if the dataset does not say."""
+
+
+class Place(NamedTuple):
+    """Where an episode is. data, video : files. begin : of the episode in its video, s. frames : of it."""
+
+    data: Path
+    video: Path
+    begin: float
+    frames: int
+
+
+class LeRobotEpisode(FrameReader):
+    """The pictures of one camera in one episode; frame i is taken at i / fps.
+
+    Parameters
+    ----------
+    spec : `lerobot:PATH?camera=observation.images.left_tactile&episode=3`.
+    directory : where a relative path is looked for if it is not in the current directory.
+
+    Raises
+    ------
+    SourceError
+        If there is no such dataset, camera or episode (it lists those that are there), or a package is
+        missing.
+    """
+
+    # What is wrong with JSON, Parquet and video files raises whatever their parsers do.
+    parser_errors = (Exception,)
+
+    def __init__(self, spec: str, directory: Path | None = None, _fps: float | None = None) -> None:
+        problem = missing("LeRobot datasets", "lerobot", ["pyarrow", "av"])
+        if problem is not None:
+            raise SourceError(f"{spec}: {problem}")
+        name, settings = split_query(spec.removeprefix(SCHEME), directory, SETTINGS)
+        root = find_path(name, directory)
+        refuse_devices(root / "meta")
+        try:
+            info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+            self._camera, self._episode, self._is_video = _choose(spec, info, settings)
+            self._place = _find(root, info, self._camera, self._episode)
+            self._rate = float(info["fps"])
+        except SourceError:
+            raise
+        except Exception as error:
+            raise damaged(f"{root}: this LeRobot dataset", error) from error
+        super().__init__(f"{root}, {self._camera}, episode {self._episode}")
+        refuse_devices(self._place.data)
+        if self._is_video:
+            refuse_playlist(self._place.video)
+        self.fps = self._rate
+        self.total = self._place.frames
+        self._read_first()
+        self.description = f"{spec}, {self.total} frames at {self.fps:g} fps"
+
+    def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
+        pictures = self._decode_video() if self._is_video else self._read_pictures()
+        # The column `timestamp` is the same, rounded to 32 bits.
+        for index, image in enumerate(pictures):
+            yield image, index / self._rate
+
+    def _read_pictures(self) -> Iterator[NDArray[Any]]:
+        import pyarrow.dataset as ds  # type: ignore[import-untyped]
+
+        wanted = ds.field("episode_index") == self._episode
+        dataset = ds.dataset(self._place.data)
+        for batch in dataset.to_batches(columns=[self._camera], filter=wanted, batch_size=16):
+            for row in batch.to_pylist():
+                yield decode_image(row[self._camera]["bytes"], self.name)
+
+    def _decode_video(self) -> Iterator[NDArray[np.uint8]]:
+        import av
+
+        place = self._place
+        left = place.frames
+        with av.open(str(place.video)) as file:
+            (stream, *_) = file.streams.video
+            check_pixel_count(self.name, stream.width, stream.height)
+            # To the key frame before; from there every picture is decoded.
+            file.seek(round(place.begin / (stream.time_base or 1)), stream=stream)
+            for frame in file.decode(stream):
+                if frame.time is not None and frame.time < place.begin - 0.5 / self._rate:
+                    continue
+                if left == 0:
+                    return
+                left -= 1
+                yield np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+        if left:
+            raise SourceError(f"{self.name}: is damaged or cut off ({left} pictures are missing)")
+
+
+def _choose(spec: str, info: Any, settings: dict[str, str]) -> tuple[str, int, bool]:
+    """The camera, the episode, and whether its pictures are a video."""
+    cameras = {
+        name: feature["dtype"]
+        for name, feature in info["features"].items()
+        if feature["dtype"] in ("video", "image")
+    }
+    episodes = int(info["total_episodes"])
+    camera, episode = settings.get("camera", ""), settings.get("episode", "")
+    if camera not in cameras or not episode.isdecimal() or int(episode) >= episodes:
+        raise SourceError(
+            f"{spec}: required ?camera=...&episode=...; cameras: {', '.join(sorted(cameras)) or 'none'}; "
+            f"episodes: 0 to {episodes - 1}"
+        )
+    return camera, int(episode), cameras[camera] == "video"
+
+
+def _find(root: Path, info: Any, camera: str, episode: int) -> Place:
+    if str(info["codebase_version"]).startswith("v2"):
+        chunk = f"chunk-{episode // int(info.get('chunks_size', CHUNK)):03d}"
+        data = root / "data" / chunk / f"episode_{episode:06d}.parquet"
+        video = root / "videos" / chunk / camera / f"episode_{episode:06d}.mp4"
+        lines = (root / "meta" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
+        lengths = {line["episode_index"]: int(line["length"]) for line in map(json.loads, lines)}
+        return Place(data, video, 0.0, lengths[episode])
+    import pyarrow.dataset as ds
+
+    table = ds.dataset(root / "meta" / "episodes", format="parquet")
+    (row,) = table.to_table(filter=ds.field("episode_index") == episode).to_pylist()
+
+    def file(key: str, suffix: str) -> str:
+        return f"chunk-{int(row[f'{key}/chunk_index']):03d}/file-{int(row[f'{key}/file_index']):03d}{suffix}"
+
+    data, key = root / "data" / file("data", ".parquet"), f"videos/{camera}"
+    if f"{key}/file_index" not in row:
+        return Place(data, data, 0.0, int(row["length"]))
+    return Place(
+        data, root / key / file(key, ".mp4"), float(row[f"{key}/from_timestamp"]), int(row["length"])
+    )

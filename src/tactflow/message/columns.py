@@ -1,0 +1,103 @@
+"""Result messages as rows of tables: the columns follow from the JSON Schema of the message.
+
+Every table has the same columns whatever a pipeline computes, so that tables of several runs can be
+concatenated; what a message lacks is null.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+from tactflow.message.schema import message_schema
+
+LEFT_OUT = ("schema", "contacts", "markers", "field")
+"""Keys of a message without a column in `frames`: the first never changes, two have tables of their own, and
+a displacement field has thousands of numbers a frame, which the JSON lines have."""
+PAIRS = {"size": ("width", "height"), "axes": ("major", "minor"), "shear": ("1", "2"), "shear_mm": ("1", "2")}
+"""Names of the parts of a pair that are not x and y."""
+XYZ = ("x", "y", "z")
+
+
+class Column(NamedTuple):
+    """One column of a table.
+
+    name : `contact_center_x`. path : keys and indices that lead to the value in a message.
+    kind : number, integer, string, boolean, points (a list of pairs) or words (name -> text).
+    description : for people.
+    """
+
+    name: str
+    path: tuple[str | int, ...]
+    kind: str
+    description: str
+
+    def value(self, message: Mapping[str, Any]) -> Any:
+        """The value in a message, or None."""
+        value: Any = message
+        for key in self.path:
+            value = value.get(key) if isinstance(key, str) else value[key]
+            if value is None:
+                return None
+        return list(value.items()) if self.kind == "words" else value
+
+
+MARKER_COLUMNS = (
+    Column("marker", (), "integer", "the same physical marker for the whole run"),
+    Column("x", (), "number", "position now, px"),
+    Column("y", (), "number", "position now, px"),
+    Column("dx", (), "number", "displacement since the reference, px"),
+    Column("dy", (), "number", "displacement since the reference, px"),
+    Column("origin_x", (), "number", "position in the reference frame, px"),
+    Column("origin_y", (), "number", "position in the reference frame, px"),
+    Column("status", (), "string", "tracked, inferred or lost"),
+    Column("stderr", (), "number", "standard error of the position, px; null when unknown"),
+)
+"""Of the table `markers`, behind `seq`."""
+
+
+@cache
+def frame_columns() -> Sequence[Column]:
+    """The columns of `frames`, in the order of the message.
+
+    >>> [column.name for column in frame_columns()][:6]
+    ['sensor', 'seq', 't', 'size_width', 'size_height', 'contact_area']
+    """
+    schema = message_schema()
+    kept = {key: part for key, part in schema["properties"].items() if key not in LEFT_OUT}
+    return tuple(_columns({"properties": kept, "type": "object"}, schema["$defs"], (), ()))
+
+
+@cache
+def contact_columns() -> Sequence[Column]:
+    """The columns of `contacts` that describe one contact.
+
+    >>> [column.name for column in contact_columns()][:3]
+    ['area', 'center_x', 'center_y']
+    """
+    schema = message_schema()
+    return tuple(_columns(schema["properties"]["contacts"]["items"], schema["$defs"], (), ()))
+
+
+def _columns(
+    part: Mapping[str, Any], defs: Mapping[str, Any], names: tuple[str, ...], path: tuple[str | int, ...]
+) -> Iterator[Column]:
+    """The columns of one part of the schema; names, path : where it stands, as words and as keys."""
+    description = part.get("description", "")
+    choices = [choice for choice in part.get("anyOf", [part]) if choice.get("type") != "null"]
+    part = choices[0]
+    if "$ref" in part:
+        part = defs[part["$ref"].rsplit("/", 1)[1]]
+    name, kind = "_".join(names), part.get("type", "string")
+    if "properties" in part:
+        for key, inner in part["properties"].items():
+            yield from _columns(inner, defs, (*names, key), (*path, key))
+    elif "prefixItems" in part:
+        suffixes = PAIRS.get(names[-1], XYZ)
+        for index, inner in enumerate(part["prefixItems"]):
+            suffix = suffixes[index] if index < len(suffixes) else str(index + 1)
+            yield Column(f"{name}_{suffix}", (*path, index), inner.get("type", "number"), description)
+    else:
+        kind = {"array": "points", "object": "words"}.get(kind, kind)
+        yield Column(name, path, kind, description)

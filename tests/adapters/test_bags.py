@@ -1,0 +1,176 @@
+"""Recordings of ROS and Foxglove: their pictures and times as they were recorded, and clear errors."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources import open_source
+
+pytest.importorskip("rosbags", reason="the extra bags is not installed")
+
+from tests.adapters.bags import BEGIN, PERIOD, TOPIC, write_bag, write_foxglove
+
+KINDS = {"ros1": "press.bag", "sqlite3": "press", "mcap": "press_mcap"}
+"""Kind of bag -> what it is called."""
+
+
+def pictures(count: int) -> list[NDArray[np.uint8]]:
+    return [np.random.default_rng(seed).integers(0, 256, (12, 16, 3), np.uint8) for seed in range(count)]
+
+
+def played(spec: str) -> list[tuple[NDArray[np.uint8], float]]:
+    reader = open_source(spec)
+    try:
+        return list(iter(reader.read, None))
+    finally:
+        reader.close()
+
+
+def test_every_kind_of_bag_gives_the_pictures_and_the_stamps_in_the_messages(tmp_path: Path) -> None:
+    images = pictures(4)
+    bags = [write_bag(tmp_path / name, images, kind) for kind, name in KINDS.items()]
+    alone = next((tmp_path / "press_mcap").glob("*.mcap"))
+    for bag in [*bags, alone, next((tmp_path / "press").glob("*.db3"))]:
+        reader = open_source(f"{bag}?topic={TOPIC}")
+        assert (reader.total, reader.size, reader.live) == (4, (16, 12), False)
+        found = list(iter(reader.read, None))
+        reader.close()
+        reader.close()
+        assert [t for _, t in found] == [index / 25 for index in range(4)]
+        assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))
+
+
+def test_a_folder_of_pictures_may_have_a_metadata_file_too(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), pictures(1)[0])
+    (tmp_path / "metadata.yaml").write_text("sensor: left\n")
+    assert len(played(str(tmp_path))) == 1
+
+
+def in_encoding(image: NDArray[np.uint8], encoding: str) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """An image as a camera with this encoding gives it, and what it must become: (H, W, 3) BGR."""
+    gray = image[:, :, 0]
+    if encoding in ("bgr8", "png"):
+        return image, image
+    if encoding == "jpeg":
+        return image, cv2.imdecode(cv2.imencode(".jpeg", image)[1], cv2.IMREAD_COLOR)
+    if encoding == "rgb8":
+        return image[:, :, ::-1], image
+    if encoding == "mono8":
+        return gray, cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+    if encoding == "mono16":
+        return gray.astype(np.uint16) * 257, cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+    # One colour: what lies between the pixels then does not matter. 16 is black to YUV, 128 has no colour.
+    if encoding == "yuv422":
+        return np.full((12, 16, 2), (128, 16), np.uint8), np.zeros((12, 16, 3), np.uint8)
+    mosaic = np.zeros((12, 16), np.uint8)
+    letters = encoding.removeprefix("bayer_").removesuffix("8")
+    for index, letter in enumerate(letters):
+        mosaic[index // 2 :: 2, index % 2 :: 2] = {"r": 30, "g": 20, "b": 10}[letter]
+    return mosaic, np.full((12, 16, 3), (10, 20, 30), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        *("bgr8", "rgb8", "mono8", "mono16", "yuv422", "jpeg", "png"),
+        *("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"),
+    ],
+)
+def test_every_encoding_becomes_bgr(encoding: str, tmp_path: Path) -> None:
+    sent, expected = in_encoding(pictures(1)[0], encoding)
+    bag = write_bag(tmp_path / "press", [np.ascontiguousarray(sent)], "mcap", encoding)
+    ((image, _),) = played(f"{bag}?topic={TOPIC}")
+    assert np.array_equal(image, expected)
+
+
+@pytest.mark.parametrize("packing", ["protobuf", "json"])
+def test_pictures_of_foxglove_are_read(packing: str, tmp_path: Path) -> None:
+    images = pictures(3)
+    messages: list[Any] = []
+    for index, image in enumerate(images):
+        taken, png = BEGIN + index * PERIOD, cv2.imencode(".png", image)[1].tobytes()
+        if packing == "json":
+            stamp = {"sec": taken // 10**9, "nsec": taken % 10**9}
+            picture = {"timestamp": stamp, "format": "png", "data": base64.b64encode(png).decode()}
+            messages.append(json.dumps(picture).encode())
+        else:
+            schemas = pytest.importorskip("foxglove_schemas_protobuf.CompressedImage_pb2")
+            one = schemas.CompressedImage(format="png", data=png)
+            one.timestamp.FromNanoseconds(taken)
+            messages.append(one)
+    found = played(f"{write_foxglove(tmp_path / 'press.mcap', messages, packing)}?topic={TOPIC}")
+    assert [t for _, t in found] == [0.0, 0.04, 0.08]
+    assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))
+
+
+def test_a_video_in_messages_is_decoded(tmp_path: Path) -> None:
+    schemas = pytest.importorskip("foxglove_schemas_protobuf.CompressedVideo_pb2")
+    av = pytest.importorskip("av")
+    messages = []
+    encoder = av.CodecContext.create("libx264", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.framerate = 64, 48, "yuv420p", 25
+    encoder.options = {"tune": "zerolatency"}
+    encoder.gop_size = 3
+    for index in range(5):
+        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 40 * index, np.uint8), format="bgr24")
+        for packet in encoder.encode(frame):
+            one = schemas.CompressedVideo(format="h264", data=bytes(packet))
+            one.timestamp.FromNanoseconds(BEGIN + index * PERIOD)
+            messages.append(one)
+    found = played(f"{write_foxglove(tmp_path / 'press.mcap', messages, 'protobuf')}?topic={TOPIC}")
+    assert [round(float(image.mean()) / 40) for image, _ in found] == [0, 1, 2, 3, 4]
+    assert [t for _, t in found] == [0.0, 0.04, 0.08, 0.12, 0.16]
+    # Begun in the middle, it is shown from the next picture on that stands alone.
+    found = played(f"{write_foxglove(tmp_path / 'late.mcap', messages[1:], 'protobuf')}?topic={TOPIC}")
+    assert [round(float(image.mean()) / 40) for image, _ in found] == [3, 4]
+    with pytest.raises(SourceError, match="there is no picture in it"):
+        open_source(f"{write_foxglove(tmp_path / 'none.mcap', messages[1:3], 'protobuf')}?topic={TOPIC}")
+
+
+def test_a_bag_of_real_frames_gives_the_results_of_the_folder_to_the_bit(
+    tmp_path: Path, shared_data: Path
+) -> None:
+    from tactflow.api import run
+
+    files = sorted((shared_data / "wedge_roll").glob("*.jpg"))[60:80]
+    images = [cv2.imread(str(file)) for file in files]
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for file, image in zip(files, images, strict=True):
+        cv2.imwrite(str(folder / f"{file.stem}.png"), image)
+    bags = [write_bag(tmp_path / name, images, kind) for kind, name in KINDS.items()]
+    specs = [str(folder), *(f"{bag}?topic={TOPIC}" for bag in bags)]
+    lines = []
+    for index, spec in enumerate(specs):
+        out = tmp_path / f"{index}.jsonl"
+        sinks = {"jsonl": {"path": str(out), "detail": True}}
+        run("wedge", source=spec, settings={"sinks": sinks, "stages.capture.fps": 25})
+        lines.append(out.read_bytes())
+    assert lines[0].count(b"\n") == 20
+    assert b'"area"' in lines[0]
+    assert lines[1:] == lines[:1] * 3
+
+
+def test_without_a_topic_the_error_lists_what_is_inside(tmp_path: Path) -> None:
+    listed = r"one of: /gel/image \(sensor_msgs/msg/Image, 2\); topics without pictures: /chatter \(std_msgs"
+    for kind, name in KINDS.items():
+        bag = write_bag(tmp_path / name, pictures(2), kind)
+        with pytest.raises(SourceError, match=r"add \?topic= " + listed):
+            open_source(str(bag))
+        with pytest.raises(SourceError, match="there is no topic /image; required " + listed):
+            open_source(f"{bag}?topic=/image")
+        with pytest.raises(
+            SourceError, match="/chatter has messages of type std_msgs/msg/String, which hold no"
+        ):
+            open_source(f"{bag}?topic=/chatter")
+    with pytest.raises(SourceError, match="speed=2: required topic=name of a topic with pictures"):
+        open_source(f"{bag}?speed=2")
