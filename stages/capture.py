@@ -21,13 +21,13 @@ from tactflow.sources import (
     Arrival,
     CameraRequest,
     FrameReader,
-    LiveReader,
     StampedReader,
     Watch,
+    Watched,
     open_source,
 )
 from tactflow.sources.files import ImageFiles, load_image
-from tactflow.sources.first import Ahead, FirstFrames
+from tactflow.sources.first import FirstFrames
 from tactflow.sources.pace import Pace
 
 logger = logging.getLogger("tactflow")
@@ -177,23 +177,23 @@ class Capture(Source):
     def stop(self) -> None:
         """End `frames()` soon; wakes it if it waits for the next frame."""
         self._stop.set()
-        if isinstance(self._source, LiveReader):
+        if isinstance(self._source, Watched):
             self._source.stop()
 
     @property
     def state(self) -> str:
         """How the source is: `running`, `waiting since ...` or `reconnecting since ...`."""
-        return self._source.state if isinstance(self._source, LiveReader) else "running"
+        return self._source.state if isinstance(self._source, Watched) else "running"
 
     @property
     def missed(self) -> int:
         """Frames of a live source that a newer one overtook, or that were only looked at: gaps in `seq`."""
-        return self._source.missed + self._looked_at if isinstance(self._source, LiveReader) else 0
+        return self._source.missed + self._looked_at if isinstance(self._source, Watched) else 0
 
     @property
     def live_threads(self) -> Sequence[int]:
         """Native ids of threads of its own that frames arrive in."""
-        reader = self._source.reader.native_id if isinstance(self._source, LiveReader) else None
+        reader = self._source.reader.native_id if isinstance(self._source, Watched) else None
         return [] if reader is None else [reader]
 
     def retake(self) -> None:
@@ -221,12 +221,12 @@ class Capture(Source):
         if isinstance(source, StampedReader):
             yield from self._replay(source, pace, count)
             return
-        if isinstance(source, LiveReader):
+        if isinstance(source, Watched):
             yield from self._watch(source, count)
             return
-        yield from self._play(Ahead(source), pace, count)
+        yield from self._play(source, pace, count)
 
-    def _play(self, source: Ahead, pace: Pace | None, count: int) -> Iterator[Frame]:
+    def _play(self, source: FrameReader, pace: Pace | None, count: int) -> Iterator[Frame]:
         """Frames of a recording, behind those that show the untouched gel if these are not the first ones."""
         for _ in range(self.params.skip):
             if self._stop.is_set() or source.read() is None:
@@ -248,7 +248,7 @@ class Capture(Source):
             yield Frame(self._sensor, seq, t, image, time.perf_counter(), reference, epoch)
             seq += 1
 
-    def _choose(self, source: Ahead, count: int) -> tuple[list[NDArray[np.uint8]], int]:
+    def _choose(self, source: FrameReader, count: int) -> tuple[list[NDArray[np.uint8]], int]:
         """Pictures to show before the first frame, and how many of the first frames are references."""
         if self._reference_image is not None:
             return [self._reference_image], 0
@@ -288,7 +288,7 @@ class Capture(Source):
             reference, epoch = stamp.reference or again, stamp.epoch + retaken
             yield Frame(self._sensor, stamp.seq, t, _read_only(image), time.perf_counter(), reference, epoch)
 
-    def _watch(self, source: LiveReader, count: int) -> Iterator[Frame]:
+    def _watch(self, source: Watched, count: int) -> Iterator[Frame]:
         """Frames of a source that numbers them where they arrive, and that may go and come back."""
         p = self.params
         image = self._reference_image

@@ -218,7 +218,7 @@ def _calibrated(pipeline: Pipeline) -> Pipeline:
         return pipeline
     from tactflow.recording.reader import attachments
     from tactflow.recording.records import NotARecordingError
-    from tactflow.sources.base import find_path
+    from tactflow.sources.paths import find_path
 
     try:
         path = find_path(name, pipeline.directory)

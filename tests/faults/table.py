@@ -168,9 +168,9 @@ GIVEN_UP = "after `no_frame_timeout` the run ends and says why"
 CAMERAS = (
     ("gone", "is gone since.*is back", "gone, no good frame"),
     ("ends", "is gone since.*is back", "gone, no good frame"),
-    ("frozen", "the same picture bit for bit.*is back", "a frozen picture, no good frame"),
-    ("black", "only black pictures.*is back", "black pictures, no good frame"),
-    ("hangs", "delivers no frames.*is back", "no frames, no good frame"),
+    ("frozen", "a frozen picture since.*is back", "a frozen picture, no good frame"),
+    ("black", "black pictures since.*is back", "black pictures, no good frame"),
+    ("hangs", "no frames since.*is back", "no frames, no good frame"),
     ("other_size", "is back", "32 x 24 pixels instead of 64 x 48"),
 )
 """What a camera does, what is said when it comes back, and when it does not."""

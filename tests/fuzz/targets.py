@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from tactflow.adapters.bags import Bag
+from tactflow.adapters.lerobot_source import LeRobotEpisode
 from tactflow.calibration.file import Calibration
 from tactflow.cli import explain, listen
 from tactflow.cli.statistics import Statistics
@@ -33,18 +35,16 @@ from tactflow.recording.repair import repair
 from tactflow.recording.schemas import channel_type
 from tactflow.recording.writer import Entry, RecordingWriter
 from tactflow.sinks.zmq import Zmq
-from tactflow.sources.bags import Bag
 from tactflow.sources.base import FrameReader, Normaliser
 from tactflow.sources.files import ArrayFile, VideoFile, read_image
-from tactflow.sources.lerobot import LeRobotEpisode
 from tactflow.sources.mcap import Recording
 from tactflow.view.address import bind
 from tactflow.view.hub import Hub, Wire
 from tactflow.view.server import Server
 from tactflow.vision.types import Contact, Flow, Markers, Scale
+from tests.adapters.test_datasets import KEY, write_lerobot
 from tests.conftest import REPOSITORY
 from tests.messages import Results, result_of
-from tests.sources.test_datasets import KEY, write_lerobot
 
 IMAGE = np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8)
 FRAMES = 20
@@ -217,7 +217,7 @@ def bags(folder: Path) -> Iterator[Parser]:
     """Recordings of ROS and Foxglove: .mcap, .bag, .db3."""
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
-    from tests.sources.bags import TOPIC, write_bag, write_foxglove
+    from tests.adapters.bags import TOPIC, write_bag, write_foxglove
 
     png = CompressedImage(format="png", data=cv2.imencode(".png", IMAGE)[1].tobytes())
     files = [

@@ -1,4 +1,4 @@
-"""Live sources that come and go: a scripted device for each fault, whatever the time it takes."""
+"""Live sources that fail and come back: a scripted device for each fault, however long it takes."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import pytest
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
-from tactflow.sources import Watch, Watched
-from tactflow.sources.watch import Arrival
+from tactflow.sources import Arrival, Watch, Watched
 from tactflow.stages.capture import Capture
 from tests.clock import PATIENCE, until
 from tests.sources.flaky import Flaky
@@ -51,14 +50,24 @@ def watched(device: Flaky) -> Iterator[Callable[..., Watched]]:
         source.close()
 
 
-def capture_of(device: Flaky, **params: Any) -> Capture:
-    """A capture of the device, watched with short times."""
+@pytest.fixture
+def capture(device: Flaky) -> Iterator[Callable[..., Capture]]:
+    """Opens a capture of the device, watched with short times."""
+    opened: list[Capture] = []
 
-    def opener(*_: object, watch: Watch, **__: object) -> Watched:
-        settings = {**QUICK, "no_frame_timeout": watch.no_frame_timeout}
-        return Watched(device.open, Watch(**settings), "flaky", device.clock)
+    def opener(*_: object, **__: object) -> Watched:
+        return Watched(device.open, Watch(**QUICK), "flaky", device.clock)
 
-    return Capture(Capture.Params.model_validate({"source": "0", **params}), opener=opener)
+    def start(**params: Any) -> Capture:
+        opened.append(Capture(Capture.Params.model_validate({"source": "0", **params}), opener=opener))
+        opened[-1].open()
+        return opened[-1]
+
+    yield start
+    device.free.set()
+    for stage in opened:
+        stage.stop()
+        stage.close()
 
 
 def take(source: Watched, count: int = 5) -> list[Arrival]:
@@ -67,71 +76,76 @@ def take(source: Watched, count: int = 5) -> list[Arrival]:
     return [arrival for arrival in arrivals if arrival is not None]
 
 
-def await_log(caplog: pytest.LogCaptureFixture, text: str) -> None:
-    until(lambda: text in caplog.text, lambda: f"never said {text!r}: {caplog.text}")
+class Reading:
+    """Reads a source in another thread."""
+
+    def __init__(self, source: Watched) -> None:
+        self.source = source
+        self.arrivals: list[Arrival] = []
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while (arrival := self.source.read_arrival()) is not None:
+            self.arrivals.append(arrival)
+
+    def stop(self) -> None:
+        self.source.stop()
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive()
 
 
-def read_beside(source: Watched) -> tuple[threading.Thread, list[Arrival]]:
-    """Read in another thread, which ends with the first frame of a new connection or after a fault."""
-    seen: list[Arrival] = []
-
-    def run() -> None:
-        arrival = source.read_arrival()
-        if arrival is not None:
-            seen.append(arrival)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    return thread, seen
+FAULTS = {
+    "gone": "is gone since",
+    "ends": "is gone since",
+    "frozen": "a frozen picture since",
+    "black": "black pictures since",
+    "hangs": "no frames since",
+}
 
 
-FAULTS = [
-    ("gone", "is gone", True),
-    ("ends", "is gone", True),
-    ("frozen", "the same picture bit for bit", True),
-    ("black", "only black pictures", True),
-    ("hangs", "delivers no frames", True),
-]
-
-
-@pytest.mark.parametrize(("does", "says", "reconnects"), FAULTS, ids=[fault[0] for fault in FAULTS])
+@pytest.mark.parametrize("does", FAULTS)
 def test_each_fault_is_reported_once_and_so_is_its_end(
-    does: str,
-    says: str,
-    reconnects: bool,
-    device: Flaky,
-    watched: Callable[..., Watched],
-    caplog: pytest.LogCaptureFixture,
+    does: str, device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
 ) -> None:
     source = watched()
-    before = take(source)
+    take(source)
     assert source.state == "running"
-    device.does = does
-    # Frames go on until the fault shows; then the read waits.
-    last = before[-1]
-    stop = threading.Event()
-
-    def run() -> None:
-        nonlocal last
-        while not stop.is_set() and (arrival := source.read_arrival()) is not None:
-            last = arrival
-
-    thread = threading.Thread(target=run)
-    thread.start()
+    reading = Reading(source)
     try:
-        await_log(caplog, says)
+        device.does = does
+        until(lambda: FAULTS[does] in caplog.text, lambda: caplog.text)
         until(lambda: source.state.startswith("reconnecting since"), lambda: source.state)
         device.does = "good"
-        await_log(caplog, "is back after")
-        until(lambda: last.connection > 0)
+        until(lambda: "is back after" in caplog.text, lambda: caplog.text)
+        until(lambda: reading.arrivals and reading.arrivals[-1].connection > 0)
         assert source.state == "running"
     finally:
-        stop.set()
-        source.stop()
-        thread.join(PATIENCE)
+        reading.stop()
     warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(warnings) == 2, warnings
-    assert reconnects == (device.opened > 1)
+    assert device.opened > 1
+
+
+def test_attempts_back_off_and_start_quickly_again_after_a_connection_that_lasted(
+    device: Flaky, watched: Callable[..., Watched]
+) -> None:
+    source = watched(first_retry=0.25, last_retry=2.0)
+    reading = Reading(source)
+
+    def waits(fault: str, openings: int) -> list[float]:
+        device.clock.sleeps.clear()
+        connection = reading.arrivals[-1].connection if reading.arrivals else 0
+        device.fail(fault, openings)
+        until(lambda: reading.arrivals and reading.arrivals[-1].connection > connection)
+        return [round(seconds, 2) for seconds in device.clock.sleeps]
+
+    assert waits("gone", 6) == [0.25, 0.5, 1, 2, 2, 2]
+    assert waits("gone", 2) == [2, 2], "the connection in between was too short"
+    steady = device.clock.now() + 6.0
+    until(lambda: device.clock.now() > steady)
+    assert waits("gone", 2) == [0.25, 0.5]
+    reading.stop()
 
 
 def test_seq_and_time_grow_across_reconnections_even_if_the_devices_clock_does_not(
@@ -139,20 +153,13 @@ def test_seq_and_time_grow_across_reconnections_even_if_the_devices_clock_does_n
 ) -> None:
     source = watched()
     arrivals = take(source)
-    for _ in range(3):
+    for connection in range(3):
         device.stamp = 0.0
         device.fail("ends", openings=2)
-        connection = arrivals[-1].connection
-
-        def again(connection: int = connection) -> bool:
+        while arrivals[-1].connection == connection:
             arrivals.extend(take(source))
-            return arrivals[-1].connection > connection
-
-        until(again)
     assert [a.seq for a in arrivals] == sorted({a.seq for a in arrivals})
     assert [a.t for a in arrivals] == sorted({a.t for a in arrivals})
-    assert [a.connection for a in arrivals] == sorted(a.connection for a in arrivals)
-    assert arrivals[-1].connection >= 3
 
 
 def test_a_reader_that_is_slow_gets_the_newest_frame_and_a_gap_in_seq(
@@ -162,59 +169,27 @@ def test_a_reader_that_is_slow_gets_the_newest_frame_and_a_gap_in_seq(
     first = take(source, 1)[0]
     before = source.missed
     until(lambda: source.missed >= before + 5)
-    second = take(source, 1)[0]
-    assert second.seq - first.seq >= 6
+    assert take(source, 1)[0].seq - first.seq >= 6
 
 
-def test_capture_tells_how_many_frames_nobody_took(device: Flaky) -> None:
-    capture = Capture(
-        Capture.Params(source="0"),
-        opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky", device.clock),
-    )
-    capture.open()
-    frames = capture.frames()
-    seqs = [next(frames).seq]
-    for wanted in (3, 6, 9):
-        until(lambda wanted=wanted: capture.missed >= wanted)
-        before = capture.missed
-        seqs.append(next(frames).seq)
-        # Of the frames up to this one, those that were not taken are gaps; more may have come meanwhile.
-        assert before <= seqs[-1] + 1 - len(seqs) <= capture.missed
-    capture.stop()
-    capture.close()
-
-
-@pytest.mark.parametrize(("settle", "looked_at"), [(0, 0), (3, 9)])
-def test_the_first_frames_of_a_camera_are_only_looked_at_and_counted(
-    device: Flaky, settle: float, looked_at: int
-) -> None:
-    capture = Capture(
-        Capture.Params(source="0", settle=settle),
-        opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky", device.clock),
-    )
-    capture.open()
-    frames = capture.frames()
-    first, second = next(frames), next(frames)
-    assert (first.reference, second.reference) == (True, False)
-    assert second.seq >= first.seq + looked_at + 1
-    assert capture.missed >= looked_at
-    capture.stop()
-    capture.close()
-
-
-@pytest.mark.parametrize("does", ["gone", "hangs", "frozen", "black", "other_size"])
+@pytest.mark.parametrize(
+    ("does", "says"),
+    [
+        ("gone", "gone, no good frame .* the last attempt of .*: nothing is plugged in"),
+        ("hangs", "no frames, no good frame"),
+        ("frozen", "a frozen picture, no good frame"),
+        ("black", "black pictures, no good frame"),
+        ("other_size", "it came back with 32 x 24 pixels instead of 64 x 48"),
+    ],
+)
 def test_without_a_good_frame_for_too_long_the_error_says_what_to_try(
-    does: str, device: Flaky, watched: Callable[..., Watched]
+    does: str, says: str, device: Flaky, watched: Callable[..., Watched]
 ) -> None:
     source = watched(no_frame_timeout=0.5)
     take(source)
     device.does = does
-    with pytest.raises(SourceError, match=r"no good frame for .* no_frame_timeout") as raised:
+    with pytest.raises(SourceError, match=f"{says}.*no_frame_timeout"):
         take(source, 10_000)
-    if does == "gone":
-        assert "nothing is plugged in" in str(raised.value)
-    if does == "other_size":
-        assert "32 x 24 pixels instead of 64 x 48" in str(raised.value)
 
 
 def test_black_pictures_at_the_start_are_not_handed_over(
@@ -222,12 +197,23 @@ def test_black_pictures_at_the_start_are_not_handed_over(
 ) -> None:
     device.does = "black"
     source = watched()
-    thread, seen = read_beside(source)
-    await_log(caplog, "only black pictures")
+    reading = Reading(source)
+    until(lambda: "black pictures" in caplog.text)
     device.does = "good"
-    thread.join(PATIENCE)
-    assert seen[0].image.mean() > 50
-    assert seen[0].seq > 0
+    until(lambda: reading.arrivals)
+    reading.stop()
+    assert reading.arrivals[0].image.mean() > 50
+    assert reading.arrivals[0].seq > 0
+
+
+def test_a_short_dark_moment_after_light_is_passed_on(
+    device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
+) -> None:
+    source = watched(black_after=1e6, frozen_after=None)
+    take(source)
+    device.does = "black"
+    assert take(source, 10)[-1].image.mean() < 4
+    assert caplog.text == ""
 
 
 @pytest.mark.parametrize(("does", "off"), [("black", "black_after"), ("frozen", "frozen_after")])
@@ -241,26 +227,21 @@ def test_a_check_of_pictures_can_be_switched_off(
     assert caplog.text == ""
 
 
-def test_without_reconnection_a_device_that_stops_is_an_error(
-    device: Flaky, watched: Callable[..., Watched]
+def test_without_reconnection_a_camera_that_stops_is_an_error_and_a_stream_that_ends_is_the_end(
+    device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
 ) -> None:
     source = watched(reconnect=False)
     take(source)
     device.does = "gone"
     with pytest.raises(SourceError, match="delivers no more frames"):
         take(source, 100)
-    assert device.opened == 1
-
-
-def test_without_reconnection_a_stream_that_ends_is_the_end(
-    device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
-) -> None:
+    device.does = "good"
     source = watched(reconnect=False)
     take(source)
     device.does = "ends"
     until(lambda: source.read_arrival() is None)
     assert "the stream ended after" in caplog.text
-    assert device.opened == 1
+    assert device.opened == 2
 
 
 def test_a_device_that_is_not_there_at_the_start_is_an_error_at_once() -> None:
@@ -273,66 +254,73 @@ def test_stopping_ends_a_read_that_waits(does: str, device: Flaky, watched: Call
     source = watched()
     take(source)
     device.does = does
-    ended = threading.Event()
-
-    def run() -> None:
-        until(lambda: source.read_arrival() is None)
-        ended.set()
-
-    threading.Thread(target=run).start()
+    reading = Reading(source)
     if does != "good":
         until(lambda: source.state != "running")
-    source.stop()
-    assert ended.wait(PATIENCE)
+    reading.stop()
 
 
-def test_every_connection_is_closed_again(device: Flaky, watched: Callable[..., Watched]) -> None:
+def test_every_connection_is_closed_again_even_those_that_hung(
+    device: Flaky, watched: Callable[..., Watched]
+) -> None:
     source = watched()
-    take(source)
     device.does = "hangs"
-    thread, _ = read_beside(source)
+    reading = Reading(source)
     until(lambda: device.opened >= 3)
     device.does = "good"
-    thread.join(PATIENCE)
+    until(lambda: reading.arrivals)
     device.free.set()
+    reading.stop()
     source.close()
     until(lambda: device.closed == device.opened)
 
 
-def test_capture_names_the_thread_that_frames_arrive_in_now(device: Flaky) -> None:
-    capture = Capture(
-        Capture.Params(source="0"),
-        opener=lambda *_, **__: Watched(device.open, Watch(**QUICK), "flaky", device.clock),
-    )
-    assert capture.live_threads == []
-    capture.open()
-    frames = capture.frames()
+def test_capture_counts_frames_that_nobody_took_or_that_were_only_looked_at(
+    capture: Callable[..., Capture],
+) -> None:
+    stage = capture(settle=0)
+    frames = stage.frames()
+    seqs = [next(frames).seq]
+    for wanted in (3, 6, 9):
+        until(lambda wanted=wanted: stage.missed >= wanted)
+        before = stage.missed
+        seqs.append(next(frames).seq)
+        # Of the frames up to this one, those that were not taken are gaps; more may have come meanwhile.
+        assert before <= seqs[-1] + 1 - len(seqs) <= stage.missed
+    stage = capture(settle=3)
+    frames = stage.frames()
+    first, second = next(frames), next(frames)
+    assert (first.reference, second.reference) == (True, False)
+    assert second.seq - first.seq > 9
+    assert stage.missed >= 9
+
+
+def test_capture_names_the_thread_that_frames_arrive_in_now(
+    device: Flaky, capture: Callable[..., Capture]
+) -> None:
+    stage = capture()
+    frames = stage.frames()
     next(frames)
-    (first,) = capture.live_threads
+    (first,) = stage.live_threads
     names = {thread.native_id: thread.name for thread in threading.enumerate()}
     assert names[first] == "tactflow-read-flaky"
     device.fail("hangs", openings=2)
-    until(lambda: next(frames) and capture.live_threads != [first])
-    assert len(capture.live_threads) == 1, "the reader that hangs is not waited for any more"
-    capture.stop()
-    device.free.set()
-    capture.close()
+    until(lambda: next(frames) and stage.live_threads != [first])
+    assert len(stage.live_threads) == 1, "nobody waits any more for the thread that hangs"
 
 
 @pytest.mark.parametrize("on_reconnect", ["keep", "retake"])
 def test_capture_keeps_or_retakes_the_reference_after_a_reconnection(
-    on_reconnect: str, device: Flaky
+    on_reconnect: str, device: Flaky, capture: Callable[..., Capture]
 ) -> None:
-    capture = capture_of(device, on_reconnect=on_reconnect, reference=2, skip=3)
-    capture.open()
+    stage = capture(on_reconnect=on_reconnect, reference=2, skip=3)
     frames: list[Frame] = []
-    for frame in capture.frames():
+    for frame in stage.frames():
         frames.append(frame)
         if len(frames) == 5:
             device.fail("ends", openings=2)
         if len(frames) == 10:
-            capture.stop()
-    capture.close()
+            stage.stop()
     seqs = [frame.seq for frame in frames]
     assert seqs == sorted(set(seqs))
     assert seqs[0] >= 3
@@ -345,4 +333,4 @@ def test_capture_keeps_or_retakes_the_reference_after_a_reconnection(
         began = epochs.index(1)
         assert seqs[began] - seqs[began - 1] > 3, "frames are skipped again while the exposure settles"
         assert [frame.reference for frame in frames[began : began + 3]] == [True, True, False]
-    assert capture.state == "running"
+    assert stage.state == "running"

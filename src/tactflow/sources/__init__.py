@@ -7,17 +7,21 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import cast
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, StampedReader
-from tactflow.sources.devices import ArrivalClock, Camera, CameraRequest, Stream
-from tactflow.sources.files import open_recording
-from tactflow.sources.health import Watch
-from tactflow.sources.watch import Arrival, LiveReader, Watched
+from tactflow.sources.devices import Camera, CameraRequest, Stream
+from tactflow.sources.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_image, open_recording
+from tactflow.sources.paths import exists, split_prefix
+from tactflow.sources.watch import Arrival, Watch, Watched
 from tactflow.system.files import expanded, is_utf8
+from tactflow.system.plugins import plugins
 from tactflow.system.redaction import public_address
 
 __all__ = [
@@ -25,7 +29,6 @@ __all__ = [
     "Arrival",
     "CameraRequest",
     "FrameReader",
-    "LiveReader",
     "StampedReader",
     "Watch",
     "Watched",
@@ -40,7 +43,17 @@ KINDS = (
 )
 """What a source can be, for people: in messages, in `--help`, and for the parameter `source` of `capture`."""
 
+GROUP = "tactflow.sources"
+"""Group of entry points that open other kinds of files.
+
+The name of an entry point is what it recognises: the suffix of a file or folder (`.h5`), a word and a colon
+in front of a path (`lerobot`), or a file that such a folder contains (`metadata.yaml`). Its value is a
+function or class that is called with `(spec, directory, fps)` of `open_source` and returns a `FrameReader`.
+"""
+
 _STREAMS = frozenset(["http", "https", "rtsp", "udp"])
+_BUILT_IN = frozenset(["", ".npy", ".npz", *IMAGE_SUFFIXES, *VIDEO_SUFFIXES])
+"""Suffixes for which no plug-in is looked for: that takes some milliseconds."""
 
 
 def open_source(
@@ -57,9 +70,9 @@ def open_source(
     ----------
     spec : one of `KINDS`, such as `sim:press?frames=300&seed=7` or `recording.avi`.
     directory : where a relative path is looked for if it is not in the current directory.
-    fps : rate of recordings that do not know their own (images, arrays), frames per second; 30 by default.
+    fps : rate of recordings that do not state one (images, arrays), frames per second; 30 by default.
     camera : size, rate and format to ask a camera for.
-    watch : watch a camera or a stream, and open it anew after faults; without it, the first fault ends it.
+    watch : watch a camera or a stream, and open it again after faults; without it, the first fault ends it.
 
     Raises
     ------
@@ -76,7 +89,7 @@ def open_source(
     ((600, 800, 3), dtype('uint8'), 0.0)
     >>> reader.close()
 
-    A wrong name says what there is:
+    The error for a wrong name lists what there is:
 
     >>> open_source("ftp://camera")
     Traceback (most recent call last):
@@ -93,60 +106,61 @@ def open_source(
         return Simulated(spec)
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]+)://", spec)
     if scheme is not None:
-        return _open_stream(spec, scheme[1], watch)
+        return _open_stream(spec, scheme[1].lower(), watch)
     if spec.isdecimal() or spec.startswith(("/dev/video", "/dev/v4l/")):
-        return _live(partial(Camera, spec, camera, ArrivalClock()), watch, f"camera {spec}")
-    reader = _open_container(spec, directory, fps)
-    if reader is not None:
-        return reader
-    return open_recording(spec, directory, fps)
-
-
-def _open_container(spec: str, directory: Path | None, fps: float | None) -> FrameReader | None:
-    """A file or folder in which frames are one thing among others; None if it is none."""
-    if spec.startswith("lerobot:"):
-        from tactflow.sources.lerobot import LeRobotEpisode
-
-        return LeRobotEpisode(spec, directory)
-    bases = (Path(), directory or Path())
-    there = any((base / expanded(spec)).exists() for base in bases)
-    name, _, query = (spec, "", "") if there else spec.partition("?")
-    suffix = Path(name).suffix.lower()
-    if glob.has_magic(name) and not there:
-        return None
-    if suffix == ".mcap" and not query.startswith("topic="):
+        return _watched(partial(Camera, spec, camera), watch, f"camera {spec}")
+    name, _, query = (spec, "", "") if exists(spec, directory) else spec.partition("?")
+    if name.lower().endswith(".mcap") and not query.startswith("topic=") and not _is_pattern(name, directory):
         from tactflow.sources.mcap import Recording
 
         return Recording(spec, directory)
-    if suffix in (".mcap", ".bag", ".db3") or any(_is_rosbag2(base / expanded(name)) for base in bases):
-        from tactflow.sources.bags import Bag
-
-        return Bag(spec, directory)
-    if suffix in (".h5", ".hdf5", ".zarr"):
-        from tactflow.sources.datasets import ArrayDataset
-
-        return ArrayDataset(spec, directory, fps)
-    return None
-
-
-def _is_rosbag2(folder: Path) -> bool:
-    """Whether ROS 2 recorded into this folder: others have a metadata.yaml too."""
-    try:
-        with (folder / "metadata.yaml").open("rb") as file:
-            return b"rosbag2_bagfile_information" in file.read(4096)
-    except OSError:
-        return False
+    opener = _plugin(name, directory)
+    return opener(spec, directory, fps) if opener is not None else open_recording(spec, directory, fps)
 
 
 def _open_stream(spec: str, scheme: str, watch: Watch | None) -> FrameReader:
-    if scheme.lower() in _STREAMS:
-        return _live(partial(Stream, spec, ArrivalClock()), watch, public_address(spec))
-    hint = f"; for a file, leave out {scheme}://" if scheme.lower() == "file" else ""
-    raise SourceError(
-        f"{public_address(spec)}: unknown kind of source {scheme}://{hint}; required one of: {KINDS}"
-    )
+    address = public_address(spec)
+    if scheme in _STREAMS:
+        return _watched(partial(Stream, spec), watch, address)
+    hint = f"; for a file, leave out {scheme}://" if scheme == "file" else ""
+    raise SourceError(f"{address}: unknown kind of source {scheme}://{hint}; required one of: {KINDS}")
 
 
-def _live(opener: Callable[[], FrameReader], watch: Watch | None, name: str) -> FrameReader:
-    """The source itself, or watched. One clock serves all connections, so that times never step back."""
+def _watched(opener: Callable[[], FrameReader], watch: Watch | None, name: str) -> FrameReader:
     return opener() if watch is None else Watched(opener, watch, name)
+
+
+def _is_pattern(name: str, directory: Path | None) -> bool:
+    return glob.has_magic(name) and not exists(name, directory)
+
+
+def _plugin(name: str, directory: Path | None) -> Callable[..., FrameReader] | None:
+    """What opens a file, folder or `word:PATH` that is not built in; None if nothing does."""
+    for key in _keys(name, directory):
+        for point in plugins(GROUP):
+            if point.name == key:
+                return _load(name, point)
+    return None
+
+
+def _load(name: str, point: EntryPoint) -> Callable[..., FrameReader]:
+    try:
+        return cast(Callable[..., FrameReader], point.load())
+    except Exception as error:
+        raise SourceError(f"{name}: the plug-in {point.value} cannot be loaded: {error}") from error
+
+
+def _keys(name: str, directory: Path | None) -> Iterator[str]:
+    """The names that a plug-in may have to open this."""
+    prefix, _ = split_prefix(name, directory)
+    if prefix:
+        yield prefix.removesuffix(":")
+        return
+    suffix = Path(name).suffix.lower()
+    if suffix not in _BUILT_IN and not _is_pattern(name, directory):
+        yield suffix
+    for base in (Path(), directory or Path()):
+        with suppress(OSError, ValueError):
+            files = sorted((base / expanded(name)).iterdir())
+            if not any(map(is_image, files)):
+                yield from (file.name for file in files)

@@ -1,15 +1,14 @@
-"""What every source has in common: the interface, and pixels as the pipeline expects them."""
+"""What all sources have in common: frames one after the other, of one size, as BGR pixels."""
 
 from __future__ import annotations
 
-import difflib
 import logging
 import os
 import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
-from tactflow.system.files import expanded, is_device
 
 log = logging.getLogger("tactflow")
 
@@ -29,21 +27,39 @@ FEWEST_BITS = 10
 BgrImage = NDArray[np.uint8]
 
 
-class FrameReader(Protocol):
+class FrameReader:
     """Frames, one after the other.
 
-    live : the frames come when they want to (cameras, streams); a recording waits until it is read.
-    fps : frames per second, or None where nothing is known.
+    Each kind of source is a subclass that yields its pictures from `_frames`, in whatever pixels they are
+    stored; `read` converts them and checks their size.
+
+    live : frames arrive at the camera's pace; a recording waits until it is read.
+    fps : frames per second, or None if unknown.
     size : (width, height) of the frames, px, or None before the first one.
-    total : number of frames, or None where it is unknown or endless.
+    total : number of frames, or None if unknown or endless.
     description : one line for people.
+
+    name : what messages call the source.
     """
 
-    live: bool
-    fps: float | None
-    size: tuple[int, int] | None
-    total: int | None
-    description: str
+    live = False
+    fps: float | None = None
+    size: tuple[int, int] | None = None
+    total: int | None = None
+    description = ""
+    parser_errors: tuple[type[Exception], ...] = (OSError,)
+    """What `_frames` may raise on damaged data; it reaches the caller as a SourceError."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._normalise = Normaliser(name)
+        self._iterator: Iterator[tuple[Any, ...]] | None = None
+        self._peeked: deque[tuple[Any, ...]] = deque()
+        self._error: SourceError | None = None
+
+    def _frames(self) -> Iterator[tuple[Any, ...]]:
+        """Yield every picture, as `Normaliser` takes them, and its time, s; ends at the last one."""
+        raise NotImplementedError
 
     def read(self) -> tuple[BgrImage, float] | None:
         """The next frame and its time, or None at the end.
@@ -58,11 +74,57 @@ class FrameReader(Protocol):
         SourceError
             If the next frame cannot be read.
         """
-        ...
+        item = self._read()
+        return None if item is None else (item[0], item[1])
+
+    def peek(self) -> tuple[BgrImage, float] | None:
+        """The next frame that was neither read nor peeked at; `read` still returns it in its turn.
+
+        None at the end, and where reading fails: `read` then raises in its turn.
+        """
+        try:
+            item = None if self._error is not None else self._next()
+        except SourceError as error:
+            self._error = error
+            return None
+        if item is None:
+            return None
+        self._peeked.append(item)
+        return item[0], item[1]
 
     def close(self) -> None:
-        """Let go of the file or device. May be called twice."""
-        ...
+        """Release the file or device; `read` then returns None. May be called twice."""
+        self._iterator, self._error = iter(()), None
+        self._peeked.clear()
+
+    def _read_first(self, empty: str = "there is no picture in it") -> None:
+        """Read the first frame ahead, so that `size` is known. Raises SourceError if there is none."""
+        if self.peek() is None:
+            error = self._error or SourceError(f"{self.name}: {empty}")
+            self.close()
+            raise error
+
+    def _read(self) -> tuple[Any, ...] | None:
+        if self._peeked:
+            return self._peeked.popleft()
+        if self._error is not None:
+            raise self._error
+        return self._next()
+
+    def _next(self) -> tuple[Any, ...] | None:
+        if self._iterator is None:
+            self._iterator = self._frames()
+        try:
+            item = next(self._iterator, None)
+        except SourceError:
+            raise
+        except self.parser_errors as error:
+            raise damaged(self.name, error) from error
+        if item is None:
+            return None
+        image = self._normalise(item[0])
+        self.size = self._normalise.size
+        return image, *item[1:]
 
 
 class Stamp(NamedTuple):
@@ -78,20 +140,144 @@ class Stamp(NamedTuple):
     paced: bool = True
 
 
-@runtime_checkable
-class StampedReader(Protocol):
-    """A source whose frames went through `capture` once before.
+class StampedReader(FrameReader):
+    """A source whose frames went through `capture` once before; `_frames` also yields a `Stamp`.
 
     Capture then decides nothing by itself: seq, references and epochs are the recorded ones.
     """
 
     def read_stamped(self) -> tuple[BgrImage, float, Stamp] | None:
-        """Like `FrameReader.read`, with the frame's stamp."""
-        ...
+        """Like `read`, with the frame's stamp."""
+        item = self._read()
+        return None if item is None else (item[0], item[1], item[2])
 
 
-def refuse_too_large(name: str, width: int, height: int) -> None:
-    """Refuse pictures of more pixels than a camera has, before memory is taken for them.
+class CaptureReader(FrameReader):
+    """A source that OpenCV opens: a video, a camera, a stream.
+
+    Parameters
+    ----------
+    name : what messages call it.
+    failure : the error message if it cannot be opened.
+    arguments : of `cv2.VideoCapture`.
+    """
+
+    def __init__(self, name: str, failure: str, *arguments: Any) -> None:
+        super().__init__(name)
+        with quiet_opencv():
+            self._capture: cv2.VideoCapture | None = cv2.VideoCapture(*arguments)
+        if not self._capture.isOpened():
+            raise SourceError(failure)
+        self._update_size()
+
+    def _update_size(self) -> None:
+        width, height = map(int, map(self._property, (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)))
+        check_pixel_count(self.name, width, height)
+        self.size = (width, height)
+        self._size_text = f"{width} x {height}"
+
+    def _property(self, number: int) -> float:
+        """What OpenCV knows of the source (`cv2.CAP_PROP_...`); 0 if it does not."""
+        return 0.0 if self._capture is None else self._capture.get(number)
+
+    def _grab(self) -> NDArray[Any] | None:
+        """Decode the next picture; None if there is none."""
+        if self._capture is None:
+            return None
+        with quiet_opencv():
+            arrived, image = self._capture.read()
+        return image if arrived else None
+
+    def close(self) -> None:
+        """Release the file or device."""
+        super().close()
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+
+class Normaliser:
+    """Converts pictures to (H, W, 3) uint8 BGR, and checks that all have the size of the first.
+
+    Gray, BGRA and 16-bit pictures are converted, with one note in the log for each kind of conversion.
+
+    >>> bgr = Normaliser("example")(np.full((2, 2), 65535, np.uint16))
+    >>> bgr.shape, bgr.dtype, int(bgr.max())
+    ((2, 2, 3), dtype('uint8'), 255)
+
+    Parameters
+    ----------
+    name : what notes and errors call the source, or the file of the next picture.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.size: tuple[int, int] | None = None
+        self._noted: set[str] = set()
+
+    def __call__(self, image: NDArray[Any]) -> BgrImage:
+        """Convert one picture.
+
+        Parameters
+        ----------
+        image : (H, W) or (H, W, C) with C in 1, 3, 4; uint8 or uint16.
+
+        Raises
+        ------
+        SourceError
+            If the pixels are of another kind, or the picture is not as large as the ones before it.
+        """
+        channels = image.shape[2] if image.ndim == 3 else 1
+        if image.ndim not in (2, 3) or channels not in (1, 3, 4):
+            raise SourceError(f"{self.name}: required 1, 3 or 4 channels, got shape {image.shape}")
+        self._check_size(image.shape[1], image.shape[0])
+        if image.dtype != np.uint8:
+            image = self._from_16_bits(image)
+        if channels == 3:
+            return image if image.flags.c_contiguous else np.ascontiguousarray(image)
+        if channels == 1:
+            self._note("gray frames are given three equal channels")
+            return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+        self._note("the fourth channel (alpha) is ignored")
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2BGR), np.uint8)
+
+    def _check_size(self, width: int, height: int) -> None:
+        if self.size is None:
+            check_pixel_count(self.name, width, height)
+            self.size = (width, height)
+        if self.size != (width, height):
+            raise SourceError(
+                f"{self.name}: this frame is {width} x {height} pixels, the ones before it are "
+                f"{self.size[0]} x {self.size[1]}; a source must keep its size. "
+                "Remove the odd frame, or run the two recordings one after the other"
+            )
+
+    def _from_16_bits(self, image: NDArray[Any]) -> NDArray[np.uint8]:
+        # A file may have 16-bit pixels in the other byte order.
+        if image.dtype.newbyteorder("=") != np.uint16:
+            raise SourceError(f"{self.name}: required 8- or 16-bit unsigned pixels, got {image.dtype}")
+        image = image.astype(np.uint16, copy=False)
+        if self._note("16-bit values are scaled to 8 bit (divided by 257)") and image.size:
+            peak = int(image.max())
+            if 0 < peak < SPARSE_PEAK:
+                bits = max(peak.bit_length(), FEWEST_BITS)
+                log.warning(
+                    "%s: no value above %d: a sensor with %d bits in a 16-bit file? It will be dark; "
+                    "multiply the values by %d beforehand",
+                    *(self.name, peak, bits, 1 << (16 - bits)),
+                )
+        return np.asarray(cv2.convertScaleAbs(image, alpha=255.0 / 65535.0), np.uint8)
+
+    def _note(self, text: str) -> bool:
+        if text in self._noted:
+            return False
+        self._noted.add(text)
+        log.info("%s: %s", self.name, text)
+        return True
+
+
+def check_pixel_count(name: str, width: int, height: int) -> None:
+    """Refuse pictures of more pixels than a camera has, before memory is allocated for them.
 
     name : the file or address. width, height : as it states them, px.
 
@@ -107,106 +293,20 @@ def refuse_too_large(name: str, width: int, height: int) -> None:
         )
 
 
-def refuse_devices(path: Path) -> None:
-    """Refuse a pipe or a device, also through a link, and a folder in which one is: reading it may never end.
-
-    Raises
-    ------
-    SourceError
-        If there is one.
-    """
-    places = [path]
-    if path.is_dir():
-        places = [Path(place, name) for place, _, names in os.walk(path) for name in names]
-    for place in places:
-        if is_device(str(place)):
-            raise SourceError(f"{place}: is a pipe or a device, not a file")
+def damaged(name: str, error: Exception) -> SourceError:
+    """The error for a file that cannot be read, or whose parser failed."""
+    if isinstance(error, OSError) and error.strerror:
+        return SourceError(f"{name}: cannot be read: {error.strerror}")
+    message = str(error).strip().partition("\n")[0]
+    return SourceError(f"{name}: is damaged or cut off ({message or type(error).__name__})")
 
 
-def frame_size(capture: cv2.VideoCapture, name: str) -> tuple[int, int]:
-    """(width, height) that a video or stream states, px; raises as `refuse_too_large`."""
-    width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-    height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    refuse_too_large(name, width, height)
-    return width, height
+SILENT = 0
+"""OpenCV's log level at which it says nothing."""
 
-
-class Normaliser:
-    """Brings whatever a source delivers to (H, W, 3) uint8 BGR of one constant size.
-
-    Gray, BGRA and 16-bit frames are converted, with one note in the log per kind of conversion.
-
-    >>> bgr = Normaliser("example")(np.full((2, 2), 65535, np.uint16))
-    >>> bgr.shape, bgr.dtype, int(bgr.max())
-    ((2, 2, 3), dtype('uint8'), 255)
-
-    Parameters
-    ----------
-    name : what the source is called in notes and errors.
-    """
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.size: tuple[int, int] | None = None
-        self._noted: set[str] = set()
-
-    def __call__(self, image: NDArray[Any], name: str | None = None) -> BgrImage:
-        """Convert one frame.
-
-        Parameters
-        ----------
-        image : (H, W) or (H, W, C) with C in 1, 3, 4; uint8 or uint16.
-        name : the file the frame comes from, where it has one of its own.
-
-        Raises
-        ------
-        SourceError
-            If the pixels are of another kind, or the frame is not as large as the ones before it.
-        """
-        where = name or self.name
-        channels = image.shape[2] if image.ndim == 3 else 1
-        if image.ndim not in (2, 3) or channels not in (1, 3, 4):
-            raise SourceError(f"{where}: required 1, 3 or 4 channels, got an image of shape {image.shape}")
-        height, width = image.shape[:2]
-        if self.size is None:
-            self.size = (width, height)
-        elif self.size != (width, height):
-            raise SourceError(
-                f"{where}: this frame is {width} x {height} pixels, the ones before it are "
-                f"{self.size[0]} x {self.size[1]}; a source must keep its size. "
-                "Remove the odd frame, or run the two recordings one after the other"
-            )
-        # A file may have 16-bit pixels in another machine's order of bytes.
-        if image.dtype.newbyteorder("=") == np.uint16:
-            image = image.astype(np.uint16, copy=False)
-            if self._note("16 bit", "16-bit values are scaled to 8 bit (divided by 257)") and image.size:
-                peak = int(image.max())
-                if 0 < peak < SPARSE_PEAK:
-                    log.warning(
-                        "%s: no value above %d: a sensor with %d bits in a 16-bit file? It will be dark; "
-                        "multiply the values by %d beforehand",
-                        where,
-                        peak,
-                        max(peak.bit_length(), FEWEST_BITS),
-                        1 << (16 - max(peak.bit_length(), FEWEST_BITS)),
-                    )
-            image = cv2.convertScaleAbs(image, alpha=255.0 / 65535.0)
-        elif image.dtype != np.uint8:
-            raise SourceError(f"{where}: required 8- or 16-bit unsigned pixels, got {image.dtype}")
-        if channels == 3:
-            return image if image.flags.c_contiguous else np.ascontiguousarray(image)
-        if channels == 1:
-            self._note("gray", "gray frames are given three equal channels")
-            return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-        self._note("alpha", "the fourth channel (alpha) is ignored")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2BGR), np.uint8)
-
-    def _note(self, kind: str, text: str) -> bool:
-        if kind in self._noted:
-            return False
-        self._noted.add(kind)
-        log.info("%s: %s", self.name, text)
-        return True
+_silence_lock = threading.Lock()
+_silencers = [0, 0]
+"""How many threads want OpenCV silent, and the log level to go back to."""
 
 
 @contextmanager
@@ -214,86 +314,16 @@ def quiet_opencv() -> Iterator[None]:
     """Keep OpenCV's and FFmpeg's own messages off standard error: ours say the same more clearly."""
     # FFmpeg reads this once, when OpenCV opens the first file with it.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    _silence.begin()
+    # OpenCV 5 keeps the function elsewhere than 4.
+    set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
+    with _silence_lock:
+        if _silencers[0] == 0:
+            _silencers[1] = int(set_level(SILENT))
+        _silencers[0] += 1
     try:
         yield
     finally:
-        _silence.end()
-
-
-SILENT = 0
-"""OpenCV's log level at which it says nothing."""
-
-
-def _set_log_level(level: int) -> int:
-    """Set OpenCV's log level; returns the one before. OpenCV 5 keeps the function elsewhere than 4."""
-    change = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
-    return int(change(level))
-
-
-class _Silence:
-    """OpenCV's one log level, silent while any thread wants it silent."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._wanted = 0
-        self._level = 0
-
-    def begin(self) -> None:
-        with self._lock:
-            if self._wanted == 0:
-                self._level = _set_log_level(SILENT)
-            self._wanted += 1
-
-    def end(self) -> None:
-        with self._lock:
-            self._wanted -= 1
-            if self._wanted == 0:
-                _set_log_level(self._level)
-
-
-_silence = _Silence()
-
-
-def find_path(spec: str, directory: Path | None) -> Path:
-    """Where a path of a command line or a pipeline file points to.
-
-    Parameters
-    ----------
-    spec : absolute, or relative to the current directory or else to `directory`; `~` is expanded.
-    directory : the pipeline file's folder, or None.
-
-    Raises
-    ------
-    SourceError
-        If nothing is there; names files whose names are close. If it is a pipe or a device: to open one may
-        wait for ever, and no signal ends that.
-    """
-    path = expanded(spec)
-    candidates = [path]
-    if directory is not None and not path.is_absolute():
-        candidates.append(directory / path)
-    for candidate in candidates:
-        if candidate.exists():
-            if is_device(str(candidate)):
-                raise SourceError(f"{spec}: is a pipe or a device, not a file")
-            return candidate
-    raise SourceError(f"{spec}: no such file or folder{_near(candidates)}")
-
-
-def _near(candidates: list[Path]) -> str:
-    for path in candidates:
-        folder, wanted = path.parent, path.name
-        # Climb to the first folder that exists, so that a typo in the middle of a path is found too.
-        while not folder.is_dir() and folder.parent != folder:
-            folder, wanted = folder.parent, folder.name
-        if not folder.is_dir():
-            continue
-        try:
-            names = sorted(entry.name for entry in folder.iterdir())
-        except OSError:
-            continue
-        close = difflib.get_close_matches(wanted, names, n=3, cutoff=0.6)
-        if close:
-            return "; did you mean " + " or ".join(str(folder / name) for name in close) + "?"
-    return f" (looked in {', '.join(dict.fromkeys(str(path.parent.absolute()) for path in candidates))})"
+        with _silence_lock:
+            _silencers[0] -= 1
+            if _silencers[0] == 0:
+                set_level(_silencers[1])

@@ -1,49 +1,18 @@
-"""The first frames of a source, looked at before they are handed out: which of them are the reference?"""
+"""The first frames of a source, examined before they are handed out: which of them are the reference?"""
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Final
 
-from tactflow.engine.errors import SourceError
-from tactflow.sources.base import BgrImage, FrameReader, log
+from tactflow.sources.base import BgrImage, log
 from tactflow.vision.change import Settling
 
 MEMORY: Final = 128_000_000
-"""Bytes of frames that are kept at most while they are looked at. Chosen by hand."""
-
-
-class Ahead:
-    """A recording, of which frames can be looked at before their turn: none is lost."""
-
-    def __init__(self, reader: FrameReader) -> None:
-        self.live = reader.live
-        self._reader = reader
-        self._waiting: deque[tuple[BgrImage, float]] = deque()
-        self._error: SourceError | None = None
-
-    def peek(self) -> tuple[BgrImage, float] | None:
-        """The next frame that was not looked at yet; None if there is none. An error waits for its turn."""
-        try:
-            item = None if self._error is not None else self._reader.read()
-        except SourceError as error:
-            self._error = error
-            return None
-        if item is not None:
-            self._waiting.append(item)
-        return item
-
-    def read(self) -> tuple[BgrImage, float] | None:
-        """The next frame; as `FrameReader.read`."""
-        if self._waiting:
-            return self._waiting.popleft()
-        if self._error is not None:
-            raise self._error
-        return self._reader.read()
+"""Bytes of frames that are held at most while they are examined. Chosen by hand."""
 
 
 class FirstFrames:
-    """Says which of the first frames are the reference, and tells the user if they are not the very first.
+    """Chooses the reference among the first frames, and tells the user if it is not the very first.
 
     name : of the source, in messages. seconds : after which the light must be steady. count : of references.
 
@@ -64,7 +33,7 @@ class FirstFrames:
         self._bytes = 0
 
     def look(self, image: BgrImage, t: float) -> bool:
-        """Look at the next frame, taken at t, s; True once no more need to be looked at."""
+        """Examine the next frame, taken at t, s; True once no more frames are needed."""
         self._began = t if self._began is None else self._began
         self._bytes += image.nbytes
         settling = self._settling
@@ -83,19 +52,17 @@ class FirstFrames:
         settling = self._settling
         best, alike = settling.best(), settling.alike()
         begin = max(0, min(alike.index(best) - self._count // 2, len(alike) - self._count))
-        self._tell(best)
+        self._report(best)
         return alike[begin : begin + self._count]
 
-    def _tell(self, best: int) -> None:
-        """Say in one line which frame is the reference and why, unless it is plainly the very first."""
+    def _report(self, best: int) -> None:
+        """Say in one line which frame is the reference and why, unless it is clearly the very first."""
         settling = self._settling
         if settling.changing:
             log.warning(
-                "%s: the light is not steady, it changed by %.0f %% within the last frames looked at; "
-                "the reference is frame %d. Fix exposure and white balance of the camera, or raise settle",
-                self._name,
-                100 * settling.drift,
-                best,
+                "%s: the light is not steady, it changed by %.0f %% within the last frames; the reference is "
+                "frame %d. Fix exposure and white balance of the camera, or raise settle",
+                *(self._name, 100 * settling.drift, best),
             )
             return
         if settling.undecided:

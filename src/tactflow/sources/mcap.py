@@ -1,16 +1,16 @@
-"""Recordings of ours, played again: the frames bit for bit, with the seq, t and flags of the first time."""
+"""Recordings of tactflow, played again: the frames bit for bit, with their original seq, t and flags."""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactflow.engine.errors import SourceError
 from tactflow.recording import missing_packages
-from tactflow.sources.base import BgrImage, Stamp, find_path, log
-from tactflow.sources.query import in_words, split_query
+from tactflow.sources.base import BgrImage, Stamp, StampedReader, damaged, log
+from tactflow.sources.paths import describe_settings, find_path, split_query
 
 if TYPE_CHECKING:
     from mcap.records import Message
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 SETTINGS = {"start": "SECONDS (from the beginning)", "loop": "N (play N times; 0 is for ever)"}
 
 LATEST_START = 1e9
-"""A beginning beyond this, s, is behind the end of every recording: 30 years. Chosen by hand."""
+"""A start beyond this, s, lies behind the end of every recording: 30 years. Chosen by hand."""
 
 
-class Recording:
+class Recording(StampedReader):
     """An .mcap file that tactflow recorded.
 
     A recording brings its own references: capture's parameters `reference` and `skip` do not apply. With
     `start`, the references that were in force at that time come first.
 
-    With `loop`, seq and t go on growing from lap to lap, and every lap is an epoch of its own: it takes its
-    references anew, so that it gives the same results as the first.
+    With `loop`, seq and t keep growing from lap to lap, and every lap is an epoch of its own: it takes its
+    references again, so that it gives the same results as the first.
 
     Parameters
     ----------
@@ -41,10 +41,8 @@ class Recording:
     Raises
     ------
     SourceError
-        If it is not there, is no recording of ours, or an option is wrong.
+        If it is not there, is not a recording of tactflow, or an option is wrong.
     """
-
-    live = False
 
     def __init__(self, spec: str, directory: Path | None = None) -> None:
         problem = missing_packages()
@@ -52,23 +50,17 @@ class Recording:
             raise SourceError(f"{spec}: {problem}")
         name, start, self._laps = _parse(spec, directory)
         self._path = find_path(name, directory)
-        self._contents = self._look()
-        contents = self._contents
+        super().__init__(str(self._path))
+        contents = self._contents = _look_into(self._path)
+        seconds = ((contents.end or 0) - (contents.start or 0)) / 1e9
         self._start = None if not start or contents.start is None else contents.start + round(start * 1e9)
-        self._frames = self._play()
-        self._first = self._next()
-        if self._first is None:
-            end = "" if contents.end is None or contents.start is None else _length(contents)
-            raise SourceError(f"{spec}: there is no frame {f'after {start:g} s{end}' if start else 'in it'}")
-        self.size: tuple[int, int] | None = self._first[0].size
-        self.fps: float | None = None
-        self.total: int | None = None
+        length = "" if contents.end is None else f"; it is {seconds:g} s long"
+        self._read_first(f"there is no frame {f'after {start:g} s{length}' if start else 'in it'}")
         if contents.frames is not None:
-            seconds = ((contents.end or 0) - (contents.start or 0)) / 1e9
             self.fps = (contents.frames - 1) / seconds if seconds > 0 else None
             self.total = contents.frames * self._laps if self._laps and self._start is None else None
         frames = "an unknown number of" if contents.frames is None else str(contents.frames)
-        self.description = f"{spec}, {frames} frames, {self.size[0]} x {self.size[1]}"
+        self.description = f"{spec}, {frames} frames, {'{} x {}'.format(*self.size or (0, 0))}"
         if not contents.finished:
             log.warning(
                 "%s: was not finished (killed?); it is played up to where it ends; "
@@ -76,52 +68,7 @@ class Recording:
                 self._path,
             )
 
-    def _look(self) -> Contents:
-        from tactflow.recording.reader import look_into
-        from tactflow.recording.records import NotARecordingError
-
-        try:
-            return look_into(self._path)
-        except NotARecordingError as error:
-            raise SourceError(f"{self._path}: {error}") from None
-        except OSError as error:
-            raise SourceError(f"{self._path}: cannot be read: {error.strerror or error}") from error
-
-    def read(self) -> tuple[BgrImage, float] | None:
-        """The next frame and its time; see `FrameReader.read`."""
-        item = self.read_stamped()
-        return None if item is None else item[:2]
-
-    def read_stamped(self) -> tuple[BgrImage, float, Stamp] | None:
-        """The next frame, its time and what else is known of it; see `StampedReader`."""
-        item, self._first = self._first or self._next(), None
-        if item is None:
-            return None
-        frame, t, stamp = item
-        try:
-            return frame.image(), t, stamp
-        except ValueError as error:
-            raise SourceError(f"{self._path}, frame {frame.seq}: {error}") from error
-
-    def close(self) -> None:
-        """Read no more."""
-        self._frames.close()
-        self._first = None
-
-    def _next(self) -> tuple[StoredFrame, float, Stamp] | None:
-        from tactflow.recording.records import DAMAGE
-
-        try:
-            return next(self._frames, None)
-        except DAMAGE as error:
-            raise SourceError(
-                f"{self._path}: is damaged ({error or type(error).__name__}); "
-                "tactflow repair keeps all that is intact"
-            ) from error
-        except OSError as error:
-            raise SourceError(f"{self._path}: cannot be read: {error.strerror or error}") from error
-
-    def _play(self) -> Generator[tuple[StoredFrame, float, Stamp], None, None]:
+    def _frames(self) -> Iterator[tuple[BgrImage, float, Stamp]]:
         """All laps: each frame, its time, and its stamp."""
         lap = seqs = epochs = 0
         seconds = latest = 0.0
@@ -135,34 +82,47 @@ class Recording:
                     times = [times[0] if times else frame.t, *times[-1:], frame.t]
                 last_seq, last_epoch = max(last_seq, frame.seq), max(last_epoch, frame.epoch)
                 t = latest = frame.t if lap == 1 else max(frame.t + seconds, latest)
-                yield frame, t, Stamp(seq, frame.reference, frame.epoch + epochs, due)
+                yield self._decode(frame), t, Stamp(seq, frame.reference, frame.epoch + epochs, due)
             if not times:
                 return
-            # From the last frame to the first of the next lap as long as from the last but one to the last.
+            # The last frame lasts as long as the one before it.
             seconds += times[-1] - times[0] + (times[-1] - times[-2])
             seqs += last_seq + 1
             epochs += last_epoch + 1
+
+    def _decode(self, frame: StoredFrame) -> BgrImage:
+        try:
+            return frame.image()
+        except ValueError as error:
+            raise SourceError(f"{self._path}, frame {frame.seq}: {error}") from error
 
     def _lap(self) -> Iterator[tuple[StoredFrame, bool]]:
         """The frames of one lap, and whether each comes at its time (True) or ahead of it."""
         from tactflow.recording.frames import nanoseconds
         from tactflow.recording.reader import messages
+        from tactflow.recording.records import DAMAGE
 
         contents, start = self._contents, self._start
         topics = {contents.frame_topic, contents.reference_topic}
-        played = messages(self._path, contents, topics, start=start)
-        if start is not None:
-            first = next(played, None)
-            if first is None:
-                return
-            before = messages(self._path, contents, {contents.reference_topic}, end=start)
-            yield from ((frame, False) for frame in _in_force([self._stored(m) for m in before]))
-            played = chain([first], played)
-        for message in played:
-            frame = self._stored(message)
-            # A recording begun late brings the references of before, at the time it began.
-            late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
-            yield frame, not late and frame.seq >= 0
+        try:
+            played = messages(self._path, contents, topics, start=start)
+            if start is not None:
+                first = next(played, None)
+                if first is None:
+                    return
+                before = messages(self._path, contents, {contents.reference_topic}, end=start)
+                yield from ((frame, False) for frame in _in_force([self._stored(m) for m in before]))
+                played = chain([first], played)
+            for message in played:
+                frame = self._stored(message)
+                # A recording begun late brings the references of before, at the time it began.
+                late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
+                yield frame, not late and frame.seq >= 0
+        except DAMAGE as error:
+            raise SourceError(
+                f"{self._path}: is damaged ({error or type(error).__name__}); "
+                "tactflow repair keeps all that is intact"
+            ) from error
 
     def _stored(self, message: Message) -> StoredFrame:
         from tactflow.recording.frames import StoredFrame
@@ -171,6 +131,18 @@ class Recording:
             return StoredFrame.parse(message.data)
         except ValueError as error:
             raise SourceError(f"{self._path}, {message.log_time / 1e9:g} s: {error}") from error
+
+
+def _look_into(path: Path) -> Contents:
+    from tactflow.recording.reader import look_into
+    from tactflow.recording.records import NotARecordingError
+
+    try:
+        return look_into(path)
+    except NotARecordingError as error:
+        raise SourceError(f"{path}: {error}") from None
+    except OSError as error:
+        raise damaged(str(path), error) from error
 
 
 def _in_force(references: list[StoredFrame]) -> list[StoredFrame]:
@@ -186,9 +158,5 @@ def _parse(spec: str, directory: Path | None) -> tuple[str, float, int]:
     except ValueError:
         start, laps = -1.0, 1
     if not 0 <= start <= LATEST_START or laps < 0:
-        raise SourceError(f"{spec}: required {in_words(SETTINGS)}")
+        raise SourceError(f"{spec}: required {describe_settings(SETTINGS)}")
     return name, start, laps
-
-
-def _length(contents: Contents) -> str:
-    return f"; it is {((contents.end or 0) - (contents.start or 0)) / 1e9:g} s long"

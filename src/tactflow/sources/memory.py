@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sized
+from collections.abc import Iterable, Iterator, Sized
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import BgrImage, Normaliser
+from tactflow.sources.base import FrameReader
 from tactflow.sources.files import DEFAULT_FPS
 
 
-class MemoryFrames:
+class MemoryFrames(FrameReader):
     """Pictures in memory, as a recording; frame i is taken at i / fps.
 
     `tactflow.stream(source=frames)` opens its pictures with this reader. Pictures of an iterator are asked
@@ -21,8 +21,8 @@ class MemoryFrames:
 
     Parameters
     ----------
-    frames : (N, H, W, 3) BGR or (N, H, W) grey array of uint8 or uint16, or an iterable of pictures
-        (H, W, 3) or (H, W), all of one size. They are not copied: leave a picture as it is once it was given.
+    frames : (N, H, W, 3) BGR or (N, H, W) gray array of uint8 or uint16, or an iterable of pictures
+        (H, W, 3) or (H, W), all of one size. They are not copied: do not change a picture afterwards.
     fps : frames per second; 30 by default.
 
     Raises
@@ -37,33 +37,21 @@ class MemoryFrames:
     (2, [((48, 64, 3), 0.0), ((48, 64, 3), 0.1)])
     """
 
-    live = False
-
     def __init__(self, frames: Iterable[NDArray[Any]], fps: float | None = None) -> None:
+        super().__init__("frames in memory")
         if isinstance(frames, np.ndarray) and (frames.ndim < 3 or frames.shape[2:] in ((3,), (4,))):
             raise SourceError(
                 f"an array of shape {frames.shape}: required N x H x W x 3 (BGR) or N x H x W (gray); "
                 "a single picture? Give array[None]"
             )
-        self.fps: float | None = fps or DEFAULT_FPS
-        self.size: tuple[int, int] | None = None
+        self.fps = fps or DEFAULT_FPS
         self.total = len(frames) if isinstance(frames, Sized) else None
-        self.description = f"frames in memory, {'' if self.total is None else f'{self.total} '}pictures"
-        self._rate = fps or DEFAULT_FPS
-        self._normalise = Normaliser("frames in memory")
-        self._frames = enumerate(frames)
+        self.description = f"{'' if self.total is None else f'{self.total} '}frames in memory"
+        self._pictures = frames
 
-    def read(self) -> tuple[BgrImage, float] | None:
-        """The next picture and its time; see `FrameReader.read`."""
-        index, image = next(self._frames, (0, None))
-        if image is None:
-            return None
-        if not isinstance(image, np.ndarray):
-            raise SourceError(f"frames in memory: picture {index}: required an array, got {type(image)}")
-        image = self._normalise(image, f"picture {index}")
-        self.size = self._normalise.size
-        return image, index / self._rate
-
-    def close(self) -> None:
-        """Ask for no more pictures."""
-        self._frames = enumerate(())
+    def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
+        for index, image in enumerate(self._pictures):
+            self._normalise.name = f"picture {index}"
+            if not isinstance(image, np.ndarray):
+                raise SourceError(f"picture {index}: required an array, got {type(image)}")
+            yield image, index / (self.fps or DEFAULT_FPS)

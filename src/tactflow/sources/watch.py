@@ -1,29 +1,70 @@
-"""Live sources that come and go: noticed, reported, reconnected.
+"""Live sources that fail and come back: faults are reported, and the source is opened again.
 
-A thread reads all the time and keeps only the newest frame, so that waiting for a frame can be ended at once,
-a driver's buffer never goes stale, and a read that hangs is noticed. What counts as a fault: `health`.
+A thread reads all the time and keeps only the newest frame, so that a driver's buffer never goes stale and
+waiting for a frame can be ended at once. A read that hangs is left behind, and another thread takes over.
 """
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import BgrImage, FrameReader, log
-from tactflow.sources.health import HANG_INTERVALS, Health, Verdict, Watch
 from tactflow.system.clock import SYSTEM, Clock
 
-OPENING_SECONDS = 15.0
-"""Opening that takes longer hangs, s; more than what drivers and streams themselves allow. Chosen by
+BLACK_LEVEL = 4.0
+"""Mean gray level at and below which a picture counts as black; a lit gel has 30 and more."""
+BLACK_STEP = 8
+"""The mean is taken over every so many rows and columns, px: a mean needs no more pixels. Chosen by hand."""
+COMPARED_STEP = 64
+"""Pictures are first compared in every so many rows, px: noise shows there already. Chosen by hand."""
+FIRST_FRAME_SECONDS = 3.0
+"""A device may take so long to its first frame before that is reported, s. Chosen by hand."""
+SILENT_INTERVALS = 3.0
+"""A gap shorter than so many usual times between frames is no stall. Chosen by hand."""
+INTERVAL_DECAY = 0.9
+"""By this factor a long gap counts less with each frame after it. Chosen by hand."""
+STEADY_SECONDS = 5.0
+"""After a connection that delivered for so long, the back-off starts at its shortest again, s. Chosen by
 hand."""
-MAX_ABANDONED = 4
+OPEN_TIMEOUT = 15.0
+"""Opening that takes longer hangs, s: more than drivers and streams allow themselves. Chosen by hand."""
+MAX_HUNG = 4
 """No new attempt while so many threads hang in a driver. Chosen by hand."""
 POLL_SECONDS = 0.1
 """How often a waiting reader looks for faults, s. Chosen by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """What counts as a fault of a live source, and what is done then. All times in s.
+
+    reconnect : open the source again after a fault, until it is back. If False, a camera that stops is an
+        error and a stream that ends is the end.
+    no_frame_timeout : an error after so long without a good frame; None or 0 never gives up.
+    frozen_after : pictures that are identical for so long are a fault; None never.
+    black_after : black pictures for so long are a fault; None never.
+    silent_after : stall timeout: no picture for so long, and for three times the usual interval, is a fault.
+    hang_after : a read that takes longer is abandoned, and the source is opened again.
+    first_retry, last_retry : back-off between attempts: doubles from the first to the last.
+    """
+
+    reconnect: bool = True
+    no_frame_timeout: float | None = 30.0
+    frozen_after: float | None = 3.0
+    black_after: float | None = 1.0
+    silent_after: float = 0.8
+    hang_after: float = 3.0
+    first_retry: float = 0.25
+    last_retry: float = 2.0
 
 
 class Arrival(NamedTuple):
@@ -31,7 +72,7 @@ class Arrival(NamedTuple):
 
     image, t : as from `FrameReader.read`; t grows strictly. seq : index among all frames of the source, those
     that nobody took included. connection : grows by one with each reconnection that delivered. captured :
-    `time.perf_counter` when it arrived, s.
+    monotonic time (`time.perf_counter`) when it arrived, s.
     """
 
     image: BgrImage
@@ -41,31 +82,30 @@ class Arrival(NamedTuple):
     captured: float
 
 
-@runtime_checkable
-class LiveReader(Protocol):
-    """A source whose frames are numbered where they arrive, and that tells how it is."""
+@dataclass(slots=True)
+class _Fault:
+    """since : on the clock, s. unix : the same as Unix time, s. attempts : to open the source again.
+
+    detail : the last error.
+    """
+
+    what: str
+    since: float
+    unix: float
+    detail: str = ""
+    attempts: int = 0
 
     @property
-    def state(self) -> str:
-        """`running`, `waiting since ...` or `reconnecting since ...`."""
-
-    @property
-    def missed(self) -> int:
-        """Good frames that a newer one replaced before they were read."""
-
-    @property
-    def reader(self) -> threading.Thread:
-        """The thread that frames arrive in; another one after a read that hung."""
-
-    def read_arrival(self) -> Arrival | None:
-        """Wait for the newest frame that was not read yet; None at the end and after `stop`."""
-
-    def stop(self) -> None:
-        """End a read that waits, at once. From any thread."""
+    def hour(self) -> str:
+        return time.strftime("%H:%M:%S", time.localtime(self.unix))
 
 
-class Watched:
-    """A live source that is watched, and opened anew when it fails.
+class _EndOfStreamError(Exception):
+    """The source says that there are no more frames."""
+
+
+class Watched(FrameReader):
+    """A live source that is watched, and opened again when it fails.
 
     The first opening happens here and must succeed: a wrong address is an error at once, not after a wait.
 
@@ -79,7 +119,8 @@ class Watched:
     Raises
     ------
     SourceError
-        If the source cannot be opened.
+        If the source cannot be opened. From `read` if there was no good frame for `no_frame_timeout`, or the
+        source failed and `reconnect` is False.
 
     Examples
     --------
@@ -94,66 +135,55 @@ class Watched:
     """
 
     live = True
-    total: int | None = None
 
     def __init__(
         self, opener: Callable[[], FrameReader], watch: Watch, name: str, clock: Clock = SYSTEM
     ) -> None:
+        super().__init__(name)
         self._opener = opener
         self._watch = watch
-        self._name = name
         self._clock = clock
         source = opener()
-        self.fps: float | None = source.fps
-        self.size: tuple[int, int] | None = source.size
-        self.description = source.description
+        self.fps, self.size, self.description = source.fps, source.size, source.description
         self.missed = 0
+        """Good frames that a newer one replaced before they were read."""
         self._changed = threading.Condition()
         self._stopped = threading.Event()
-        self._end: SourceError | bool = False
-        self._slot: Arrival | None = None
-        self._seq = -1
-        self._t = float("-inf")
-        self._connection = 0
-        self._health = Health(watch, name, source.fps, clock)
-        self._busy_since: float | None = None
-        self._opening = False
-        self._abandoned: list[threading.Thread] = []
-        self._generation = 0
+        self._end: Exception | None = None
+        self._newest: Arrival | None = None
+        self._seq, self._t, self._connection = -1, -math.inf, 0
+        self._fault: _Fault | None = None
+        self._interval = 1.0 / source.fps if source.fps else 0.0
+        self._arrived_at = self._good_at = self._steady_since = clock.now()
+        self._pictures = _PictureCheck(watch, clock.now())
+        self._failures, self._retry_at, self._hangs_at = 0, 0.0, math.inf
+        self._hung: list[threading.Thread] = []
         self.reader = self._start(source)
-
-    # -- the side that takes frames -----------------------------------------------------------------------
+        """The thread that frames arrive in; another one after a read that hung."""
 
     @property
     def state(self) -> str:
         """How the source is: `running`, `waiting since ...` or `reconnecting since ...`."""
-        return self._health.state
-
-    def read(self) -> tuple[BgrImage, float] | None:
-        """The newest frame that was not read yet, and its time; see `FrameReader.read`."""
-        arrival = self.read_arrival()
-        return None if arrival is None else (arrival.image, arrival.t)
+        fault = self._fault
+        if fault is None:
+            return "running"
+        attempts = f", attempt {fault.attempts}" if fault.attempts else ""
+        word = "reconnecting" if fault.attempts or fault.what == "gone" else "waiting"
+        return f"{word} since {fault.hour} ({fault.what}{attempts})"
 
     def read_arrival(self) -> Arrival | None:
-        """Wait for the newest frame that was not read yet; None at the end and after `stop`.
-
-        Raises
-        ------
-        SourceError
-            If there was no good frame for `no_frame_timeout`, or the source failed and is not to be opened
-            anew.
-        """
+        """Wait for the newest frame that was not read yet; None at the end and after `stop`."""
         with self._changed:
             while not self._stopped.is_set():
-                arrival, self._slot = self._slot, None
+                arrival, self._newest = self._newest, None
                 if arrival is not None:
                     return arrival
-                if isinstance(self._end, SourceError):
-                    raise self._end
-                if self._end:
+                if isinstance(self._end, _EndOfStreamError):
                     return None
-                self._look(self._clock.now())
-                if not self._end:
+                if self._end is not None:
+                    raise self._end
+                self._check_time(self._clock.now())
+                if self._end is None:
                     self._clock.wait(POLL_SECONDS, self._changed)
         return None
 
@@ -164,123 +194,219 @@ class Watched:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Let go of the source. A read that hangs is given a moment; it lets go when it ends."""
+        """Release the source. A read that hangs is given a moment; it releases it when it ends."""
+        super().close()
         self.stop()
         if self.reader is not threading.current_thread():
             self.reader.join(self._watch.hang_after)
 
-    def _look(self, now: float) -> None:
-        """Notice what no frame can tell: silence, the end of all patience, a read that hangs."""
-        watch, health = self._watch, self._health
-        health.look(now)
-        if (error := health.given_up(now)) is not None:
-            self._end = error
-            return
-        limit = OPENING_SECONDS if self._opening else max(watch.hang_after, HANG_INTERVALS * health.interval)
-        if watch.reconnect and self._busy_since is not None and now - self._busy_since >= limit:
-            self._abandoned = [thread for thread in self._abandoned if thread.is_alive()]
-            if len(self._abandoned) < MAX_ABANDONED:
-                self._abandoned.append(self.reader)
-                self._generation += 1
-                health.note("opening hangs" if self._opening else "reading hangs")
+    def _frames(self) -> Iterator[tuple[BgrImage, float]]:
+        while (arrival := self.read_arrival()) is not None:
+            yield arrival.image, arrival.t
+
+    # -- faults; whoever calls these holds the lock -------------------------------------------------------
+
+    def _check_time(self, now: float) -> None:
+        """Notice what no frame can show: a stall, the end of all patience, a read that hangs."""
+        watch = self._watch
+        usual = FIRST_FRAME_SECONDS if self._seq < 0 else watch.silent_after
+        if self._fault is None and now - self._arrived_at >= max(usual, SILENT_INTERVALS * self._interval):
+            self._report("no frames", self._arrived_at, now)
+        if watch.no_frame_timeout and now - self._good_at >= watch.no_frame_timeout:
+            self._end = self._timeout_error(now)
+        elif watch.reconnect and now >= self._hangs_at:
+            self._hung = [thread for thread in self._hung if thread.is_alive()]
+            if len(self._hung) < MAX_HUNG:
+                self._hung.append(self.reader)
+                self._note("it hangs")
                 self.reader = self._start(None)
+
+    def _timeout_error(self, now: float) -> SourceError:
+        fault = self._fault
+        last = f"; the last attempt of {fault.attempts}" if fault and fault.attempts else ""
+        detail = f"{last}: {fault.detail}" if fault and fault.detail else last
+        return SourceError(
+            f"{self.name}: {fault.what if fault else 'no frames'}, no good frame for "
+            f"{now - self._good_at:.1f} s{detail}; check its cable, power and light and what else may be "
+            "using it; no_frame_timeout says how long to wait (0: for ever)"
+        )
+
+    def _report(self, what: str, since: float, now: float, detail: str = "") -> None:
+        fault = self._fault = _Fault(what, since, self._clock.unix() - (now - since), detail)
+        if now - self._steady_since >= STEADY_SECONDS:
+            self._failures = 0
+        then = "" if not self._watch.reconnect else "; waiting" if what == "no frames" else "; reconnecting"
+        words = f"is {what}" if what == "gone" else what
+        reason = f": {detail}" if detail else ""
+        log.warning("%s: %s since %s (%.1f s)%s%s", self.name, words, fault.hour, now - since, reason, then)
+
+    def _recover(self, fault: _Fault, now: float) -> None:
+        self._fault, self._steady_since = None, now
+        tries = f" and {fault.attempts} attempt{'s'[: fault.attempts > 1]}" if fault.attempts else ""
+        log.warning("%s: is back after %.1f s%s (%s)", self.name, now - fault.since, tries, fault.what)
+
+    def _note(self, detail: str) -> None:
+        """Remember the last error for the message that may follow."""
+        if self._fault is not None:
+            self._fault.detail = detail
+
+    def _back_off(self) -> None:
+        delay = min(self._watch.first_retry * 2.0 ** min(self._failures, 30), self._watch.last_retry)
+        self._failures += 1
+        self._retry_at = self._clock.now() + delay
 
     # -- the thread that reads ----------------------------------------------------------------------------
 
     def _start(self, source: FrameReader | None) -> threading.Thread:
-        self._busy_since, self._opening = self._clock.now(), False
-        name = f"tactflow-read-{self._name}"
-        thread = threading.Thread(target=self._work, args=(self._generation, source), name=name, daemon=True)
+        name = f"tactflow-read-{self.name}"
+        thread = self.reader = threading.Thread(target=self._work, args=(source,), name=name, daemon=True)
         thread.start()
         return thread
 
-    def _work(self, generation: int, source: FrameReader | None) -> None:
-        try:
-            while self._enter(generation, opening=False):
-                if source is None:
-                    source = self._connect(generation)
-                elif self._step(generation, source):
-                    source.close()
-                    source = None
-        finally:
-            if source is not None:
-                source.close()
+    def _work(self, source: FrameReader | None) -> None:
+        """Read the source until it fails, and open it again, for as long as this thread is the reader."""
+        while source is not None or (source := self._reconnect()) is not None:
+            try:
+                with closing(source):
+                    self._read_until_fault(source)
+            except Exception as error:
+                self._fail(error)
+            source = None
 
-    def _enter(self, generation: int, *, opening: bool) -> bool:
-        """Say what is done next; False if this thread is not wanted any more."""
-        with self._changed:
-            if generation != self._generation or self._stopped.is_set() or self._end:
-                return False
-            self._busy_since, self._opening = self._clock.now(), opening
-            return True
-
-    def _connect(self, generation: int) -> FrameReader | None:
-        """One attempt, when its time has come."""
-        with self._changed:
-            if generation != self._generation:
-                return None
-            self._busy_since = None
-            wait = self._health.retry_at - self._clock.now()
-        if self._clock.sleep(wait, self._stopped) or not self._enter(generation, opening=True):
-            return None
-        try:
-            source = self._opener()
-        except Exception as error:
-            self._missed_attempt(generation, self._words(error))
-            return None
-        if self.size and source.size and source.size != self.size:
-            source.close()
-            came, was = ("{} x {}".format(*size) for size in (source.size, self.size))
-            self._missed_attempt(generation, f"it came back with {came} pixels instead of {was}")
-            return None
-        self._missed_attempt(generation, "it was opened, but gave no good frame")
-        with self._changed:
-            self._connection += generation == self._generation
-        return source
-
-    def _missed_attempt(self, generation: int, why: str) -> None:
-        with self._changed:
-            if generation == self._generation:
-                self._health.missed_attempt(why, self._clock.now())
-
-    def _step(self, generation: int, source: FrameReader) -> bool:
-        """Read one frame; True if the source is to be opened anew."""
-        why = "it ended"
-        ended: SourceError | bool = True
-        try:
+    def _read_until_fault(self, source: FrameReader) -> None:
+        """Read until a picture is faulty, or this thread is no longer the reader."""
+        while self._enter(self._watch.hang_after + SILENT_INTERVALS * self._interval):
             item = source.read()
-        except Exception as error:
-            item, why = None, self._words(error)
-            ended = error if isinstance(error, SourceError) else SourceError(f"{self._name}: {why}")
+            if item is None:
+                raise _EndOfStreamError("it ended")
+            if self._take(*item):
+                return
+
+    def _reconnect(self) -> FrameReader | None:
+        """Try to open the source until it works, with back-off; None if stopped meanwhile."""
+        while self._enter(math.inf):
+            if self._clock.sleep(self._retry_at - self._clock.now(), self._stopped):
+                return None
+            if not self._enter(OPEN_TIMEOUT):
+                return None
+            source, detail = None, "it was opened, but gave no good frame"
+            try:
+                source = self._opener()
+            except Exception as error:
+                detail = self._text(error)
+            if source is not None and self.size and source.size and source.size != self.size:
+                came, was = ("{} x {}".format(*size) for size in (source.size, self.size))
+                detail = f"it came back with {came} pixels instead of {was}"
+                source.close()
+                source = None
+            with self._changed:
+                if self._is_reader():
+                    self._note(detail)
+                    if self._fault is not None:
+                        self._fault.attempts += 1
+                    self._connection += source is not None
+                    self._back_off()
+            if source is not None:
+                return source
+        return None
+
+    def _is_reader(self) -> bool:
+        return self.reader is threading.current_thread() and not self._stopped.is_set() and not self._end
+
+    def _enter(self, limit: float) -> bool:
+        """Begin something that hangs if it takes longer than `limit`, s; False if this thread is to end."""
+        with self._changed:
+            if self._is_reader():
+                self._hangs_at = self._clock.now() + limit
+                return True
+            return False
+
+    def _take(self, image: BgrImage, t: float) -> bool:
+        """A frame has arrived; True if the source is to be opened again."""
         now = self._clock.now()
         with self._changed:
-            if generation != self._generation or self._stopped.is_set():
+            if not self._is_reader():
                 return True
-            if item is not None:
-                again = self._take(*item, now)
-                self._changed.notify_all()
-                return again
-            if self._watch.reconnect:
-                self._health.ended(why, now)
-            else:
-                if ended is True:
-                    log.warning("%s: the stream ended after %d frames", self._name, self._seq + 1)
-                self._end = ended
-            self._changed.notify_all()
-            return True
-
-    def _take(self, image: BgrImage, t: float, now: float) -> bool:
-        """A frame has arrived; True if it is faulty and the source is to be opened anew."""
-        self._seq += 1
-        if self.size is None:
-            self.size = (image.shape[1], image.shape[0])
-        verdict = self._health.frame(image, now)
-        if verdict is Verdict.GOOD:
+            gap, self._arrived_at = now - self._arrived_at, now
+            self._seq += 1
+            if self._seq and not (self._fault and self._fault.attempts):
+                self._interval = max(gap, INTERVAL_DECAY * self._interval)
+            self.size = self.size or (image.shape[1], image.shape[0])
+            problem = self._pictures.check(image, now)
+            if problem is not None:
+                what, since, reportable = problem
+                if self._fault is None and reportable:
+                    self._report(what, since, now)
+                    self._retry_at = now
+                return self._fault is not None and self._watch.reconnect and now >= self._retry_at
+            if self._fault is not None:
+                self._recover(self._fault, now)
+            self._good_at = now
             self._t = max(t, float(np.nextafter(self._t, np.inf)))
-            self.missed += self._slot is not None
-            self._slot = Arrival(image, self._t, self._seq, self._connection, now)
-        return verdict is Verdict.REOPEN
+            self.missed += self._newest is not None
+            self._newest = Arrival(image, self._t, self._seq, self._connection, now)
+            self._changed.notify_all()
+            return False
 
-    def _words(self, error: Exception) -> str:
-        text = str(error).removeprefix(f"{self._name}: ")
-        return text if isinstance(error, SourceError) else f"{type(error).__name__}: {text}"
+    def _fail(self, error: Exception) -> None:
+        """Reading failed, or said that it is the end."""
+        now = self._clock.now()
+        with self._changed:
+            if not self._is_reader():
+                return
+            if self._watch.reconnect and self._fault is None:
+                self._report("gone", self._arrived_at, now, self._text(error))
+                self._back_off()
+            elif self._watch.reconnect:
+                self._note(self._text(error))
+            else:
+                if isinstance(error, _EndOfStreamError):
+                    log.warning("%s: the stream ended after %d frames", self.name, self._seq + 1)
+                elif not isinstance(error, SourceError):
+                    error = SourceError(f"{self.name}: {self._text(error)}")
+                self._end = error
+            self._changed.notify_all()
+
+    def _text(self, error: Exception) -> str:
+        text = str(error).removeprefix(f"{self.name}: ")
+        known = isinstance(error, SourceError | _EndOfStreamError)
+        return text if known else f"{type(error).__name__}: {text}"
+
+
+class _PictureCheck:
+    """Detects black and frozen pictures.
+
+    watch : after how long they are a fault. now : on the clock of `check`, s.
+    """
+
+    def __init__(self, watch: Watch, now: float) -> None:
+        self._watch = watch
+        self._previous: BgrImage | None = None
+        self._lit = False
+        self._lit_at = self._changed_at = now
+
+    def check(self, image: BgrImage, now: float) -> tuple[str, float, bool] | None:
+        """What is wrong with a picture, since when (s), and whether that has lasted long enough to report it.
+
+        Before anything was seen, black is no picture of the gel: it must not become the reference.
+        """
+        watch = self._watch
+        if watch.black_after is not None:
+            if float(image[::BLACK_STEP, ::BLACK_STEP].mean()) > BLACK_LEVEL:
+                self._lit_at, self._lit = now, True
+            lasts = now - self._lit_at >= watch.black_after
+            if self._lit_at != now and (lasts or not self._lit):
+                return "black pictures", self._lit_at, lasts
+        if watch.frozen_after is not None:
+            if self._previous is None or not _is_equal(image, self._previous):
+                self._previous, self._changed_at = image, now
+            elif now - self._changed_at >= watch.frozen_after:
+                return "a frozen picture", self._changed_at, True
+        return None
+
+
+def _is_equal(a: BgrImage, b: BgrImage) -> bool:
+    """Whether two pictures are identical; noise is found in the first few rows compared."""
+    return (
+        a.shape == b.shape and np.array_equal(a[::COMPARED_STEP], b[::COMPARED_STEP]) and np.array_equal(a, b)
+    )

@@ -1,0 +1,120 @@
+"""Paths of sources, and settings behind them: `bag.mcap?topic=/camera/image`."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from urllib.parse import parse_qsl
+
+from tactflow.engine.errors import SourceError
+from tactflow.system.files import expanded, is_device
+
+
+def exists(spec: str, directory: Path | None) -> bool:
+    """Whether a file or folder has this name, here or in `directory`."""
+    return any((base / expanded(spec)).exists() for base in (Path(), directory or Path()))
+
+
+def split_prefix(spec: str, directory: Path | None) -> tuple[str, str]:
+    """The word and colon in front of a path, or "", and the path.
+
+    >>> split_prefix("lerobot:datasets/press", None), split_prefix("press.avi", None)
+    (('lerobot:', 'datasets/press'), ('', 'press.avi'))
+    """
+    prefix, colon, path = spec.partition(":")
+    # A single letter is a drive of Windows.
+    if len(prefix) < 2 or not colon or not prefix.isidentifier() or exists(spec.partition("?")[0], directory):
+        return "", spec
+    return prefix + colon, path
+
+
+def find_path(spec: str, directory: Path | None) -> Path:
+    """Where a path of a command line or a pipeline file points to.
+
+    Parameters
+    ----------
+    spec : absolute, or relative to the current directory or else to `directory`; `~` is expanded.
+    directory : the pipeline file's folder, or None.
+
+    Raises
+    ------
+    SourceError
+        If nothing is there; suggests files with similar names. If it is a pipe or a device: opening one may
+        block for ever, and no signal ends that.
+    """
+    path = expanded(spec)
+    candidates = [path]
+    if directory is not None and not path.is_absolute():
+        candidates.append(directory / path)
+    for candidate in candidates:
+        if candidate.exists():
+            if is_device(str(candidate)):
+                raise SourceError(f"{spec}: is a pipe or a device, not a file")
+            return candidate
+    raise SourceError(f"{spec}: no such file or folder{_suggestion(candidates)}")
+
+
+def _suggestion(candidates: list[Path]) -> str:
+    for path in candidates:
+        folder, wanted = path.parent, path.name
+        # Climb to the first folder that exists, so that a typo in the middle of a path is found too.
+        while not folder.is_dir() and folder.parent != folder:
+            folder, wanted = folder.parent, folder.name
+        try:
+            names = sorted(entry.name for entry in folder.iterdir())
+        except OSError:
+            continue
+        close = difflib.get_close_matches(wanted, names, n=3, cutoff=0.6)
+        if close:
+            return "; did you mean " + " or ".join(str(folder / name) for name in close) + "?"
+    return f" (looked in {', '.join(dict.fromkeys(str(path.parent.absolute()) for path in candidates))})"
+
+
+def refuse_devices(path: Path) -> None:
+    """Refuse a pipe or a device, also through a link, and a folder with one inside: reading it may never end.
+
+    Raises
+    ------
+    SourceError
+        If there is one.
+    """
+    inside = [Path(place, name) for place, _, names in os.walk(path) for name in names]
+    for file in inside or [path]:
+        if is_device(str(file)):
+            raise SourceError(f"{file}: is a pipe or a device, not a file")
+
+
+def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """The path and the settings of a source.
+
+    Parameters
+    ----------
+    spec : `path`, or `path?name=value&name=value`; `%26` stands for &. A file that has a ? in its name takes
+        precedence.
+    directory : where a relative path is looked for if it is not in the current directory.
+    known : name -> what it is, for messages.
+
+    Raises
+    ------
+    SourceError
+        If a setting is unknown, empty or given twice.
+
+    >>> split_query("bag.mcap?topic=/gel/image", None, {"topic": "name of a topic"})
+    ('bag.mcap', {'topic': '/gel/image'})
+    """
+    name, mark, query = spec.partition("?")
+    if not mark or exists(spec, directory):
+        return spec, {}
+    settings: dict[str, str] = {}
+    for key, value in parse_qsl(query.replace("+", "%2B"), keep_blank_values=True):
+        if key not in known or key in settings or not value:
+            raise SourceError(f"{spec}: {key}={value}: required {describe_settings(known)}")
+        settings[key] = value
+    return name, settings
+
+
+def describe_settings(known: Mapping[str, str]) -> str:
+    """The settings that there are, as `name=what it is`."""
+    return ", ".join(f"{setting}={meaning}" for setting, meaning in known.items())
