@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.adapters.tables import frame_columns
 from tactflow.drawing.results import Annotator
+from tactflow.message.columns import frame_columns
 from tactflow.message.result import Result
 from tactflow.streaming import stream
 from tactflow.vision.types import Contact

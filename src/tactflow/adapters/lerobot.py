@@ -70,7 +70,7 @@ def export(
 
     Parameters
     ----------
-    folder : empty.
+    folder : empty, or not there.
     episodes : the name of each recording, and its results with pictures.
     fps : of the dataset, frames per second.
     task : what is done, in words.
