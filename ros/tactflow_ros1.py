@@ -4,7 +4,7 @@
     python3 tactflow_ros1.py _endpoint:=tcp://127.0.0.1:5556 _sensor:=main _frame_id:=tactile_optical_frame
 
 Needs rospy, std_msgs, geometry_msgs and pyzmq. Topics, units and stamps are those of the ROS 2 bridge
-(docs/ros.md), as far as they are here: touching, contact, contact_pose, flow, and the same with _pixels.
+(docs/robots.md), as far as they are here: touching, contact, contact_pose, flow, and the same with _pixels.
 """
 
 import json

@@ -27,7 +27,7 @@ from tactflow.engine.graph import Pipeline
 from tactflow.vision.types import Markers, MarkerStatus
 
 CONTACT_FORCE = 0.75
-"""Grip force from which on there is contact, N; docs/contact-limits.md shows what depends on it."""
+"""Grip force from which on there is contact, N."""
 
 WEDGE_DOTS = 140
 """Dots printed on the Wedge's gel: 10 x 14."""

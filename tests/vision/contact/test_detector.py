@@ -604,5 +604,5 @@ def test_real_grasps_agree_with_the_force_of_the_grip(shared_data: Path) -> None
         assert not found[-1]
         right += sum(seen == (newton >= 0.75) for seen, newton in zip(found, force, strict=True))
         frames += len(force)
-    # Measured 94.1 %: docs/contact-limits.md says which 19 frames are missing, and why.
+    # Measured 94.1 %.
     assert right / frames > 0.93

@@ -12,10 +12,10 @@ from tactflow.vision.compiled import helper, kernel
 
 _LINES = 40
 """Lines of the frame that are read, about. Each costs a trip to memory: reading all of these takes 0.4 of the
-time of copying the frame, and their sums as much again (docs/skipping.md)."""
+time of copying the frame, and their sums as much again."""
 _COARSE = 4
 """One in so many of these lines is read first; a contact that moves mostly shows in them, for 0.1 of the
-time of copying the frame (docs/skipping.md)."""
+time of copying the frame."""
 _EDGES = 24
 """Samples of a tile on its steepest edges, 1. Chosen by hand."""
 _SMOOTHING = 5

@@ -65,7 +65,7 @@ FORGET_WIDE: Final = 0.98
 """The same for wide, faint changes, which a gel that creeps back shows longest. Chosen by hand."""
 WIDE: Final = 0.01
 """Part of the picture that a wide change covers at least: more than the noise of compression, which comes in
-blocks of 16 px of the camera (docs/contact-limits.md: 4 cells without contact where 48 would be contact)."""
+blocks of 16 px of the camera (4 cells without contact where 48 would be contact)."""
 CLUSTER: Final = 0.7
 """Cells by which a wide change must be larger for each factor of e in the rate of false alarms: measured on
 white noise, smoothed as the cells are."""
