@@ -17,6 +17,7 @@ from tests.clock import PATIENCE
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 README = (REPOSITORY / "README.md").read_text()
+STAGES = (REPOSITORY / "docs" / "pipeline-file.md").read_text()
 
 
 def block(first_line: str) -> str:
@@ -58,10 +59,11 @@ def test_the_notebook_example_finds_the_dots(tmp_path: Path) -> None:
     assert done.stdout.startswith("80 dots of radius"), done.stderr
 
 
-def test_every_command_and_stage_that_the_readme_names_is_there(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_and_stage_that_the_pages_name_is_there(capsys: pytest.CaptureFixture[str]) -> None:
     for command in set(re.findall(r"`tactflow (\w+)", README)):
         assert main([command, "--help"]) == 0, command
-    stages = set(re.findall(r"^\| `(\w+)` \|.*\|.*\|$", README, re.M))
+    table = STAGES.split("## The stages")[1].split("Sinks:")[0]
+    stages = set(re.findall(r"^\| `(\w+)` \|.*\|.*\|$", table, re.M))
     capsys.readouterr()
     assert main(["stages"]) == 0
     listed = capsys.readouterr().out
