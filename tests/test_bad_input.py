@@ -1,4 +1,4 @@
-"""Recordings of others, tables and datasets when something is wrong: the rows of docs/bad-input.md."""
+"""Recordings of others, tables and datasets when something is wrong: the message says what to do."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -21,25 +20,10 @@ from tactflow.cli.main import main
 from tests.adapters.bags import TOPIC, write_bag
 from tests.adapters.test_bags import pictures
 from tests.adapters.test_datasets import KEY, write_hdf5, write_lerobot, write_zarr
-from tests.conftest import REPOSITORY
 from tests.faults.rig import array, run
+from tests.sources.flaky import Flaky
 
-PAGE = (REPOSITORY / "docs" / "bad-input.md").read_text()
 IMAGES = np.stack(pictures(5))
-
-
-class Row(NamedTuple):
-    """What is tried, what is wrong with it, the exit code, and words of what is said.
-
-    make : prepares it in an empty folder, and gives the source. without : a package that is missing.
-    """
-
-    part: str
-    wrong: str
-    exit: int
-    said: str
-    make: Callable[[Path], str]
-    without: str = ""
 
 
 def bag(folder: Path, kind: str = "sqlite3", encoding: str = "bgr8") -> Path:
@@ -105,159 +89,109 @@ def without_info(folder: Path) -> Path:
 
 
 ROSBAGS = "need rosbags: pip install 'tactflow[bags]'"
-ROWS = [
-    Row(
-        "rosbag2, `.mcap`, `.bag`",
-        "no `?topic=`",
-        4,
-        "add ?topic= one of: /gel/image (",
-        lambda f: str(bag(f)),
-    ),
-    Row("", "no such topic", 4, "there is no topic /x; required one of:", lambda f: topic(bag(f), "/x")),
-    Row("", "a topic without pictures", 4, "which hold no picture", lambda f: topic(bag(f), "/chatter")),
-    Row(
-        "",
+SOURCES: list[tuple[str, Callable[[Path], str], int, str]] = [
+    ("a bag without ?topic=", lambda f: str(bag(f)), 4, "add ?topic= one of: /gel/image ("),
+    ("no such topic", lambda f: topic(bag(f), "/x"), 4, "there is no topic /x; required one of:"),
+    ("a topic without pictures", lambda f: topic(bag(f), "/chatter"), 4, "which hold no picture"),
+    (
         "unknown encoding",
+        lambda f: topic(overwritten(one_file(f, "mcap"), b"\x05\0\0\0bgr8\0", b"\x05\0\0\0xyz8\0")),
         4,
         "pictures are encoded as 'xyz8'; required one of: bgr8",
-        lambda f: topic(overwritten(one_file(f, "mcap"), b"\x05\0\0\0bgr8\0", b"\x05\0\0\0xyz8\0")),
     ),
-    Row(
-        "",
+    (
         "fewer bytes than the picture needs",
+        lambda f: topic(overwritten(one_file(f, "mcap"), b"\x05\0\0\0bgr8\0", b"\x05\0\0\08UC4\0")),
         4,
         "need rows of 64 bytes; got 576 bytes in rows of 48",
-        lambda f: topic(overwritten(one_file(f, "mcap"), b"\x05\0\0\0bgr8\0", b"\x05\0\0\08UC4\0")),
     ),
-    Row("`.mcap`", "cut off", 0, "", lambda f: topic(cut(one_file(f, "mcap"), 0.8))),
-    Row(
-        "",
-        "not one",
+    ("an MCAP file that was cut off", lambda f: topic(cut(one_file(f, "mcap"), 0.8)), 0, ""),
+    (
+        "a file that is not MCAP",
+        lambda f: topic(overwritten(one_file(f, "mcap"), b"MCAP", b"ABCD")),
         4,
         "is not an MCAP file",
-        lambda f: topic(overwritten(one_file(f, "mcap"), b"MCAP", b"ABCD")),
     ),
-    Row(
-        "",
-        "of another program, no `?topic=`",
+    (
+        "an MCAP file of another program without ?topic=",
+        lambda f: str(one_file(f, "mcap")),
         4,
         "no frames that tactflow recorded; to play one of its topics, add",
-        lambda f: str(one_file(f, "mcap")),
     ),
-    Row(
-        "rosbag2 (sqlite3)",
-        "cut off",
-        4,
-        "is damaged or cut off",
-        lambda f: topic(cut(one_file(f, "sqlite3"))),
-    ),
-    Row("`.bag`", "cut off", 4, "is damaged or cut off", lambda f: topic(cut(bag(f, "ros1")))),
-    Row("all of these", "rosbags is missing", 4, ROSBAGS, lambda f: topic(bag(f)), "rosbags"),
-    Row(
-        "`.h5`, `.zarr`",
-        "no `?dataset=`",
+    ("a rosbag2 that was cut off", lambda f: topic(cut(one_file(f, "sqlite3"))), 4, "is damaged or cut off"),
+    ("a ROS 1 bag that was cut off", lambda f: topic(cut(bag(f, "ros1"))), 4, "is damaged or cut off"),
+    (
+        "HDF5 without ?dataset=",
+        lambda f: str(hdf5(f)),
         4,
         "add ?dataset= one of: /gel/force (float64 5 x 3), /gel/frames",
-        lambda f: str(hdf5(f)),
     ),
-    Row(
-        "",
-        "no such array",
-        4,
-        "there is no /x; required one of: /gel/frames",
-        lambda f: f"{zarr(f)}?dataset=/x",
-    ),
-    Row(
-        "",
-        "no frames",
+    ("no such array", lambda f: f"{zarr(f)}?dataset=/x", 4, "there is no /x; required one of: /gel/frames"),
+    (
+        "an array without frames",
+        lambda f: f"{hdf5(f)}?dataset=/gel/force",
         4,
         "required uint8 or uint16 of N x H x W x 3",
-        lambda f: f"{hdf5(f)}?dataset=/gel/force",
     ),
-    Row("`.h5`", "cut off", 4, "is damaged or cut off", lambda f: f"{cut(hdf5(f))}?dataset=/gel/frames"),
-    Row(
-        "",
-        "h5py is missing",
-        4,
-        "need h5py: pip install 'tactflow[hdf5]'",
-        lambda f: f"{hdf5(f)}?dataset=/x",
-        "h5py",
-    ),
-    Row(
-        "`.zarr`",
-        "a chunk is damaged",
+    ("HDF5 that was cut off", lambda f: f"{cut(hdf5(f))}?dataset=/gel/frames", 4, "is damaged or cut off"),
+    (
+        "a damaged chunk",
+        lambda f: f"{damaged_zarr(f)}?dataset=/gel/frames",
         4,
         "is damaged or cut off",
-        lambda f: f"{damaged_zarr(f)}?dataset=/gel/frames",
     ),
-    Row(
-        "",
-        "zarr is missing",
-        4,
-        "need zarr: pip install 'tactflow[zarr]'",
-        lambda f: f"{zarr(f)}?dataset=/x",
-        "zarr",
-    ),
-    Row(
-        "`lerobot:`",
-        "no camera or episode",
+    (
+        "LeRobot without camera and episode",
+        lambda f: f"lerobot:{lerobot(f)}",
         4,
         f"cameras: {KEY}; episodes: 0 to 1",
-        lambda f: f"lerobot:{lerobot(f)}",
     ),
-    Row(
-        "",
-        "not a dataset",
-        4,
-        "this LeRobot dataset: cannot be read",
-        lambda f: episode(without_info(f)),
-    ),
-    Row("", "a video that was cut off", 4, "is damaged or cut off", lambda f: episode(cut_film(f))),
-    Row(
-        "",
-        "pyarrow is missing",
-        4,
-        "need pyarrow: pip install 'tactflow[lerobot]'",
-        lambda f: episode(lerobot(f)),
-        "pyarrow",
-    ),
+    ("not a dataset", lambda f: episode(without_info(f)), 4, "this LeRobot dataset: is damaged or cut off"),
+    ("a video that was cut off", lambda f: episode(cut_film(f)), 4, "is damaged or cut off"),
 ]
-"""An empty part is that of the row above."""
+"""What is wrong, the source, the exit code, and words of what is said."""
+
+MISSING: list[tuple[str, Callable[[Path], str], str]] = [
+    ("rosbags", lambda f: topic(bag(f)), "need rosbags: pip install 'tactflow[bags]'"),
+    ("h5py", lambda f: f"{hdf5(f)}?dataset=/x", "need h5py: pip install 'tactflow[hdf5]'"),
+    ("zarr", lambda f: f"{zarr(f)}?dataset=/x", "need zarr: pip install 'tactflow[zarr]'"),
+    ("pyarrow", lambda f: episode(lerobot(f)), "need pyarrow: pip install 'tactflow[lerobot]'"),
+]
+"""A package, a source that needs it, and what is said without it."""
 
 
-def line(row: Row | tuple[str, str, int, str]) -> str:
-    """A row of the page."""
-    part, wrong, code, said = row[:4]
-    return f"| {part} | {wrong} | {code} | {said or 'it is played up to there'} |"
-
-
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.part}: {row.wrong}")
+@pytest.mark.parametrize(("wrong", "make", "code", "said"), SOURCES, ids=[row[0] for row in SOURCES])
 def test_a_bad_source_ends_the_run_and_says_what_to_do(
-    row: Row, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wrong: str, make: Callable[[Path], str], code: int, said: str, tmp_path: Path
 ) -> None:
-    assert line(row) in PAGE
-    source = row.make(tmp_path)
-    if row.without:
-        monkeypatch.setitem(sys.modules, row.without, None)
+    _, seen = run(tmp_path, {}, source=make(tmp_path))
+    assert seen.exit == code, (wrong, seen.said)
+    assert said in seen.said
+    assert said or seen.said == ""
+
+
+@pytest.mark.parametrize(("package", "make", "said"), MISSING, ids=[row[0] for row in MISSING])
+def test_a_source_without_its_package_says_what_to_install(
+    package: str, make: Callable[[Path], str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = make(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
     _, seen = run(tmp_path, {}, source=source)
-    assert seen.exit == row.exit, seen.said
-    assert row.said in seen.said
-    assert row.said or seen.said == ""
+    assert seen.exit == 4
+    assert said in seen.said
 
 
-SINKS = [
-    ("sink `parquet`", "tables are there", 3, "holds tables already; set overwrite: true"),
-    ("", "a file in its place", 3, "out is a file, not a folder"),
-    ("", "pyarrow is missing", 3, "need pyarrow: pip install 'tactflow[parquet]'"),
-]
-
-
-@pytest.mark.parametrize("row", SINKS, ids=lambda row: row[1])
-def test_a_sink_that_cannot_write_ends_the_run_and_says_what_to_do(
-    row: tuple[str, str, int, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("tables are there", "holds tables already; set overwrite: true"),
+        ("a file in its place", "out is a file, not a folder"),
+        ("pyarrow is missing", "need pyarrow: pip install 'tactflow[parquet]'"),
+    ],
+)
+def test_tables_that_cannot_be_written_end_the_run(
+    wrong: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert line(row) in PAGE
-    _, wrong, code, said = row
     out = tmp_path / "out"
     if "there" in wrong:
         (out / "frames").mkdir(parents=True)
@@ -267,44 +201,36 @@ def test_a_sink_that_cannot_write_ends_the_run_and_says_what_to_do(
     else:
         monkeypatch.setitem(sys.modules, "pyarrow", None)
     _, seen = run(tmp_path, {"parquet": {"path": str(out)}}, source=str(array(tmp_path, 12)))
-    assert seen.exit == code, seen.said
+    assert seen.exit == 3
     assert said in seen.said
 
 
-EXPORTS = [
-    ("`tactflow export`", "the folder is there", 2, "is already there; give another folder", ""),
-    ("", "no rate is known", 2, "does not say how many frames come in a second; give --fps", ""),
-    ("", "a camera", 2, "required a recording, not a camera or a stream", ""),
-    ("", "av is missing", 3, "need av: pip install 'tactflow[lerobot]'", "av"),
-]
-
-
-def test_an_export_that_cannot_be_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("wrong", "code", "said"),
+    [
+        ("the folder is there", 2, "is already there; give another folder"),
+        ("no rate is known", 2, "does not say how many frames come in a second; give --fps"),
+        ("a camera", 2, "required a recording, not a camera or a stream"),
+        ("av is missing", 3, "need av: pip install 'tactflow[lerobot]'"),
+    ],
+)
+def test_an_export_that_is_impossible_says_what_to_do(
+    wrong: str,
+    code: int,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "there").mkdir()
-    source = str(array(tmp_path, 3))
-    unrated = topic(write_bag(tmp_path / "press", list(IMAGES), "mcap"))
-    live = "udp://127.0.0.1:9"
-    monkeypatch.setattr("tactflow.sources.open_source", _live(live))
-    tried = ((source, "there"), (unrated, "new"), (live, "new"), (source, "new"))
-    for row, (recording, out) in zip(EXPORTS, tried, strict=True):
-        assert line(row[:4]) in PAGE
-        if row[4]:
-            monkeypatch.setitem(sys.modules, row[4], None)
-        code = main(["export", "lerobot", recording, "--out", str(tmp_path / out)])
-        assert (code, row[3] in capsys.readouterr().err) == (row[2], True)
-        assert not (tmp_path / "new").exists()
-
-
-def _live(spec: str) -> Callable[..., object]:
-    """Opens what `open_source` opens, but this one as a live source, which nobody has to serve."""
-    from tactflow.sources import open_source
-    from tests.sources.flaky import Flaky
-
-    return lambda name, **options: Flaky().open() if name == spec else open_source(name, **options)
-
-
-def test_the_page_has_no_other_row() -> None:
-    rows = len(ROWS) + len(SINKS) + len(EXPORTS)
-    assert PAGE.count("\n| ") == rows + 2
+    recording, out = str(array(tmp_path, 3)), tmp_path / "new"
+    if wrong == "the folder is there":
+        out.mkdir()
+    elif wrong == "no rate is known":
+        recording = topic(write_bag(tmp_path / "press", list(IMAGES), "mcap"))
+    elif wrong == "a camera":
+        monkeypatch.setattr("tactflow.sources.open_source", lambda _: Flaky().open())
+    else:
+        monkeypatch.setitem(sys.modules, "av", None)
+    assert main(["export", "lerobot", recording, "--out", str(out)]) == code
+    assert said in capsys.readouterr().err
+    assert out.exists() == (wrong == "the folder is there")
