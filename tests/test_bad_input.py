@@ -146,7 +146,7 @@ SOURCES: list[tuple[str, Callable[[Path], str], int, str]] = [
         4,
         f"cameras: {KEY}; episodes: 0 to 1",
     ),
-    ("not a dataset", lambda f: episode(without_info(f)), 4, "this LeRobot dataset: is damaged or cut off"),
+    ("not a dataset", lambda f: episode(without_info(f)), 4, "this LeRobot dataset: cannot be read"),
     ("a video that was cut off", lambda f: episode(cut_film(f)), 4, "is damaged or cut off"),
 ]
 """What is wrong, the source, the exit code, and words of what is said."""
