@@ -7,6 +7,7 @@ import pytest
 from pydantic import Field
 
 from tactflow.bench.methods import alternatives, measure_methods, methods_of
+from tactflow.bench.pipelines import Bench
 from tactflow.bench.results import BenchResult
 from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, Rendered
 from tactflow.bench.timing import CopyUnit
@@ -78,7 +79,7 @@ def test_a_tracker_of_ones_own_is_measured_whichever_ports_it_takes_and_a_broken
         use = f"stages.tracker={{use: {tmp_path / 'own.py'}:{name}}}"
         measured[name] = load_pipeline(find_pipeline("default"), overrides=[use])
     result = BenchResult(quick=True)
-    measure_methods(result, measured, Rendered(Case("press", 3), tmp_path), CopyUnit(), lambda _: None)
+    measure_methods(Bench(result, CopyUnit(), tmp_path), measured, Rendered(Case("press", 3), tmp_path))
     found = {m.method: m.errors for m in result.measurements("tracker")}
     assert found.keys() == {"default", "Own"}
     assert found["Own"]["displacement_rms"] >= 0

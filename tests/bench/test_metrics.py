@@ -14,8 +14,7 @@ ALL = np.ones(len(GRID), dtype=bool)
 
 def test_the_pitch_of_a_square_grid_is_its_spacing_and_one_point_has_none() -> None:
     assert metrics.dot_pitch(GRID) == 20
-    with pytest.raises(ValueError, match="at least 2 points"):
-        metrics.dot_pitch(GRID[:1])
+    assert metrics.dot_pitch(GRID[:1]) == np.inf
 
 
 def wrong(position: np.ndarray) -> list[int]:
@@ -43,22 +42,20 @@ def test_no_markers_give_no_identity_errors() -> None:
 
 def test_detection_counts_a_point_between_two_dots_once() -> None:
     points = np.array([(10.0, 1.0)])
-    found = metrics.detection(points, np.array([(0.0, 0.0), (20.0, 0.0)]), radius=15)
-    assert found.recall == 0.5
-    assert found.precision == 1
+    recall, precision, _ = metrics.detection(points, np.array([(0.0, 0.0), (20.0, 0.0)]), radius=15)
+    assert (recall, precision) == (0.5, 1)
 
 
 def test_detection_counts_spurious_and_missing_points() -> None:
     points = np.vstack([GRID[:20] + np.array((0.3, 0.4)), [(500.0, 500.0)] * 5])
-    found = metrics.detection(points, GRID, radius=10)
-    assert found.recall == pytest.approx(20 / 25)
-    assert found.precision == pytest.approx(20 / 25)
-    assert found.errors == pytest.approx(np.full(20, 0.5))
+    recall, precision, errors = metrics.detection(points, GRID, radius=10)
+    assert (recall, precision) == pytest.approx((20 / 25, 20 / 25))
+    assert errors == pytest.approx(np.full(20, 0.5))
 
 
 def test_detection_of_nothing_where_nothing_is_is_perfect() -> None:
-    found = metrics.detection(np.zeros((0, 2)), np.zeros((0, 2)), radius=10)
-    assert (found.recall, found.precision, found.errors.size) == (1, 1, 0)
+    recall, precision, errors = metrics.detection(np.zeros((0, 2)), np.zeros((0, 2)), radius=10)
+    assert (recall, precision, errors.size) == (1, 1, 0)
 
 
 def test_iou_of_two_squares_that_share_a_quarter() -> None:
@@ -107,11 +104,6 @@ def test_iou_of_polygons_agrees_with_counting_pixels(
     assert metrics.convex_iou(a, b) == pytest.approx(counted, abs=0.06)
 
 
-def test_masks_of_different_shape_are_refused() -> None:
-    with pytest.raises(ValueError, match="one shape"):
-        metrics.mask_iou(np.zeros((2, 2)), np.zeros((2, 3)))
-
-
 def test_empty_masks_are_equal() -> None:
     assert metrics.mask_iou(np.zeros((2, 2)), np.zeros((2, 2))) == 1
 
@@ -130,7 +122,6 @@ def test_psnr_of_a_constant_offset() -> None:
     assert metrics.masked_mae(image, image + 5, mask) == 5
     assert metrics.masked_psnr(image, image + 5, mask) == pytest.approx(20 * np.log10(255 / 5))
     assert metrics.masked_psnr(image, image, mask) == 100
-    assert metrics.masked_mae(image, image, mask * 0) is None
 
 
 def test_two_markers_on_one_dot_are_both_counted() -> None:

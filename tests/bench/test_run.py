@@ -71,9 +71,9 @@ def test_pictures_show_the_worst_frame_of_every_pipeline(pictures: Path) -> None
     assert names == [f"{scene}-{name}.png" for scene in shown for name in ("classic", shown[scene])]
     picture = cv2.imread(str(pictures / names[0]))
     assert picture is not None
-    assert picture.shape == (2 * 400 + 24, 2 * 300, 3)
-    # The truth's outline is drawn in green.
-    assert np.any(np.all(picture == (80, 220, 60), axis=2))
+    assert picture.shape == (2 * 400, 2 * 300, 3)
+    # The truth's outline is drawn in cyan.
+    assert np.any(np.all(picture == (255, 255, 0), axis=2))
 
 
 def test_scenes_can_be_chosen() -> None:

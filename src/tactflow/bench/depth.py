@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench.lockstep import on_recording
+from tactflow.bench.pipelines import Bench
 from tactflow.bench.quantities import Tally
 from tactflow.bench.recordings import labelled_presses, stack
-from tactflow.bench.results import RECORDING, BenchResult
+from tactflow.bench.results import RECORDING
 from tactflow.calibration.photometric import Photometry, fit_photometry
 from tactflow.calibration.presses import Press, Session, find_presses
 from tactflow.calibration.scale import centre
@@ -40,7 +41,7 @@ WEDGE_BALL: Final = 1.98
 """Radius of its ball, mm."""
 
 
-def measure_simulated(result: BenchResult) -> None:
+def measure_simulated(bench: Bench) -> None:
     """Calibrate on each light, and compare height maps with the surface that the simulator knows."""
     for light in LIGHTS:
         photometry = fit_photometry(session_of(open_scene(f"ball?frames=600&light={light}")), scale(), BALL)
@@ -48,8 +49,8 @@ def measure_simulated(result: BenchResult) -> None:
         for name in SCENES:
             tally = Tally()
             times = list(_compare(photometry, open_scene(f"{name}?seed=11&light={light}"), tally, honest))
-            result.add(DEPTH, light, name, tally.errors(), times={"contact": times}, frames=len(times))
-        result.add(DEPTH, light, "all", honest.errors())
+            bench.result.add(DEPTH, light, name, tally.errors(), times={"contact": times}, frames=len(times))
+        bench.result.add(DEPTH, light, "all", honest.errors())
 
 
 def scale() -> Scale:
@@ -112,17 +113,17 @@ def _compare(photometry: Photometry, scene: Scene, tally: Tally, honest: Tally) 
         yield cpu_s
 
 
-def measure_ball(result: BenchResult, wedge: Pipeline, folder: Path, scratch: Path) -> None:
+def measure_ball(bench: Bench, wedge: Pipeline, folder: Path) -> None:
     """Errors of a calibration on the presses of wedge_ball, each half learned from the other.
 
-    wedge : the pipeline of this sensor. folder : with `labels.csv`. scratch : for temporary files.
+    wedge : the pipeline of this sensor. folder : with `labels.csv`.
     """
     files, _ = labelled_presses(folder)
-    session = find_presses(on_recording(wedge, stack(files, scratch)))
+    session = find_presses(on_recording(wedge, stack(files, bench.scratch)))
     found = fit_photometry(session, WEDGE_SCALE, WEDGE_BALL).found
     errors = {
         "normal_error": found.normal_error,
         "ball_radius_error": 100 * abs(found.radius_error),
         "sphere_rms": found.sphere_rms,
     }
-    result.add(DEPTH, "wedge", f"{RECORDING}wedge_ball", errors, frames=len(files) - 1)
+    bench.result.add(DEPTH, "wedge", f"{RECORDING}wedge_ball", errors, frames=len(files) - 1)

@@ -6,9 +6,9 @@ Every recording runs through the default pipeline, or through the one for gels w
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +16,16 @@ from numpy.typing import NDArray
 
 from tactflow.bench.labels import (
     DotMotion,
-    Polygons,
+    Label,
     compare_decisions,
     compare_first_contact,
     labels_of,
     outlines_by_eye,
 )
-from tactflow.bench.lockstep import TimedResult, on_recording, take_turns
-from tactflow.bench.pictures import WorstFrame
-from tactflow.bench.pipelines import PIPELINE, measure_refusal
+from tactflow.bench.lockstep import TimedResult, on_recording
+from tactflow.bench.pipelines import PIPELINE, Bench, Judge
 from tactflow.bench.quantities import Tally
-from tactflow.bench.results import RECORDING, BenchResult
-from tactflow.bench.timing import CopyUnit, Times
+from tactflow.bench.results import RECORDING
 from tactflow.engine.graph import Pipeline
 
 FOLDER = "gels"
@@ -35,9 +33,6 @@ FOLDER = "gels"
 
 OUTLINES = "outlines by eye"
 """Name of the recording that stands for the outlines of all gels together."""
-
-STEPS = 100
-"""Steps of the progress display for one recording. Chosen by hand: some are longer."""
 
 _VIDEOS = (".avi", ".mp4", ".m4v", ".gif")
 _PICTURES = (".png", ".jpg")
@@ -131,11 +126,6 @@ def left_out(data: Path) -> list[str]:
     ]
 
 
-def step_count(data: Path) -> int:
-    """Steps that `measure_gels` will report."""
-    return STEPS * sum(len(gel.sources(data / FOLDER)) for gel in present(data))
-
-
 def prepared(pipeline: Pipeline, downsample: int) -> Pipeline:
     """The same pipeline with no other preprocessing than making the picture smaller."""
     node = pipeline.nodes["preprocess"]
@@ -143,114 +133,73 @@ def prepared(pipeline: Pipeline, downsample: int) -> Pipeline:
     return replace(pipeline, nodes={**pipeline.nodes, "preprocess": replace(node, params=params)})
 
 
-def measure_gels(
-    result: BenchResult,
-    marked: tuple[str, Pipeline],
-    bare: tuple[str, Pipeline],
-    data: Path,
-    unit: CopyUnit,
-    step: Callable[[int], None],
-    pictures: Path | None = None,
-) -> None:
+def measure_gels(bench: Bench, marked: tuple[str, Pipeline], bare: tuple[str, Pipeline], data: Path) -> None:
     """Measure every recording of a gel that is known here and in the folder.
 
     For a gel without dots, also what the pipeline for dots takes for such; and all outlines together.
 
-    Parameters
-    ----------
-    result : what is measured is added to it.
-    marked, bare : name and pipeline for gels with dots, and for gels without.
-    data : folder of recordings. unit : measured along the way. step : called with steps, see `step_count`.
-    pictures : folder for a picture of the worst labelled frame of each recording, or None.
+    marked, bare : name and pipeline for gels with dots, and for gels without. data : folder of recordings.
     """
     drawn = outlines_by_eye(data / FOLDER)
     together = Tally()
     for gel in present(data):
         name, pipeline = bare if gel.dots == 0 else marked
-        ready = prepared(pipeline, gel.downsample)
-        tally = _measure(result, gel, name, ready, data / FOLDER, drawn, unit, step, pictures)
+        sources, scene = gel.sources(data / FOLDER), RECORDING + gel.folder
+        labels = [labels_of(source, data / FOLDER, gel.downsample, drawn) for source in sources]
+        parts = [
+            (source, partial(GelJudge, gel, known)) for source, known in zip(sources, labels, strict=True)
+        ]
+        tally = bench.measure({name: prepared(pipeline, gel.downsample)}, scene, parts)[name]
         if not {"label_distance_p50", "line_angle_p50"} & set(tally.values):
             for key in ("outline_iou_p50", "outline_iou_min"):
                 together.values[key] += tally.values[key]
         if gel.dots == 0:
-            source = on_recording(prepared(marked[1], gel.downsample), gel.sources(data / FOLDER)[0])
-            measure_refusal(result, marked[0], source, RECORDING + gel.folder)
+            source = on_recording(prepared(marked[1], gel.downsample), sources[0])
+            bench.measure_refusal(marked[0], source, scene)
     if errors := together.errors():
         count = len(together.values["outline_iou_p50"])
-        result.add(PIPELINE, marked[0], RECORDING + OUTLINES, errors, frames=count)
+        bench.result.add(PIPELINE, marked[0], RECORDING + OUTLINES, errors, frames=count)
 
 
-def _measure(
-    result: BenchResult,
-    gel: Gel,
-    name: str,
-    pipeline: Pipeline,
-    gels: Path,
-    drawn: Polygons,
-    unit: CopyUnit,
-    step: Callable[[int], None],
-    pictures: Path | None,
-) -> Tally:
-    """Measure one pipeline on all recordings of one sensor."""
-    tally, scene, frames = Tally(), RECORDING + gel.folder, 0
-    times: Times = defaultdict(list)
-    for source in gel.sources(gels):
-        watch = _Watch(gel, source, gels, drawn, tally)
-        ready = {name: on_recording(pipeline, source)}
-        found, failures = take_turns(ready, watch.see, unit=unit, late=watch.is_over)
-        for kind, samples in found[name].items():
-            times[kind] += samples
-        if name in failures:
-            result.failures[f"{PIPELINE}/{name}/{scene}"] = f"{source.name}: {failures[name]}"
-        watch.judge()
-        watch.worst.write(pictures, f"{gel.folder}-{source.stem}-{name}")
-        frames += len(watch.found)
-        step(STEPS)
-    result.add(PIPELINE, name, scene, tally.errors(), times=times, frames=frames)
-    return tally
+class GelJudge(Judge):
+    """Compares with labels of single frames, with what is known of rest and touch, and a count of dots."""
 
-
-class _Watch:
-    """One pipeline on one recording. found : frame by frame, whether a contact was seen."""
-
-    def __init__(self, gel: Gel, source: Path, gels: Path, drawn: Polygons, tally: Tally) -> None:
-        self.found: list[bool] = []
-        self.worst = WorstFrame()
+    def __init__(self, gel: Gel, labels: Mapping[int, Label], tally: Tally) -> None:
+        super().__init__(tally)
         self._gel = gel
-        self._tally = tally
-        self._labels = labels_of(source, gels, gel.downsample, drawn)
+        self._labels = labels
+        self._found: list[bool] = []
         self._motion = None if gel.moves is None else DotMotion(gel.moves)
         self._dots: int | None = None
 
-    def see(self, _: str, result: TimedResult) -> str:
+    def add(self, result: TimedResult) -> str:
         """Take one frame's answer; returns the kind of frame."""
-        contact, index = result.contact, result.frame.seq
-        self.found.append(contact is not None)
+        contact = result.contact
+        self._found.append(contact is not None)
         if self._motion is not None:
             self._motion.add(result.frame.image)
         if self._dots is None and result.markers is not None:
             self._dots = len(result.markers.position)
-        if index in self._labels and result.image is not None:
-            label, shape = self._labels[index], result.image.shape[:2]
-            overlap = label.compare(self._tally, contact, shape)
-            self.worst.see(overlap, result, label.mask(shape), label.center)
+        if result.seq in self._labels and result.image is not None:
+            label, shape = self._labels[result.seq], result.image.shape[:2]
+            self.worst.add(label.compare(self.tally, contact, shape), result, label.mask(shape))
         return "idle" if contact is None else "contact"
 
     def is_over(self) -> bool:
         """Whether enough frames were seen."""
-        return self._gel.frames is not None and len(self.found) >= self._gel.frames
+        return self._gel.frames is not None and len(self._found) >= self._gel.frames
 
-    def judge(self) -> None:
+    def finish(self) -> None:
         """Compare the decisions and the number of dots with what is known of the whole recording."""
-        found, counted = np.array(self.found, np.bool_), self._gel.dots
+        found, counted = np.array(self._found, np.bool_), self._gel.dots
         if self._motion is None:
-            compare_decisions(self._tally, self._gel.known(len(found)), found)
+            compare_decisions(self.tally, self._gel.known(len(found)), found)
         else:
             touched = self._motion.touched()
-            compare_decisions(self._tally, touched, found)
-            compare_first_contact(self._tally, touched, found)
+            compare_decisions(self.tally, touched, found)
+            compare_first_contact(self.tally, touched, found)
         if counted and self._dots is not None:
-            self._tally.add(
+            self.tally.add(
                 dots_found=100.0 * min(self._dots, counted) / counted,
                 dots_beyond=100.0 * max(self._dots - counted, 0) / counted,
             )

@@ -14,6 +14,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from inspect import signature
 from itertools import islice
@@ -40,17 +41,8 @@ class TimedResult(Result):
     mapping : from raw to processed pixels, or None. cpu_s : CPU time, s.
     """
 
-    __slots__ = ("cpu_s",)
     mapping: PixelMapping | None
-
-    def __init__(
-        self,
-        frame: Frame,
-        values: Mapping[str, Any] | None = None,
-        skipped: Mapping[str, str] | None = None,
-    ) -> None:
-        super().__init__(frame, values, skipped)
-        self.cpu_s = 0.0
+    cpu_s = 0.0
 
 
 class LockstepPipeline:
@@ -72,16 +64,9 @@ class LockstepPipeline:
         self._thread.start()
 
     def block(self, frames: int = BLOCK) -> list[TimedResult]:
-        """Run the next frames without a pause between them.
+        """Run so many more frames without a pause between them, and return their results.
 
-        Parameters
-        ----------
-        frames : how many, >= 1. Their results are kept until all are done, so they must fit into memory.
-
-        Returns
-        -------
-        The results. Fewer than asked for where the recording ends or the pipeline fails; the call after that
-        returns an empty list or raises.
+        Returns fewer where the recording ends or the pipeline fails; the call after that returns none.
 
         Raises
         ------
@@ -134,14 +119,14 @@ class LockstepPipeline:
     def _in_one_thread(self, pipeline: Pipeline) -> Pipeline:
         """The same graph in one segment, with frames in turns and a sink that keeps the results."""
         source_class: Any = pipeline.source.component.cls
-        take_turns_with = self._frames
+        in_turns = self._frames
 
         class Source(source_class):  # type: ignore[misc]
             # The engine offers what the constructor asks for.
             __signature__ = signature(source_class)
 
             def frames(self) -> Iterator[Frame]:
-                return take_turns_with(super().frames())
+                return in_turns(super().frames())
 
         collecting = with_collector(pipeline, TimedResult, self._take, name="tactflow.bench")
         segment = pipeline.source.segment or "capture"
@@ -167,7 +152,6 @@ def take_turns(
     see: Callable[[str, TimedResult], str],
     *,
     unit: CopyUnit | None = None,
-    step: Callable[[int], None] = lambda _: None,
     late: Callable[[], bool] = lambda: False,
     block: int = BLOCK,
 ) -> tuple[dict[str, Times], dict[str, str]]:
@@ -178,8 +162,8 @@ def take_turns(
     pipelines : name -> pipeline, each with its recording.
     see : called with (name, result) for each frame, after its turn; returns the kind of frame its time
         belongs to. The time of references is kept apart.
-    unit : measured along the way. step : called with the number of frames, when all have done them.
-    late : asked when all have had a turn; if it is, that was the last one. block : frames in a turn.
+    unit : measured along the way. block : frames in a turn.
+    late : asked when all have had a turn; if it is, that was the last one.
 
     Returns
     -------
@@ -188,33 +172,25 @@ def take_turns(
     times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
     failures: dict[str, str] = {}
     running: dict[str, LockstepPipeline] = {}
-    with quiet():
-        try:
-            for name, pipeline in pipelines.items():
+    with quiet(), ExitStack() as stack:
+        for name, pipeline in pipelines.items():
+            try:
+                running[name] = stack.enter_context(closing(LockstepPipeline(pipeline)))
+            except TactflowError as error:
+                failures[name] = str(error)
+        while running:
+            if unit is not None:
+                unit.take(block)
+            for name in list(running):
                 try:
-                    running[name] = LockstepPipeline(pipeline)
+                    results = running[name].block(block)
                 except TactflowError as error:
-                    failures[name] = str(error)
-            active = list(running)
-            while active:
-                if unit is not None:
-                    unit.take(block)
-                longest = 0
-                for name in list(active):
-                    try:
-                        results = running[name].block(block)
-                    except TactflowError as error:
-                        failures[name], results = str(error), []
-                    if not results:
-                        active.remove(name)
-                    longest = max(longest, len(results))
-                    for result in results:
-                        kind = see(name, result)
-                        times[name]["reference" if result.frame.reference else kind].append(result.cpu_s)
-                step(longest)
-                if late():
-                    break
-        finally:
-            for lockstep in running.values():
-                lockstep.close()
+                    failures[name], results = str(error), []
+                for result in results:
+                    kind = see(name, result)
+                    times[name]["reference" if result.frame.reference else kind].append(result.cpu_s)
+                if not results:
+                    del running[name]
+            if late():
+                break
     return times, failures

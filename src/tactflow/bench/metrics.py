@@ -1,19 +1,11 @@
-"""Errors against known truth. Pure functions; positions in pixels of the processed frame, angles in degrees.
+"""Errors against known truth, of outlines, centres, directions, dots, identities and pictures.
 
-By what is compared:
-
-outlines    `convex_iou`, `mask_iou`, `polygon_area`, `pixel_area`, `filled_polygons`
-centres     `distance`, `distances_without_offset`
-directions  `angle_error`, `aspect_ratio`
-dots        `match_points`, `detection`, `dot_pitch`, `mask_centroids`
-identities  `identity_errors`; without truth `shared_dots`, `flow_jumps`
-pictures    `masked_mae`, `masked_psnr`
+Pure functions; positions in pixels of the processed frame, x right, y down; angles in degrees.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -28,24 +20,16 @@ def pairwise_distances(a: FloatArray, b: FloatArray) -> NDArray[np.float64]:
     """(N, M) float64, distance of every row of `a` (N, 2) to every row of `b` (M, 2), px."""
     from scipy.spatial.distance import cdist
 
-    return np.asarray(
-        cdist(np.asarray(a, np.float64).reshape(-1, 2), np.asarray(b, np.float64).reshape(-1, 2))
-    )
+    first, second = (np.asarray(points, np.float64).reshape(-1, 2) for points in (a, b))
+    return np.asarray(cdist(first, second))
 
 
-# Outlines
-
-
-def polygon_area(polygon: FloatArray) -> float:
-    """Area of a simple polygon (N, 2), px^2."""
+def signed_area(polygon: FloatArray) -> float:
+    """Area of a simple polygon (N, 2), px^2; negative where its vertices run the other way round."""
     if len(polygon) < 3:
         return 0.0
-    return abs(_signed_area(np.asarray(polygon, dtype=np.float64)))
-
-
-def _signed_area(points: NDArray[np.float64]) -> float:
     # About a vertex, not about the image's origin: far from it the products would cancel catastrophically.
-    x, y = (points - points[0]).T
+    x, y = (np.asarray(polygon, dtype=np.float64) - polygon[0]).T
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
 
 
@@ -54,16 +38,14 @@ def pixel_area(hull: FloatArray) -> float:
 
     The polygon through the centres of its border pixels misses half a pixel all around.
 
-    References
-    ----------
-    G. Pick, "Geometrisches zur Zahlenlehre", Lotos 19 (1899) 311-319.
+    By Pick, "Geometrisches zur Zahlenlehre", Lotos 19 (1899) 311-319.
     """
     if len(hull) == 0:
         return 0.0
     corners = np.rint(np.asarray(hull)).astype(np.int64)
     edge = np.roll(corners, -1, axis=0) - corners
     on_border = int(np.gcd(np.abs(edge[:, 0]), np.abs(edge[:, 1])).sum())
-    return polygon_area(corners.astype(np.float64)) + on_border / 2 + 1
+    return abs(signed_area(corners.astype(np.float64))) + on_border / 2 + 1
 
 
 def convex_iou(a: FloatArray, b: FloatArray) -> float:
@@ -71,8 +53,8 @@ def convex_iou(a: FloatArray, b: FloatArray) -> float:
 
     Vertices in order, either sense. Two polygons without area are equal (1) only if both are empty.
     """
-    common = polygon_area(_clip_convex(a, b))
-    union = polygon_area(a) + polygon_area(b) - common
+    area_a, area_b, common = (abs(signed_area(polygon)) for polygon in (a, b, _clip_convex(a, b)))
+    union = area_a + area_b - common
     if union <= 0:
         return 1.0 if len(a) == len(b) == 0 else 0.0
     return float(min(1.0, common / union))
@@ -87,7 +69,7 @@ def _clip_convex(subject: FloatArray, clip: FloatArray) -> NDArray[np.float64]:
     if len(subject) < 3 or len(clip) < 3:
         return np.zeros((0, 2))
     result, border = np.asarray(subject, dtype=np.float64), np.asarray(clip, dtype=np.float64)
-    if _signed_area(border) < 0:
+    if signed_area(border) < 0:
         border = border[::-1]
     for start, end in zip(border, np.roll(border, -1, axis=0), strict=True):
         if len(result) == 0:
@@ -106,8 +88,6 @@ def _clip_convex(subject: FloatArray, clip: FloatArray) -> NDArray[np.float64]:
 
 def mask_iou(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
     """Intersection over union of two masks (H, W), non-zero inside, in [0, 1]; 1 where both are empty."""
-    if a.shape != b.shape:
-        raise ValueError(f"required masks of one shape, got {a.shape} and {b.shape}")
     inside_a, inside_b = np.asarray(a) != 0, np.asarray(b) != 0
     union = int(np.count_nonzero(inside_a | inside_b))
     return int(np.count_nonzero(inside_a & inside_b)) / union if union else 1.0
@@ -119,9 +99,6 @@ def filled_polygons(polygons: Sequence[NDArray[Any]], shape: tuple[int, int]) ->
     for polygon in polygons:
         cv2.fillPoly(mask, [np.rint(polygon).astype(np.int32)], (255,))
     return mask
-
-
-# Centres
 
 
 def distance(a: ArrayLike, b: ArrayLike) -> Any:
@@ -137,9 +114,6 @@ def distances_without_offset(points: FloatArray, labels: FloatArray) -> NDArray[
     """
     offset = np.asarray(points, dtype=np.float64) - np.asarray(labels, dtype=np.float64)
     return np.asarray(distance(offset, np.median(offset, axis=0)))
-
-
-# Directions
 
 
 def angle_error(angle: float, truth: float) -> float:
@@ -162,22 +136,14 @@ def aspect_ratio(mask: NDArray[np.generic]) -> float:
     return float(np.sqrt((middle + half) / (middle - half)))
 
 
-# Dots
-
-
 def dot_pitch(points: FloatArray) -> float:
     """Median distance of a point (N, 2) to its nearest neighbour, px.
 
-    Raises
-    ------
-    ValueError
-        With fewer than two points.
+    A single point has no neighbour that it could be mistaken for: infinite.
     """
-    if len(points) < 2:
-        raise ValueError(f"required at least 2 points for a pitch, got {len(points)}")
     apart = pairwise_distances(points, points)
     np.fill_diagonal(apart, np.inf)
-    return float(np.median(apart.min(axis=1)))
+    return float(np.median(apart.min(axis=1, initial=np.inf)))
 
 
 def mask_centroids(mask: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -213,32 +179,16 @@ def match_points(points: FloatArray, truth: FloatArray, radius: float) -> NDArra
     return index
 
 
-@dataclass(frozen=True, slots=True)
-class Detection:
-    """Found points against true ones.
+def detection(points: FloatArray, truth: FloatArray, radius: float) -> tuple[float, float, FloatArray]:
+    """Recall and precision of found points, and (K,) px, the distance of each matched one to the truth.
 
-    recall, precision : in [0, 1]; 1 where there was nothing to find, or nothing was found.
-    errors : (K,) float64, distance of each matched point to the truth, px.
+    Arguments as for `match_points`. Both shares are 1 where there was nothing to find, or nothing was found.
     """
-
-    recall: float
-    precision: float
-    errors: NDArray[np.float64]
-
-
-def detection(points: FloatArray, truth: FloatArray, radius: float) -> Detection:
-    """Recall, precision and localisation error of found points; arguments as for `match_points`."""
     index = match_points(points, truth, radius)
     hit = index >= 0
     count = int(np.count_nonzero(hit))
-    return Detection(
-        recall=count / len(truth) if len(truth) else 1.0,
-        precision=count / len(points) if len(points) else 1.0,
-        errors=distance(points[index[hit]], truth[hit]) if count else np.zeros(0),
-    )
-
-
-# Identities
+    errors = distance(points[index[hit]], truth[hit]) if count else np.zeros(0)
+    return count / len(truth) if len(truth) else 1.0, count / len(points) if len(points) else 1.0, errors
 
 
 def identity_errors(position: FloatArray, truth: FloatArray, pitch: float) -> BoolArray:
@@ -291,8 +241,6 @@ def flow_jumps(origin: FloatArray, displacement: FloatArray, trusted: BoolArray)
     origin : (N, 2) floating, positions in the reference frame, px. displacement : (N, 2) floating, px.
     trusted : (N,) bool, not declared lost.
     """
-    if len(origin) < 2:
-        return 0
     pitch = dot_pitch(origin)
     near = pairwise_distances(origin, origin) <= 1.25 * pitch
     np.fill_diagonal(near, False)
@@ -305,22 +253,14 @@ def flow_jumps(origin: FloatArray, displacement: FloatArray, trusted: BoolArray)
     return jumps
 
 
-# Pictures
+def masked_mae(image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.generic]) -> float:
+    """Mean absolute error inside a mask (H, W) that is not empty, grey levels."""
+    return float(np.mean(cv2.absdiff(image, truth)[np.asarray(mask) != 0]))
 
 
-def masked_mae(image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.generic]) -> float | None:
-    """Mean absolute error inside a mask (H, W), grey levels; None where the mask is empty."""
-    inside = np.asarray(mask) != 0
-    return float(np.mean(cv2.absdiff(image, truth)[inside])) if inside.any() else None
-
-
-def masked_psnr(
-    image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.generic]
-) -> float | None:
-    """Peak signal-to-noise ratio inside a mask (H, W), dB (peak 255, at most 100); None for an empty mask."""
-    inside = np.asarray(mask) != 0
-    if not inside.any():
-        return None
-    squared = float(np.mean(np.square(cv2.absdiff(image, truth)[inside], dtype=np.float64)))
+def masked_psnr(image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.generic]) -> float:
+    """Peak signal-to-noise ratio inside a mask (H, W) that is not empty, dB (peak 255, at most 100)."""
+    error = cv2.absdiff(image, truth)[np.asarray(mask) != 0]
     # Equal images have no finite ratio; 100 dB is a mean squared error far below one quantisation step.
-    return 100.0 if squared <= 255.0**2 * 1e-10 else float(10 * np.log10(255.0**2 / squared))
+    squared = max(float(np.mean(np.square(error, dtype=np.float64))), 255.0**2 * 1e-10)
+    return float(10 * np.log10(255.0**2 / squared))

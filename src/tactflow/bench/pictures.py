@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,78 +10,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.message.result import Result
-from tactflow.vision.types import MarkerStatus
-
-_SCALE = 2
-"""Pixels of the picture for each of the processed frame, so that lines stay apart."""
-
-_TRUE, _FOUND, _MARKER, _LOST = (80, 220, 60), (60, 60, 240), (255, 255, 255), (0, 165, 255)
-"""Colours, BGR grey levels: green, red, white, orange."""
-
-_CAPTION = 24
-"""Height of the line of text at the top, px."""
+from tactflow.notebook import draw
 
 
-@dataclass(slots=True)
 class WorstFrame:
-    """The frame with the least overlap. region, center : of the true contact, (H, W) and px."""
+    """The frame in which the contact that was found overlaps least with the true one."""
 
-    overlap: float = 2.0
-    result: Result | None = None
-    region: NDArray[np.uint8] | None = None
-    center: tuple[float, float] | None = None
+    def __init__(self) -> None:
+        self._overlap = 2.0
+        self._result: Result | None = None
+        self._region: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
 
-    def see(
-        self, overlap: float, result: Result, region: NDArray[Any], center: tuple[float, float] | None
-    ) -> None:
-        """Keep this frame if it is worse. overlap : of the found contact with the true one, 0 to 1."""
-        if overlap < self.overlap:
-            self.overlap, self.result, self.center = overlap, result, center
-            self.region = np.asarray(region, dtype=np.uint8)
+    def add(self, overlap: float, result: Result, region: NDArray[Any]) -> None:
+        """Keep this frame if it is worse. overlap : 0 to 1. region : (H, W), not 0 in the true contact."""
+        if overlap < self._overlap and result.image is not None:
+            self._overlap, self._result = overlap, result
+            self._region = np.asarray(region, dtype=np.uint8)
 
-    def write(self, folder: Path | None, name: str) -> None:
-        """Write FOLDER/NAME.png; nothing without a folder or a frame.
-
-        Green: outline and centre of the true contact. Red: those of the contact that was found. White
-        crosses: tracked markers; orange ones: inferred or lost.
-        """
-        if folder is None or self.result is None or self.result.image is None or self.region is None:
+    def write(self, folder: Path, name: str) -> None:
+        """Write FOLDER/NAME.png: what was found as the live page draws it, the true outline in cyan."""
+        if self._result is None:
             return
-        caption = f"{name}, frame {self.result.frame.seq}: IoU {self.overlap:.2f}"
+        size = tuple(2 * side for side in self._result.size)
+        picture = cv2.resize(draw(self._result, text=False), size, interpolation=cv2.INTER_CUBIC)
+        region = cv2.resize(self._region, size, interpolation=cv2.INTER_NEAREST)
+        outline, _ = cv2.findContours(region, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(picture, outline, -1, (255, 255, 0), 1)
+        caption = f"{name}, frame {self._result.seq}: overlap {self._overlap:.2f}"
+        cv2.putText(
+            picture, caption, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA
+        )
         folder.mkdir(parents=True, exist_ok=True)
-        picture = _draw(self.result, self.result.image, self.region, self.center, caption)
         cv2.imwrite(str(folder / f"{name.replace('/', '_')}.png"), picture)
-
-
-def _draw(
-    result: Result,
-    image: NDArray[np.uint8],
-    region: NDArray[np.uint8],
-    center: tuple[float, float] | None,
-    caption: str,
-) -> NDArray[np.uint8]:
-    """(2 H + 24, 2 W, 3) uint8 BGR."""
-    size = (image.shape[1] * _SCALE, image.shape[0] * _SCALE)
-    picture: NDArray[Any] = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
-    for mask, color in ((region, _TRUE), (result.contact_mask, _FOUND)):
-        if mask is not None:
-            large = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
-            contours, _ = cv2.findContours(large, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-            cv2.drawContours(picture, contours, -1, color, 1, cv2.LINE_AA)
-    if center is not None:
-        cv2.circle(picture, _place(center), 5, _TRUE, 2, cv2.LINE_AA)
-    if result.contact is not None:
-        cv2.drawMarker(picture, _place(result.contact.center), _FOUND, cv2.MARKER_CROSS, 14, 2)
-    if result.markers is not None:
-        for point, status in zip(result.markers.position, result.markers.status, strict=True):
-            color = _MARKER if status == MarkerStatus.TRACKED else _LOST
-            cv2.drawMarker(picture, _place(point), color, cv2.MARKER_TILTED_CROSS, 7, 1)
-    bar = np.full((_CAPTION, size[0], 3), 30, np.uint8)
-    cv2.putText(bar, caption, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (235, 235, 235), 1, cv2.LINE_AA)
-    return np.vstack([bar, np.asarray(picture, dtype=np.uint8)])
-
-
-def _place(point: Any) -> tuple[int, int]:
-    # The centre of processed pixel 0 lies half a large pixel into the enlarged picture.
-    half = (_SCALE - 1) / 2
-    return round(point[0] * _SCALE + half), round(point[1] * _SCALE + half)

@@ -1,19 +1,18 @@
-"""Whole pipelines on simulated scenes."""
+"""Whole pipelines on simulated scenes and on recordings, compared with what is known of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
-from tactflow.bench import metrics
 from tactflow.bench.lockstep import LockstepPipeline, TimedResult, on_recording, take_turns
 from tactflow.bench.pictures import WorstFrame
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import BenchResult
-from tactflow.bench.scenes import Rendered
-from tactflow.bench.score import PipelineScore
-from tactflow.bench.timing import CopyUnit, quiet
+from tactflow.bench.timing import CopyUnit, Times, quiet
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.vision.markers.detection import NoMarkersError
@@ -25,57 +24,103 @@ CLASSIC = "classic"
 """Name of the pipeline that is the yardstick: the original script."""
 
 
-def measure_pipelines(
-    result: BenchResult,
-    pipelines: Mapping[str, Pipeline],
-    rendered: Rendered,
-    unit: CopyUnit,
-    step: Callable[[int], None],
-    pictures: Path | None = None,
-) -> None:
-    """Measure every pipeline on one scene, in turns of a few frames.
+class Judge:
+    """Compares what one pipeline finds in one recording with what is known of it.
 
-    Parameters
-    ----------
-    result : what is measured is added to it. pipelines : name -> pipeline. rendered : the scene.
-    unit : measured along the way. step : called with the number of frames that all have done.
-    pictures : folder for the frame of at least half depth on which each pipeline was worst, or None.
+    tally : gets the errors. frames : how many were judged. worst : on which frame the pipeline was worst.
     """
-    scene = rendered.case.label
-    scores = {name: PipelineScore(rendered, Tally()) for name in pipelines}
-    worst = {name: WorstFrame() for name in pipelines}
 
-    def see(name: str, found: TimedResult) -> str:
-        truth = scores[name].truth(found)
-        if pictures is not None and truth.touching and rendered.deep(found.frame.seq):
-            overlap = metrics.convex_iou(found.contact.hull, truth.hull) if found.contact else 0.0
-            worst[name].see(overlap, found, truth.contact_mask, truth.center)
-        return scores[name].add(found)
+    def __init__(self, tally: Tally) -> None:
+        self.tally = tally
+        self.frames = 0
+        self.worst = WorstFrame()
 
-    ready = {name: on_recording(pipeline, rendered.path) for name, pipeline in pipelines.items()}
-    times, failures = take_turns(ready, see, unit=unit, step=step)
-    for name in pipelines:
-        if name in failures:
-            result.failures[f"{PIPELINE}/{name}/{scene}"] = failures[name]
-        else:
-            errors = scores[name].tally.errors()
-            result.add(PIPELINE, name, scene, errors, times=times[name], frames=len(rendered))
-            worst[name].write(pictures, f"{scene}-{name}")
+    def add(self, result: TimedResult) -> str:
+        """Compare one frame; returns the kind of frame: "contact" or "idle"."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Compare what can be compared only when the recording is over."""
+
+    def is_over(self) -> bool:
+        """Whether no more frames are wanted."""
+        return False
 
 
-def measure_refusal(result: BenchResult, name: str, pipeline: Pipeline, scene: str) -> None:
-    """Measure what a pipeline for markers takes for markers on a gel without: at best, it refuses to run.
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """What all measurements share.
 
-    result : the number of false markers is added to it. name : of the pipeline. pipeline : with a recording
-    of such a gel. scene : its name in the result.
+    result : rows are added to it. unit : measured along the way. scratch : folder for temporary files.
+    pictures : folder for pictures of worst frames, or None.
     """
-    false_markers = 0
-    try:
-        with quiet(), closing(LockstepPipeline(pipeline)) as running:
-            for found in running.block(1):
-                false_markers = 0 if found.markers is None else len(found.markers.position)
-    except TactflowError as error:
-        if NoMarkersError.__name__ not in str(error):
-            result.failures[f"{PIPELINE}/{name}/{scene}"] = str(error)
-            return
-    result.add(PIPELINE, name, scene, {"markers_false": float(false_markers)}, frames=1)
+
+    result: BenchResult
+    unit: CopyUnit
+    scratch: Path
+    pictures: Path | None = None
+
+    def measure(
+        self,
+        pipelines: Mapping[str, Pipeline],
+        scene: str,
+        parts: Sequence[tuple[Path, Callable[[Tally], Judge]]],
+    ) -> dict[str, Tally]:
+        """Run pipelines, in turns of a few frames, on a scene or on the parts of a recording.
+
+        Parameters
+        ----------
+        pipelines : name -> pipeline. scene : name of the scene or recording in the result.
+        parts : recordings, each with a function that makes a judge for one pipeline.
+
+        Returns
+        -------
+        pipeline -> all values of all its errors.
+        """
+        tallies = {name: Tally() for name in pipelines}
+        times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
+        frames, failures = dict.fromkeys(pipelines, 0), dict[str, str]()
+        for path, make_judge in parts:
+            judges = {name: make_judge(tally) for name, tally in tallies.items()}
+
+            def see(name: str, found: TimedResult, judges: Mapping[str, Judge] = judges) -> str:
+                judges[name].frames += 1
+                return judges[name].add(found)
+
+            def is_over(judges: Mapping[str, Judge] = judges) -> bool:
+                return all(judge.is_over() for judge in judges.values())
+
+            ready = {name: on_recording(pipeline, path) for name, pipeline in pipelines.items()}
+            measured, failed = take_turns(ready, see, unit=self.unit, late=is_over)
+            failures.update(failed)
+            for name, judge in judges.items():
+                judge.finish()
+                frames[name] += judge.frames
+                for kind, samples in measured[name].items():
+                    times[name][kind] += samples
+                if self.pictures is not None:
+                    part = f"{scene}-{path.stem}" if len(parts) > 1 else scene
+                    judge.worst.write(self.pictures, f"{part.removeprefix('data:')}-{name}")
+        for name, tally in tallies.items():
+            if name in failures:
+                self.result.failures[f"{PIPELINE}/{name}/{scene}"] = failures[name]
+            else:
+                errors = tally.errors()
+                self.result.add(PIPELINE, name, scene, errors, times=times[name], frames=frames[name])
+        return tallies
+
+    def measure_refusal(self, name: str, pipeline: Pipeline, scene: str) -> None:
+        """Measure what a pipeline for markers takes for markers on a gel without: at best, it refuses to run.
+
+        name : of the pipeline. pipeline : with a recording of such a gel. scene : its name in the result.
+        """
+        false_markers = 0
+        try:
+            with quiet(), closing(LockstepPipeline(pipeline)) as running:
+                for found in running.block(1):
+                    false_markers = 0 if found.markers is None else len(found.markers.position)
+        except TactflowError as error:
+            if NoMarkersError.__name__ not in str(error):
+                self.result.failures[f"{PIPELINE}/{name}/{scene}"] = str(error)
+                return
+        self.result.add(PIPELINE, name, scene, {"markers_false": float(false_markers)}, frames=1)

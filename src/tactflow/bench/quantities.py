@@ -122,11 +122,6 @@ _ALL = [
     Quantity("normal_error", "normals of a ball, mean angle", "deg", slack=0.3),
     Quantity("ball_radius_error", "radius of a ball from its heights, median", "%", slack=0.5),
     Quantity("sphere_rms", "heights of a ball, RMS from a sphere", "mm", slack=0.003),
-    Quantity("field_rms", "displacement of the gel in contact, error of a component", "px", rms, slack=0.05),
-    *_within("field", "displacement errors"),
-    Quantity("slip_onset", "onset of slip, error, largest", "frames", MOST, slack=1.0),
-    Quantity("slip_missed", "slips missed", "%"),
-    Quantity("slip_false", "frames of sticking contacts called slip", "%"),
     _percent_right("found_percent", "labelled contacts found"),
     Quantity("label_center_p50", "centre against hand label, median", "px", P50_OF_OFFSETS, slack=0.1),
     Quantity(

@@ -7,9 +7,9 @@ its 140 dots are printed on one continuous gel.
 from __future__ import annotations
 
 import csv
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import gels, metrics
-from tactflow.bench.lockstep import TimedResult, on_recording, take_turns
-from tactflow.bench.pipelines import PIPELINE
+from tactflow.bench.lockstep import TimedResult
+from tactflow.bench.pipelines import Bench, Judge
 from tactflow.bench.quantities import Tally
-from tactflow.bench.results import RECORDING, BenchResult
-from tactflow.bench.timing import CopyUnit, Times
+from tactflow.bench.results import RECORDING
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.vision.types import Markers, MarkerStatus
@@ -42,43 +41,6 @@ RECTIFY = {
 _MARKER_STAGES = frozenset({"tracker", "flow_in_mask", "visualize"})
 """Ids of the stages that need markers."""
 
-Judge = Callable[[Tally, TimedResult], str]
-"""Adds the errors of one frame to a tally; returns the kind of frame."""
-
-
-@dataclass(frozen=True, slots=True)
-class Bench:
-    """What measurements share. result : rows are added to it. unit : measured along the way.
-
-    step : called with the number of frames that all pipelines have done. scratch : for temporary files.
-    """
-
-    result: BenchResult
-    unit: CopyUnit
-    step: Callable[[int], None]
-    scratch: Path
-
-    def run(self, pipelines: Mapping[str, Pipeline], scene: str, parts: Sequence[tuple[Path, Judge]]) -> None:
-        """Run pipelines, in turns, on the parts of a recording, each with the function that judges it."""
-        tallies = {name: Tally() for name in pipelines}
-        times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
-        frames: dict[str, int] = dict.fromkeys(pipelines, 0)
-        for path, judge in parts:
-
-            def see(name: str, found: TimedResult, judge: Judge = judge) -> str:
-                frames[name] += 1
-                return judge(tallies[name], found)
-
-            ready = {name: on_recording(pipeline, path) for name, pipeline in pipelines.items()}
-            measured, failures = take_turns(ready, see, unit=self.unit, step=self.step)
-            for name, kinds in measured.items():
-                for kind, samples in kinds.items():
-                    times[name][kind] += samples
-            self.result.failures |= {f"{PIPELINE}/{n}/{RECORDING}{scene}": why for n, why in failures.items()}
-        for name, tally in tallies.items():
-            errors = tally.errors()
-            self.result.add(PIPELINE, name, RECORDING + scene, errors, times=times[name], frames=frames[name])
-
 
 def measure_recordings(
     bench: Bench, marked: Mapping[str, Pipeline], bare: Mapping[str, Pipeline], data: Path
@@ -91,17 +53,15 @@ def measure_recordings(
     ready = {name: rectified(pipeline) for name, pipeline in marked.items()}
     if (data / "wedge_ball" / "labels.csv").exists():
         files, labels = labelled_presses(data / "wedge_ball")
-        path = stack(files, bench.scratch)
-        bench.run(ready, "wedge_ball", [(path, lambda t, r: _press(t, r, labels))])
+        ball = [(stack(files, bench.scratch), partial(PressJudge, labels))]
+        bench.measure(ready, RECORDING + "wedge_ball", ball)
     if (data / "wedge_roll").is_dir():
         path = stack(sorted((data / "wedge_roll").glob("*.jpg")), bench.scratch)
-        bench.run(ready, "wedge_roll", [(path, _roll)])
-    parts = []
-    for path in sorted((data / "wedge_grasp").glob("*.csv")):
-        contact, trusted = judged_by_force(_forces(path))
-        parts.append((path.with_suffix(".avi"), _grasp_judge(contact, trusted)))
-    if parts:
-        bench.run(bare, "wedge_grasp", parts)
+        bench.measure(ready, RECORDING + "wedge_roll", [(path, RollJudge)])
+    files = sorted((data / "wedge_grasp").glob("*.csv"))
+    grasps = [(path.with_suffix(".avi"), partial(GraspJudge, _forces(path))) for path in files]
+    if grasps:
+        bench.measure(bare, RECORDING + "wedge_grasp", grasps)
 
 
 def check(data: Path) -> None:
@@ -115,12 +75,6 @@ def check(data: Path) -> None:
     known = ("wedge_ball", "wedge_roll", "wedge_grasp", gels.FOLDER)
     if not any((data / name).is_dir() for name in known):
         raise ConfigError(f"--data {data}: required a folder with one of {', '.join(known)} in it")
-
-
-def frame_count(data: Path) -> int:
-    """How many frames `measure_recordings` will look at, for a progress display."""
-    still = len(list((data / "wedge_ball").glob("*.jpg"))) + len(list((data / "wedge_roll").glob("*.jpg")))
-    return still + sum(len(_forces(path)) for path in (data / "wedge_grasp").glob("*.csv"))
 
 
 def rectified(pipeline: Pipeline) -> Pipeline:
@@ -155,20 +109,31 @@ def labelled_presses(folder: Path) -> tuple[list[Path], NDArray[np.float64]]:
     return [folder / "reference.jpg", *(folder / row["file"] for row in rows)], labels
 
 
-def _press(tally: Tally, result: TimedResult, labels: NDArray[np.float64]) -> str:
-    """Compare a centre with its label, (N, 2) px for the frames from 1 on."""
-    if result.frame.seq > 0:
-        tally.percent(found_percent=result.contact is not None)
-        if result.contact is not None:
-            offset = np.subtract(result.contact.center, labels[result.frame.seq - 1])
-            tally.add(label_center_p50=offset, label_center_p95=offset)
-    return "contact"
+class PressJudge(Judge):
+    """Compares centres with labels, (N, 2) px of the frames from 1 on."""
+
+    def __init__(self, labels: NDArray[np.float64], tally: Tally) -> None:
+        super().__init__(tally)
+        self._labels = labels
+
+    def add(self, result: TimedResult) -> str:
+        """Compare the centre in one frame."""
+        if result.seq > 0:
+            self.tally.percent(found_percent=result.contact is not None)
+            if result.contact is not None:
+                offset = np.subtract(result.contact.center, self._labels[result.seq - 1])
+                self.tally.add(label_center_p50=offset, label_center_p95=offset)
+        return "contact"
 
 
-def _roll(tally: Tally, result: TimedResult) -> str:
-    if result.frame.seq > 0 and result.markers is not None:
-        add_identity_signs(tally, result.markers)
-    return "contact"
+class RollJudge(Judge):
+    """Looks for signs of wrong identities."""
+
+    def add(self, result: TimedResult) -> str:
+        """Count the signs in one frame."""
+        if result.seq > 0 and result.markers is not None:
+            add_identity_signs(self.tally, result.markers)
+        return "contact"
 
 
 def add_identity_signs(tally: Tally, markers: Markers) -> None:
@@ -207,13 +172,18 @@ def judged_by_force(force: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDAr
     return contact, contact == (force >= CONTACT_FORCE)
 
 
-def _grasp_judge(contact: NDArray[np.bool_], trusted: NDArray[np.bool_]) -> Judge:
-    def judge(tally: Tally, result: TimedResult) -> str:
-        index = result.frame.seq
-        if index >= len(contact):
-            return "idle"
-        if trusted[index]:
-            tally.percent(force_right=(result.contact is not None) == bool(contact[index]))
-        return "contact" if contact[index] else "idle"
+class GraspJudge(Judge):
+    """Compares decisions with the grip's force, (N,) N."""
 
-    return judge
+    def __init__(self, force: NDArray[np.float64], tally: Tally) -> None:
+        super().__init__(tally)
+        self._contact, self._trusted = judged_by_force(force)
+
+    def add(self, result: TimedResult) -> str:
+        """Compare the decision in one frame."""
+        if result.seq >= len(self._contact):
+            return "idle"
+        contact = bool(self._contact[result.seq])
+        if self._trusted[result.seq]:
+            self.tally.percent(force_right=(result.contact is not None) == contact)
+        return "contact" if contact else "idle"

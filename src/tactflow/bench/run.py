@@ -6,19 +6,22 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 
 import cv2
 
-from tactflow.bench import depth, gels, motion, recordings
+from tactflow.bench import depth, gels, recordings
 from tactflow.bench.lockstep import on_recording
-from tactflow.bench.methods import STAGES, measure_methods
-from tactflow.bench.pipelines import CLASSIC, measure_pipelines, measure_refusal
+from tactflow.bench.methods import measure_methods
+from tactflow.bench.pipelines import CLASSIC, Bench
 from tactflow.bench.results import BenchResult
-from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, render_all
+from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, Rendered
+from tactflow.bench.score import PipelineScore
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
@@ -69,6 +72,29 @@ class Plan:
         return [case for case in whole if case.label in scenes], [c for c in alone if c.label in scenes]
 
 
+@dataclass(frozen=True, slots=True)
+class Pipelines:
+    """Name -> pipeline.
+
+    loaded : all of them. marked, bare : for gels with markers, and without; none that rectifies one camera's
+    picture and makes no sense on others.
+    """
+
+    loaded: Mapping[str, Pipeline]
+    marked: Mapping[str, Pipeline]
+    bare: Mapping[str, Pipeline]
+
+    @classmethod
+    def load(cls, files: Mapping[str, Path]) -> Pipelines:
+        """Read the files. ConfigError if one is wrong."""
+        loaded = {name: load_pipeline(path) for name, path in files.items()}
+        marked = {n: p for n, p in loaded.items() if not _is_for_one_camera(p) and n != MARKERLESS}
+        markerless = loaded.get(MARKERLESS) or load_pipeline(find_pipeline(MARKERLESS))
+        return cls(
+            loaded, marked, {MARKERLESS: markerless, CLASSIC: recordings.without_markers(loaded[CLASSIC])}
+        )
+
+
 def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
     """Measure everything of a plan.
 
@@ -78,86 +104,69 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
         If a pipeline file is wrong, a scene is unknown, or there are no recordings where they should be.
     """
     began = time.perf_counter()
-    run = _Run(plan, progress)
+    whole, alone = plan.chosen()
+    if plan.data is not None:
+        recordings.check(plan.data)
+    pipelines = Pipelines.load(plan.files)
+    result, unit = BenchResult(quick=plan.quick, machine=machine()), CopyUnit()
     with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
-        run.scenes(Path(folder))
+        bench = Bench(result, unit, Path(folder), plan.pictures)
+        steps = [(f"pipelines on {c.label}", partial(_measure_pipelines, bench, pipelines, c)) for c in whole]
+        steps += [(f"methods on {c.label}", partial(_measure_methods, bench, pipelines, c)) for c in alone]
         if not plan.quick and plan.scenes is None:
-            run.doing = "depth and motion"
-            depth.measure_simulated(run.result)
-            motion.measure_motion(run.result)
+            steps.append(("heights", partial(depth.measure_simulated, bench)))
         if plan.data is not None:
-            run.recordings(Path(folder), plan.data)
-    run.step(run.total)
-    run.result.copy_ms = run.unit.copy_ms
-    run.result.wall_s = time.perf_counter() - began
-    return run.result
+            steps.append(("recordings", partial(_measure_recordings, bench, pipelines, plan.data)))
+            steps.append(("real gels", partial(_measure_gels, bench, pipelines, plan.data)))
+        for number, (what, measure) in enumerate(steps):
+            progress(what, number, len(steps))
+            measure()
+    progress("done", len(steps), len(steps))
+    result.copy_ms, result.wall_s = unit.copy_ms, time.perf_counter() - began
+    return result
 
 
-class _Run:
-    """A run of the bench: what it measures with, what it has found, and how far it is.
+@contextmanager
+def _rendered(case: Case, folder: Path) -> Iterator[Rendered]:
+    """A rendered scene, whose file is removed after the block."""
+    rendered = Rendered(case, folder)
+    try:
+        yield rendered
+    finally:
+        rendered.path.unlink(missing_ok=True)
 
-    marked : pipelines for gels with markers. bare : for gels without.
-    """
 
-    def __init__(self, plan: Plan, progress: Progress) -> None:
-        self.plan, self.progress = plan, progress
-        self.whole, self.alone = plan.chosen()
-        if plan.data is not None:
-            recordings.check(plan.data)
-        self.loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
-        special = {name for name, pipeline in self.loaded.items() if _is_for_one_camera(pipeline)}
-        self.marked = {n: p for n, p in self.loaded.items() if n not in special and n != MARKERLESS}
-        self.bare = {
-            MARKERLESS: self.loaded.get(MARKERLESS) or load_pipeline(find_pipeline(MARKERLESS)),
-            CLASSIC: recordings.without_markers(self.loaded[CLASSIC]),
-        }
-        self.result = BenchResult(quick=plan.quick, machine=machine())
-        self.unit = CopyUnit()
-        self.doing, self.done, self.total = "rendering", 0, self._steps()
+def _measure_pipelines(bench: Bench, pipelines: Pipelines, case: Case) -> None:
+    with _rendered(case, bench.scratch) as rendered:
+        suited = pipelines.marked if len(rendered.scene.layout.rest) else pipelines.bare
+        if case in TROUBLES:
+            # The script takes half of a run's time and was not made for any of this.
+            suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
+        if rendered.scene.settings.speckle:
+            speckled = on_recording(pipelines.loaded[DEFAULT], rendered.path)
+            bench.measure_refusal(DEFAULT, speckled, case.label)
+        bench.measure(suited, case.label, [(rendered.path, partial(PipelineScore, rendered))])
 
-    def _steps(self) -> int:
-        """Steps of the whole run: about one for each frame of a whole pipeline."""
-        steps = 1 + sum(case.frames for case in self.whole) + len(STAGES) * len(self.alone)
-        if self.plan.data is not None:
-            steps += recordings.frame_count(self.plan.data) + gels.step_count(self.plan.data)
-        return steps
 
-    def step(self, count: int) -> None:
-        """Report that so many more steps are done."""
-        self.done = min(self.done + count, self.total)
-        self.progress(self.doing, self.done, self.total)
+def _measure_methods(bench: Bench, pipelines: Pipelines, case: Case) -> None:
+    with _rendered(case, bench.scratch) as rendered:
+        measure_methods(bench, pipelines.marked, rendered)
 
-    def scenes(self, scratch: Path) -> None:
-        """Measure whole pipelines, then methods alone, on simulated scenes."""
-        for rendered in render_all(self.whole, scratch):
-            label = rendered.case.label
-            self.doing = f"pipelines on {label}"
-            suited = self.marked if len(rendered.scene.layout.rest) else self.bare
-            if rendered.case in TROUBLES:
-                # The script takes half of a run's time and was not made for any of this.
-                suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
-            if rendered.scene.settings.speckle:
-                speckled = on_recording(self.loaded[DEFAULT], rendered.path)
-                measure_refusal(self.result, DEFAULT, speckled, label)
-            measure_pipelines(self.result, suited, rendered, self.unit, self.step, self.plan.pictures)
-        for rendered in render_all(self.alone, scratch):
-            self.doing = f"methods on {rendered.case.label}"
-            measure_methods(self.result, self.marked, rendered, self.unit, self.step)
 
-    def recordings(self, scratch: Path, data: Path) -> None:
-        """Measure whole pipelines on the real recordings."""
-        self.doing = "recordings"
-        bench = recordings.Bench(self.result, self.unit, self.step, scratch)
-        wedge = {WEDGE: self.loaded[WEDGE]} if WEDGE in self.loaded else {}
-        recordings.measure_recordings(bench, wedge | self.marked, self.bare, data)
-        if wedge and (data / "wedge_ball" / "labels.csv").exists():
-            depth.measure_ball(self.result, self.loaded[WEDGE], data / "wedge_ball", scratch)
-        marked, bare = (DEFAULT, self.loaded[DEFAULT]), (MARKERLESS, self.bare[MARKERLESS])
-        gels.measure_gels(self.result, marked, bare, data, self.unit, self.step, self.plan.pictures)
+def _measure_recordings(bench: Bench, pipelines: Pipelines, data: Path) -> None:
+    loaded = pipelines.loaded
+    wedge = {WEDGE: loaded[WEDGE]} if WEDGE in loaded else {}
+    recordings.measure_recordings(bench, wedge | dict(pipelines.marked), pipelines.bare, data)
+    if wedge and (data / "wedge_ball" / "labels.csv").exists():
+        depth.measure_ball(bench, loaded[WEDGE], data / "wedge_ball")
+
+
+def _measure_gels(bench: Bench, pipelines: Pipelines, data: Path) -> None:
+    marked, bare = (DEFAULT, pipelines.loaded[DEFAULT]), (MARKERLESS, pipelines.bare[MARKERLESS])
+    gels.measure_gels(bench, marked, bare, data)
 
 
 def _is_for_one_camera(pipeline: Pipeline) -> bool:
-    """Whether a pipeline rectifies one camera's picture and makes no sense on the simulated one."""
     node = pipeline.nodes.get("preprocess")
     return node is not None and any(
         getattr(node.params, name, None) is not None for name in ("homography", "undistort")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,13 +104,3 @@ class Rendered:
         """Whether something is pressed to at least half of its depth."""
         # The smooth ramp passes through half depth; a hair of tolerance keeps that frame on one side.
         return any(press.depth >= 0.5 * press.shape.depth - 1e-9 for press in self.scene.presses(index))
-
-
-def render_all(cases: Iterable[Case], folder: Path) -> Iterator[Rendered]:
-    """Render one scene after the other; each file is removed when the next one is asked for."""
-    for case in cases:
-        rendered = Rendered(case, folder)
-        try:
-            yield rendered
-        finally:
-            rendered.path.unlink(missing_ok=True)

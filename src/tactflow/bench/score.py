@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import metrics
+from tactflow.bench.lockstep import TimedResult
+from tactflow.bench.pipelines import Judge
 from tactflow.bench.quantities import Tally
 from tactflow.bench.scenes import Rendered
-from tactflow.message.result import Result
 from tactflow.sim import Truth
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
@@ -89,8 +90,8 @@ def add_detection(tally: Tally, points: NDArray[np.float64], truth: Truth) -> No
     visible = truth.position[np.asarray(truth.visible, dtype=np.bool_)]
     if len(visible) < 2:
         return
-    found = metrics.detection(points, visible, metrics.dot_pitch(visible) / 2)
-    tally.add(marker_recall=found.recall, marker_precision=found.precision, localisation_rms=found.errors)
+    recall, precision, errors = metrics.detection(points, visible, metrics.dot_pitch(visible) / 2)
+    tally.add(marker_recall=recall, marker_precision=precision, localisation_rms=errors)
 
 
 class MarkerScore:
@@ -133,8 +134,7 @@ class MarkerScore:
 
         A place that is only inferred is no false marker.
         """
-        # A single dot has no neighbour that it could be mistaken for.
-        self._pitch = metrics.dot_pitch(truth.origin) if len(truth.origin) > 1 else 1e9
+        self._pitch = metrics.dot_pitch(truth.origin)
         index = metrics.match_points(markers.origin, truth.origin, self._pitch / 2)
         seen = np.flatnonzero(markers.status == MarkerStatus.TRACKED)
         self._tally.add(
@@ -145,33 +145,28 @@ class MarkerScore:
         return index
 
 
-class PipelineScore:
-    """Compares the results of a whole pipeline on one scene.
-
-    tally : where the errors are collected; may be shared by several scenes.
-    """
+class PipelineScore(Judge):
+    """Compares the results of a whole pipeline on one scene. tally : may be shared by several scenes."""
 
     def __init__(self, rendered: Rendered, tally: Tally) -> None:
-        self.rendered = rendered
-        self.tally = tally
+        super().__init__(tally)
+        self._rendered = rendered
         self._markers = MarkerScore(tally)
 
-    def truth(self, result: Result) -> Truth:
-        """The truth about the frame of a result, in its pixels."""
-        mapping = result.value("mapping")
-        if mapping is None:
-            height, width = result.frame.image.shape[:2]
-            mapping = PixelMapping.identity((width, height))
-        return self.rendered.truths(mapping)[result.frame.seq]
-
-    def add(self, result: Result) -> str:
+    def add(self, result: TimedResult) -> str:
         """Compare one frame; returns what it shows: "contact" or "idle"."""
-        truth = self.truth(result)
-        if add_decision(self.tally, result.contact is not None, truth, self.rendered.deep(result.frame.seq)):
-            assert result.contact is not None
-            add_geometry(self.tally, result.contact, truth)
+        height, width = result.frame.image.shape[:2]
+        mapping = result.mapping or PixelMapping.identity((width, height))
+        truth, deep = self._rendered.truths(mapping)[result.seq], self._rendered.deep(result.seq)
+        contact = result.contact
+        if add_decision(self.tally, contact is not None, truth, deep):
+            assert contact is not None
+            add_geometry(self.tally, contact, truth)
             if result.contact_mask is not None:
                 add_mask(self.tally, result.contact_mask, truth)
+        if deep and truth.touching:
+            overlap = 0.0 if contact is None else metrics.convex_iou(contact.hull, truth.hull)
+            self.worst.add(overlap, result, truth.contact_mask)
         if result.markers is not None:
             self._markers.add(result.markers, truth)
         add_flow(self.tally, result.flow, truth)

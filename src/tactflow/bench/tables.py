@@ -40,14 +40,6 @@ PRIMARY = {
     "tracker": ("displacement_rms", "displacement_p99", "wrong_percent"),
     "flow_in_mask": ("flow_error",),
     "depth": ("depth_rms", "volume_error", "depth_within_one", "depth_within_two"),
-    "motion": (
-        "field_rms",
-        "field_within_one",
-        "field_within_two",
-        "slip_onset",
-        "slip_missed",
-        "slip_false",
-    ),
 }
 """Group -> quantities that are shown of it."""
 
