@@ -1,7 +1,7 @@
 # make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
 # make test         lint, types, tests
 # make soak         what takes longer: faults in running processes, a million frames (two hours)
-# make load         results, drops, latency and memory against the load (ten minutes)
+# make load         results, drops, latency and memory against the load (five minutes)
 # make fuzz         damaged input to every parser, SECONDS for each
 # make reliability  lets every fault happen, and writes that into docs/reliability.md
 # make audit        known weaknesses of the packages that are used, where the list can be reached
@@ -33,10 +33,10 @@ test: lint types
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
 soak: $(VENV)/.installed-test
 	$(PY) -m pytest -m slow
-	$(PY) -m benchmarks.load.soak
+	$(PY) benchmarks/load.py --soak 1000000
 
 load: $(VENV)/.installed-test
-	$(PY) -m benchmarks.load.knee
+	$(PY) benchmarks/load.py
 
 fuzz: SECONDS := 300
 fuzz: $(VENV)/.installed-test

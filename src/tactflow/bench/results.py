@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import median
@@ -163,26 +163,18 @@ def regressions(
 
     stored : of `load_errors`. scenes : the simulated scenes that were chosen, or None for all.
     """
-    now = result.errors()
-    here = {key.rpartition("/")[2] for key in now}
-    return [line for key, errors in stored.items() for line in _worse(key, errors, now, here, scenes)]
-
-
-def _worse(
-    key: str,
-    stored: Mapping[str, float],
-    now: Mapping[str, Mapping[str, float]],
-    here: Collection[str],
-    chosen: Collection[str] | None,
-) -> Iterable[str]:
-    """What is worse in one measurement. here : scenes that were measured. chosen : as `scenes` above."""
-    scene = key.rpartition("/")[2]
-    # Recordings are not everywhere; simulated scenes are, so a missing one is a regression.
-    if scene not in here and (scene.startswith(RECORDING) or (chosen is not None and scene not in chosen)):
-        return
-    for name, value in stored.items():
-        quantity, current = QUANTITIES.get(name), now.get(key, {}).get(name)
-        if quantity is not None and (current is None or quantity.is_worse(current, value)):
-            measured = "no longer measured" if current is None else f"now {current:.4g}"
-            allowed = quantity.allowed(value)
-            yield f"{key}: {quantity.title}: was {value:.4g}, allowed {allowed:.4g}, {measured}"
+    now, worse = result.errors(), []
+    measured = {key.rpartition("/")[2] for key in now}
+    for key, errors in stored.items():
+        scene = key.rpartition("/")[2]
+        # Recordings are not everywhere; simulated scenes are, so a missing one is a regression.
+        left_out = scene.startswith(RECORDING) or (scenes is not None and scene not in scenes)
+        if scene not in measured and left_out:
+            continue
+        for name, value in errors.items():
+            quantity, current = QUANTITIES.get(name), now.get(key, {}).get(name)
+            if quantity is not None and (current is None or quantity.is_worse(current, value)):
+                found = "no longer measured" if current is None else f"now {current:.4g}"
+                allowed = quantity.allowed(value)
+                worse.append(f"{key}: {quantity.title}: was {value:.4g}, allowed {allowed:.4g}, {found}")
+    return worse

@@ -6,8 +6,7 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -20,7 +19,7 @@ from tactflow.bench.lockstep import on_recording
 from tactflow.bench.methods import measure_methods
 from tactflow.bench.pipelines import CLASSIC, Bench
 from tactflow.bench.results import BenchResult
-from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, Rendered
+from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, rendered
 from tactflow.bench.score import PipelineScore
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
@@ -72,29 +71,6 @@ class Plan:
         return [case for case in whole if case.label in scenes], [c for c in alone if c.label in scenes]
 
 
-@dataclass(frozen=True, slots=True)
-class Pipelines:
-    """Name -> pipeline.
-
-    loaded : all of them. marked, bare : for gels with markers, and without; none that rectifies one camera's
-    picture and makes no sense on others.
-    """
-
-    loaded: Mapping[str, Pipeline]
-    marked: Mapping[str, Pipeline]
-    bare: Mapping[str, Pipeline]
-
-    @classmethod
-    def load(cls, files: Mapping[str, Path]) -> Pipelines:
-        """Read the files. ConfigError if one is wrong."""
-        loaded = {name: load_pipeline(path) for name, path in files.items()}
-        marked = {n: p for n, p in loaded.items() if not _is_for_one_camera(p) and n != MARKERLESS}
-        markerless = loaded.get(MARKERLESS) or load_pipeline(find_pipeline(MARKERLESS))
-        return cls(
-            loaded, marked, {MARKERLESS: markerless, CLASSIC: recordings.without_markers(loaded[CLASSIC])}
-        )
-
-
 def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
     """Measure everything of a plan.
 
@@ -107,17 +83,17 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
     whole, alone = plan.chosen()
     if plan.data is not None:
         recordings.check(plan.data)
-    pipelines = Pipelines.load(plan.files)
+    loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
     result, unit = BenchResult(quick=plan.quick, machine=machine()), CopyUnit()
     with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
-        bench = Bench(result, unit, Path(folder), plan.pictures)
-        steps = [(f"pipelines on {c.label}", partial(_measure_pipelines, bench, pipelines, c)) for c in whole]
-        steps += [(f"methods on {c.label}", partial(_measure_methods, bench, pipelines, c)) for c in alone]
+        run = _Run(Bench(result, unit, Path(folder), plan.pictures), loaded)
+        steps = [(f"pipelines on {case.label}", partial(run.pipelines, case)) for case in whole]
+        steps += [(f"methods on {case.label}", partial(run.methods, case)) for case in alone]
         if not plan.quick and plan.scenes is None:
-            steps.append(("heights", partial(depth.measure_simulated, bench)))
+            steps.append(("heights", partial(depth.measure_simulated, run.bench)))
         if plan.data is not None:
-            steps.append(("recordings", partial(_measure_recordings, bench, pipelines, plan.data)))
-            steps.append(("real gels", partial(_measure_gels, bench, pipelines, plan.data)))
+            steps.append(("recordings", partial(run.recordings, plan.data)))
+            steps.append(("real gels", partial(run.gels, plan.data)))
         for number, (what, measure) in enumerate(steps):
             progress(what, number, len(steps))
             measure()
@@ -126,47 +102,52 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
     return result
 
 
-@contextmanager
-def _rendered(case: Case, folder: Path) -> Iterator[Rendered]:
-    """A rendered scene, whose file is removed after the block."""
-    rendered = Rendered(case, folder)
-    try:
-        yield rendered
-    finally:
-        rendered.path.unlink(missing_ok=True)
+class _Run:
+    """What is measured, step by step.
 
+    loaded : name -> pipeline. marked, bare : those for gels with markers, and without, on any camera.
+    """
 
-def _measure_pipelines(bench: Bench, pipelines: Pipelines, case: Case) -> None:
-    with _rendered(case, bench.scratch) as rendered:
-        suited = pipelines.marked if len(rendered.scene.layout.rest) else pipelines.bare
-        if case in TROUBLES:
-            # The script takes half of a run's time and was not made for any of this.
-            suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
-        if rendered.scene.settings.speckle:
-            speckled = on_recording(pipelines.loaded[DEFAULT], rendered.path)
-            bench.measure_refusal(DEFAULT, speckled, case.label)
-        bench.measure(suited, case.label, [(rendered.path, partial(PipelineScore, rendered))])
+    def __init__(self, bench: Bench, loaded: Mapping[str, Pipeline]) -> None:
+        self.bench, self.loaded = bench, loaded
+        self.marked = {n: p for n, p in loaded.items() if not _is_for_one_camera(p) and n != MARKERLESS}
+        self.bare = {
+            MARKERLESS: loaded.get(MARKERLESS) or load_pipeline(find_pipeline(MARKERLESS)),
+            CLASSIC: recordings.without_markers(loaded[CLASSIC]),
+        }
 
+    def pipelines(self, case: Case) -> None:
+        """Measure whole pipelines on a simulated scene."""
+        with rendered(case, self.bench.scratch) as scene:
+            suited = self.marked if len(scene.scene.layout.rest) else self.bare
+            if case in TROUBLES:
+                # The script takes half of a run's time and was not made for any of this.
+                suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
+            if scene.scene.settings.speckle:
+                speckled = on_recording(self.loaded[DEFAULT], scene.path)
+                self.bench.measure_refusal(DEFAULT, speckled, case.label)
+            self.bench.measure(suited, case.label, [(scene.path, partial(PipelineScore, scene))])
 
-def _measure_methods(bench: Bench, pipelines: Pipelines, case: Case) -> None:
-    with _rendered(case, bench.scratch) as rendered:
-        measure_methods(bench, pipelines.marked, rendered)
+    def methods(self, case: Case) -> None:
+        """Measure the methods of each stage on a simulated scene."""
+        with rendered(case, self.bench.scratch) as scene:
+            measure_methods(self.bench, self.marked, scene)
 
+    def recordings(self, data: Path) -> None:
+        """Measure whole pipelines on recordings of the Wedge."""
+        wedge = {WEDGE: self.loaded[WEDGE]} if WEDGE in self.loaded else {}
+        recordings.measure_recordings(self.bench, wedge | self.marked, self.bare, data)
+        if wedge and (data / "wedge_ball" / "labels.csv").exists():
+            depth.measure_ball(self.bench, self.loaded[WEDGE], data / "wedge_ball")
 
-def _measure_recordings(bench: Bench, pipelines: Pipelines, data: Path) -> None:
-    loaded = pipelines.loaded
-    wedge = {WEDGE: loaded[WEDGE]} if WEDGE in loaded else {}
-    recordings.measure_recordings(bench, wedge | dict(pipelines.marked), pipelines.bare, data)
-    if wedge and (data / "wedge_ball" / "labels.csv").exists():
-        depth.measure_ball(bench, loaded[WEDGE], data / "wedge_ball")
-
-
-def _measure_gels(bench: Bench, pipelines: Pipelines, data: Path) -> None:
-    marked, bare = (DEFAULT, pipelines.loaded[DEFAULT]), (MARKERLESS, pipelines.bare[MARKERLESS])
-    gels.measure_gels(bench, marked, bare, data)
+    def gels(self, data: Path) -> None:
+        """Measure the default and the markerless pipeline on recordings of many labs."""
+        marked, bare = (DEFAULT, self.loaded[DEFAULT]), (MARKERLESS, self.bare[MARKERLESS])
+        gels.measure_gels(self.bench, marked, bare, data)
 
 
 def _is_for_one_camera(pipeline: Pipeline) -> bool:
+    """Whether a pipeline rectifies one camera's picture and makes no sense on the simulated one."""
     node = pipeline.nodes.get("preprocess")
     return node is not None and any(
         getattr(node.params, name, None) is not None for name in ("homography", "undistort")

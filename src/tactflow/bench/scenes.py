@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,3 +106,13 @@ class Rendered:
         """Whether something is pressed to at least half of its depth."""
         # The smooth ramp passes through half depth; a hair of tolerance keeps that frame on one side.
         return any(press.depth >= 0.5 * press.shape.depth - 1e-9 for press in self.scene.presses(index))
+
+
+@contextmanager
+def rendered(case: Case, folder: Path) -> Iterator[Rendered]:
+    """Render a scene for the block, after which its file is removed."""
+    scene = Rendered(case, folder)
+    try:
+        yield scene
+    finally:
+        scene.path.unlink(missing_ok=True)

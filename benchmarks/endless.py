@@ -9,15 +9,14 @@ from collections.abc import Iterator
 import numpy as np
 from pydantic import Field
 
-from tactflow.engine.contract import Source, StageParams
-from tactflow.engine.frame import Frame
+from tactflow import Frame, Source, StageParams
 
 
 class Endless(Source):
     """Pictures at a rate, like a camera, or as fast as possible, like a recording.
 
-    The time of a live frame is when it was due, on the monotonic clock: all processes have the same one, so
-    a subscriber can tell how old a result is.
+    The time of a live frame is when it was due on the monotonic clock, which all processes share, so that a
+    subscriber can tell how old a result is.
     """
 
     class Params(StageParams):
@@ -42,8 +41,7 @@ class Endless(Source):
         began = time.perf_counter()
         for seq in range(self.params.frames):
             t = began + seq / self.params.rate if self.live else seq / 60
-            wait = t - time.perf_counter() if self.live else 0.0
-            if self._stopped.wait(wait) if wait > 0 else self._stopped.is_set():
+            if self._stopped.wait(max(0.0, t - time.perf_counter()) if self.live else 0.0):
                 return
             captured = t if self.live else time.perf_counter()
             yield Frame(self._sensor, seq, t, pictures[seq % len(pictures)], captured, reference=seq == 0)

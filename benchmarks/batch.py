@@ -1,0 +1,66 @@
+"""What `tactflow batch` costs: a plain loop over recordings, one process, and several; and whether all agree.
+
+python benchmarks/batch.py                  # 100 short simulated recordings; two minutes
+python benchmarks/batch.py --recordings 1000 --workers 1 2 4
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+FRAMES = 12
+"""Of each recording: opening it and writing its tables then takes half of the time."""
+LOOP = (
+    "import sys, tactflow, pathlib\n"
+    "for i, source in enumerate(pathlib.Path(sys.argv[1]).read_text().split()):\n"
+    "    sinks = {'parquet': {'path': f'{sys.argv[2]}/{i}'}}\n"
+    "    tactflow.run('default', source=source, settings={'sinks': sinks})\n"
+)
+"""The same work in one process, without a batch."""
+
+
+def seconds(*arguments: str | Path) -> float:
+    """Wall time of a call of Python, s."""
+    began = time.perf_counter()
+    subprocess.run([sys.executable, *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - began
+
+
+def digest(out: Path) -> str:
+    """One digest for all results of a batch."""
+    files = sorted(path for path in (out / "results").rglob("*") if path.is_file())
+    return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
+
+
+def main() -> None:
+    """Measure and print a table in Markdown."""
+    parser = argparse.ArgumentParser(description="What `tactflow batch` costs.")
+    parser.add_argument("--recordings", type=int, default=100)
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        sources = folder / "sources.txt"
+        specs = (f"sim:press?frames={FRAMES}&seed={seed}\n" for seed in range(args.recordings))
+        sources.write_text("".join(specs))
+        walls = {"plain loop": seconds("-c", LOOP, sources, folder / "loop")}
+        digests = set()
+        for workers in args.workers:
+            out = folder / str(workers)
+            command = ("-m", "tactflow", "batch", "default", sources, "--out", out, "--quiet")
+            walls[f"{workers} workers"] = seconds(*command, "--workers", str(workers))
+            digests.add(digest(out))
+    print("| by | wall, s | a recording, ms |\n| --- | --- | --- |")
+    for by, wall in walls.items():
+        print(f"| {by} | {wall:.1f} | {1e3 * wall / args.recordings:.0f} |")
+    print(f"results equal to the bit: {'yes' if len(digests) == 1 else 'no'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,223 @@
+"""A running tactflow under load: how old results are, how many are dropped, what it holds over time.
+
+    python benchmarks/load.py                       # 1 to 16 sensors, 1 to 128 subscribers; five minutes
+    python benchmarks/load.py --sensors 1 --rate 60
+    python benchmarks/load.py --soak 1000000        # frames through all sinks as fast as possible; an hour
+
+Each sensor shows 800 x 600 px pictures of a contact that comes and goes to the default pipeline. Subscribers
+run on the same machine. Tables are printed in Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+import zmq
+
+import tactflow
+
+ROOT = Path(__file__).resolve().parents[1]
+CYCLE = 60
+"""Pictures that are shown again and again: one press and release."""
+SETTLE, MEASURED = 4.0, 15.0
+"""Seconds that a run is given after its first results, and that it is measured for. Chosen by hand."""
+LOOK_EVERY = 5.0
+"""Seconds between two looks at what a process holds. Chosen by hand."""
+PORT = 5750
+"""Of the publisher; the page has the next one."""
+SOAK_SIZE = (200, 150)
+"""Small pictures, so that a million take an hour: what is lost with each frame shows all the same."""
+
+
+def write_pipeline(folder: Path, size: tuple[int, int], source: Mapping[str, Any], **changes: Any) -> None:
+    """The default pipeline with the endless source, its pictures beside it, and changes of its keys."""
+    scene = tactflow.open_scene(f"press?frames={CYCLE}")
+    pictures = [cv2.resize(scene.frame(i), size, interpolation=cv2.INTER_AREA) for i in range(CYCLE)]
+    np.save(folder / "pictures.npy", np.stack(pictures))
+    shutil.copy(Path(__file__).with_name("endless.py"), folder)
+    document = yaml.safe_load((ROOT / "pipeline.yaml").read_text(encoding="utf-8"))
+    capture = {"use": "./endless.py:Endless", "pictures": str(folder / "pictures.npy"), **source}
+    document["stages"]["capture"] = capture
+    if "sensors" in changes:
+        del document["sensor"]
+    (folder / "pipeline.yaml").write_text(
+        yaml.safe_dump(document | changes, sort_keys=False), encoding="utf-8"
+    )
+
+
+@contextmanager
+def running(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """`tactflow run` in a folder, until the block ends."""
+    command = [sys.executable, "-P", "-m", "tactflow", "run", "--quiet", *arguments]
+    with (folder / "messages.txt").open("wb") as messages:
+        process = subprocess.Popen(command, cwd=folder, stderr=messages, stdout=subprocess.DEVNULL)
+        try:
+            yield process
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def fail_if_ended(process: subprocess.Popen[bytes], folder: Path) -> None:
+    """Stop with what the process has reported if it has ended."""
+    if process.poll() is not None:
+        raise SystemExit((folder / "messages.txt").read_text(encoding="utf-8"))
+
+
+def held_by(pid: int) -> dict[str, float]:
+    """Memory of a process and its children, MB, and its open files and threads; empty once it has ended."""
+    folder = Path(f"/proc/{pid}")
+    with suppress(OSError, IndexError):
+        children = (folder / f"task/{pid}/children").read_text().split()
+        pages = [int(Path(f"/proc/{p}/statm").read_text().split()[1]) for p in [str(pid), *children]]
+        megabytes = sum(pages) * os.sysconf("SC_PAGE_SIZE") / 2**20
+        files, threads = (len(list((folder / name).iterdir())) for name in ("fd", "task"))
+        return {"memory, MB": megabytes, "open files": files, "threads": threads}
+    return {}
+
+
+class Subscribers:
+    """Reads results over several connections. ages : s. seqs : sensor -> those of the first connection."""
+
+    def __init__(self, count: int) -> None:
+        self.ages: list[float] = []
+        self.seqs: defaultdict[str, list[int]] = defaultdict(list)
+        self._count = count
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Read in a thread of its own while the block lasts."""
+        end = threading.Event()
+        thread = threading.Thread(target=self._read, args=(end,))
+        thread.start()
+        try:
+            yield
+        finally:
+            end.set()
+            thread.join()
+
+    def _read(self, end: threading.Event) -> None:
+        with ExitStack() as stack:
+            context, poller = stack.enter_context(zmq.Context()), zmq.Poller()
+            sockets = [stack.enter_context(context.socket(zmq.SUB)) for _ in range(self._count)]
+            for socket in sockets:
+                socket.linger = 0
+                socket.subscribe(b"tactflow.s")
+                socket.connect(f"tcp://127.0.0.1:{PORT}")
+                poller.register(socket, zmq.POLLIN)
+            while not end.is_set():
+                for socket, _ in poller.poll(100):
+                    topic, _, body = socket.recv().partition(b" ")
+                    if topic != b"tactflow.stats":
+                        message = json.loads(body)
+                        self.ages.append(time.perf_counter() - message["t"])
+                        if socket is sockets[0]:
+                            self.seqs[message["sensor"]].append(message["seq"])
+
+
+def measure(sensors: int, subscribers: int, rate: float) -> list[str]:
+    """Run one load; returns the cells of its row."""
+    names = {"sensors": {f"s{n}": {} for n in range(sensors)}} if sensors > 1 else {"sensor": "s0"}
+    readers = Subscribers(subscribers)
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder = Path(name)
+        sinks = {"zmq": {"endpoint": f"tcp://127.0.0.1:{PORT}"}}
+        write_pipeline(folder, (800, 600), {"rate": rate}, sinks=sinks, **names)
+        process = stack.enter_context(running(folder))
+        stack.enter_context(readers.reading())
+        while len(readers.seqs) < sensors:
+            fail_if_ended(process, folder)
+            time.sleep(0.1)
+        time.sleep(SETTLE)
+        readers.ages.clear()
+        readers.seqs.clear()
+        before = held_by(process.pid)["memory, MB"]
+        time.sleep(MEASURED)
+        memory = held_by(process.pid)["memory, MB"]
+        ages = 1e3 * np.array(readers.ages)
+        arrived = [len(seqs) / (seqs[-1] - seqs[0] + 1) for seqs in readers.seqs.values()]
+    p50, p99 = np.percentile(ages, (50, 99))
+    cells = [f"{sensors}", f"{subscribers}", f"{100 * np.mean(arrived):.1f} %", f"{p50:.2f}", f"{p99:.1f}"]
+    return [
+        *cells,
+        f"{ages[-max(1, len(ages) // 10) :].max():.0f}",
+        f"{memory:.0f}",
+        f"{memory - before:+.1f}",
+    ]
+
+
+def soak(frames: int, folder: Path) -> list[dict[str, float]]:
+    """Run frames through all sinks; returns what the process held, look by look."""
+    sinks = {
+        "zmq": {"endpoint": f"tcp://127.0.0.1:{PORT}"},
+        "jsonl": {"path": "results.jsonl"},
+        "record": {"path": "recording.mcap", "rotate_size": 200},
+        "images": {"folder": "images", "format": "jpg", "every": 100},
+        "video": {"path": "annotated.mkv", "fps": 60},
+        "view": {"port": PORT + 1},
+    }
+    write_pipeline(folder, SOAK_SIZE, {"frames": frames}, sinks=sinks, sensor="s0")
+    looks = []
+    with running(folder, "--set", "stages.preprocess.downsample=1") as process, Subscribers(1).reading():
+        while process.poll() is None:
+            looks.append(held_by(process.pid))
+            for old in sorted(folder.glob("recording*.mcap"), key=os.path.getmtime)[:-2]:
+                old.unlink()
+            time.sleep(LOOK_EVERY)
+    if process.returncode:
+        fail_if_ended(process, folder)
+    with (folder / "results.jsonl").open("rb") as lines:
+        count = sum(1 for _ in lines)
+    if count != frames:
+        raise SystemExit(f"required {frames} lines, got {count}")
+    # The last looks find a process that closes what it has open.
+    return [look for look in looks if look][:-1]
+
+
+def print_row(cells: Sequence[str]) -> None:
+    """Print a row of a table in Markdown."""
+    print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def main() -> None:
+    """Measure what the command line asks for."""
+    parser = argparse.ArgumentParser(description="A running tactflow under load.")
+    parser.add_argument("--sensors", type=int, nargs="+", default=[1, 2, 4, 8, 16])
+    parser.add_argument("--subscribers", type=int, nargs="+", default=[16, 128], help="of one sensor")
+    parser.add_argument("--rate", type=float, default=30.0, help="of each sensor, frames per second (30)")
+    parser.add_argument("--soak", type=int, metavar="FRAMES", help="instead: memory over so many frames")
+    args = parser.parse_args()
+    if args.soak:
+        with tempfile.TemporaryDirectory() as folder:
+            looks = soak(args.soak, Path(folder))
+        print_row(["", "after a tenth", "least since", "most since", "at the end"])
+        print_row(["---"] * 5)
+        for what in looks[0]:
+            values = [look[what] for look in looks[len(looks) // 10 :]]
+            print_row([what, *(f"{v:.0f}" for v in (values[0], min(values), max(values), values[-1]))])
+        return
+    heads = ["sensors", "subscribers", "results", "age, ms: p50", "p99", "oldest at the end", "memory, MB"]
+    print_row([*heads, "growth, MB"])
+    print_row(["---"] * 8)
+    for sensors, subscribers in [(n, 1) for n in args.sensors] + [(1, n) for n in args.subscribers]:
+        print_row(measure(sensors, subscribers, args.rate))
+
+
+if __name__ == "__main__":
+    main()
