@@ -121,13 +121,6 @@ def test_workers_end_with_the_process_that_started_them(
     until(lambda: not is_running(worker))
 
 
-def test_workers_import_nothing_from_the_current_folder(folder: Path) -> None:
-    (folder / "random.py").write_text("raise SystemExit('imported from the current folder')")
-    command = [sys.executable, "-P", "-m", "tactflow", *batch("a.npy", "--workers", "1")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 @pytest.fixture
 def scheduler(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """A Dask cluster in this process."""

@@ -111,7 +111,7 @@ def test_errors_are_the_same_with_the_same_seed(tmp_path: Path) -> None:
     errors = []
     for _ in range(2):
         rendered = [Fitted(SMALL, Case("press", 16), tmp_path, 5)]
-        errors.append(judge({"one": tactflow.load("default")}, rendered, 5)[0].error)
+        errors.append(judge({"one": tactflow.load("default")}, rendered, 5)[0].errors)
     assert errors[0] == errors[1]
 
 

@@ -91,6 +91,7 @@ def _table(runs: Runs) -> Table:
 
 def _details(store: Store, recording: Recording, outcome: Outcome) -> Section:
     """Why a recording failed, or its plot and pictures."""
-    text = "\n\n".join(filter(None, (outcome.error, outcome.warnings, recording.source)))
+    place = recording.source if recording.source != recording.name else None
+    text = "\n\n".join(filter(None, (outcome.error, outcome.warnings, place)))
     pictures = [Html(store.preview(recording))] if outcome.status == "done" else []
     return Section(recording.name, text, pictures)

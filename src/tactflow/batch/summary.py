@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.drawing.results import Annotator
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
-from tactflow.report import COLORS, figure, picture
+from tactflow.report import COLORS, Html, figure, picture
 
 MOST_POINTS = 480
 """Points of a curve, before neighbours are merged: two a pixel of a plot."""
@@ -97,19 +99,38 @@ class Summary:
         self._end_contact()
         pictures = [picture(p.jpeg, f"{p.t:.2f} s") for p in sorted(self._pictures)]
         try:
-            drawing, axes = figure(3, 1, size=(4.2, 2.8), sharex=True)
+            plot = picture(_drawn(np.array(self.points, float).reshape(-1, 4)))
         except ConfigError:
-            return "".join(pictures)
-        t, *curves = np.array(self.points, float).reshape(-1, 4).T
-        labels = ("area, px²", "flow, px", "angle, °")
-        for axis, curve, label, color in zip(axes, curves, labels, COLORS[:3], strict=True):
-            # A point between gaps is seen only as a dot.
-            axis.plot(t, curve, color=color, marker=".", markersize=2)
-            axis.set_ylabel(label, fontsize=8)
-            axis.tick_params(labelsize=8)
-        axes[2].set_ylim(-90, 90)
-        axes[2].set_xlabel("time, s", fontsize=8)
-        return "".join([picture(drawing), *pictures])
+            plot = Html()
+        return "".join([plot, *pictures])
+
+
+@functools.cache
+def _axes() -> tuple[Any, Any]:
+    """The figure of all recordings: a new one for each takes three times as long (0.2 s)."""
+    drawing, axes = figure(3, 1, size=(4.2, 2.8), sharex=True)
+    for axis, label, color in zip(axes, ("area, px²", "flow, px", "angle, °"), COLORS[:3], strict=True):
+        axis.plot([], [], color=color)
+        axis.set_ylabel(label, fontsize=8)
+        axis.tick_params(labelsize=8)
+    axes[2].set_xlabel("time, s", fontsize=8)
+    drawing.align_ylabels()
+    # The widest labels that there may be, px^2; the layout stays as they need it.
+    axes[0].set_ylim(0, 90_000)
+    drawing.draw_without_rendering()
+    drawing.set_layout_engine("none")
+    return drawing, axes
+
+
+def _drawn(points: NDArray[np.float64]) -> Any:
+    """The figure of a recording's points (N, 4)."""
+    drawing, axes = _axes()
+    for axis, curve in zip(axes, points.T[1:], strict=True):
+        axis.lines[0].set_data(points[:, 0], curve)
+        axis.relim()
+        axis.autoscale(axis="both")
+    axes[2].set_ylim(-90, 90)
+    return drawing
 
 
 def _jpeg(result: Result) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,13 +62,13 @@ class Interval:
 class Found:
     """What is known of a candidate.
 
-    error : of each of `ERRORS` that it has, px of the camera's picture. quantities : errors by the names of
+    errors : of each of `ERRORS` that it has, px of the camera's picture. quantities : errors by the names of
     the bench, processed pixels. ms : CPU time of a frame with contact, median. failure : why it does not run.
     unsound : what it gets wrong. checks : of `CHECKS`.
     """
 
     name: str
-    error: dict[str, Interval] = field(default_factory=dict[str, Interval])
+    errors: dict[str, Interval] = field(default_factory=dict[str, Interval])
     quantities: dict[str, float] = field(default_factory=dict[str, float])
     ms: Interval = field(default_factory=Interval)
     failure: str | None = None
@@ -77,7 +77,7 @@ class Found:
 
     def of(self, kind: str) -> float:
         """The error of a kind, inf where there is none."""
-        known = self.error.get(kind)
+        known = self.errors.get(kind)
         return math.inf if known is None or self.failure else known.value
 
     @property
@@ -147,9 +147,9 @@ def _found(name: str, tally: Tally, scale: float, times: Times, seed: int) -> Fo
     }
     for kind, errors in per_frame.items():
         if len(errors):
-            found.error[kind] = _interval(scale * errors, seed, 2.0 if kind == "dots" else 1.0)
-    if found.error:
-        found.error[ANY] = max(found.error.values(), key=lambda interval: interval.value)
+            found.errors[kind] = _interval(scale * errors, rms if kind == "dots" else np.mean, seed)
+    if found.errors:
+        found.errors[ANY] = max(found.errors.values(), key=lambda interval: interval.value)
     set_time(found, times, seed)
     return found
 
@@ -157,23 +157,23 @@ def _found(name: str, tally: Tally, scale: float, times: Times, seed: int) -> Fo
 def set_time(found: Found, times: Times, seed: int) -> None:
     """Time of a frame with contact, or of any but references where no frame has one."""
     counted = {kind: np.array(samples) * 1e3 for kind, samples in times.items() if kind != "reference"}
-    if not counted:
-        return
-    busy = counted.get("contact", np.concatenate(list(counted.values())))
-    draws = np.median(np.random.default_rng([seed, 0x6D73]).choice(busy, (DRAWS, len(busy))), axis=1)
-    low, high = np.percentile(draws, INTERVAL)
-    found.ms = Interval(float(np.median(busy)), float(low), float(high))
+    if counted:
+        busy = counted.get("contact", np.concatenate(list(counted.values())))
+        found.ms = _interval(busy, np.median, seed, block=1)
 
 
-def _interval(values: NDArray[np.float64], seed: int, power: float) -> Interval:
-    """Power mean of values (N,), and its interval by a bootstrap of blocks of frames; of five, at least."""
-    raised = values**power
-    blocks = np.array_split(raised, min(len(raised), max(5, len(raised) // BLOCK)))
-    sums, counts = np.array([block.sum() for block in blocks]), np.array([len(block) for block in blocks])
-    drawn = np.random.default_rng([seed, 0x6572]).integers(0, len(blocks), (DRAWS, len(blocks)))
-    means = (sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)) ** (1 / power)
-    low, high = np.percentile(means, INTERVAL)
-    return Interval(float(raised.mean() ** (1 / power)), float(low), float(high))
+def _interval(
+    values: NDArray[np.float64],
+    statistic: Callable[[NDArray[np.float64]], Any],
+    seed: int,
+    block: int = BLOCK,
+) -> Interval:
+    """A statistic of values (N,), and its interval by a bootstrap of blocks of frames; of five, at least."""
+    blocks = np.array_split(values, min(len(values), max(5, len(values) // block)))
+    draws = np.random.default_rng(seed).integers(0, len(blocks), (DRAWS, len(blocks)))
+    drawn = [statistic(np.concatenate([blocks[index] for index in draw])) for draw in draws]
+    low, high = np.percentile(drawn, INTERVAL)
+    return Interval(float(statistic(values)), float(low), float(high))
 
 
 def mark_unsound(found: Sequence[Found]) -> None:

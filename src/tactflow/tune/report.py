@@ -26,7 +26,7 @@ def lines(tuned: Tuned) -> Iterator[str]:
         if one.failure:
             yield f"  {'fails':<8} {one.name}: {one.failure.splitlines()[0]}"
             continue
-        cells = _cell(one.ms, 6, 2) + "".join(_cell(one.error.get(kind), 8, 3) for kind in kinds)
+        cells = _cell(one.ms, 6, 2) + "".join(_cell(one.errors.get(kind), 8, 3) for kind in kinds)
         yield f"  {_role(tuned, one):<8} {cells}{one.name}{f'  ({one.unsound})' if one.unsound else ''}"
     yield ""
     yield "; ".join(f"{kind}: {ERRORS[kind]}" for kind in kinds)
@@ -49,7 +49,7 @@ def _facts(tuned: Tuned) -> Iterator[str]:
 
 
 def _kinds(tuned: Tuned) -> list[str]:
-    return [kind for kind in ERRORS if kind != ANY and any(kind in one.error for one in tuned.found)]
+    return [kind for kind in ERRORS if kind != ANY and any(kind in one.errors for one in tuned.found)]
 
 
 def _cell(interval: Interval | None, width: int, digits: int) -> str:
@@ -75,17 +75,7 @@ def as_json(tuned: Tuned) -> dict[str, Any]:
         "settings": None if tuned.chosen is None else dict(tuned.chosen.settings),
         "front": tuned.front,
         "words": tuned.notes,
-        "candidates": [
-            {
-                "name": one.name,
-                "ms": asdict(one.ms),
-                "errors": {kind: asdict(interval) for kind, interval in one.error.items()},
-                "checks": one.checks,
-                "failure": one.failure,
-                "unsound": one.unsound,
-            }
-            for one in tuned.found
-        ],
+        "candidates": [asdict(one) for one in tuned.found],
     }
 
 
@@ -144,7 +134,7 @@ def write_page(path: Path, tuned: Tuned) -> Path:
     columns = ["", "pipeline", "time, ms", *(f"{ERRORS[kind]}, px" for kind in kinds), "remarks"]
     rows = []
     for one in tuned.found:
-        errors = [one.error[kind].value if kind in one.error else None for kind in kinds]
+        errors = [one.errors[kind].value if kind in one.errors else None for kind in kinds]
         role = _role(tuned, one)
         marked = mark(role, role != "fails")
         rows.append([marked, one.name, one.ms.value, *errors, one.failure or one.unsound])
@@ -176,7 +166,7 @@ def _plot(tuned: Tuned) -> Any:
     for one in tuned.found:
         if one.failure or not 0 < one.of(kind) < math.inf or not one.ms.value > 0:
             continue
-        error, role = one.error[kind], _role(tuned, one)
+        error, role = one.errors[kind], _role(tuned, one)
         color = COLORS[2] if role == "CHOSEN" else COLORS[1] if one.name == DEFAULT else COLORS[6]
         spans = [[[i.value - i.low], [i.high - i.value]] for i in (one.ms, error)]
         axes.errorbar(one.ms.value, error.value, spans[1], spans[0], fmt="o", color=color, elinewidth=1)

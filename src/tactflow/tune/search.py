@@ -249,7 +249,7 @@ def _frames(cases: Sequence[Case]) -> int:
 
 def _likely(one: Found, kind: str) -> float:
     """What an error most likely stays below, px."""
-    error = one.error[kind]
+    error = one.errors[kind]
     return error.value + LIKELY * (error.high - error.value)
 
 
