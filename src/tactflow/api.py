@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.calibration.stored import with_recorded_calibration
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
 from tactflow.config.registry import resolve
@@ -23,10 +24,9 @@ from tactflow.config.validation import validated
 from tactflow.engine.by_hand import with_frames_made
 from tactflow.engine.conformance import build, component
 from tactflow.engine.contract import Stage
-from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner, RunResult
-from tactflow.recording import CALIBRATION, missing_packages
 from tactflow.sources.memory import MemoryFrames
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED, Interrupted, ending_handled, on_ending
@@ -182,7 +182,7 @@ def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
     """
     if pipeline.opencv_threads is not None:
         cv2.setNumThreads(pipeline.opencv_threads)
-    return Runner(_calibrated(pipeline), **options)
+    return Runner(with_recorded_calibration(pipeline), **options)
 
 
 @contextmanager
@@ -206,27 +206,6 @@ def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
 
     with ending_handled(handle):
         yield caught
-
-
-def _calibrated(pipeline: Pipeline) -> Pipeline:
-    """With the calibration that its recording was made with, unless the pipeline names one, or null."""
-    source = getattr(pipeline.source.params, "source", None)
-    name = source.partition("?")[0] if isinstance(source, str) else ""
-    if pipeline.calibration or "calibration" in pipeline.settings or not name.endswith(".mcap"):
-        return pipeline
-    if missing_packages() is not None:
-        return pipeline
-    from tactflow.recording.reader import attachments
-    from tactflow.recording.records import NotARecordingError
-    from tactflow.sources.paths import find_path
-
-    try:
-        path = find_path(name, pipeline.directory)
-        attached = attachments(path).keys()
-    except (SourceError, OSError, NotARecordingError):
-        # The source will say what is wrong with the file.
-        return pipeline
-    return replace(pipeline, calibration=path) if attached >= CALIBRATION else pipeline
 
 
 @overload

@@ -15,7 +15,7 @@ from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Pipeline
-from tactflow.sim import scene_names
+from tactflow.sim import scene_descriptions
 from tactflow.vision.geometry import PixelMapping, Preprocessor
 
 
@@ -88,7 +88,7 @@ def test_a_tracker_of_ones_own_is_measured_whichever_ports_it_takes_and_a_broken
 
 def test_all_scenes_exist_and_have_names_of_their_own() -> None:
     for cases in (QUICK, FULL, TROUBLES, QUICK_STAGES, FULL_STAGES):
-        assert {case.name for case in cases} <= set(scene_names())
+        assert {case.name for case in cases} <= set(scene_descriptions())
     labels = [case.label for case in (*FULL, *TROUBLES)]
     assert len(labels) == len(set(labels))
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tactflow.calibration.keeping import KeptPresses
-from tactflow.calibration.presses import Press, _Collect
-from tactflow.engine.contract import StageParams
+from tactflow.calibration.presses import Press, PressFinder
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.frame import Frame
+from tactflow.message.result import Result
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact
 
@@ -69,47 +67,47 @@ def test_presses_that_cannot_be_kept_are_told_in_words(tmp_path: Path) -> None:
         KeptPresses(tmp_path / "main.presses").sync([PRESS])
 
 
-class LiveSink(_Collect):
-    """The sink of `find_presses`, at a live source, with nobody who guides."""
-
-    report = staticmethod(lambda _frames, _presses, _lasts: False)
+def result(seq: int, gel: np.ndarray, *, touched: bool, reference: bool = False, epoch: int = 0) -> Result:
+    """A frame of a session."""
+    mask = MASK.copy()
+    mask[10:20, 10:20] = 255 if touched else 0
+    contact = Contact(100.0, (14.5, 14.5), None, None, np.zeros((0, 2)), None)
+    frame = Frame("main", seq, seq / 60, gel, reference=reference, epoch=epoch)
+    found = {"contact": contact, "contact_mask": mask} if touched else {}
+    return Result(frame, {"image": gel, "mapping": MAPPING, **found})
 
 
 @pytest.mark.parametrize(("brighter", "left"), [(2, 2), (20, 1)])
 def test_a_new_reference_replaces_the_one_before_and_presses_of_another_look_are_left_out(
     brighter: int, left: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    live: Any = SimpleNamespace(source=SimpleNamespace(live=True))
-    kept = KeptPresses(tmp_path / "main.presses")
-    sink = LiveSink(StageParams(), live)
-    sink.keeper = lambda: kept
-    sink.open()
-    contact = Contact(100.0, (14.5, 14.5), None, None, np.zeros((0, 2)), None)
+    kept, finder = KeptPresses(tmp_path / "main.presses"), PressFinder()
     changed = np.asarray(GEL + brighter, np.uint8)
     for seq, (gel, touched) in enumerate(
-        [(GEL, 0), (GEL, 1), (GEL, 0), (changed, 0), (changed, 0), (changed, 1)]
+        [
+            (GEL, False),
+            (GEL, True),
+            (GEL, False),
+            (changed, False),
+            (changed, False),
+            (changed, True),
+            (changed, False),
+        ]
     ):
-        tick = Tick(Frame("main", seq, seq / 60, gel, reference=seq in (0, 3), epoch=int(seq > 2)))
-        sink.write(tick, gel, contact if touched else None, MASK, None, None, MAPPING)
-    sink.write(Tick(Frame("main", 9, 1.0, changed, epoch=1)), changed, None, MASK, None, None, MAPPING)
-    assert np.array_equal(sink.untouched(), changed)
-    assert len(sink.presses) == len(KeptPresses(kept.folder).presses) == left
+        finder.add(result(seq, gel, touched=touched, reference=seq in (0, 3), epoch=int(seq > 2)))
+        kept.update(finder)
+    assert np.array_equal(finder.untouched, changed)
+    assert len(finder.presses) == len(KeptPresses(kept.folder).presses) == left
     assert ("1, are left out" in caplog.text) == (left == 1)
 
 
-def test_a_live_session_begins_with_the_presses_of_the_one_before(tmp_path: Path) -> None:
-    live: Any = SimpleNamespace(source=SimpleNamespace(live=True))
-    touched = MASK.copy()
-    touched[10:20, 10:20] = 255
-    contact = Contact(100.0, (14.5, 14.5), None, None, np.zeros((0, 2)), None)
+def test_a_live_session_goes_on_with_the_presses_of_the_one_before(tmp_path: Path) -> None:
     counts = []
     for _ in range(2):
-        sink = LiveSink(StageParams(), live)
-        sink.keeper = lambda: KeptPresses(tmp_path / "main.presses")
-        sink.open()
+        kept, finder = KeptPresses(tmp_path / "main.presses"), PressFinder()
+        finder.presses[:] = kept.presses
         for seq in range(9):
-            now = contact if seq % 3 == 1 else None
-            tick = Tick(Frame("main", seq, seq / 60, GEL, reference=seq == 0))
-            sink.write(tick, GEL, now, touched, None, None, MAPPING)
-        counts.append(len(sink.presses))
+            finder.add(result(seq, GEL, touched=seq % 3 == 1, reference=seq == 0))
+            kept.update(finder)
+        counts.append(len(finder.presses))
     assert counts == [3, 6]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
+import pytest
 
 import tactflow
 from tactflow.calibration.presses import Press, find_presses
@@ -38,30 +37,10 @@ def test_the_part_with_the_fewest_good_presses_is_asked_for_next() -> None:
     assert progress(presses, False, 9)["now"] == "These are enough presses."
 
 
-def test_a_press_taken_out_of_the_list_is_no_part_of_the_session() -> None:
-    seen: list[list[tuple[float, float]]] = []
-
-    def report(_frames: int, presses: list[Press], lasts: bool) -> bool:
-        over = presses[: len(presses) - lasts]
-        if len(over) == 2 and not seen:
-            seen.append([one.center for one in over])
-            del presses[1]
-        return False
-
-    session = find_presses(tactflow.load(source="sim:ball?frames=75"), report)
-    assert seen[0][0] == session.presses[0].center
-    assert seen[0][1] not in [one.center for one in session.presses]
-    assert len(session.presses) == 2
-
-
-def test_the_untouched_gel_is_the_reference_also_where_that_is_no_frame_of_the_session(
-    tmp_path: Path,
-) -> None:
-    scene = tactflow.open_scene("ball")
-    darker = (scene.frame(0) * 0.8).astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "rest.png"), darker)
-    settings = {"stages.capture.reference": str(tmp_path / "rest.png")}
-    session = find_presses(tactflow.load(source="sim:ball?frames=30", settings=settings))
-    own = find_presses(tactflow.load(source="sim:ball?frames=30"))
-    assert session.untouched.mean() < 0.85 * own.untouched.mean()
-    assert session.frames == own.frames == 30
+def test_the_presses_of_a_recording_are_found() -> None:
+    scene = tactflow.open_scene("ball?frames=75")
+    session = find_presses(tactflow.stream(source="sim:ball?frames=75", images=True))
+    assert len(session.presses) == 3
+    for found in session.presses:
+        (pressed,) = scene.presses(found.seq)
+        assert found.center == pytest.approx(((599 - pressed.y) / 2, pressed.x / 2), abs=3)

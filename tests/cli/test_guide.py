@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tactflow.calibration.presses import Press
+from tactflow.calibration.presses import Press, PressFinder
 from tactflow.cli.guide import Guide, judged
 
 GEL = np.zeros((90, 90, 3), np.uint8)
@@ -13,6 +13,13 @@ MASK = np.zeros((90, 90), np.uint8)
 
 def press(x: float, y: float, radius: float = 10.0) -> Press:
     return Press(0, GEL, MASK, MASK > 0, (x, y), radius)
+
+
+def finder(presses: list[Press], *, lasts: bool = False) -> PressFinder:
+    """A session with these presses."""
+    session = PressFinder()
+    session.presses, session.lasts = presses, lasts
+    return session
 
 
 def test_a_press_is_good_or_light_or_cut_off() -> None:
@@ -34,28 +41,24 @@ def test_the_last_press_is_undone_and_the_session_ended_by_what_is_typed() -> No
         return taken
 
     guide = Guide(3, said.append, take)
-    presses: list[Press] = []
-    assert not guide(1, presses, False)
-    presses.append(press(45, 45))
-    assert not guide(2, presses, True)
+    assert not guide(finder([]))
+    assert not guide(finder([press(45, 45)], lasts=True))
     assert not said
-    assert not guide(3, presses, False)
+    assert not guide(finder([press(45, 45)]))
     assert said[-1].startswith("press 1 of 3: good")
     typed.append("u")
-    presses.append(press(20, 20))
-    assert not guide(4, presses, True)
-    # That which lasts stays; the one before it is gone.
-    assert [one.center for one in presses] == [(20, 20)]
+    session = finder([press(45, 45), press(20, 20)], lasts=True)
+    assert not guide(session)
+    assert [one.center for one in session.presses] == [(20, 20)], "the one that lasts stays"
     assert said[-1] == "press 1 is undone; press again"
     typed.append("q")
-    assert guide(5, presses, False)
-    presses += [press(70, 20), press(70, 70)]
-    assert guide(6, presses, False)
+    assert guide(finder(session.presses))
+    assert guide(finder([*session.presses, press(70, 20), press(70, 70)]))
 
 
 def test_a_session_that_goes_on_says_where_it_stands() -> None:
     said: list[str] = []
-    Guide(3, said.append)(1, [press(45, 45)], False)
+    Guide(3, said.append)(finder([press(45, 45)]))
     assert said == [
         "going on with 1 presses of before; nothing yet at the upper left, upper centre, upper right, "
         "middle left, ..."
@@ -65,7 +68,7 @@ def test_a_session_that_goes_on_says_where_it_stands() -> None:
 def test_presses_of_a_recording_beyond_those_that_are_wanted_are_counted_alone() -> None:
     said: list[str] = []
     guide = Guide(1, said.append)
-    guide(1, [], False)
-    guide(2, [press(45, 45), press(20, 20)], False)
+    guide(finder([]))
+    guide(finder([press(45, 45), press(20, 20)]))
     assert said[0].startswith("press 1 of 1: good")
     assert said[1].startswith("press 2: good")

@@ -19,15 +19,6 @@ def scene() -> Scene:
     return open_scene("slide?frames=12")
 
 
-def test_npy_holds_every_frame_and_opens_as_a_memory_map(scene: Scene, tmp_path: Path) -> None:
-    export.write_frames(scene, tmp_path / "a.npy")
-    stored = np.load(tmp_path / "a.npy", mmap_mode="r")
-    assert stored.shape == (12, 600, 800, 3)
-    assert stored.dtype == np.uint8
-    for index in range(12):
-        np.testing.assert_array_equal(stored[index], scene.frame(index))
-
-
 @pytest.mark.parametrize("suffix", [".avi", ".mkv"])
 def test_videos_are_lossless(scene: Scene, tmp_path: Path, suffix: str) -> None:
     export.write_frames(scene, tmp_path / f"a{suffix}")

@@ -44,11 +44,6 @@ def test_frames_are_independent_at_every_pixel_and_at_small_shifts(first: int, s
         assert abs((one * shifted).mean()) < 5 * COUNT**-0.5
 
 
-def test_no_two_of_many_frames_share_their_noise() -> None:
-    corners = {sensor_noise(1, index, SHAPE)[0, :4].tobytes() for index in range(20_000)}
-    assert len(corners) == 20_000
-
-
 def test_the_mean_of_many_frames_has_the_noise_that_independence_gives() -> None:
     total = np.zeros(SHAPE)
     for index in range(64):
@@ -63,11 +58,6 @@ def test_the_difference_of_two_frames_at_rest_shows_the_noise_asked_for() -> Non
     # Derived: sqrt(2) x 3, plus the rounding of two frames (1/12 each).
     assert difference.std() == pytest.approx((2 * 9 + 2 / 12) ** 0.5, rel=0.005)
     assert abs(difference.mean()) < 0.02
-
-
-def test_without_noise_frames_at_rest_are_equal() -> None:
-    scene = open_scene("idle?noise=0")
-    np.testing.assert_array_equal(scene.frame(0), scene.frame(200))
 
 
 def test_shot_noise_grows_with_the_square_root_of_the_light() -> None:

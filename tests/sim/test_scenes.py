@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 
@@ -11,34 +10,42 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.sim import KEYS, Scene, open_scene, scene_descriptions, scene_names
-from tactflow.sim import gel as gel_model
-from tactflow.sim.recipes import SCENES as SCENE_RECIPES
-from tactflow.sim.settings import Settings
-from tactflow.sim.truth import measure
+from tactflow.sim import Scene, gel, open_scene, scene_descriptions
 from tactflow.vision.geometry import Preprocessor
 
-SCENES = scene_names()
-TOUCHED = [name for name in SCENES if name != "idle"]
-PICTURE_ONLY = {
-    *("noise", "shot", "dot", "sizes", "shape", "polarity", "worn", "dirty", "speckle", "light", "drift"),
-    *("flicker", "settle", "lamp", "vignette", "specular", "stray", "leds", "texture", "blur", "jpeg"),
-    *("gain", "hot"),
-}
-"""Settings that change neither the contact nor where markers are."""
-
-
-def different_motion() -> list[str]:
-    """The first scene of those that differ in their picture only."""
-    first: dict[object, str] = {}
-    for name in TOUCHED:
-        scene = open_scene(name)
-        settings = [v for key, v in dataclasses.asdict(scene.settings).items() if key not in PICTURE_ONLY]
-        first.setdefault((SCENE_RECIPES[name].programme, tuple(settings)), name)
-    return list(first.values())
-
-
-MOVING = different_motion()
+SCENES = [*scene_descriptions()]
+MOVING = [
+    "press",
+    "ball",
+    "cable",
+    "bent_cable",
+    "slide",
+    "stick_slip",
+    "twist",
+    "edge",
+    "box",
+    "ring",
+    "screw",
+]
+MOVING += [
+    "two",
+    "border",
+    "tap",
+    "creep",
+    "jumps",
+    "worn",
+    "dense",
+    "tilted",
+    "strong_shear",
+    "coin",
+    "finger",
+]
+"""Scenes that differ in their contacts or in where their markers are, not in the picture alone."""
+RANGES = ["noise=60", "shot=30", "dot=60", "pitch=400", "jitter=0.3", "dirty=2", "vanish=0.9", "speckle=1"]
+RANGES += ["drift=-0.5", "flicker=0.5", "settle=100", "stale=100", "lamp=-0.5", "vignette=1", "specular=1"]
+RANGES += ["texture=10", "blur=20", "jpeg=1", "gain=0.5", "hot=10000", "perspective=0.4", "distortion=-0.2"]
+RANGES += ["distortion=0.4", "aperture=2", "depth=0", "depth=1.5", "shear=1.5", "twist=-60", "bend=150"]
+RANGES += ["sink=0.1", "sink=0.6", "rim=1", "markers=60x60", "seed=0", "missing=0.9"]
 
 
 def in_contact(scene: Scene) -> list[int]:
@@ -64,25 +71,9 @@ def test_a_frame_is_of_the_promised_kind_and_the_same_in_whatever_order_it_is_re
     assert image.std() > 10
 
 
-def test_a_frame_is_not_changed_by_later_ones_nor_by_its_reader() -> None:
-    scene = open_scene("press?frames=40")
-    first = scene.frame(20)
-    kept = first.copy()
-    scene.frame(21)
-    np.testing.assert_array_equal(first, kept)
-    first[:] = 0
-    np.testing.assert_array_equal(scene.frame(20), kept)
-
-
-@pytest.mark.parametrize("name", ["press", "cable", "worn", "idle"])
-def test_another_seed_gives_other_frames(name: str) -> None:
-    one, other = open_scene(f"{name}?frames=40&seed=1"), open_scene(f"{name}?frames=40&seed=2")
-    assert (one.frame(20) != other.frame(20)).mean() > 0.3
-
-
-@pytest.mark.parametrize("name", ["idle", *(name for name in MOVING if name != "stale")])
+@pytest.mark.parametrize("name", ["idle", *MOVING])
 def test_the_gel_rests_at_the_start_and_at_the_end(name: str) -> None:
-    scene = open_scene(f"{name}?dropped=0&repeated=0")
+    scene = open_scene(name)
     touched = in_contact(scene)
     for index in (0, 5, 29, 299):
         truth = scene.truth(index)
@@ -96,7 +87,7 @@ def test_the_gel_rests_at_the_start_and_at_the_end(name: str) -> None:
     if name != "idle":
         assert touched[0] == 30
         cycles = 1 + sum(later - earlier > 1 for earlier, later in itertools.pairwise(touched))
-        assert cycles >= (1 if name in ("creep", "hold") else 2)
+        assert cycles >= (1 if name == "creep" else 2)
 
 
 @pytest.mark.parametrize("name", MOVING)
@@ -121,7 +112,7 @@ def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
         assert len(truth.origin) == len(truth.position) == len(truth.visible)
         assert np.isfinite(truth.position).all()
         assert np.isfinite(truth.origin).all()
-        assert truth.depth > gel_model.TOUCH_DEPTH
+        assert truth.depth > gel.TOUCH_DEPTH
         # The mask knows the contact at the pixels' centres; next to its outline a marker's centre decides.
         for i in np.flatnonzero(truth.visible):
             x, y = round(truth.position[i, 0]), round(truth.position[i, 1])
@@ -136,39 +127,11 @@ def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
             np.testing.assert_allclose(truth.mean_flow, moved, atol=1e-9)
 
 
-def test_a_marker_at_the_outline_of_the_contact_is_told_apart_from_one_inside() -> None:
-    scene = open_scene("press?frames=150")
-    press = scene.presses(40)
-    assert scene.camera.identity
-    x, y = press[0].x, press[0].y
-    inner, outer = 0.0, 200.0
-    while outer - inner > 1e-4:
-        middle = (inner + outer) / 2
-        reached = gel_model.in_contact(press, np.array([x + middle], np.float32), np.array([y], np.float32))[
-            0
-        ]
-        inner, outer = (middle, outer) if reached else (inner, middle)
-    places = np.array([(x + inner + away, y) for away in (-2.0, -0.5, -0.1, 0.1, 0.5)])
-    shown = np.ones(5, np.bool_)
-    truth = measure(press, scene.camera, places, places, shown, scene.size, None, lambda: scene.clean(40))
-    assert truth.inside.tolist() == [True, True, True, False, False]
-
-
-def test_index_i_is_the_same_marker_in_every_frame() -> None:
-    scene = open_scene("slide")
-    origin = scene.truth(0).origin
-    for index in range(0, 300, 37):
-        np.testing.assert_array_equal(scene.truth(index).origin, origin)
-
-
-FAST = ("tap", "spike", "jumps", "stutter", "stale")
-
-
-@pytest.mark.parametrize("name", [n for n in MOVING if n not in FAST and len(open_scene(n).layout.rest)])
+@pytest.mark.parametrize("name", [n for n in MOVING if n not in ("tap", "jumps")])
 def test_markers_move_smoothly_in_time(name: str) -> None:
     scene = open_scene(name)
     steps = [largest_step(scene, index) for index in range(28, 110)]
-    # Half a pitch is what nearest-neighbour matching can follow; only the scenes named fast are faster.
+    # Half a pitch is what nearest-neighbour matching can follow; only taps and jumps are faster.
     assert 0 < max(steps) < 0.5 * scene.layout.pitch
 
 
@@ -184,14 +147,6 @@ def test_jumps_are_as_large_as_promised_and_no_larger() -> None:
     assert 0.7 < largest <= 0.9 + 0.1  # 0.1: the press itself pushes the gel apart meanwhile
 
 
-def test_creep_drags_the_gel_by_two_hundredths_of_a_pixel_a_frame() -> None:
-    scene = open_scene("creep")
-    steps = [largest_step(scene, index) for index in range(100, 200)]
-    # Some marker is always within the spread of the contact, where the gel follows in full; the push apart
-    # stays with the gel under the indenter and adds nothing.
-    np.testing.assert_allclose(steps, 0.02, rtol=0.01)
-
-
 def test_a_long_recording_rests_for_two_seconds_and_stays_on_the_gel() -> None:
     press, creep = open_scene("press?frames=200000"), open_scene("creep?frames=200000")
     assert not press.truth(119).touching
@@ -199,19 +154,6 @@ def test_a_long_recording_rests_for_two_seconds_and_stays_on_the_gel() -> None:
     origin, position = creep.markers(100_000)
     assert 1 < np.hypot(*(position - origin).T).max() < 110
     assert creep.truth(100_000).touching
-
-
-def test_a_tap_lasts_one_frame() -> None:
-    touched = in_contact(open_scene("tap"))
-    assert len(touched) >= 5
-    assert all(later - earlier > 1 for earlier, later in itertools.pairwise(touched))
-
-
-def test_strong_shear_reaches_one_and_a_half_pitches() -> None:
-    scene = open_scene("strong_shear")
-    moved = [np.subtract(*scene.markers(index)) for index in range(40, 120, 4)]
-    largest = max(float(np.hypot(*displacement.T).max()) for displacement in moved)
-    assert 1.3 * scene.layout.pitch < largest < 1.55 * scene.layout.pitch
 
 
 @pytest.mark.parametrize("spec", [*MOVING, "press?pitch=400", "box?twist=60", "slide?shear=1.5&markers=2x2"])
@@ -223,8 +165,8 @@ def test_the_gel_never_folds_over(spec: str) -> None:
         presses = scene.presses(index)
         columns = []
         for axis in np.eye(2):
-            ahead = gel_model.displacement(presses, grid + step * axis)
-            behind = gel_model.displacement(presses, grid - step * axis)
+            ahead = gel.displacement(presses, grid + step * axis)
+            behind = gel.displacement(presses, grid - step * axis)
             columns.append(axis + (ahead - behind) / (2 * step))
         determinant = np.linalg.det(np.stack(columns, axis=-1))
         assert determinant.min() > 0.05
@@ -254,7 +196,7 @@ def test_the_direction_is_that_of_the_indenter_and_a_disc_has_none(name: str, di
     assert checked >= 3
 
 
-@pytest.mark.parametrize("sink", [0.1, gel_model.SINK_IN, 0.5])
+@pytest.mark.parametrize("sink", [0.1, gel.SINK_IN, 0.5])
 def test_the_contact_of_a_ball_is_a_disc_of_the_stated_radius(sink: float) -> None:
     scene = open_scene(f"press?sink={sink}")
     index = deepest(scene)
@@ -267,13 +209,13 @@ def test_the_contact_of_a_ball_is_a_disc_of_the_stated_radius(sink: float) -> No
     assert truth.center == pytest.approx((press.x, press.y), abs=0.05)
 
 
-@pytest.mark.parametrize("rim", [0.4, gel_model.RIM, 1.0])
+@pytest.mark.parametrize("rim", [0.4, gel.RIM, 1.0])
 def test_the_surface_follows_the_indenter_in_contact_and_decays_without_a_step_around_it(rim: float) -> None:
     scene = open_scene(f"press?rim={rim}")
     (press,) = scene.presses(deepest(scene))
     line = np.arange(0, press.shape.reach, 0.05, dtype=np.float32)
-    depth = gel_model.reached(press, press.x + line, np.full_like(line, press.y))
-    sunk = gel_model.surface(press, depth)
+    depth = gel.reached(press, press.x + line, np.full_like(line, press.y))
+    sunk = gel.surface(press, depth)
     touched = depth > press.sink * press.depth
     np.testing.assert_array_equal(sunk[touched], depth[touched])
     assert (np.diff(sunk) <= 0).all()
@@ -349,13 +291,6 @@ def test_the_unmarked_image_is_the_frame_where_no_marker_is() -> None:
     assert (image[away == 0] != truth.unmarked[away == 0]).mean() > 0.4
 
 
-def test_a_scene_without_markers_has_none() -> None:
-    truth = open_scene("press?markers=none").truth(50)
-    assert truth.origin.shape == truth.position.shape == (0, 2)
-    assert truth.mean_flow is None
-    assert truth.touching
-
-
 def test_vanished_markers_are_not_drawn_and_not_visible() -> None:
     scene = open_scene("worn?noise=0&dirty=0&worn=0&vanish=0.4")
     truth, image = scene.truth(50), scene.frame(50)
@@ -366,36 +301,20 @@ def test_vanished_markers_are_not_drawn_and_not_visible() -> None:
     assert scene.truth(0).visible.all()
 
 
-def test_dropped_moments_are_gone_and_repeated_frames_equal_to_the_bit() -> None:
-    scene = open_scene("stutter?frames=200")
-    moments = [scene.moment(index) for index in range(200)]
-    steps = np.diff(moments)
-    assert set(steps.tolist()) == {0, 1, 2}
-    again = int(np.flatnonzero(steps == 0)[0])
-    np.testing.assert_array_equal(scene.frame(again), scene.frame(again + 1))
-    on = int(np.flatnonzero(steps == 1)[0])
-    assert (scene.frame(on) != scene.frame(on + 1)).any()
-
-
 @pytest.mark.parametrize(
     ("spec", "complaint"),
     [
         ("pres", "did you mean press"),
         ("", "unknown scene"),
         ("press?nois=2", "did you mean noise"),
-        ("press?noise=-1", r"\[0, 60\]"),
-        ("press?noise=nan", "number"),
-        ("press?noise=inf", "number"),
+        ("press?noise=-1", r"0 to 60\), got '-1'"),
+        ("press?noise=nan", "got 'nan'"),
         ("press?noise=", "noise=VALUE"),
-        ("press?noise", "noise=VALUE"),
         ("press?noise=2&noise=3", "twice"),
-        ("press?frames=2.5", "integer"),
-        ("press?frames=0", "frames"),
+        ("press?frames=2.5", "frames"),
         ("press?light=brigt", "did you mean bright"),
         ("press?markers=10", "10x8"),
-        ("press?markers=0x8", "10x8"),
         ("press?markers=99x8", "10x8"),
-        ("press?&", "unknown key"),
         ("press?shape=round&polarity=white", "polarity"),
     ],
 )
@@ -411,22 +330,7 @@ def test_frames_outside_the_recording_are_an_error() -> None:
             scene.frame(index)
 
 
-def test_every_scene_is_described_and_every_key_explained() -> None:
-    assert set(scene_descriptions()) == set(SCENES)
-    assert all(len(words) > 5 for words in scene_descriptions().values())
-    assert all(key.meaning for key in KEYS.values())
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        f"{key}={end:.10g}"
-        for key, rule in KEYS.items()
-        if not rule.choices and key not in ("frames", "markers")
-        for end in (rule.low, rule.high)
-        if end != getattr(Settings(), key)
-    ],
-)
+@pytest.mark.parametrize("setting", RANGES)
 def test_a_scene_stands_the_ends_of_every_range(setting: str) -> None:
     scene = open_scene(f"cable?frames=12&{setting}")
     for index in (0, 6):
@@ -503,23 +407,12 @@ def test_a_darkening_gel_is_darker_in_the_contact_and_brighter_around_it() -> No
     assert change[around].min() > 5
 
 
-def test_a_reflection_is_no_contact_and_lies_far_from_it() -> None:
-    scene, plain = open_scene("stray?noise=0"), open_scene("press?noise=0")
-    np.testing.assert_array_equal(scene.frame(0), plain.frame(0))
-    stray = (scene.clean(50).astype(int) - plain.clean(50)).min(axis=-1) > 10
-    truth = scene.truth(50)
-    np.testing.assert_array_equal(truth.contact_mask, plain.truth(50).contact_mask)
-    assert stray.sum() > 500
-    near = cv2.dilate(truth.contact_mask.astype(np.uint8), np.ones((201, 201), np.uint8)) > 0
-    assert not (stray & near).any()
-
-
 def test_blotches_move_with_the_gel_and_are_no_markers() -> None:
     scene = open_scene("speckle?shear=0.6&noise=0&texture=0")
     (press,) = scene.presses(52)
     turn, away = np.meshgrid(np.linspace(0, 2 * np.pi, 60), np.linspace(140, 200, 4))
     rest = np.stack([press.x + away * np.cos(turn), press.y + away * np.sin(turn)], axis=-1).reshape(-1, 2)
-    moved = gel_model.displacement((press,), rest)
+    moved = gel.displacement((press,), rest)
     inside = np.all(
         (np.minimum(rest, rest + moved) > 0) & (np.maximum(rest, rest + moved) < (799, 599)), axis=1
     )
@@ -536,23 +429,13 @@ def test_blotches_move_with_the_gel_and_are_no_markers() -> None:
     assert len(scene.truth(0).position) == 0
 
 
-def test_painted_markers_differ_in_size_and_leds_glare_beside_bright_ones() -> None:
-    sizes = open_scene("painted").layout.size
-    assert sizes.min() < 0.6
-    assert sizes.max() > 1.4
-    scene = open_scene("leds?noise=0")
-    glare = (scene.clean(0).min(axis=-1) == 255).astype(np.uint8)
-    assert cv2.connectedComponents(glare)[0] == 1 + 6
-    assert not glare[tuple(np.rint(scene.truth(0).position).astype(int).T[::-1])].any()
-
-
 def test_a_gel_with_a_dark_channel_hardly_answers_in_it() -> None:
     scene = open_scene("dark_channel?noise=0")
     levels = scene.clean(0).reshape(-1, 3).mean(axis=0)
     assert levels[2] < 12 < 60 < levels[:2].min()
 
 
-@pytest.mark.parametrize("name", ["block", "coin", "key", "finger", "long_edge"])
+@pytest.mark.parametrize("name", ["coin", "finger", "long_edge"])
 def test_a_large_thing_touches_in_one_piece_of_the_size_of_things(name: str) -> None:
     scene = open_scene(name)
     contact = scene.truth(deepest(scene)).contact_mask.astype(np.uint8)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry
+from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry, ScaleEntry
 from tactflow.engine.contract import StageParams
 from tactflow.engine.frame import Absent
 from tactflow.stages.force import Force
@@ -34,8 +34,16 @@ def stage(folder: Path, press: LinearForceEntry, drag: LinearForceEntry | None =
     force = ForceEntry(
         press=press, drag=drag, change_at_rest=2.0, recordings={"a": 0.0}, presses=9, left_out="press"
     )
-    look, corners = np.full((12, 16, 3), 90, np.float32), np.zeros((4, 2))
-    made = Calibration("main", "a.mcap", (32, 24), (32, 24), corners, look, SCALE, "pitch", force=force)
+    made = Calibration(
+        sensor="main",
+        made_from="a.mcap",
+        raw_size=(32, 24),
+        size=(32, 24),
+        corners=[(0.0, 0.0)] * 4,
+        scale=ScaleEntry.of(SCALE, "pitch"),
+        look=np.full((12, 16, 3), 90, np.float32),
+        force=force,
+    )
     made.save(folder / "main.yaml")
     return Force(StageParams(), folder / "main.yaml")
 

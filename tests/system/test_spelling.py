@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tactflow.config.registry import available, resolve
-from tactflow.sim.settings import KEYS
+from tactflow.sim.settings import Settings
 from tactflow.system.spelling import closest, did_you_mean
 
 
@@ -40,4 +40,4 @@ def test_another_word_is_not_taken_for_a_parameter(use: str, section: str, word:
 
 def test_another_word_is_not_taken_for_a_key_of_a_simulated_scene() -> None:
     for word in ("kind", "help", "force", "image", "threads", "camera", "method"):
-        assert closest(word, KEYS) is None
+        assert closest(word, Settings.model_fields) is None

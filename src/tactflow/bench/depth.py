@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +22,7 @@ from tactflow.calibration.scale import centre
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Scene, open_scene
 from tactflow.sim.elastic import MM
+from tactflow.streaming import stream
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Scale
@@ -119,7 +121,8 @@ def measure_ball(bench: Bench, wedge: Pipeline, folder: Path) -> None:
     wedge : the pipeline of this sensor. folder : with `labels.csv`.
     """
     files, _ = labelled_presses(folder)
-    session = find_presses(on_recording(wedge, stack(files, bench.scratch)))
+    pipeline = replace(on_recording(wedge, stack(files, bench.scratch)), skipping=False)
+    session = find_presses(stream(pipeline, images=True))
     found = fit_photometry(session, WEDGE_SCALE, WEDGE_BALL).found
     errors = {
         "normal_error": found.normal_error,

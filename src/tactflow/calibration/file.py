@@ -8,20 +8,29 @@ from __future__ import annotations
 
 import io
 import zipfile
-from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
 import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from tactflow import __version__
+from tactflow.calibration.stored import MAX_ARRAYS, stored_arrays, stored_text
 from tactflow.engine.errors import ConfigError
-from tactflow.system.files import completed, is_device
+from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import ending_held_back
 from tactflow.vision.depth.slopes import SlopeModel
@@ -30,7 +39,6 @@ from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, ForceModel, Lin
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
 
-FORMAT: Final = "tactflow.calibration/1"
 LOOK: Final = (16, 12)
 """Columns and rows of the small picture of the untouched gel that is kept. Chosen by hand."""
 MOVED: Final = 1.0
@@ -38,29 +46,33 @@ MOVED: Final = 1.0
 what rounding in a pipeline file does is less."""
 UNLIKE: Final = 0.1
 """Difference of the untouched gel, relative to its brightness and after its light was scaled channel by
-channel, from which on it is said to look unlike. Chosen by hand: presses of one session differ by 0.01."""
+channel, above which the gel counts as different. Chosen by hand: presses of one session differ by 0.01."""
+
+Pair = Annotated[tuple[float, float], BeforeValidator(tuple)]
+Size = Annotated[tuple[int, int], BeforeValidator(tuple)]
 
 
-LARGEST: Final = 1 << 20
-"""Bytes of the arrays at most, packed and unpacked; ours have some thousands."""
-LONGEST: Final = 1 << 17
-"""Bytes of the YAML file at most; ours have some thousands. PyYAML takes 4 s for so many."""
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+class ScaleEntry(_Entry):
+    """`scale` of the file: along x and y, mm per px, their standard errors, the origin (px), the method."""
 
-
-class ScaleEntry(_Strict):
-    """`scale` of the file."""
-
-    mm_per_pixel: list[float] = Field(min_length=2, max_length=2)
-    stderr: list[float] = Field(min_length=2, max_length=2)
-    origin: list[float] = Field(min_length=2, max_length=2)
+    mm_per_pixel: Annotated[Pair, AfterValidator(lambda pair: _positive(pair))]
+    stderr: Pair
+    origin: Pair
     found_by: str
 
+    @classmethod
+    def of(cls, scale: Scale, found_by: str) -> Self:
+        """The entry for a scale. found_by : how it was found, for people."""
+        return cls(
+            mm_per_pixel=(scale.x, scale.y), stderr=scale.stderr, origin=scale.origin, found_by=found_by
+        )
 
-class PhotometricEntry(_Strict):
+
+class PhotometricEntry(_Entry):
     """`photometric` of the file: what it was learned from, and its errors on presses it was not learned from.
 
     ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. radius_error : median
@@ -79,12 +91,12 @@ class PhotometricEntry(_Strict):
     steepest: float | None = None
 
     def errors(self) -> SurfaceErrors:
-        """What the standard errors of heights come from."""
+        """The basis of the standard errors of heights."""
         return SurfaceErrors(self.depth_stderr, self.volume_stderr, self.steepest)
 
 
-class LinearForceEntry(_Strict):
-    """A force that is linear in features, and how right it is on what it was not fitted to.
+class LinearForceEntry(_Entry):
+    """A force that is linear in features, and its errors on forces that the fit has not seen.
 
     stiffness, greatest, error : see `LinearForce`. range : least and largest force of the fit, N.
     rmse : RMS error, N. r2 : share of the variance that is explained. hysteresis : mean distance between the
@@ -94,18 +106,18 @@ class LinearForceEntry(_Strict):
 
     stiffness: dict[str, float]
     greatest: dict[str, float]
-    error: list[float] = Field(min_length=2, max_length=2)
-    range: list[float] = Field(min_length=2, max_length=2)
+    error: Pair
+    range: Pair
     rmse: float
     r2: float
     hysteresis: float | None = None
 
     def model(self) -> LinearForce:
-        """What the stage `force` computes with."""
-        return LinearForce(self.stiffness, self.greatest, (self.error[0], self.error[1]))
+        """The model that the stage `force` evaluates."""
+        return LinearForce(self.stiffness, self.greatest, self.error)
 
 
-class ForceEntry(_Strict):
+class ForceEntry(_Entry):
     """`force` of the file.
 
     press : of z. drag : of x and y; None where the reference had no such columns. change_at_rest : see
@@ -131,53 +143,47 @@ class ForceEntry(_Strict):
         return self
 
     def model(self) -> ForceModel:
-        """What the stage `force` computes with."""
+        """The model that the stage `force` evaluates."""
         drag = None if self.drag is None else self.drag.model()
         return ForceModel(self.press.model(), drag, self.change_at_rest)
 
 
-class _File(_Strict):
-    format: Literal["tactflow.calibration/1"]
-    sensor: str
-    made: str
-    made_from: str
-    tactflow: str
-    raw_size: list[int] = Field(min_length=2, max_length=2)
-    size: list[int] = Field(min_length=2, max_length=2)
-    corners: list[Annotated[list[float], Field(min_length=2, max_length=2)]] = Field(
-        min_length=4, max_length=4
-    )
-    scale: ScaleEntry
-    photometric: PhotometricEntry | None = None
-    force: ForceEntry | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
+class Calibration(_Entry):
     """What is known about one sensor.
 
-    sensor, made, made_from : its name, when (UTC), from which source.
+    sensor, made, made_from, tactflow : its name, when (UTC), from which source, by which version.
     raw_size, size : (width, height) of the raw and of the processed frame, px.
-    corners : (4, 2) float64, where the corner pixels of the processed frame lie in the raw one, px.
+    corners : (4, 2), where the corner pixels of the processed frame lie in the raw one, px.
+    scale_entry : millimetres per pixel. photometric, slopes : which slope has which colour, and how well;
+    None where that is not known. force : how the force follows from a contact; None where that is not known.
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
-    scale, scale_by : millimetres per pixel, and how they were found. version : of tactflow.
-    slopes, photometric : which slope has which colour, and how well; None where that is not known.
-    force : how the force follows from a contact; None where that is not known.
     """
 
+    model_config = ConfigDict(arbitrary_types_allowed=True, populate_by_name=True)
+
+    format: Literal["tactflow.calibration/1"] = "tactflow.calibration/1"
     sensor: str
+    made: str = Field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     made_from: str
-    raw_size: tuple[int, int]
-    size: tuple[int, int]
-    corners: NDArray[np.float64]
-    look: NDArray[np.float32]
-    scale: Scale
-    scale_by: str
-    slopes: SlopeModel | None = None
+    tactflow: str = __version__
+    raw_size: Size
+    size: Size
+    corners: Annotated[list[Pair], Field(min_length=4, max_length=4)]
+    scale_entry: ScaleEntry = Field(alias="scale")
     photometric: PhotometricEntry | None = None
     force: ForceEntry | None = None
-    made: str = ""
-    version: str = __version__
+    look: NDArray[np.float32] = Field(exclude=True, repr=False)
+    slopes: SlopeModel | None = Field(None, exclude=True, repr=False)
+
+    @cached_property
+    def scale(self) -> Scale:
+        """Millimetres per pixel."""
+        entry = self.scale_entry
+        return Scale(*entry.mm_per_pixel, entry.stderr, entry.origin)
+
+    def with_force(self, force: ForceEntry) -> Self:
+        """A copy with another force."""
+        return self.model_copy(update={"force": force})
 
     def save(self, path: Path) -> None:
         """Write the YAML file, and beside it the arrays in a `.npz` of the same name.
@@ -186,29 +192,12 @@ class Calibration:
         """
         if path.suffix != ".yaml":
             raise ConfigError(f"calibration: required a file whose name ends in .yaml, got {path}")
-        text = _File(
-            format=FORMAT,
-            sensor=self.sensor,
-            made=self.made or datetime.now(UTC).isoformat(timespec="seconds"),
-            made_from=public_address(self.made_from),
-            tactflow=self.version,
-            raw_size=list(self.raw_size),
-            size=list(self.size),
-            corners=self.corners.tolist(),
-            scale=ScaleEntry(
-                mm_per_pixel=[self.scale.x, self.scale.y],
-                stderr=list(self.scale.stderr),
-                origin=list(self.scale.origin),
-                found_by=self.scale_by,
-            ),
-            photometric=self.photometric,
-            force=self.force,
-        ).model_dump()
+        text = self.model_dump(by_alias=True) | {"made_from": public_address(self.made_from)}
         arrays: dict[str, Any] = {"look": self.look}
         if self.slopes is not None:
             arrays["slopes"] = self.slopes.coefficients
         try:
-            # Both are whole before one takes the place of an earlier calibration, and then both do.
+            # Both are complete before either replaces an earlier calibration, and then both do.
             with (
                 ending_held_back(),
                 completed(path) as unfinished,
@@ -220,49 +209,32 @@ class Calibration:
             raise ConfigError(f"calibration: cannot write {path}: {error.strerror or error}") from None
 
     @classmethod
-    def load(cls, path: Path) -> Calibration:
+    def load(cls, path: Path) -> Self:
         """Read a calibration file, or the one that a recording (`.mcap`) was made with.
 
-        Raises ConfigError if it or its arrays are not there, or are no calibration.
+        Raises ConfigError if it or its arrays are missing, damaged, or not a calibration.
         """
         try:
-            said = _File.model_validate(yaml.safe_load(stored_text(path).decode("utf-8")))
+            said = yaml.safe_load(stored_text(path).decode("utf-8"))
+            if not isinstance(said, dict) or "format" not in said:
+                raise ValueError("is not a calibration file")
             arrays = _arrays(stored_arrays(path))
-            look = np.asarray(arrays["look"], np.float32)
+            if arrays["look"].shape != (LOOK[1], LOOK[0], 3) or not np.isfinite(arrays["look"]).all():
+                raise ValueError("its .npz is of another file")
             slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
+            loaded = cls(**said, look=arrays["look"].astype(np.float32), slopes=slopes)
+            if (slopes is None) != (loaded.photometric is None):
+                raise ValueError("its .npz is of another file")
+            return loaded
         except OSError as error:
             raise ConfigError(f"calibration {path}: {error.filename}: {error.strerror}") from None
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            other = not where or (where, first["type"]) == ("format", "missing")
-            told = "is no calibration file" if other else f"{where}: {first['msg']}"
-            raise ConfigError(f"calibration {path}: {told}; {_REMEDY}") from None
+            reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         except Exception as error:
-            # What YAML, ZIP and numpy raise about damaged data is many things.
-            raise ConfigError(f"calibration {path}: cannot be read: {error}; {_REMEDY}") from None
-        if look.shape != (LOOK[1], LOOK[0], 3) or not np.isfinite(look).all():
-            raise ConfigError(f"calibration {path}: its .npz is of another file; {_REMEDY}")
-        if (slopes is None) != (said.photometric is None):
-            raise ConfigError(f"calibration {path}: its .npz is of another file; {_REMEDY}")
-        x, y = said.scale.mm_per_pixel
-        if not (x > 0 and y > 0):
-            raise ConfigError(f"calibration {path}: scale.mm_per_pixel: required > 0, got {x:g}, {y:g}")
-        return cls(
-            sensor=said.sensor,
-            made=said.made,
-            made_from=said.made_from,
-            version=said.tactflow,
-            raw_size=_pair(said.raw_size),
-            size=_pair(said.size),
-            corners=np.array(said.corners, np.float64).reshape(4, 2),
-            look=look,
-            scale=Scale(x, y, _pair(said.scale.stderr), _pair(said.scale.origin)),
-            scale_by=said.scale.found_by,
-            slopes=slopes,
-            photometric=said.photometric,
-            force=said.force,
-        )
+            # YAML, ZIP and numpy raise many kinds of errors about damaged data.
+            reason = str(error)
+        raise ConfigError(f"calibration {path}: {reason}; make it anew with `tactflow calibrate`")
 
     def misfit(self, mapping: PixelMapping) -> str | None:
         """Why it cannot be used for frames of this geometry; None if it can."""
@@ -271,7 +243,7 @@ class Calibration:
             return f"{made}, with frames of {_by(self.raw_size)}; these have {_by(mapping.raw_size)}"
         if mapping.size != self.size:
             return f"{made}, where preprocess gave {_by(self.size)}; here it gives {_by(mapping.size)}"
-        moved = float(np.linalg.norm(raw_corners(mapping) - self.corners, axis=1).max())
+        moved = float(np.linalg.norm(np.subtract(raw_corners(mapping), self.corners), axis=1).max())
         if moved > MOVED:
             return (
                 f"{made}, with another preprocess: a corner of the picture lies {moved:.1f} raw px elsewhere"
@@ -290,9 +262,6 @@ class Calibration:
         return float(np.sqrt(np.mean(((now * gain - self.look) / level) ** 2)))
 
 
-_REMEDY = "make it anew with `tactflow calibrate`"
-
-
 def small_picture(untouched: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(12, 16, 3) float32: means over blocks of a picture (H, W, 3) uint8, grey levels."""
     return np.asarray(
@@ -300,69 +269,31 @@ def small_picture(untouched: NDArray[np.uint8]) -> NDArray[np.float32]:
     )
 
 
-def raw_corners(mapping: PixelMapping) -> NDArray[np.float64]:
-    """(4, 2) float64: where the corner pixels of the processed frame lie in the raw one, px.
+def raw_corners(mapping: PixelMapping) -> list[tuple[float, float]]:
+    """Where the four corner pixels of the processed frame lie in the raw one, px.
 
-    >>> raw_corners(PixelMapping.identity((3, 2))).tolist()
-    [[0.0, 0.0], [2.0, 0.0], [0.0, 1.0], [2.0, 1.0]]
+    >>> raw_corners(PixelMapping.identity((3, 2)))
+    [(0.0, 0.0), (2.0, 0.0), (0.0, 1.0), (2.0, 1.0)]
     """
     width, height = mapping.size
     right, low = width - 1, height - 1
-    return np.asarray(mapping.to_raw([[0, 0], [right, 0], [0, low], [right, low]]), np.float64)
-
-
-def _bounded(path: Path, most: int) -> bytes:
-    """The bytes of a file, unless they are more than any calibration has: a device has no end."""
-    if is_device(str(path)):
-        raise ValueError(f"{path} is a pipe or a device, not a file")
-    with path.open("rb") as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise ValueError(f"{path} is larger than {most >> 10} KiB")
-    return data
-
-
-def stored_text(path: Path) -> bytes:
-    """The YAML file of a calibration: the file itself, or what is attached to a recording.
-
-    Raises OSError or ValueError if it is not there, or larger than any calibration.
-    """
-    if path.suffix != ".mcap":
-        return _bounded(path, LONGEST)
-    text = _recorded(path, "calibration.yaml")
-    if len(text) > LONGEST:
-        raise ValueError(f"its calibration is larger than {LONGEST >> 10} KiB")
-    return text
-
-
-def stored_arrays(path: Path) -> bytes:
-    """The `.npz` file of a calibration; as `stored_text`."""
-    if path.suffix == ".mcap":
-        return _recorded(path, "calibration.npz")
-    return _bounded(path.with_suffix(".npz"), LARGEST)
-
-
-def _recorded(path: Path, name: str) -> bytes:
-    from tactflow.recording import CALIBRATION
-    from tactflow.recording.reader import attachments
-
-    found = attachments(path)
-    if not found.keys() >= CALIBRATION:
-        raise ValueError("the recording was made without a calibration")
-    return found[name]
+    corners = np.asarray(mapping.to_raw([[0, 0], [right, 0], [0, low], [right, low]]), np.float64)
+    return [(float(x), float(y)) for x, y in corners]
 
 
 def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of a `.npz` file, unless they unpack to more than they may."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(member.file_size for member in archive.infolist()) > LARGEST:
-            raise ValueError(f"its arrays unpack to more than {LARGEST >> 20} MiB")
+        if sum(member.file_size for member in archive.infolist()) > MAX_ARRAYS:
+            raise ValueError(f"its arrays unpack to more than {MAX_ARRAYS >> 20} MiB")
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         return dict(arrays)
 
 
-def _pair(values: list[Any]) -> Any:
-    return (values[0], values[1])
+def _positive(pair: tuple[float, float]) -> tuple[float, float]:
+    if min(pair) <= 0:
+        raise ValueError("required > 0")
+    return pair
 
 
 def _by(size: tuple[int, int]) -> str:

@@ -8,27 +8,23 @@ not seen: each recording in turn is left out, or each press where there are too 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.calibration.collecting import collect
 from tactflow.calibration.file import ForceEntry, LinearForceEntry
 from tactflow.calibration.reference import Reference, nonnegative, time_offset
-from tactflow.engine.contract import Sink
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Pipeline
-from tactflow.ports import Unmarked, Untouched
+from tactflow.message.result import Result
 from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, Seen, seen, total_change
-from tactflow.vision.types import Contact, Depth, Flow, Scale
 
 Double = NDArray[np.float64]
 
+NEEDED: Final = {"contact": "hull", "untouched": "untouched", "scale": "scale"}
+"""Ports that a pipeline must have -> the stage that gives them; heights need `depth`, shear a flow."""
 FEWEST_PRESSES: Final = 4
 """Presses that a fit needs at least; ten or more are advised. Chosen by hand."""
 FEWEST_RECORDINGS: Final = 3
@@ -43,12 +39,12 @@ RATIOS: Final = np.concatenate([[0.0], np.logspace(-3, 1, 41)])
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Watched:
-    """What was seen in a recording, frame by frame; n frames.
+    """Features of the contacts in a recording, frame by frame; n frames.
 
-    frames, times : (n,) float64, number and time (s). press : feature -> (n,) float64, those of `BY_DEPTH`
-    where heights are known, else of `BY_CHANGE`; 0 where nothing touches; the change with what is there at
-    rest too. drag : feature -> (n,) complex128,
-    x + i y; NaN where the flow is not known. touched : (n,) bool. change_at_rest : see `ForceModel`.
+    frames, times : (n,) float64, number and time (s). press : feature -> (n,) float64, of `BY_DEPTH`
+    where heights are known, else of `BY_CHANGE`; 0 where nothing touches; the change includes that at rest.
+    drag : feature -> (n,) complex128, x + i y; NaN where the flow is not known. touched : (n,) bool.
+    change_at_rest : see `ForceModel`.
     """
 
     frames: Double
@@ -60,70 +56,63 @@ class Watched:
 
 
 class _Moment(NamedTuple):
-    """A frame. found : what is seen of the contact, None without one. change : see `ForceModel`."""
+    """A frame. features : of the contact, None without one. change : see `ForceModel`."""
 
     seq: int
     t: float
-    found: Seen | None
+    features: Seen | None
     change: float
 
 
-class _Watch(Sink):
-    """Keeps what is seen of each contact."""
+class Watcher:
+    """Collects the features that the force follows from, of results that are added one after the other.
 
-    def __init__(self, params: Any) -> None:
-        super().__init__(params)
-        self.moments: list[_Moment] = []
-
-    def write(
-        self,
-        tick: Tick,
-        unmarked: Unmarked,
-        untouched: Untouched,
-        scale: Scale,
-        contact: Contact | None,
-        depth: Depth | None,
-        flow: Flow | None,
-    ) -> None:
-        """Look at one frame."""
-        change = scale.area(total_change(unmarked, untouched))
-        found = None if contact is None else seen(contact, scale, depth, change, flow)
-        self.moments.append(_Moment(tick.frame.seq, tick.frame.t, found, change))
-
-
-def watch(pipeline: Pipeline, calibration: Path) -> Watched:
-    """Run a pipeline on its source, and see what tells of the force.
-
-    Parameters
-    ----------
-    pipeline : with the stages `hull`, `untouched` and `scale`; heights need `depth`, force sideways a flow.
-    calibration : the file, with a scale.
-
-    Raises
-    ------
-    ConfigError : the pipeline lacks a stage, or its source has no frames.
-    TactflowError : a stage or the source failed, as where the calibration does not fit.
+    The results hold their pictures and come from a pipeline with a scale (`NEEDED`) that skips nothing.
     """
-    needed = {"contact": "hull", "untouched": "untouched", "scale": "scale"}
-    watched: Any = collect(pipeline, _Watch, {}, needed, calibration)
-    moments: list[_Moment] = watched.moments
-    if not moments:
-        raise ConfigError("calibrate force: the source has no frames")
-    at_rest = float(np.median([m.change for m in moments if m.found is None] or [0.0]))
-    touched = np.array([moment.found is not None for moment in moments])
-    by_depth = any(moment.found is not None and "volume" in moment.found.press for moment in moments)
-    names = BY_DEPTH if by_depth else BY_CHANGE
-    press = {name: np.zeros(len(moments)) for name in names}
-    drag = {name: np.full(len(moments), complex(math.nan, math.nan)) for name in BY_SHEAR}
-    for i, moment in enumerate(moments):
-        if moment.found is None:
-            continue
-        for name, values in press.items():
-            values[i] = moment.found.press.get(name, 0.0)
-        for name, (x, y) in moment.found.drag.items():
-            drag[name][i] = complex(x, y)
-    frames, times = (np.array([getattr(moment, name) for moment in moments], float) for name in ("seq", "t"))
-    return Watched(frames, times, press, drag, touched, at_rest)
+
+    def __init__(self) -> None:
+        self._moments: list[_Moment] = []
+
+    def add(self, result: Result) -> None:
+        """Look at one result."""
+        scale, unmarked, contact = result.scale, result.get("unmarked", result.image), result.contact
+        if scale is None or unmarked is None:
+            return
+        change = scale.area(total_change(unmarked, result["untouched"]))
+        features = None if contact is None else seen(contact, scale, result.depth, change, result.flow)
+        self._moments.append(_Moment(result.seq, result.t, features, change))
+
+    def watched(self) -> Watched:
+        """The features of all results. Raises ConfigError if there were none."""
+        if not self._moments:
+            raise ConfigError("calibrate force: the source has no frames")
+        contacts = [moment.features or Seen({}, {}) for moment in self._moments]
+        touched = np.array([moment.features is not None for moment in self._moments])
+        at_rest = [moment.change for moment in self._moments if moment.features is None]
+        by_depth = any("volume" in contact.press for contact in contacts)
+        unknown = (math.nan, math.nan)
+        return Watched(
+            frames=np.array([moment.seq for moment in self._moments], float),
+            times=np.array([moment.t for moment in self._moments], float),
+            press={
+                name: np.array([contact.press.get(name, 0.0) for contact in contacts])
+                for name in (BY_DEPTH if by_depth else BY_CHANGE)
+            },
+            drag={
+                name: np.array([complex(*contact.drag.get(name, unknown)) for contact in contacts])
+                for name in BY_SHEAR
+            },
+            touched=touched,
+            change_at_rest=float(np.median(at_rest or [0.0])),
+        )
+
+
+def watch(results: Iterable[Result]) -> Watched:
+    """The features of results with their pictures, as `tactflow.stream(..., images=True)` gives them."""
+    watcher = Watcher()
+    for result in results:
+        watcher.add(result)
+    return watcher.watched()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -175,57 +164,67 @@ class Fit(NamedTuple):
     mirrored : whether its y axis lies on the other side of it than the picture's."""
 
     entry: ForceEntry
-    turned: float | None
-    mirrored: bool
+    turned: float | None = None
+    mirrored: bool = False
 
 
 def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference]) -> Fit:
     """Learn the force from recordings.
 
-    watched, references : recording -> what was seen in it, and what the gauge said.
+    watched, references : recording -> the features of its contacts, and the readings of the gauge.
 
     Raises
     ------
     ConfigError : too few presses, a reference of another recording, or heights in some recordings only.
     """
-    names = {tuple(one.press) for one in watched.values()}
+    names = {tuple(recording.press) for recording in watched.values()}
     if len(names) > 1:
         raise ConfigError("calibrate force: heights are known in some of the recordings only")
-    at_rest = float(np.median([one.change_at_rest for one in watched.values()]))
+    at_rest = float(np.median([recording.change_at_rest for recording in watched.values()]))
     aligned = [align(name, watched[name], references[name], at_rest) for name in watched]
-    numbered = _numbered(aligned)
-    presses = int(numbered.max()) + 1
-    if presses < FEWEST_PRESSES:
+    first = np.cumsum([0, *(int(recording.presses.max()) + 1 for recording in aligned)])
+    presses = np.concatenate([part.presses + start for part, start in zip(aligned, first, strict=False)])
+    if first[-1] < FEWEST_PRESSES:
         raise ConfigError(
             f"calibrate force: required {FEWEST_PRESSES} presses or more (ten are better, by all that the "
-            f"sensor will meet), found {presses} in {len(aligned)} recordings"
+            f"sensor will meet), found {first[-1]} in {len(aligned)} recordings"
         )
     left_out: Literal["recording", "press"] = "recording" if len(aligned) >= FEWEST_RECORDINGS else "press"
-    groups = numbered if left_out == "press" else _recordings(aligned)
-    force = np.concatenate([one.force for one in aligned])
-    press = np.concatenate([one.press for one in aligned])
+    recordings = np.repeat(np.arange(len(aligned)), [len(part.press) for part in aligned])
+    groups = presses if left_out == "press" else recordings
+    force = np.concatenate([part.force for part in aligned])
+    features = np.concatenate([part.press for part in aligned])
     entry = ForceEntry(
-        press=_learn(next(iter(names)), press, force[:, 2], groups, numbered),
+        press=_learn(next(iter(names)), features, force[:, 2], groups, presses),
         change_at_rest=at_rest,
-        recordings={one.name: one.offset for one in aligned},
-        presses=presses,
+        recordings={part.name: part.offset for part in aligned},
+        presses=int(first[-1]),
         left_out=left_out,
     )
     if not all(references[name].sideways for name in watched):
-        return Fit(entry, None, False)
-    drag = np.concatenate([one.drag for one in aligned])
+        return Fit(entry)
+    drag = np.concatenate([part.drag for part in aligned])
     known = np.isfinite(drag).all(axis=1)
     if len(np.unique(groups[known])) < 2:
         raise ConfigError(
             "calibrate force: the CSV has fx and fy, but the flow of the contact is not known; add the "
             "stages tracker and flow_in_mask, or leave these columns out"
         )
-    sideways = force[known, 0] + 1j * force[known, 1]
-    turn, mirrored = _turn(drag[known], sideways)
+    return _with_drag(entry, drag[known], force[known, 0] + 1j * force[known, 1], groups[known])
+
+
+def _with_drag(
+    entry: ForceEntry,
+    drag: NDArray[np.complex128],
+    sideways: NDArray[np.complex128],
+    groups: NDArray[np.intp],
+) -> Fit:
+    """Add the force sideways. drag : (n, 2). sideways : (n,), fx + i fy, N, in the axes of the gauge."""
+    turn, mirrored = _turn(drag, sideways)
     sideways = (sideways.conj() if mirrored else sideways) * turn
     # The same stiffness for x and y: both are samples of one fit.
-    both = [np.concatenate([part.real, part.imag]) for part in (*drag[known].T, sideways)]
-    learned = _learn(BY_SHEAR, np.stack(both[:-1], axis=1), both[-1], np.tile(groups[known], 2), None)
+    both = [np.concatenate([part.real, part.imag]) for part in (*drag.T, sideways)]
+    learned = _learn(BY_SHEAR, np.stack(both[:-1], axis=1), both[-1], np.tile(groups, 2), None)
     # y points down, so that a positive angle of a complex number is clockwise as seen.
     turned = -float(np.degrees(np.angle(turn)))
     return Fit(entry.model_copy(update={"drag": learned if learned.r2 > 0 else None}), turned, mirrored)
@@ -240,50 +239,39 @@ def try_force(entry: ForceEntry, name: str, watched: Watched, reference: Referen
         raise ConfigError(
             f"{name}: heights are known here and not in the calibration, or the other way round"
         )
-    one = align(name, watched, reference, entry.change_at_rest)
+    aligned = align(name, watched, reference, entry.change_at_rest)
     stiffness = np.array([entry.press.stiffness[feature] for feature in watched.press])
-    return float(np.sqrt(np.mean((one.press @ stiffness - one.force[:, 2]) ** 2)))
-
-
-def _recordings(aligned: Sequence[Aligned]) -> NDArray[np.intp]:
-    """(n,) int: the recording that each frame belongs to."""
-    return np.repeat(np.arange(len(aligned)), [len(one.press) for one in aligned])
-
-
-def _numbered(aligned: Sequence[Aligned]) -> NDArray[np.intp]:
-    """(n,) int: the press that each frame belongs to, counted through all recordings."""
-    first = np.cumsum([0, *(int(one.presses.max()) + 1 for one in aligned)])
-    return np.concatenate([one.presses + start for one, start in zip(aligned, first, strict=False)])
+    return float(np.sqrt(np.mean((aligned.press @ stiffness - aligned.force[:, 2]) ** 2)))
 
 
 def _learn(
     names: Sequence[str], features: Double, force: Double, groups: NDArray[np.intp], presses: Any
 ) -> LinearForceEntry:
-    """Fit one component. features : (n, k). force : (n,). groups : (n,). presses : (n,), or None for no
-    hysteresis."""
-    # Features differ by orders of magnitude; at equal size the subsets are told apart best.
+    """Fit one component. features : (n, k). force : (n,). groups : (n,), left out in turn. presses : (n,), or
+    None for no hysteresis."""
+    # Features differ by orders of magnitude.
     size = np.maximum(np.abs(features).max(axis=0), 1e-12)
     features = features / size
     fitted = nonnegative(features, force)
-    unseen = np.zeros(len(force))
+    predicted = np.zeros(len(force))
     for group in np.unique(groups):
         held = groups == group
-        unseen[held] = features[held] @ nonnegative(features[~held], force[~held])
-    left = force - unseen
+        predicted[held] = features[held] @ nonnegative(features[~held], force[~held])
+    residual = force - predicted
     spread = float(((force - force.mean()) ** 2).sum())
     return LinearForceEntry(
         stiffness=dict(zip(names, (fitted / size).tolist(), strict=True)),
         greatest=dict(zip(names, size.tolist(), strict=True)),
-        error=list(_error(left, unseen)),
-        range=[float(force.min()), float(force.max())],
-        rmse=float(np.sqrt(np.mean(left**2))),
-        r2=1 - float(left @ left) / spread if spread else 0.0,
+        error=_error(residual, predicted),
+        range=(float(force.min()), float(force.max())),
+        rmse=float(np.sqrt(np.mean(residual**2))),
+        r2=1 - float(residual @ residual) / spread if spread else 0.0,
         hysteresis=None if presses is None else _hysteresis(features @ fitted, force, presses),
     )
 
 
-def _error(left: Double, force: Double) -> tuple[float, float]:
-    """The absolute and the relative part of the standard error that make errors `left` (n,) most likely.
+def _error(residual: Double, force: Double) -> tuple[float, float]:
+    """The absolute and the relative part of the standard error that make the residuals (n,) most likely.
 
     force : (n,), N, at which they were made.
 
@@ -292,33 +280,32 @@ def _error(left: Double, force: Double) -> tuple[float, float]:
     >>> absolute < 0.02, round(relative, 1)
     (True, 0.1)
     """
-    best, least = (0.0, 0.0), math.inf
-    for ratio in RATIOS.tolist():
-        form = 1 + (ratio * force) ** 2
-        variance = float(np.mean(left**2 / form))
-        surprise = len(left) * math.log(max(variance, 1e-30)) + float(np.log(form).sum())
-        if surprise < least:
-            absolute = math.sqrt(variance)
-            best, least = (absolute, ratio * absolute), surprise
-    return best
+    forms = 1 + (RATIOS[:, None] * force) ** 2
+    variances = np.maximum(np.mean(residual**2 / forms, axis=1), 1e-30)
+    best = int(np.argmin(len(residual) * np.log(variances) + np.log(forms).sum(axis=1)))
+    absolute = math.sqrt(variances[best])
+    return absolute, float(RATIOS[best]) * absolute
 
 
 def _hysteresis(predicted: Double, force: Double, presses: NDArray[np.intp]) -> float | None:
     """Mean distance of the force while the prediction grows and while it falls, over the largest force."""
-    apart: list[float] = []
+    distances: list[float] = []
     for number in np.unique(presses):
-        ours = presses == number
-        seen_now, felt = predicted[ours], force[ours]
-        top = int(seen_now.argmax())
-        up, down = (np.argsort(part, kind="stable") for part in (seen_now[: top + 1], seen_now[top:]))
-        low = max(seen_now[: top + 1].min(), seen_now[top:].min())
-        if min(len(up), len(down)) < 2 or low >= seen_now[top]:
+        chosen = presses == number
+        x, y = predicted[chosen], force[chosen]
+        top = int(x.argmax())
+        parts = [(x[: top + 1], y[: top + 1]), (x[top:], y[top:])]
+        low = max(part.min() for part, _ in parts)
+        if min(len(part) for part, _ in parts) < 2 or low >= x[top]:
             continue
-        levels = np.linspace(low, seen_now[top], LEVELS)
-        growing = np.interp(levels, seen_now[: top + 1][up], felt[: top + 1][up])
-        falling = np.interp(levels, seen_now[top:][down], felt[top:][down])
-        apart.append(float(np.abs(growing - falling).mean() / felt.max()))
-    return float(np.mean(apart)) if apart else None
+        levels = np.linspace(low, x[top], LEVELS)
+        orders = [np.argsort(part, kind="stable") for part, _ in parts]
+        growing, falling = (
+            np.interp(levels, part[order], felt[order])
+            for (part, felt), order in zip(parts, orders, strict=True)
+        )
+        distances.append(float(np.abs(growing - falling).mean() / y.max()))
+    return float(np.mean(distances)) if distances else None
 
 
 def _turn(drag: NDArray[np.complex128], force: NDArray[np.complex128]) -> tuple[complex, bool]:

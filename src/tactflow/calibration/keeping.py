@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.calibration.file import raw_corners
-from tactflow.calibration.presses import SAME, Press, difference
+from tactflow.calibration.presses import SAME, Picture, Press, PressFinder, difference
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.system.files import completed
 from tactflow.vision.geometry import PixelMapping
@@ -22,25 +22,42 @@ class KeptPresses:
 
     folder : made when there is something to keep.
 
-    Raises ConfigError if what is in it cannot be read.
+    Raises ConfigError if a file in it cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._saved: list[tuple[Press, Path]] = []
-        try:
-            for path in sorted(folder.glob("press-*.npz")):
-                self._saved.append((_read(path), path))
-        except Exception as error:
-            raise _unreadable(path, error) from None
+        self._files: dict[Path, Press] = {}
+        self._checked = False
+        self._renewed = 0
+        for path in sorted(folder.glob("press-*.npz")):
+            stored = _read(path)
+            x, y = stored.pop("center").tolist()
+            seq, radius = int(stored.pop("seq")), float(stored.pop("radius"))
+            self._files[path] = Press(seq=seq, radius=radius, center=(x, y), **stored)
 
     @property
     def presses(self) -> list[Press]:
-        """Those of before."""
-        return [press for press, _ in self._saved]
+        """Those of the session so far."""
+        return list(self._files.values())
 
-    def check(self, untouched: NDArray[np.uint8], mapping: PixelMapping) -> None:
-        """Refuse to go on with other frames or another light; the first session says what they are.
+    def update(self, finder: PressFinder) -> None:
+        """Save the presses that are over, and delete those that were undone or belong to another look.
+
+        Raises
+        ------
+        ConfigError : the frames or the light are others than in the session so far.
+        """
+        if finder.renewed != self._renewed:
+            self.clear()
+            self._checked, self._renewed = False, finder.renewed
+        if finder.lasts and not self._checked:
+            self.check(finder.untouched, finder.mapping)
+            self._checked = True
+        self.sync(finder.presses[: len(finder.presses) - finder.lasts])
+
+    def check(self, untouched: Picture, mapping: PixelMapping) -> None:
+        """Refuse to go on with other frames or another light than those of the first session.
 
         Raises ConfigError, with what differs.
         """
@@ -48,15 +65,12 @@ class KeptPresses:
         if not path.exists():
             _save(path, untouched=untouched, corners=corners)
             return
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as before:
-                then, where = before["untouched"], before["corners"]
-        except Exception as error:
-            raise _unreadable(path, error) from None
-        remedy = f"begin anew with --fresh, which forgets the {len(self._saved)} presses in {self.folder}"
-        if then.shape != untouched.shape or np.abs(where - corners).max() > 1:
+        before = _read(path)
+        remedy = f"begin anew with --fresh, which forgets the {len(self._files)} presses in {self.folder}"
+        same_shape = before["untouched"].shape == untouched.shape
+        if not same_shape or np.abs(np.subtract(before["corners"], corners)).max() > 1:
             raise ConfigError(f"calibrate: the session of before had another preprocess; {remedy}")
-        differs = difference(untouched, then)
+        differs = difference(untouched, before["untouched"])
         if differs > SAME:
             raise ConfigError(
                 f"calibrate: the untouched gel differs by {100 * differs:.0f} % of its brightness from the "
@@ -64,30 +78,22 @@ class KeptPresses:
             )
 
     def sync(self, presses: Sequence[Press]) -> None:
-        """Save those that are new, forget those that are no more."""
-        there = {id(press) for press in presses}
-        for press, path in self._saved:
-            if id(press) not in there:
-                path.unlink(missing_ok=True)
-        self._saved = [pair for pair in self._saved if id(pair[0]) in there]
-        saved = {id(press) for press, _ in self._saved}
+        """Save new presses and delete the files of those that are gone."""
+        kept = {id(press) for press in presses}
+        for path in [path for path, press in self._files.items() if id(press) not in kept]:
+            path.unlink(missing_ok=True)
+            del self._files[path]
+        saved = {id(press) for press in self._files.values()}
         for press in presses:
             if id(press) not in saved:
-                number = int(self._saved[-1][1].stem[6:]) + 1 if self._saved else 1
-                self._saved.append((press, self.folder / f"press-{number:04d}.npz"))
-                _save(
-                    self._saved[-1][1],
-                    seq=press.seq,
-                    image=press.image,
-                    mask=press.mask,
-                    hidden=press.hidden,
-                    center=press.center,
-                    radius=press.radius,
-                )
+                number = max((int(path.stem[6:]) for path in self._files), default=0) + 1
+                path = self.folder / f"press-{number:04d}.npz"
+                _save(path, **asdict(press))
+                self._files[path] = press
 
     def clear(self) -> None:
-        """Forget all of them."""
-        self._saved = []
+        """Delete all of them."""
+        self._files = {}
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
@@ -103,14 +109,11 @@ def _save(path: Path, **arrays: Any) -> None:
         ) from error
 
 
-def _unreadable(path: Path, error: Exception) -> ConfigError:
-    """What ZIP and numpy raise about damaged data is many things."""
-    return ConfigError(f"{path}: cannot be read: {error}; remove it")
-
-
-def _read(path: Path) -> Press:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as said:
-        x, y = said["center"].tolist()
-        return Press(
-            int(said["seq"]), said["image"], said["mask"], said["hidden"], (x, y), float(said["radius"])
-        )
+def _read(path: Path) -> dict[str, Any]:
+    """Raises ConfigError if it cannot be read."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return dict(arrays)
+    except Exception as error:
+        # ZIP and numpy raise many kinds of errors about damaged data.
+        raise ConfigError(f"{path}: cannot be read: {error}; remove it") from None

@@ -1,31 +1,31 @@
 """Which colour of the gel is which slope, learned from presses of a ball.
 
 Where the ball touches, the surface is the ball: at a distance d from the middle of a ball of radius R the
-horizontal part of the unit normal is d / R, towards the middle. Where exactly the middle is, is not known to
-a pixel from the outline, so fit and centres take turns: with a model, each pixel of a press says where the
-middle would be, and the median of them is the press's new centre. What they lie off in common shows as a
-slope of the unchanged colour, which has none.
+horizontal part of the unit normal is d / R, towards the middle. The outline gives the middle to some pixels
+only, so fit and centres take turns: with a model, each pixel of a press says where the middle would be, and
+the median of them is the press's new centre. What they lie off in common shows as a slope of the unchanged
+colour, which has none.
 
 Around the ball nothing is known of the slope but that it is the same all around and points to the middle: a
 gel that is pressed by a ball is as round as the ball. Colours that a shadow or a reflection gives one side
 alone would break this, and with it the heights, which are integrals of the slopes: so it is part of the fit.
 On wedge_ball it halves the RMS distance of the heights from the ball.
 
-All of it is linear in the coefficients, so a ridge regression with a few hundred unknowns; numpy solves it.
+All of it is linear in the coefficients: a ridge regression with a few hundred unknowns.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.calibration.file import PhotometricEntry
-from tactflow.calibration.presses import Press, Session
-from tactflow.calibration.scale import MAD_TO_SIGMA
+from tactflow.calibration.presses import Press, Session, usual_radius
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel, colour_terms, place_terms
 from tactflow.vision.depth.surface import Rest, Surface, colour_change
@@ -47,7 +47,7 @@ ROUND: Final = 0.05
 """Weight of a pixel around the contact, where the surface is round, to one inside of it. Chosen on
 wedge_ball: 0.03 leaves 0.033 mm RMS and 0.1 flattens the ball."""
 RIDGE: Final = 1e-6
-"""Part of a coefficient's own weight by which it is drawn to 0. Chosen by hand."""
+"""Ridge penalty, as a part of a coefficient's own weight. Chosen by hand."""
 PLACE_RIDGE: Final = 1e-3
 """The same of coefficients that change with the place, so that a colour means much the same where nothing was
 pressed. Chosen on the simulator, where 8 presses leave normals of others 12, 55 and 54 degrees off with 1e-6
@@ -64,10 +64,11 @@ drawn to the mean, and not taken for a slope. With averages there, too, cables u
 errors of 5.6 % instead of 3.8, and those of edges are no smaller; with 12, coins have 19 % instead of 18."""
 TURNS: Final = 3
 """How often fit and centres take turns; later ones move centres by less than 0.05 px on wedge_ball."""
-STRANGE: Final = 4.0
-"""Standard deviations above the median, by median deviation, from which the misfit of a press has it
-rejected. Chosen by hand."""
-JUDGED: Final = 2
+OUTLIER: Final = 4.0
+"""Robust standard deviations above the median misfit at which a press is rejected. Chosen by hand."""
+LEAST_SCATTER: Final = 0.1
+"""Standard deviation of the misfits that is assumed at least, degrees. Chosen by hand."""
+ROUNDS: Final = 2
 """How often presses are judged: the second time by what was learned without the bad ones, beside which good
 ones look bad too."""
 FEWEST_PIXELS: Final = 12
@@ -79,11 +80,26 @@ RIM: Final = 6
 hand."""
 
 
-class _Sample(NamedTuple):
+@dataclass(frozen=True, eq=False, slots=True)
+class Photometry:
+    """A fit. model : of the slopes. found : numbers for the calibration file. centers : (n, 2) float64, px,
+    of the presses. kept : (n,) bool, which presses were not rejected. misfit : (n,) float64, mean angle
+    between the normals of each press and its ball, degrees."""
+
+    model: SlopeModel
+    found: PhotometricEntry
+    centers: Double
+    kept: NDArray[np.bool_]
+    misfit: Double
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Sample:
     """A press, prepared: pixels (m) in its window at half resolution, in mm.
 
     x, y : (m,), places, mm. terms : (m, 114) float32. hidden : (m,) bool. inner : (m,) bool, not too near the
     border of the window. start : (x, y) of the outline, mm. reach : radius inside which it is the ball, mm.
+    ball_radius : mm.
     """
 
     x: Double
@@ -94,19 +110,37 @@ class _Sample(NamedTuple):
     start: Double
     reach: float
     window: Window
+    ball_radius: float
 
+    def on_ball(self, center: Double) -> NDArray[np.bool_]:
+        """(m,): visible pixels where the surface is a ball with this centre."""
+        near = np.hypot(self.x - center[0], self.y - center[1]) < self.reach
+        return np.asarray(near & ~self.hidden)
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Photometry:
-    """What was learned. model : of the slopes. found : numbers for the calibration file. centers : (n, 2)
-    float64, px, of the presses. kept : (n,) bool, which presses were not rejected. misfit : (n,) float64,
-    mean angle between the normals of each press and its ball, degrees."""
+    def normals(self, weights: Double, chosen: NDArray[np.bool_]) -> Double:
+        """(k, 2): horizontal part of the normals at some pixels, by the fit."""
+        return np.asarray(self.terms[chosen] @ weights.T.astype(np.float32), np.float64)
 
-    model: SlopeModel
-    found: PhotometricEntry
-    centers: Double
-    kept: NDArray[np.bool_]
-    misfit: Double
+    def center(self, start: Double, weights: Double) -> Double:
+        """(2,), mm: the median of where pixels of the press say that the middle of the ball is."""
+        center = start
+        for _ in range(TURNS):
+            ball = self.on_ball(center)
+            if not ball.any():
+                return center
+            places = np.stack([self.x[ball], self.y[ball]], axis=1)
+            center = np.median(places - self.ball_radius * self.normals(weights, ball), axis=0)
+        return center
+
+    def misfit(self, center: Double, weights: Double) -> float:
+        """Mean angle between the normals of the press and those of the ball, degrees; 180 if it has none."""
+        ball = self.on_ball(center)
+        if not ball.any():
+            return 180.0
+        places = np.stack([self.x[ball] - center[0], self.y[ball] - center[1]], axis=1)
+        true = _upright(places / self.ball_radius)
+        cosine = np.sum(_upright(self.normals(weights, ball)) * true, axis=1)
+        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
 
 
 def fit_photometry(session: Session, scale: Scale, ball_radius: float) -> Photometry:
@@ -126,31 +160,38 @@ def fit_photometry(session: Session, scale: Scale, ball_radius: float) -> Photom
     check_presses(session, scale, ball_radius)
     samples = _prepared(session, scale, ball_radius)
     kept = np.ones(len(samples), np.bool_)
-    for _ in range(JUDGED):
-        weights, centers = _fit(samples, np.flatnonzero(kept), ball_radius)
-        centers = np.array(
-            [_center(s, c, weights, ball_radius) for s, c in zip(samples, centers, strict=True)]
-        )
-        misfit = np.array(
-            [_misfit(s, c, weights, ball_radius) for s, c in zip(samples, centers, strict=True)]
-        )
-        spread = MAD_TO_SIGMA * np.median(np.abs(misfit - np.median(misfit)))
-        before, kept = kept, misfit <= np.median(misfit) + STRANGE * max(float(spread), 0.1)
+    for _ in range(ROUNDS):
+        weights, starts = _fit(samples, np.flatnonzero(kept))
+        fitted = [sample.center(start, weights) for sample, start in zip(samples, starts, strict=True)]
+        centers = np.array(fitted)
+        misfit = np.array([s.misfit(c, weights) for s, c in zip(samples, centers, strict=True)])
+        before, kept = kept, _fitting(misfit)
         if (kept == before).all():
             break
     else:
-        weights, _ = _fit(samples, np.flatnonzero(kept), ball_radius)
+        weights, _ = _fit(samples, np.flatnonzero(kept))
     good = np.flatnonzero(kept)
-    errors = _held_out(session, samples, good, scale, ball_radius)
     found = PhotometricEntry(
         ball_radius=ball_radius,
         presses=len(good),
         rejected=len(samples) - len(good),
         steepest=max(samples[i].reach for i in good) / ball_radius,
-        **errors,
+        **_held_out(session, samples, good, scale),
     )
     pixels = centers / (scale.x, scale.y) + scale.origin
     return Photometry(SlopeModel(_shaped(weights)), found, pixels, kept, misfit)
+
+
+def try_photometry(session: Session, model: SlopeModel, scale: Scale, ball_radius: float) -> dict[str, float]:
+    """How well a model fits presses of a ball: the errors of `PhotometricEntry`.
+
+    session : what `find_presses` found, at least one press. ball_radius : mm.
+    """
+    weights = model.coefficients.transpose(2, 0, 1).reshape(2, -1).astype(np.float64)
+    samples = _prepared(session, scale, ball_radius)
+    rest, surface = Rest(session.untouched), Surface(model, scale)
+    pairs = zip(session.presses, samples, strict=True)
+    return _summary([_errors(s, weights, _heights(surface, p, rest, s.window)) for p, s in pairs])
 
 
 def check_presses(session: Session, scale: Scale, ball_radius: float) -> None:
@@ -176,7 +217,7 @@ def check_presses(session: Session, scale: Scale, ball_radius: float) -> None:
             f"calibrate: the presses span {wide:g} % of the picture's width and "
             f"{high:g} % of its height, required {100 * SPREAD:.0f} %; press all over the gel"
         )
-    radius = float(np.median([press.radius for press in presses])) * (scale.x * scale.y) ** 0.5
+    radius = usual_radius(presses) * (scale.x * scale.y) ** 0.5
     if radius > TOO_LARGE * ball_radius:
         raise ConfigError(
             f"calibrate: the contacts have a radius of {radius:.2f} mm in the median, which a ball of radius "
@@ -206,65 +247,62 @@ def _prepare(
     dark = cv2.resize(smoothed[window.whole], size, interpolation=cv2.INTER_AREA).min(axis=2) < DARK
     change[dark] = colour_change(press.image, rest, window)[dark]
     place = place_terms((rest.window.right, rest.window.bottom))[(slice(None), *window.part)]
-    colours = colour_terms(change)
-    terms = (place.reshape(PLACE_TERMS, 1, -1) * colours).reshape(PLACE_TERMS * COLOUR_TERMS, -1)
+    terms = place.reshape(PLACE_TERMS, 1, -1) * colour_terms(change)
     rows, columns = np.mgrid[window.part]
-    # The centre of a pixel at half resolution lies between two of the processed frame.
-    x = (2.0 * columns + 0.5 - scale.origin[0]) * scale.x
-    y = (2.0 * rows + 0.5 - scale.origin[1]) * scale.y
-    hidden = _halved(press.hidden, window)
+    hidden = press.hidden[window.whole]
     inner = np.zeros(change.shape[:2], np.bool_)
     inner[RIM:-RIM, RIM:-RIM] = True
-    reach = min(INNER * press.radius * (scale.x * scale.y) ** 0.5, INNER * ball_radius)
-    start = np.array(scale.point(press.center))
     return _Sample(
-        x.ravel(),
-        y.ravel(),
-        np.ascontiguousarray(terms.T),
-        hidden.ravel(),
-        inner.ravel(),
-        start,
-        reach,
-        window,
+        # The centre of a pixel at half resolution lies between two of the processed frame.
+        x=((2.0 * columns + 0.5 - scale.origin[0]) * scale.x).ravel(),
+        y=((2.0 * rows + 0.5 - scale.origin[1]) * scale.y).ravel(),
+        terms=np.ascontiguousarray(terms.reshape(PLACE_TERMS * COLOUR_TERMS, -1).T),
+        hidden=(hidden[::2, ::2] | hidden[1::2, ::2] | hidden[::2, 1::2] | hidden[1::2, 1::2]).ravel(),
+        inner=inner.ravel(),
+        start=np.array(scale.point(press.center)),
+        reach=min(INNER * press.radius * (scale.x * scale.y) ** 0.5, INNER * ball_radius),
+        window=window,
+        ball_radius=ball_radius,
     )
 
 
-def _halved(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
-    """(h, w) bool: whether any of the 2 x 2 pixels of a mask is set."""
-    part = mask[window.whole]
-    return part[::2, ::2] | part[1::2, ::2] | part[::2, 1::2] | part[1::2, 1::2]
+def _fitting(misfit: Double) -> NDArray[np.bool_]:
+    """(n,): which presses fit about as well as the others."""
+    from scipy.stats import median_abs_deviation
+
+    scatter = float(median_abs_deviation(misfit, scale="normal"))
+    return np.asarray(misfit <= np.median(misfit) + OUTLIER * max(scatter, LEAST_SCATTER))
 
 
-def _fit(samples: list[_Sample], chosen: NDArray[np.intp], ball_radius: float) -> tuple[Double, Double]:
+def _fit(samples: Sequence[_Sample], chosen: NDArray[np.intp]) -> tuple[Double, Double]:
     """Coefficients (2, 114), and the centres (n, 2), mm, of all samples, from the chosen ones."""
     centers = np.array([sample.start for sample in samples])
     for turn in range(TURNS):
-        weights, offset = _solve([(samples[i], centers[i]) for i in chosen], ball_radius)
+        weights, offset = _solve([(samples[i], centers[i]) for i in chosen])
         if turn < TURNS - 1:
             centers += offset
-            centers[chosen] = [_center(samples[i], centers[i], weights, ball_radius) for i in chosen]
+            centers[chosen] = [samples[i].center(centers[i], weights) for i in chosen]
     return weights, centers
 
 
-def _solve(presses: list[tuple[_Sample, Double]], ball_radius: float) -> tuple[Double, Double]:
+def _solve(presses: Sequence[tuple[_Sample, Double]]) -> tuple[Double, Double]:
     """Coefficients (2, 114) for given centres, and how far all of these lie off in common, (2,) mm.
 
-    The second is what a constant beside the terms says: where no change of colour would have a slope.
+    The second comes from a constant beside the terms: where no change of colour would have a slope.
     """
+    ball_radius = presses[0][0].ball_radius
     count = PLACE_TERMS * COLOUR_TERMS
     inside = np.zeros((count + 1, count + 1))
     aim = np.zeros((2, count + 1))
     around = np.zeros((2 * count, 2 * count))
     for sample, center in presses:
         dx, dy = sample.x - center[0], sample.y - center[1]
-        distance = np.hypot(dx, dy)
-        seen = ~sample.hidden
-        ball = seen & (distance < sample.reach)
+        ball = sample.on_ball(center)
         terms = np.column_stack([sample.terms[ball], np.ones(np.count_nonzero(ball), np.float32)])
         inside += terms.T @ terms
         aim += np.stack([dx[ball], dy[ball]]) / ball_radius @ terms
-        outer = np.flatnonzero(seen & ~ball & sample.inner)
-        around += _roundness(sample.terms[outer], dx[outer], dy[outer], distance[outer])
+        outer = np.flatnonzero(~sample.hidden & ~ball & sample.inner)
+        around += _roundness(sample.terms[outer], dx[outer], dy[outer])
     matrix = np.kron(np.eye(2), inside)
     free = np.flatnonzero(np.arange(2 * count + 2) % (count + 1) < count)
     matrix[np.ix_(free, free)] += ROUND * around
@@ -274,8 +312,9 @@ def _solve(presses: list[tuple[_Sample, Double]], ball_radius: float) -> tuple[D
     return solved[:, :count], ball_radius * solved[:, count]
 
 
-def _roundness(terms: NDArray[np.float32], dx: Double, dy: Double, distance: Double) -> Double:
+def _roundness(terms: NDArray[np.float32], dx: Double, dy: Double) -> Double:
     """(228, 228): quadratic form that is 0 for normals which point to the middle, the same all around."""
+    distance = np.hypot(dx, dy)
     ux, uy = ((part / distance).astype(np.float32)[:, None] for part in (dx, dy))
     across = np.concatenate([-uy * terms, ux * terms], axis=1)
     along = np.concatenate([ux * terms, uy * terms], axis=1)
@@ -291,72 +330,25 @@ def _roundness(terms: NDArray[np.float32], dx: Double, dy: Double, distance: Dou
     return np.asarray(across.T @ across + along.T @ along, np.float64)
 
 
-def _normals(sample: _Sample, weights: Double, chosen: NDArray[np.bool_]) -> Double:
-    """(m, 2): horizontal part of the normals at some pixels, as the fit has it."""
-    return np.asarray(sample.terms[chosen] @ weights.T.astype(np.float32), np.float64)
-
-
-def _center(sample: _Sample, center: Double, weights: Double, ball_radius: float) -> Double:
-    """(2,), mm: where most pixels of a press say that the middle of the ball is."""
-    for _ in range(TURNS):
-        ball = ~sample.hidden & (np.hypot(sample.x - center[0], sample.y - center[1]) < sample.reach)
-        if not ball.any():
-            return center
-        places = np.stack([sample.x[ball], sample.y[ball]], axis=1)
-        center = np.median(places - ball_radius * _normals(sample, weights, ball), axis=0)
-    return center
-
-
-def _misfit(sample: _Sample, center: Double, weights: Double, ball_radius: float) -> float:
-    """Mean angle between the normals of a press and those of the ball, degrees; 180 if it has none."""
-    dx, dy = sample.x - center[0], sample.y - center[1]
-    ball = ~sample.hidden & (np.hypot(dx, dy) < sample.reach)
-    if not ball.any():
-        return 180.0
-    true = _upright(np.stack([dx[ball], dy[ball]], axis=1) / ball_radius)
-    cosine = np.sum(_upright(_normals(sample, weights, ball)) * true, axis=1)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
-
-
 def _upright(flat: Double) -> Double:
     """(m, 3): unit normals from their horizontal parts (m, 2); longer ones than 1 lie flat."""
-    length = np.maximum(np.hypot(flat[:, 0], flat[:, 1]), 1)[:, None]
-    flat = flat / length
+    flat = flat / np.maximum(np.hypot(flat[:, 0], flat[:, 1]), 1)[:, None]
     return np.concatenate([flat, np.sqrt(np.maximum(1 - (flat**2).sum(axis=1, keepdims=True), 0))], axis=1)
 
 
 def _held_out(
-    session: Session,
-    samples: list[_Sample],
-    good: NDArray[np.intp],
-    scale: Scale,
-    ball_radius: float,
+    session: Session, samples: Sequence[_Sample], good: NDArray[np.intp], scale: Scale
 ) -> dict[str, float]:
     """Errors of presses that the fit has not seen, for `PhotometricEntry`."""
     rest = Rest(session.untouched)
     tried = []
     for learned, others in ((good[::2], good[1::2]), (good[1::2], good[::2])):
-        weights, _ = _fit(samples, learned, ball_radius)
+        weights, _ = _fit(samples, learned)
         surface = Surface(SlopeModel(_shaped(weights)), scale)
         for i in others:
             heights = _heights(surface, session.presses[i], rest, samples[i].window)
-            tried.append(_errors(samples[i], weights, heights, ball_radius))
-    return _summary(np.array(tried))
-
-
-def try_photometry(session: Session, model: SlopeModel, scale: Scale, ball_radius: float) -> dict[str, float]:
-    """How well a model fits presses of a ball: the errors of `PhotometricEntry`.
-
-    session : what `find_presses` found, at least one press. ball_radius : mm.
-    """
-    rest = Rest(session.untouched)
-    weights = model.coefficients.transpose(2, 0, 1).reshape(2, -1).astype(np.float64)
-    surface = Surface(model, scale)
-    tried = []
-    for press, sample in zip(session.presses, _prepared(session, scale, ball_radius), strict=True):
-        heights = _heights(surface, press, rest, sample.window)
-        tried.append(_errors(sample, weights, heights, ball_radius))
-    return _summary(np.array(tried))
+            tried.append(_errors(samples[i], weights, heights))
+    return _summary(tried)
 
 
 def _heights(surface: Surface, press: Press, rest: Rest, window: Window) -> NDArray[np.float32]:
@@ -367,16 +359,15 @@ def _heights(surface: Surface, press: Press, rest: Rest, window: Window) -> NDAr
     return whole[window.part]
 
 
-def _errors(
-    sample: _Sample, weights: Double, heights: NDArray[np.float32], ball_radius: float
-) -> list[float]:
+def _errors(sample: _Sample, weights: Double, heights: NDArray[np.float32]) -> list[float]:
     """Of one press: mean angle, relative error of the radius, RMS from the sphere, of depth, of volume.
 
     The depth is judged by how far the surface falls from the middle of the ball to the rim of the contact,
     and the volume by the mean of that: the gel around the ball is not known.
     """
-    center = _center(sample, sample.start, weights, ball_radius)
-    angle = _misfit(sample, center, weights, ball_radius)
+    ball_radius = sample.ball_radius
+    center = sample.center(sample.start, weights)
+    angle = sample.misfit(center, weights)
     found = heights.ravel().astype(np.float64)
     dx, dy = sample.x - center[0], sample.y - center[1]
     distance = np.hypot(dx, dy)
@@ -393,9 +384,9 @@ def _errors(
     return [angle, radius / ball_radius - 1, rms, depth, volume]
 
 
-def _summary(tried: Double) -> dict[str, float]:
-    """Numbers of `PhotometricEntry` from what `_errors` says of each press, (n, 5)."""
-    angle, radius, rms, depth, volume = tried.T
+def _summary(tried: Sequence[Sequence[float]]) -> dict[str, float]:
+    """Numbers of `PhotometricEntry` from the errors of each press."""
+    angle, radius, rms, depth, volume = np.transpose(tried)
     return {
         "normal_error": float(np.mean(angle)),
         "radius_error": float(np.nanmedian(radius)),

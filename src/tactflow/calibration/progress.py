@@ -1,4 +1,4 @@
-"""How a session goes in which a ball is pressed: which presses are good, and where the next one is wanted."""
+"""Which presses of a session are good, and where the next one is wanted."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.calibration.presses import Press
+from tactflow.calibration.presses import Press, usual_radius
 
 LIGHT: Final = 0.5
 """Radius of a contact over the usual one, below which a press is called light. Chosen by hand."""
@@ -62,20 +62,19 @@ def part_name(row: int, column: int) -> str:
 
 
 def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str, Any]:
-    """What was done and what to do now, as the live page takes it.
+    """The state of a session, as the live page takes it.
 
-    lasts : whether the last press is not over. wanted : so many presses.
+    lasts : whether the last press is not over. wanted : number of presses to reach.
 
     Returns
     -------
     now : what to do, in words. done, good, wanted : numbers of presses. next : (row, column) of the part of
-    the gel that has the fewest good ones. lasts. presses : center and radius of each, px, and fault, see
-    above; None if it is good.
+    the gel that has the fewest good ones. lasts. presses : center and radius of each, px, and its fault.
 
     >>> progress([], False, 20)["now"]
     'Press the ball firmly at the middle centre.'
     """
-    usual = float(np.median([press.radius for press in presses])) if presses else 0.0
+    usual = usual_radius(presses)
     faults = [fault(press, usual) for press in presses]
     done = len(presses) - lasts
     good = [press for press, wrong in zip(presses[:done], faults[:done], strict=True) if wrong is None]

@@ -1,43 +1,63 @@
-"""`tactflow calibrate`: make the calibration file of a sensor, and see whether it still fits."""
+"""`tactflow calibrate`: make the calibration file of a sensor, add the force, see whether it still fits."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
-from tactflow.api import Settings, load
-from tactflow.calibration.file import UNLIKE, Calibration, PhotometricEntry, raw_corners, small_picture
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from tactflow.api import Settings, ended_by_signals, load, make_runner
+from tactflow.calibration import force, presses, target
+from tactflow.calibration.file import (
+    UNLIKE,
+    Calibration,
+    ForceEntry,
+    LinearForceEntry,
+    PhotometricEntry,
+    ScaleEntry,
+    raw_corners,
+    small_picture,
+)
 from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
-from tactflow.calibration.presses import Press, Session, find_presses
+from tactflow.calibration.presses import PressFinder, Session
+from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
 from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
-from tactflow.cli.calibrate_force import add_force, add_force_arguments, check_force
-from tactflow.cli.calibrate_lens import add_target_arguments, print_lens, target_scale
 from tactflow.cli.guide import Guide, typed_lines
-from tactflow.cli.options import positive
+from tactflow.cli.options import add_overwrite, positive
 from tactflow.cli.terminal import notes, printable, say, typed
+from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
+from tactflow.engine.run import Runner
+from tactflow.message.result import Result
+from tactflow.sources import open_source
+from tactflow.system.signals import INTERRUPTED, Interrupted
 from tactflow.view.guided import Guiding
 from tactflow.vision.types import Scale
 
 WORSE: Final = 1.5
-"""Error on new presses over that in the file, from which on a calibration is called drifted. By hand."""
+"""Error on new presses over that in the file above which a calibration counts as drifted. By hand."""
 LOOSE: Final = 0.02
-"""Relative error of a scale by pitch from which on it is told how to get a better one. Chosen by hand: grids
-of the simulator have less than 0.01, the rings of a TacTip 0.1 to 0.15."""
+"""Relative error of a scale by pitch above which a better method is advised. Chosen by hand: grids of the
+simulator have less than 0.01, the rings of a TacTip 0.1 to 0.15."""
 SHORTEST: Final = 1e-3
 LONGEST: Final = 1e4
-"""Lengths that are taken, mm. Chosen by hand: gels and balls have 1 to 100."""
+"""Lengths that are accepted, mm. Chosen by hand: gels and balls have 1 to 100."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `calibrate`."""
-    parser.add_argument(
+    option = parser.add_argument
+    option(
         "what",
         nargs="*",
         metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE] | lens PICTURES",
@@ -46,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "calibration file, to add to it how the force follows from the contact; or lens, and pictures of a "
         "printed target, to get undistort and homography of a preprocess",
     )
-    parser.add_argument(
+    option(
         "--source",
         "--from",
         dest="source",
@@ -55,39 +75,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "then presses of the ball. For force, a recording with a CSV of the same name beside it, or a folder "
         "of them",
     )
-    parser.add_argument("--sensor", metavar="NAME", help="which one of a file with sensors")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="calibration/SENSOR.yaml unless given")
-    parser.add_argument(
-        "--realtime", action="store_true", help="play a recording at its own pace, like a camera, to try it"
-    )
-    parser.add_argument(
-        "--fresh", action="store_true", help="forget the presses of a session that was broken off"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
-    parser.add_argument(
+    option("--sensor", metavar="NAME", help="which one of a file with sensors")
+    option("--out", type=Path, metavar="FILE", help="default: calibration/SENSOR.yaml")
+    option("--realtime", action="store_true", help="play a recording at its own pace, like a camera")
+    option("--fresh", action="store_true", help="forget the presses of a session that was broken off")
+    add_overwrite(parser)
+    option(
         "--pitch",
         type=_millimetres,
         metavar="MM",
         help="distance of neighbouring dots of the gel, which stand in a square grid, or of the target",
     )
-    parser.add_argument(
+    option(
         "--area",
         type=_millimetres,
         nargs=2,
         metavar=("WIDTH", "HEIGHT"),
         help="what the whole processed picture shows, mm, where the gel has no dots of known pitch",
     )
-    parser.add_argument(
-        "--ball-radius", type=_millimetres, metavar="MM", help="of the ball; without it, scale only"
+    option("--ball-radius", type=_millimetres, metavar="MM", help="of the ball; without it, scale only")
+    option("--presses", type=positive, default=30, metavar="N", help="of a live source: enough presses (30)")
+    option("--view", action="store_true", help="show the live page, which says where to press next")
+    _add_target_and_force(parser)
+
+
+def _add_target_and_force(parser: argparse.ArgumentParser) -> None:
+    """Declare the options about a printed target, and those of `calibrate force`."""
+    option = parser.add_argument
+    option(
+        "--target",
+        metavar="PICTURE",
+        help="scale from this raw picture of a printed target where the gel is, of --grid and --pitch",
     )
-    parser.add_argument(
-        "--presses", type=positive, default=30, metavar="N", help="of a live source: enough presses (30)"
+    option(
+        "--grid",
+        metavar="COLUMNSxROWS",
+        help="of the target: inner corners of its checkerboard, or dots with --dots",
     )
-    parser.add_argument(
-        "--view", action="store_true", help="show the live page, which says where to press next"
+    option("--dots", action="store_true", help="the target is a grid of dots")
+    option(
+        "--csv",
+        type=Path,
+        metavar="FILE",
+        help="for force, and to check it: readings of the gauge, where they do not lie beside the recording; "
+        "columns t (s) or frame, fz (N), and fx and fy if there are",
     )
-    add_target_arguments(parser)
-    add_force_arguments(parser)
+    option(
+        "--offset",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="for force: add so much to the time of the CSV; the rest, up to 2 s, is estimated",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -96,26 +135,20 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     TactflowError
-        If options are wrong, or what was recorded gives no calibration.
+        If options are wrong, or the recording gives no calibration.
     """
+    verb, *words = args.what if args.what[:1] in (["check"], ["force"], ["lens"]) else ["make", *args.what]
     with notes():
-        return _run(args, list(args.what))
-
-
-def _run(args: argparse.Namespace, words: list[str]) -> int:
-    if words[:1] == ["check"]:
-        if len(words) not in (2, 3):
-            raise ConfigError("calibrate check: required a calibration file, and a pipeline if wanted")
-        return _check(args, Path(words[1]), words[2] if len(words) == 3 else None)
-    if words[:1] == ["force"]:
-        if len(words) not in (2, 3):
-            raise ConfigError("calibrate force: required a calibration file, and a pipeline if wanted")
-        return add_force(args, Path(words[1]), words[2] if len(words) == 3 else None)
-    if words[:1] == ["lens"]:
-        return print_lens(args, words[1:])
-    if len(words) > 1:
-        raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
-    return _make(args, words[0] if words else None)
+        if verb == "lens":
+            return _print_lens(args, words)
+        if verb == "make":
+            if len(words) > 1:
+                raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
+            return _make(args, words[0] if words else None)
+        if len(words) not in (1, 2):
+            raise ConfigError(f"calibrate {verb}: required a calibration file, and a pipeline if wanted")
+        command = _check if verb == "check" else _add_force
+        return command(args, Path(words[0]), words[1] if len(words) > 1 else None)
 
 
 def _make(args: argparse.Namespace, pipeline: str | None) -> int:
@@ -132,12 +165,11 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     if args.fresh:
         kept.clear()
     guide = Guide(args.presses, say, typed_lines())
-    page = _page(args, pipeline, guide) if args.view else None
+    page = _page(args, pipeline, guide) if args.view else {}
     if args.ball_radius is None:
-        # The untouched gel is enough for a scale.
-        session = find_presses(loaded, _at_once, watchers=page)
+        session = _find_presses(loaded, None, page=page)
     else:
-        session = find_presses(loaded, guide, kept, page)
+        session = _find_presses(loaded, guide, kept, page)
     try:
         calibration = _learned(args, loaded, session)
     except ConfigError as error:
@@ -160,9 +192,12 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
 
 
 def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Calibration:
-    """What a session gives. Raises ConfigError if that is no calibration."""
-    scale = _scale(args, loaded, session)
-    say(f"scale: {_scale_words(scale)}")
+    """The calibration that a session gives. Raises ConfigError if it gives none."""
+    scale, found_by = _scale(args, loaded, session)
+    say(
+        f"scale: {scale.x:.5f} +- {scale.stderr[0]:.5f} mm per px in x, "
+        f"{scale.y:.5f} +- {scale.stderr[1]:.5f} in y"
+    )
     error = max(scale.stderr[0] / scale.x, scale.stderr[1] / scale.y)
     if args.pitch is not None and args.target is None and error > LOOSE:
         say(
@@ -170,25 +205,24 @@ def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Ca
             "in none (rings are not, for one), or the picture is stretched. Measure a length instead: --area "
             "WIDTH HEIGHT takes what the whole processed picture shows, --target a printed grid"
         )
-    found = None
+    fitted = None
     if args.ball_radius is not None:
         say(f"{len(session.presses)} presses; learning from them ...")
-        found = fit_photometry(session, scale, args.ball_radius)
-        for press, kept, misfit in zip(session.presses, found.kept, found.misfit, strict=True):
+        fitted = fit_photometry(session, scale, args.ball_radius)
+        for press, kept, misfit in zip(session.presses, fitted.kept, fitted.misfit, strict=True):
             if not kept:
                 say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
-        say(_photometric_words(found.found.model_dump()))
+        say(_photometric_words(fitted.found.model_dump()))
     return Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
         raw_size=session.mapping.raw_size,
         size=session.mapping.size,
         corners=raw_corners(session.mapping),
+        scale=ScaleEntry.of(scale, found_by),
+        photometric=None if fitted is None else fitted.found,
         look=small_picture(session.untouched),
-        scale=scale,
-        scale_by=_given(args),
-        slopes=None if found is None else found.model,
-        photometric=None if found is None else found.found,
+        slopes=None if fitted is None else fitted.model,
     )
 
 
@@ -196,9 +230,8 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
     then = calibration.photometric
     _instruct(args, None if then is None else then.ball_radius)
-    # The untouched gel is enough for a scale.
-    report = _at_once if then is None else Guide(args.presses, say, typed_lines())
-    session = find_presses(_load(args, pipeline), report)
+    guide = None if then is None else Guide(args.presses, say, typed_lines())
+    session = _find_presses(_load(args, pipeline), guide)
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
         print(
@@ -211,17 +244,17 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
         f"untouched gel: differs by {100 * unlike:.1f} % of its brightness; up to {100 * UNLIKE:.0f} % fits"
     )
     if not fits:
-        print("so it does too with another sensor or light, or where something touches the gel at the start")
+        print("it also differs with another sensor or light, or where something touches the gel at the start")
     if then is not None:
         fits = _check_presses(calibration, then, session) and fits
     if args.csv is not None:
-        fits = check_force(args, path, calibration.force, pipeline, WORSE) and fits
+        fits = _check_force(args, path, calibration.force, pipeline) and fits
     print("it still fits" if fits else "it does not fit; if none of this explains it, calibrate anew")
     return 0 if fits else 3
 
 
 def _check_presses(calibration: Calibration, then: PhotometricEntry, session: Session) -> bool:
-    """Whether a calibration fits the presses of today, which is told; True where there are none."""
+    """Print how well a calibration fits the presses of today; True where there are none."""
     count = len(session.presses)
     if calibration.slopes is None or not count:
         print(
@@ -242,6 +275,236 @@ def _check_presses(calibration: Calibration, then: PhotometricEntry, session: Se
     return False
 
 
+def _check_force(
+    args: argparse.Namespace, path: Path, entry: ForceEntry | None, pipeline: str | None
+) -> bool:
+    """Print how right the force of a calibration is today; whether it still is."""
+    if entry is None:
+        raise ConfigError(f"calibrate check: {path} has no force that --csv could be compared with")
+    watched = _watch(_load(args, pipeline), path)
+    now = force.try_force(entry, args.csv.name, watched, _read(args.csv, args.offset))
+    print(f"force: {now:.2f} N RMS from the gauge today; when it was made: {entry.press.rmse:.2f} N")
+    return now <= WORSE * entry.press.rmse
+
+
+def _add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
+    """Fit the force and write it into the calibration file."""
+    calibration = Calibration.load(path)
+    if calibration.force is not None and not args.overwrite:
+        raise ConfigError(f"calibrate force: {path} has a force already; give --overwrite to replace it")
+    if args.source is None:
+        raise ConfigError(
+            "calibrate force: required --from, a recording with a CSV of the same name beside it"
+        )
+    pairs = {args.source: args.csv} if args.csv else recordings_with_csv(args.source)
+    references = {source: _read(file, args.offset) for source, file in pairs.items()}
+    watched = {}
+    for source in references:
+        loaded = load(pipeline, source=source, sensor=args.sensor, settings={"calibration": None})
+        watched[source] = _watch(loaded, path)
+        touched = watched[source].touched
+        say(f"{source}: {len(touched)} frames, {touched.sum()} of them with contact")
+    fit = force.fit_force(watched, references)
+    for words in _force_words(fit, references):
+        say(words)
+    calibration.with_force(fit.entry).save(path)
+    say(f"{path} has the force now")
+    return 0
+
+
+def _force_words(fit: force.Fit, references: Mapping[str, Reference]) -> list[str]:
+    entry = fit.entry
+    words = [f"{name}: its clock is {s:+.3f} s ahead of its CSV's" for name, s in entry.recordings.items()]
+    words.append(f"force, {entry.presses} presses: {_quality(entry.press, entry.left_out)}")
+    if entry.press.hysteresis is not None:
+        words.append(f"hysteresis: {100 * entry.press.hysteresis:.0f} % of the largest force of a press")
+    if "volume" not in entry.press.stiffness:
+        words.append(
+            "heights are not known, so it is by the change of the light and the area: good for objects "
+            "like these only"
+        )
+    if fit.turned is not None:
+        side = ", mirrored" if fit.mirrored else ""
+        words.append(
+            f"the gauge's x axis lies {fit.turned:+.0f} degrees counter-clockwise in the picture{side}"
+        )
+        if entry.drag is None:
+            words.append("fx and fy do not follow the flow of the contact, and are left out")
+        else:
+            words.append(f"force sideways: {_quality(entry.drag, entry.left_out)}")
+    elif any(reference.sideways for reference in references.values()):
+        words.append("fx and fy are left out: not every CSV has them")
+    return words
+
+
+def _quality(part: LinearForceEntry, left_out: str) -> str:
+    absolute, relative = part.error
+    groups = "recordings" if left_out == "recording" else "presses"
+    return (
+        f"RMS error {part.rmse:.2f} N of {part.range[0]:.1f} to {part.range[1]:.1f} N, "
+        f"{100 * part.r2:.0f} % of the variance explained, by {groups} that the fit has not seen; "
+        f"standard error {absolute:.2f} N and {100 * relative:.0f} % of the force"
+    )
+
+
+def _print_lens(args: argparse.Namespace, words: Sequence[str]) -> int:
+    """Print `undistort` and `homography` for a pipeline file."""
+    if len(words) != 1:
+        raise ConfigError("calibrate lens: required one folder, pattern or video with pictures of the target")
+    printed = _target(args)
+    views: list[NDArray[np.float64]] = []
+    reader = open_source(words[0])
+    try:
+        while (read := reader.read()) is not None:
+            size = (read[0].shape[1], read[0].shape[0])
+            points = target.find_target(read[0], printed)
+            views += [] if points is None else [points]
+        if not views:
+            raise ConfigError(_not_shown(printed, words[0]))
+        fit = target.fit_lens(views, printed, size)
+    except ValueError as problem:
+        raise ConfigError(f"calibrate {problem}") from None
+    finally:
+        reader.close()
+    say(
+        f"{len(views)} pictures: {fit.rms:.2f} px RMS; focal lengths to {fit.stderr[0]:.1f} and "
+        f"{fit.stderr[1]:.1f} px, centre to {fit.stderr[2]:.1f} and {fit.stderr[3]:.1f} px. For the "
+        "parameters of preprocess:"
+    )
+    undistort = {
+        "camera_matrix": np.round(fit.lens.camera_matrix, 3).tolist(),
+        "distortion": np.round(fit.lens.distortion, 6).tolist(),
+    }
+    corners, places = (np.round(part, 2).tolist() for part in (fit.corners, fit.places))
+    homography = {"from": corners, "to": places, "size": list(fit.size)}
+    print(yaml.safe_dump({"undistort": undistort, "homography": homography}, default_flow_style=None), end="")
+    return 0
+
+
+def _scale(args: argparse.Namespace, loaded: Pipeline, session: Session) -> tuple[Scale, str]:
+    """Millimetres per pixel, and how they were found."""
+    width, height = session.mapping.size
+    try:
+        if args.target is not None:
+            return _target_scale(args, loaded), f"target of {args.grid}, pitch of {args.pitch:g} mm"
+        if args.pitch is not None:
+            scale = scale_from_pitch(session.dots, args.pitch, (width, height))
+            return scale, f"pitch of {args.pitch:g} mm"
+        # The picture reaches half a pixel beyond the centres of its outermost pixels.
+        corners = [[-0.5, -0.5], [width - 0.5, height - 0.5]]
+        scale = scale_from_corners(corners, [[0, 0], args.area], (width, height))
+        return scale, f"area of {args.area[0]:g} x {args.area[1]:g} mm"
+    except ValueError as problem:
+        raise ConfigError(f"calibrate: {problem}") from None
+
+
+def _target(args: argparse.Namespace) -> target.Target:
+    """The target that the options describe."""
+    if args.grid is None or args.pitch is None:
+        raise ConfigError("calibrate: a target needs --grid COLUMNSxROWS and --pitch MM")
+    columns, _, rows = str(args.grid).lower().partition("x")
+    if not (columns.isdecimal() and rows.isdecimal()):
+        raise ConfigError(f"--grid: required COLUMNSxROWS, as in 9x6, got {args.grid}")
+    return target.Target(int(columns), int(rows), args.pitch, args.dots)
+
+
+def _target_scale(args: argparse.Namespace, loaded: Pipeline) -> Scale:
+    """Scale from `--target`, after the pipeline's own preprocess."""
+    printed = _target(args)
+    pictured = load(loaded.file, source=args.target, sensor=args.sensor, settings={"calibration": None})
+    images: list[Any] = []
+    _run(pictured, lambda result, _: images.append(result.image), {"image": "preprocess"})
+    points = target.find_target(images[0], printed) if images and images[0] is not None else None
+    if points is None:
+        raise ConfigError(_not_shown(printed, args.target))
+    scale, bent = target.scale_from_target(points, printed, (images[0].shape[1], images[0].shape[0]))
+    if bent > target.BENT:
+        say(
+            f"the target is off a plane grid by {100 * bent:.1f} % of its pitch: one scale is not right for "
+            "all of the picture; give preprocess the undistort and homography of `tactflow calibrate lens`"
+        )
+    return scale
+
+
+def _not_shown(printed: target.Target, source: str) -> str:
+    kind = "dots" if printed.dots else "inner corners of a checkerboard"
+    counted = "dots" if printed.dots else "corners between four squares"
+    return (
+        f"calibrate: {source} does not show {printed.columns} x {printed.rows} {kind}; all of the target "
+        f"must be in the picture, and --grid counts {counted}"
+    )
+
+
+def _run(
+    pipeline: Pipeline,
+    take: Callable[[Result, Runner], None],
+    needed: Mapping[str, str],
+    calibration: Path | None = None,
+    page: Mapping[str, Node] = MappingProxyType({}),
+) -> None:
+    """Run a pipeline without its sinks, nothing skipped, and call `take` with every result and the run.
+
+    needed : port -> the stage that gives it. page : sinks that look on. A signal such as Ctrl-C ends it.
+    """
+    for port, stage in needed.items():
+        if pipeline.last_output(port) is None:
+            raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
+    plain = replace(pipeline, skipping=False, calibration=calibration)
+    name = "tactflow.calibrate"
+    collecting = with_collector(
+        plain, Result, lambda result: take(result, runner), name=name, references=True
+    )
+    runner = make_runner(replace(collecting, nodes={**collecting.nodes, **page}))
+    with ended_by_signals(runner):
+        ended = runner.run()
+    if ended.exit_code == INTERRUPTED:
+        raise Interrupted
+    if ended.failure is not None:
+        raise ended.failure
+
+
+def _watch(pipeline: Pipeline, calibration: Path) -> force.Watched:
+    """The features that the force follows from. calibration : the file, with a scale."""
+    watcher = force.Watcher()
+    _run(pipeline, lambda result, _: watcher.add(result), force.NEEDED, calibration)
+    return watcher.watched()
+
+
+def _find_presses(
+    pipeline: Pipeline,
+    guide: Guide | None,
+    kept: KeptPresses | None = None,
+    page: Mapping[str, Node] = MappingProxyType({}),
+) -> Session:
+    """The presses that a source shows; of a live one until there are enough.
+
+    guide : None if the untouched gel is enough. kept : has the presses so far of a live session.
+    """
+    finder = PressFinder()
+    enough = guide is None
+
+    def take(result: Result, runner: Runner) -> None:
+        nonlocal enough
+        live = runner.source is not None and runner.source.live
+        if live and kept is not None and not finder.frames:
+            finder.presses[:] = kept.presses
+        finder.add(result)
+        enough = (guide is not None and guide(finder)) or enough
+        if live and kept is not None:
+            kept.update(finder)
+        # All frames of the reference count, however many presses there are.
+        if enough and live and not result.frame.reference:
+            runner.stop()
+
+    _run(pipeline, take, presses.NEEDED, page=page)
+    return finder.session()
+
+
+def _read(file: Path, offset: float) -> Reference:
+    reference = read_reference(file)
+    return reference if reference.by_frame else replace(reference, time=reference.time + offset)
+
+
 def _instruct(args: argparse.Namespace, ball_radius: float | None, ended: str = "") -> None:
     """Say what to do with the gel. ball_radius : mm; None without a ball. ended : what becomes of presses."""
     if ball_radius is None:
@@ -254,43 +517,12 @@ def _instruct(args: argparse.Namespace, ball_radius: float | None, ended: str = 
     )
 
 
-def _at_once(_frames: int, _presses: list[Press], _lasts: bool) -> bool:
-    """A `Report` for which the untouched gel is enough."""
-    return True
-
-
 def _load(
     args: argparse.Namespace, pipeline: str | None, settings: Settings = MappingProxyType({})
 ) -> Pipeline:
-    return load(
-        pipeline,
-        source=args.source,
-        sensor=args.sensor,
-        settings={"calibration": None, **settings},
-        realtime=args.realtime,
-    )
-
-
-def _scale(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Scale:
-    width, height = session.mapping.size
-    try:
-        if args.target is not None:
-            return target_scale(args, loaded)
-        if args.pitch is not None:
-            return scale_from_pitch(session.dots, args.pitch, (width, height))
-        # The picture reaches half a pixel beyond the centres of its outermost pixels.
-        return scale_from_corners(
-            [[-0.5, -0.5], [width - 0.5, height - 0.5]], [[0, 0], args.area], (width, height)
-        )
-    except ValueError as problem:
-        raise ConfigError(f"calibrate: {problem}") from None
-
-
-def _given(args: argparse.Namespace) -> str:
-    """How the scale is found."""
-    if args.target is not None:
-        return f"target of {args.grid}, pitch of {args.pitch:g} mm"
-    return f"pitch of {args.pitch:g} mm" if args.pitch else f"area of {args.area[0]:g} x {args.area[1]:g} mm"
+    """The pipeline without a calibration."""
+    settings = {"calibration": None, **settings}
+    return load(pipeline, source=args.source, sensor=args.sensor, settings=settings, realtime=args.realtime)
 
 
 def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[str, Node]:
@@ -302,12 +534,6 @@ def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[
                 component = replace(node.component, cls=node.component.cls.through(guide))
                 return {id_: replace(node, component=component)}
     raise AssertionError("the sink view guides")
-
-
-def _scale_words(scale: Scale) -> str:
-    return (
-        f"{scale.x:.5f} +- {scale.stderr[0]:.5f} mm per px in x, {scale.y:.5f} +- {scale.stderr[1]:.5f} in y"
-    )
 
 
 def _millimetres(text: str) -> float:

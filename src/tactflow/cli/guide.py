@@ -9,17 +9,15 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
-import numpy as np
-
-from tactflow.calibration.presses import Press
+from tactflow.calibration.presses import Press, PressFinder, usual_radius
 from tactflow.calibration.progress import PARTS, fault, part, part_name, progress
 
 
 class Guide:
-    """A `Report` that tells whether each press was good, and where one is missing.
+    """Tells whether each press was good, and where one is missing.
 
-    wanted : so many presses are enough. say : shows a line. typed : what was typed since the last call: `u`
-        undoes the last press, `q` ends the session.
+    wanted : number of presses that are enough. say : shows a line. typed : the lines typed since the last
+        call: `u` undoes the last press, `q` ends the session.
 
     `state` (see `progress`) may be read, and `undo` called, from any thread: that is what the live page does.
     """
@@ -39,8 +37,9 @@ class Guide:
         """Undo the last press, as `u` does."""
         self._asked.put("u")
 
-    def __call__(self, _frames: int, presses: list[Press], lasts: bool) -> bool:
+    def __call__(self, finder: PressFinder) -> bool:
         """Look at the presses so far; whether they are enough."""
+        presses, lasts = finder.presses, finder.lasts
         over = len(presses) - lasts
         if self._told is None:
             self._told = over
@@ -67,12 +66,13 @@ class Guide:
 def judged(presses: Sequence[Press], number: int) -> str:
     """Whether a press was good, and what to do next.
 
+    >>> import numpy as np
     >>> gel, mask = np.zeros((60, 60, 3), np.uint8), np.zeros((60, 60), np.uint8)
     >>> judged([Press(0, gel, mask, mask > 0, (30, 30), 9.0)], 0)
     'good, radius 9 px; nothing yet at the upper left, upper centre, upper right, middle left, ...'
     """
     press = presses[number]
-    usual = float(np.median([other.radius for other in presses]))
+    usual = usual_radius(presses)
     wrong = fault(press, usual)
     if wrong is not None:
         return f"{wrong} (u: undo)"

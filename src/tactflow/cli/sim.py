@@ -101,19 +101,16 @@ def _check_place(option: str, path: Path, overwrite: bool) -> None:
 
 
 def _list() -> None:
-    from tactflow.sim import KEYS, scene_descriptions
+    from tactflow.sim import scene_descriptions
+    from tactflow.sim.settings import setting_descriptions
 
-    scenes = scene_descriptions()
-    print("scenes:")
-    for name, description in scenes.items():
-        print(f"  {name:<{max(map(len, scenes))}}  {description}")
-    print("settings, as in NAME?key=value&key=value:")
-    for name, key in KEYS.items():
-        limits = f"{key.low:g} to {key.high:.10g} {key.unit}".strip()
-        values = "|".join(key.choices) or limits
-        if name == "markers":
-            values = "COLUMNSxROWS | none"
-        print(f"  {name:<{max(map(len, KEYS))}}  {key.meaning} ({values})")
+    for title, lines in (
+        ("scenes:", scene_descriptions()),
+        ("settings, as in NAME?key=value&key=value:", setting_descriptions()),
+    ):
+        print(title)
+        for name, words in lines.items():
+            print(f"  {name:<{max(map(len, lines))}}  {words}")
 
 
 @contextlib.contextmanager

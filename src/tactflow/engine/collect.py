@@ -29,6 +29,12 @@ class Collect(Sink):
         self.params.take(result)
 
 
+class CollectReferences(Collect):
+    """The same with every reference frame, also of a reference image that is not part of the source."""
+
+    takes_references = True
+
+
 class CollectInBackground(Collect):
     """The same from a thread of its own, so that `take` may block; of a live source it gets the newest."""
 
@@ -45,6 +51,7 @@ def with_collector(
     sinks: bool = False,
     background: bool = False,
     pictures: bool = True,
+    references: bool = False,
 ) -> Pipeline:
     """The pipeline with a sink that hands every result to a function.
 
@@ -59,6 +66,7 @@ def with_collector(
     sinks : keep the pipeline's own sinks.
     background : call `take` in a thread of its own, where it may block.
     pictures : also collect outputs that are (H, W, 3) uint8 and that `kind` does not name.
+    references : also collect a reference image that is not part of the source.
     """
     nodes = {id_: node for id_, node in pipeline.nodes.items() if sinks or node.component.kind != "sink"}
     known = {port.name for port in ports_of(kind)}
@@ -73,7 +81,7 @@ def with_collector(
     passive = {port: ref for port, ref in outputs.items() if port not in inputs}
     # Any value: whether it is what its port promises is checked where it is made.
     ports = Ports([Parameter("result", [Port(port, object, True) for port in inputs], kind)], ())
-    cls = CollectInBackground if background else Collect
+    cls = CollectInBackground if background else CollectReferences if references else Collect
     component = Component(name, "sink", cls, cls.Params, ports, "pure", "tactflow")
     nodes[name] = Node(
         name, component, cls.Params(take=take), inputs, Mark(name, 0, 0), passive_inputs=passive

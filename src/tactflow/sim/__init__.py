@@ -5,8 +5,7 @@
 >>> image, truth = scene.frame(100), scene.truth(100)
 """
 
-from tactflow.sim.scenes import Scene, open_scene, scene_descriptions, scene_names
-from tactflow.sim.settings import KEYS
+from tactflow.sim.scenes import Scene, open_scene, scene_descriptions
 from tactflow.sim.truth import Truth
 
-__all__ = ["KEYS", "Scene", "Truth", "open_scene", "scene_descriptions", "scene_names"]
+__all__ = ["Scene", "Truth", "open_scene", "scene_descriptions"]

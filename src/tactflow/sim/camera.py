@@ -6,19 +6,25 @@ the same plane. Everything is closed-form or solved to machine precision, so tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.geometry.homography import find_homography, project
+
 Points = NDArray[np.float64]
 
+SIZE = (800, 600)
+"""Width and height of every scene's frames, px."""
 NOISE_UNIT = 4096.0
 """Integer steps of the noise bank per standard deviation."""
 _APERTURE_EDGE = 3.0
 """Width of the unsharp rim of the aperture, px. Chosen by hand."""
+_NEWTON_STEPS = 12
+"""Steps by which the distortion is inverted; they converge quadratically, to machine precision."""
 _BANK_SPAN = 1 << 22
 _BANK_STEP = 2592173
 """Offsets into the noise bank, elements, and the step from one frame's to the next. An odd step near span /
@@ -26,89 +32,90 @@ golden ratio visits all 2**22 offsets before it repeats one, and keeps any two o
 span / (2.7 n) apart."""
 
 
+@dataclass(frozen=True)
 class Camera:
     """Perspective followed by radial lens distortion, seen through a round aperture.
 
-    Parameters
-    ----------
     size : (width, height) of the raw frame, px.
     perspective : in [0, 0.4]; each lower corner of the gel moves inwards by this fraction of half the width
         and the whole gel shrinks a little, so that it appears as the trapezoid of a tilted camera. 0: none.
     distortion : in [-0.2, 0.4]; k of undistorted = distorted * (1 + k rho^2), rho = distance from the centre
         in half diagonals. Positive is a barrel (wide lens), negative a pincushion. 0: none.
-    aperture : radius of the round picture in a black frame, in half heights of the frame. 0: none.
+    aperture_radius : radius of the round picture in a black frame, in half heights of the frame. 0: none.
     """
 
-    def __init__(
-        self,
-        size: tuple[int, int],
-        perspective: float = 0.0,
-        distortion: float = 0.0,
-        aperture: float = 0.0,
-    ) -> None:
-        self.size = size
-        self._key = (size, perspective, distortion, aperture)
-        width, height = size
-        self._radius = aperture * height / 2.0 if aperture else np.inf
-        self.identity = perspective == 0.0 and distortion == 0.0
-        self._k = distortion
-        self._center = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
-        self._half_diagonal = float(np.hypot(width, height)) / 2.0
-        self._homography = np.eye(3)
-        if perspective:
-            left, top, right, bottom = -0.5, -0.5, width - 0.5, height - 0.5
-            inset_x, inset_y = 0.1 * perspective * width, 0.15 * perspective * height
-            squeeze = perspective * width / 2.0
-            gel = np.array([[left, top], [right, top], [left, bottom], [right, bottom]])
-            raw = np.array(
-                [
-                    [left + inset_x, top + inset_y],
-                    [right - inset_x, top + inset_y],
-                    [left + inset_x + squeeze, bottom - inset_y],
-                    [right - inset_x - squeeze, bottom - inset_y],
-                ]
-            )
-            self._homography = homography(gel, raw)
-        self._inverse = np.linalg.inv(self._homography).astype(np.float64)
+    size: tuple[int, int] = SIZE
+    perspective: float = 0.0
+    distortion: float = 0.0
+    aperture_radius: float = 0.0
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Camera) and other._key == self._key
+    @property
+    def identity(self) -> bool:
+        """Whether the raw frame is the gel plane."""
+        return self.perspective == 0.0 and self.distortion == 0.0
 
-    def __hash__(self) -> int:
-        return hash(self._key)
+    @cached_property
+    def _center(self) -> Points:
+        return (np.array(self.size) - 1) / 2.0
+
+    @cached_property
+    def _half_diagonal(self) -> float:
+        return float(np.hypot(*self.size)) / 2.0
+
+    @cached_property
+    def _homography(self) -> NDArray[np.float64]:
+        """From the gel plane to the undistorted frame, 3 x 3."""
+        if not self.perspective:
+            return np.eye(3)
+        width, height = self.size
+        left, top, right, bottom = -0.5, -0.5, width - 0.5, height - 0.5
+        inset_x, inset_y = 0.1 * self.perspective * width, 0.15 * self.perspective * height
+        squeeze = self.perspective * width / 2.0
+        gel = [[left, top], [right, top], [left, bottom], [right, bottom]]
+        raw = [
+            [left + inset_x, top + inset_y],
+            [right - inset_x, top + inset_y],
+            [left + inset_x + squeeze, bottom - inset_y],
+            [right - inset_x - squeeze, bottom - inset_y],
+        ]
+        return find_homography(gel, raw)
+
+    @cached_property
+    def _inverse(self) -> NDArray[np.float64]:
+        return np.linalg.inv(self._homography).astype(np.float64)
 
     def to_gel(self, raw: Points) -> Points:
         """Gel coordinates (N, 2) float64 of raw pixel positions (N, 2)."""
         if self.identity:
             return np.array(raw, dtype=np.float64)
-        offset = self._relative(raw)
-        offset *= 1.0 + self._k * np.sum(offset * offset, axis=-1, keepdims=True)
-        return project(self._inverse, self._absolute(offset))
+        offset = (raw - self._center) / self._half_diagonal
+        offset *= 1.0 + self.distortion * np.sum(offset * offset, axis=-1, keepdims=True)
+        return project(self._inverse, offset * self._half_diagonal + self._center)
 
     def to_raw(self, gel: Points) -> Points:
         """Raw pixel positions (N, 2) float64 of gel coordinates (N, 2)."""
         if self.identity:
             return np.array(gel, dtype=np.float64)
-        offset = self._relative(project(self._homography, np.asarray(gel, dtype=np.float64)))
-        if self._k:
+        offset = (project(self._homography, gel) - self._center) / self._half_diagonal
+        k = self.distortion
+        if k:
             radius = np.sqrt(np.sum(offset * offset, axis=-1))
             solved = radius.copy()
-            for _ in range(12):  # Newton; quadratic, so a dozen steps reach machine precision
-                solved -= (solved * (1.0 + self._k * solved**2) - radius) / (1.0 + 3.0 * self._k * solved**2)
-            shrink = np.divide(solved, radius, out=np.ones_like(radius), where=radius > 0)
-            offset *= shrink[..., None]
-        return self._absolute(offset)
+            for _ in range(_NEWTON_STEPS):
+                solved -= (solved * (1.0 + k * solved**2) - radius) / (1.0 + 3.0 * k * solved**2)
+            offset *= np.divide(solved, radius, out=np.ones_like(radius), where=radius > 0)[..., None]
+        return np.asarray(offset * self._half_diagonal + self._center, dtype=np.float64)
 
     def aperture(self, raw: Points) -> NDArray[np.float64]:
         """Share of the light, (N,) in [0, 1], that reaches raw pixel positions (N, 2): 0 in a black frame."""
-        inside = self._radius - np.hypot(raw[..., 0] - self._center[0], raw[..., 1] - self._center[1])
+        radius = self.aperture_radius * self.size[1] / 2.0 if self.aperture_radius else np.inf
+        inside = radius - np.hypot(raw[..., 0] - self._center[0], raw[..., 1] - self._center[1])
         return np.asarray(0.5 + 0.5 * np.tanh(inside / _APERTURE_EDGE), dtype=np.float64)
 
-    def _relative(self, pixels: Points) -> Points:
-        return np.asarray((pixels - self._center) / self._half_diagonal, dtype=np.float64)
-
-    def _absolute(self, offset: Points) -> Points:
-        return np.asarray(offset * self._half_diagonal + self._center, dtype=np.float64)
+    def sees(self, raw: Points) -> NDArray[np.bool_]:
+        """(N,): which raw positions (N, 2) lie in the frame and get light."""
+        inside = np.all((raw >= -0.5) & (raw <= np.array(self.size) - 0.5), axis=1)
+        return np.asarray(inside & (self.aperture(raw) >= 0.5))
 
     def local_inverse(self, gel: Points) -> NDArray[np.float64]:
         """(N, 2, 2) derivative d gel / d raw at gel points (N, 2): how a small dot is deformed."""
@@ -120,22 +127,6 @@ class Camera:
             shift[axis] = step
             columns.append((self.to_gel(raw + shift) - self.to_gel(raw - shift)) / (2 * step))
         return np.stack(columns, axis=-1)
-
-
-def homography(source: Points, target: Points) -> NDArray[np.float64]:
-    """The 3 x 3 projective map that takes four points (4, 2) to four points (4, 2), float64."""
-    rows = []
-    for (x, y), (u, v) in zip(source, target, strict=True):
-        rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y])
-        rows.append([0, 0, 0, x, y, 1, -v * x, -v * y])
-    solved = np.linalg.solve(np.array(rows, dtype=np.float64), np.asarray(target, dtype=np.float64).ravel())
-    return np.append(solved, 1.0).reshape(3, 3)
-
-
-def project(matrix: NDArray[np.float64], points: Points) -> Points:
-    """Apply a 3 x 3 projective map to points (..., 2)."""
-    mapped = points @ matrix[:, :2].T + matrix[:, 2]
-    return np.asarray(mapped[..., :2] / mapped[..., 2:], dtype=np.float64)
 
 
 @lru_cache(maxsize=2)
@@ -164,19 +155,3 @@ def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     """The image (H, W, 3) uint8 after a JPEG round trip at `quality` in 1..100."""
     _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), dtype=np.uint8)
-
-
-def delivered_frames(count: int, dropped: float, repeated: float, seed: int) -> Sequence[int]:
-    """(count,): which moment of the scene the camera delivers as frame i.
-
-    dropped, repeated : fractions in [0, 0.9]. A dropped moment is never delivered (the next frame comes in
-    its place); a repeated one is delivered twice, bit for bit.
-    """
-    if not dropped and not repeated:
-        return range(count)
-    draw = np.random.default_rng([seed, 0x6472]).random((count, 2))
-    steps = np.ones(count, dtype=np.int64)
-    steps[draw[:, 0] < dropped] = 2
-    steps[draw[:, 1] < repeated] = 0
-    steps[0] = 0
-    return [int(moment) for moment in np.cumsum(steps)]

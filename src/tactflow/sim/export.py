@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.sim.scenes import Scene
 from tactflow.system.files import completed
@@ -26,6 +24,8 @@ TRUTH_SUFFIXES = (".jsonl", ".npz", ".csv")
 Report = Callable[[int], None]
 # Lossless through OpenCV, and every frame written so far can be read after a crash.
 _FOURCC = "HFYU"
+_ARRAYS = ("contact_mask", "touching", "area", "depth", "position", "visible")
+"""What a `.npz` holds of every frame as it is."""
 
 
 class NotLosslessError(RuntimeError):
@@ -61,6 +61,7 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
         origin, position, visible, mean_flow, with null for what there is not. `.npz` holds the same as
         arrays, with contact_mask (N, H, W) bool besides: center, angle and mean_flow are 0 where `touching`,
         `directed` and `has_flow` are false; the hull of frame i is hull[hull_start[i]:hull_start[i + 1]].
+        All of it is held in memory until it is written.
         `.csv` is what a gauge would write: t (s), fx, fy, fz (N).
     report : called with the number of frames written so far.
 
@@ -165,38 +166,22 @@ def _write_forces(scene: Scene, path: Path, report: Report) -> None:
 
 
 def _write_npz(scene: Scene, path: Path, report: Report) -> None:
-    rows: list[dict[str, Any]] = []
-    hulls: list[NDArray[np.float64]] = []
-    width, height = scene.size
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        with archive.open("contact_mask.npy", "w", force_zip64=True) as member:
-            shape = (len(scene), height, width)
-            header = {"descr": "|b1", "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(member, header)
-            for index in range(len(scene)):
-                truth = scene.truth(index)
-                member.write(truth.contact_mask.tobytes())
-                hulls.append(truth.hull)
-                rows.append(
-                    {
-                        "t": index / scene.fps,
-                        "touching": truth.touching,
-                        "center": truth.center or (0.0, 0.0),
-                        "angle": truth.angle or 0.0,
-                        "directed": truth.angle is not None,
-                        "area": truth.area,
-                        "depth": truth.depth,
-                        "position": truth.position,
-                        "visible": truth.visible,
-                        "mean_flow": truth.mean_flow or (0.0, 0.0),
-                        "has_flow": truth.mean_flow is not None,
-                    }
-                )
-                report(index + 1)
-        arrays = {key: np.asarray([row[key] for row in rows]) for key in rows[0]}
-        arrays["origin"] = scene.truth(0).origin
-        arrays["hull"] = np.concatenate(hulls)
-        arrays["hull_start"] = np.cumsum([0] + [len(hull) for hull in hulls])
-        for key, array in arrays.items():
-            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+    truths = []
+    for index in range(len(scene)):
+        truths.append(scene.truth(index))
+        report(index + 1)
+    arrays: dict[str, Any] = {name: [getattr(truth, name) for truth in truths] for name in _ARRAYS}
+    with path.open("wb") as file:
+        np.savez_compressed(
+            file,
+            **arrays,
+            t=np.arange(len(scene)) / scene.fps,
+            center=[truth.center or (0.0, 0.0) for truth in truths],
+            angle=[truth.angle or 0.0 for truth in truths],
+            directed=[truth.angle is not None for truth in truths],
+            mean_flow=[truth.mean_flow or (0.0, 0.0) for truth in truths],
+            has_flow=[truth.mean_flow is not None for truth in truths],
+            origin=truths[0].origin,
+            hull=np.concatenate([truth.hull for truth in truths]),
+            hull_start=np.cumsum([0] + [len(truth.hull) for truth in truths]),
+        )

@@ -163,13 +163,14 @@ def lamp(size: tuple[int, int], strength: float) -> NDArray[np.float32]:
     return np.ascontiguousarray(np.broadcast_to(row, (size[1], size[0], 3)), dtype=np.float32)
 
 
-def spot(size: tuple[int, int], place: tuple[float, float], spread: tuple[float, float]) -> Array:
-    """(H, W) float32: a Gaussian, 1 at `place` (x, y), of standard deviations `spread` (x, y), px."""
-    across, down = (
-        np.exp(-0.5 * ((np.arange(length) - middle) / deviation) ** 2).astype(np.float32)
-        for length, middle, deviation in zip(size, place, spread, strict=True)
-    )
-    return np.outer(down, across)
+def add_mirror_spots(image: NDArray[np.float32], x: Array, y: Array, strength: float, seed: int) -> None:
+    """Add mirror images of lamps to the untouched gel (H, W, 3), grey levels; x, y : (H, W) coordinates."""
+    rng = np.random.default_rng([seed, 0x7370])
+    height, width = x.shape
+    for _ in range(4):
+        center_x, center_y, spread = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(5, 16)
+        spot = np.exp(-((x - center_x) ** 2 + (y - center_y) ** 2) / np.float32(2 * spread**2))
+        image += np.float32(110.0 * strength) * spot[..., None]
 
 
 @lru_cache(maxsize=2)

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.sim.settings import Settings
+
 EDGE = 0.8
 """Standard deviation of the lens blur at a marker's edge, px. Chosen by hand."""
-SHAPES = ("round", "square", "doubled")
 DARK_MARKER = 0.88
 """Share of the light that a fresh dark marker takes away. Chosen by hand."""
 FIXED_POINT = 64.0
@@ -27,79 +28,57 @@ class Layout:
     """What is printed on the gel.
 
     rest : (N, 2) float64 positions on the untouched gel, px. contrast : (N,) in [0, 1], 1 for a fresh marker.
-    group : (N,) int; markers of the same group never overlap. size : (N,) > 0, radii in units of `radius`.
+    group : (N,) int; markers of the same group never overlap. pitch, radius : px.
     """
 
     rest: NDArray[np.float64]
     contrast: NDArray[np.float64]
     group: NDArray[np.int64]
-    size: NDArray[np.float64]
     pitch: float
     radius: float
 
 
-def layout(
-    columns: int,
-    rows: int,
-    size: tuple[int, int],
-    *,
-    pitch: float = 0.0,
-    radius: float = 0.0,
-    jitter: float = 0.0,
-    missing: float = 0.0,
-    worn: float = 0.0,
-    sizes: float = 0.0,
-    seed: int = 0,
-) -> Layout:
-    """A grid of markers, centred.
-
-    columns, rows : 0 for a gel without markers. size : (width, height) of the gel, px.
-    pitch, radius : px; 0 fits the grid to the gel, and the radius to the pitch.
-    jitter : standard deviation of each coordinate, in pitches. missing : fraction that was never printed.
-    worn : fraction that has faded to between 35 and 80 % of its contrast.
-    sizes : radii are spread evenly between 1 - sizes and 1 + sizes of `radius`.
-    """
-    width, height = size
-    pitch = pitch or min(width / ((columns or 10) + 0.7), height / ((rows or 8) + 0.7))
-    radius = radius or 0.135 * pitch
-    rng = np.random.default_rng([seed, 0x6D61])
+def layout(settings: Settings, size: tuple[int, int]) -> Layout:
+    """A grid of markers, centred on a gel of size (width, height), px."""
+    (columns, rows), (width, height) = settings.markers, size
+    pitch = settings.pitch or min(width / ((columns or 10) + 0.7), height / ((rows or 8) + 0.7))
+    rng = np.random.default_rng([settings.seed, 0x6D61])
     across = (np.arange(columns) - (columns - 1) / 2.0) * pitch + (width - 1) / 2.0
     down = (np.arange(rows) - (rows - 1) / 2.0) * pitch + (height - 1) / 2.0
     rest = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
     # No printer and no mould is perfect: a hundredth of a pitch keeps centres off special sub-pixel phases.
     rest = rest + rng.normal(0.0, 0.01, rest.shape) * pitch
-    rest += np.clip(rng.normal(0.0, 1.0, rest.shape), -1.5, 1.5) * (jitter * pitch)
+    rest += np.clip(rng.normal(0.0, 1.0, rest.shape), -1.5, 1.5) * (settings.jitter * pitch)
     parity = np.stack(np.meshgrid(np.arange(columns) % 2, np.arange(rows) % 2), axis=-1).reshape(-1, 2)
-    contrast = np.where(rng.random(len(rest)) < worn, rng.uniform(0.35, 0.8, len(rest)), 1.0)
-    kept = rng.random(len(rest)) >= missing
-    group = parity[:, 0] + 2 * parity[:, 1]
-    size_of = 1.0 + sizes * rng.uniform(-1.0, 1.0, len(rest))
-    return Layout(rest[kept], contrast[kept], group[kept].astype(np.int64), size_of[kept], pitch, radius)
+    faded = rng.random(len(rest)) < settings.worn
+    contrast = np.where(faded, rng.uniform(0.35, 0.8, len(rest)), 1.0)
+    kept = rng.random(len(rest)) >= settings.missing
+    group = (parity[:, 0] + 2 * parity[:, 1]).astype(np.int64)
+    return Layout(rest[kept], contrast[kept], group[kept], pitch, settings.dot or 0.135 * pitch)
 
 
-def _ramp(inside: NDArray[np.float32], edge: float) -> NDArray[np.float32]:
-    return np.asarray(
-        np.float32(0.5) + np.float32(0.5) * np.tanh(inside * np.float32(0.851 / edge)), np.float32
-    )
+def _ramp(inside: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Opacity at a distance inside a marker's edge, px; negative outside."""
+    ramp = np.float32(0.5) + np.float32(0.5) * np.tanh(inside * np.float32(0.851 / EDGE))
+    return np.asarray(ramp, np.float32)
 
 
 def coverage(
     x: NDArray[np.float32],
     y: NDArray[np.float32],
-    radius: float | NDArray[np.float32],
+    radius: float,
     shape: str,
-    edge: float = EDGE,
 ) -> NDArray[np.float32]:
     """How much of a pixel at offset (x, y) from a marker's centre the marker covers, in [0, 1]."""
-    r = np.asarray(radius, np.float32)
+    r = np.float32(radius)
     if shape == "square":
-        return _ramp(r - np.abs(x), edge) * _ramp(r - np.abs(y), edge)
+        return _ramp(r - np.abs(x)) * _ramp(r - np.abs(y))
     if shape == "doubled":
-        small = np.asarray(0.72 * radius, np.float32)
-        left = _ramp(small - np.hypot(x + small, y), edge)
-        right = _ramp(small - np.hypot(x - small, y), edge)
+        small = np.float32(0.72) * r
+        left = _ramp(small - np.hypot(x + small, y))
+        right = _ramp(small - np.hypot(x - small, y))
         return np.asarray(1 - (1 - left) * (1 - right), np.float32)
-    return _ramp(r - np.hypot(x, y), edge)
+    return _ramp(r - np.hypot(x, y))
 
 
 def half_patch(radius: float, shape: str, scale: float = 1.0) -> int:
@@ -113,18 +92,18 @@ def draw(
     centers: NDArray[np.float64],
     strength: NDArray[np.float64],
     group: NDArray[np.int64],
+    radius: float,
     *,
-    radius: NDArray[np.float64],
-    shape: str,
     half: int,
-    bright: float | None,
+    shape: str = "round",
+    bright: float | None = None,
     deform: NDArray[np.float64] | None = None,
 ) -> None:
     """Paint markers onto a padded canvas, in place.
 
     canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT`.
     centers : (N, 2) positions without the padding, px. strength : (N,) in [0, 1], how opaque each is.
-    radius : (N,) px.
+    radius : px. half : see `half_patch`.
     bright : grey level of a bright marker, or None for a dark one, which lets 12 % of the light through.
     deform : (N, 2, 2), from offsets in the image to offsets on the gel; None where they are equal.
     """
@@ -146,8 +125,7 @@ def draw(
         if deform is not None:
             m = deform[chosen].astype(np.float32)[:, :, :, None, None]
             dx, dy = m[:, 0, 0] * dx + m[:, 0, 1] * dy, m[:, 1, 0] * dx + m[:, 1, 1] * dy
-        radii = radius[chosen, None, None].astype(np.float32)
-        opaque = coverage(dx, dy, radii, shape) * strength[chosen].astype(np.float32)[:, None, None]
+        opaque = coverage(dx, dy, radius, shape) * strength[chosen].astype(np.float32)[:, None, None]
         rows = anchor[chosen, 1, None] + half + span
         columns = anchor[chosen, 0, None] + half + span
         np.clip(rows, 0, padded_height - 1, out=rows)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim.gel import Press
+from tactflow.sim.settings import Settings
 from tactflow.sim.shapes import Shape
 
 _REST = 0.1
@@ -30,6 +31,9 @@ _FULL_LOAD = 0.75
 
 _LARGEST_CREEP = 60.0
 """Farthest that a creeping gel is dragged before it turns back, px; chosen by hand."""
+
+_LARGEST_STROKE = 110.0
+"""Contacts move the gel in proportion to the markers' pitch, up to this pitch, px. Chosen by hand."""
 
 _LARGEST_JUMP = 0.45
 """Farthest that a jumping gel is from its middle, pitches: jumps of up to 0.9 pitches from place to place."""
@@ -189,42 +193,35 @@ def presses(
     programme: Programme,
     shapes: tuple[Shape, ...],
     moment: int,
-    frames: int,
+    settings: Settings,
     *,
-    seed: int,
     size: tuple[int, int],
     pitch: float,
-    depth: float,
-    shear: float,
-    twist: float,
-    sink: float,
-    rim: float,
 ) -> tuple[tuple[Press, ...], int]:
     """The indenters at one moment, and the number of the contact they belong to (-1 between contacts).
 
-    moment : frame of the scene. frames : its length. depth : scales all depths. shear : pitches by which the
-        gel is dragged at most. twist : degrees by which it is turned at most.
-    sink, rim : of the gel, see `Press`.
+    moment : frame of the scene. size : (width, height) of the gel, px. pitch : of its markers, px.
     """
-    timing = _timing(programme, moment, frames)
+    timing = _timing(programme, moment, settings.frames)
     if timing is None:
         return (), -1
-    plan = _plan(programme, seed, timing.cycle, size)
+    pitch = min(pitch, _LARGEST_STROKE)
+    plan = _plan(programme, settings.seed, timing.cycle, size)
     swing = float(np.sin(np.pi * _smooth(timing.progress)))
-    drag, travelled, stick, sliding = _dragged(programme, timing, plan, seed, pitch, shear)
-    turn = np.radians(twist) * plan.sign * swing
+    drag, travelled, stick, sliding = _dragged(programme, timing, plan, settings.seed, pitch, settings.shear)
+    turn = np.radians(settings.twist) * plan.sign * swing
     made = [
         Press(
             shape,
             plan.x + offset_x + float(travelled[0]),
             plan.y + offset_y + float(travelled[1]),
             plan.angle + float(turn),
-            timing.envelope * plan.depth * depth * shape.depth,
+            timing.envelope * plan.depth * settings.depth * shape.depth,
             (float(drag[0]), float(drag[1])),
             float(turn),
             programme.dilation * pitch,
-            sink,
-            rim,
+            settings.sink,
+            settings.rim,
             stick,
             sliding,
         )

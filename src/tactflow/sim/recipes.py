@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
-from tactflow.sim import motion, shapes
+from tactflow.sim import shapes
+from tactflow.sim.motion import Programme
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Recipe:
     """A scene: what it shows, what the indenters do (None: nothing), and its own settings."""
 
     description: str
-    programme: motion.Programme | None
+    programme: Programme | None
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
@@ -23,35 +23,26 @@ def _sphere(_bend: float) -> tuple[shapes.Shape, ...]:
     return (shapes.sphere(),)
 
 
-def _ball(_bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.ball(),)
-
-
-def _cable(bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.cable(bend=bend),)
-
-
-def _one(make: Any, **sizes: Any) -> Any:
-    return partial(_made, make, tuple(sizes.items()))
-
-
-def _made(make: Any, sizes: tuple[tuple[str, Any], ...], _bend: float) -> tuple[shapes.Shape, ...]:
-    return (make(**dict(sizes)),)
+def _box(_bend: float) -> tuple[shapes.Shape, ...]:
+    return (shapes.box(),)
 
 
 def _pair(_bend: float) -> tuple[shapes.Shape, ...]:
     return (shapes.sphere(radius=70.0, depth=22.0), shapes.box(half_width=48.0, half_height=36.0, depth=11.0))
 
 
-_PRESS = motion.Programme(_sphere)
-_CABLE = motion.Programme(_cable, wander=(60.0, 60.0), angles=(-75.0, 75.0), dilation=0.25)
+_PRESS = Programme(_sphere)
+_CABLE = Programme(
+    lambda bend: (shapes.cable(bend=bend),), wander=(60.0, 60.0), angles=(-75.0, 75.0), dilation=0.25
+)
 """Programmes that several scenes share; lengths in px of the raw frame, angles in degrees."""
 SCENES: dict[str, Recipe] = {
     "press": Recipe("a ball is pressed in several places, at several depths", _PRESS),
     "ball": Recipe(
         "a ball of radius 2.375 mm is pressed all over the gel, for a calibration: 0.025 mm a raw pixel",
-        motion.Programme(
-            _ball, wander=(300.0, 210.0), period=20, rise=4, hold=10, depths=(1.0, 0.8, 0.9, 0.6)
+        Programme(
+            lambda _: (shapes.ball(),), wander=(300.0, 210.0), period=20, rise=4, hold=10,
+            depths=(1.0, 0.8, 0.9, 0.6),
         ),
         {"shear": 0.0},
     ),
@@ -59,85 +50,67 @@ SCENES: dict[str, Recipe] = {
     "bent_cable": Recipe("a cable that bends by 70 degrees", _CABLE, {"bend": 70.0}),
     "slide": Recipe(
         "a ball drags the gel along until it slips, and slides over it",
-        motion.Programme(
-            _sphere, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)
-        ),
+        Programme(_sphere, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)),
         {"shear": 0.9},
     ),
     "stick_slip": Recipe(
         "a ball is dragged until the gel slips, at the edge of the contact first",
-        motion.Programme(
+        Programme(
             _sphere, wander=(100.0, 60.0), travel=260.0, hold=80, period=120, depths=(1.0, 0.8), partial=True
         ),
         {"shear": 0.5},
     ),
     "roll": Recipe(
         "a ball rolls over the gel without dragging it",
-        motion.Programme(
-            _sphere, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7)
-        ),
+        Programme(_sphere, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7)),
         {"shear": 0.0},
     ),
     "idle": Recipe("nothing touches the gel", None),
     "twist": Recipe(
         "a flat punch is pressed and turned by 20 degrees to either side",
-        motion.Programme(
-            _one(shapes.box), wander=(120.0, 80.0), angles=(-40.0, 40.0), hold=50, period=90,
+        Programme(
+            _box, wander=(120.0, 80.0), angles=(-40.0, 40.0), hold=50, period=90,
             depths=(1.0, 0.6, 0.8), dilation=0.12,
         ),
         {"twist": 20.0, "shear": 0.0},
     ),
     "edge": Recipe(
         "a knife edge at several angles",
-        motion.Programme(_one(shapes.edge), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.2),
+        Programme(lambda _: (shapes.edge(),), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.2),
     ),
     "box": Recipe(
         "a flat rectangular punch at several angles",
-        motion.Programme(_one(shapes.box), wander=(170.0, 110.0), angles=(-90.0, 90.0), dilation=0.15),
+        Programme(_box, wander=(170.0, 110.0), angles=(-90.0, 90.0), dilation=0.15),
     ),
     "ring": Recipe(
         "a ring: a contact with a hole, and without a direction",
-        motion.Programme(_one(shapes.ring), wander=(150.0, 90.0), dilation=0.15),
-    ),
-    "text": Recipe(
-        "raised letters",
-        motion.Programme(_one(shapes.text), wander=(60.0, 110.0), angles=(-20.0, 20.0), dilation=0.1),
+        Programme(lambda _: (shapes.ring(),), wander=(150.0, 90.0), dilation=0.15),
     ),
     "screw": Recipe(
         "a threaded rod: a contact in many pieces",
-        motion.Programme(_one(shapes.screw), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.25),
+        Programme(lambda _: (shapes.screw(),), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.25),
     ),
     "two": Recipe(
         "a ball and a small flat punch at once",
-        motion.Programme(_pair, offsets=((-150.0, -40.0), (150.0, 50.0)), wander=(90.0, 90.0), dilation=0.2),
+        Programme(_pair, offsets=((-150.0, -40.0), (150.0, 50.0)), wander=(90.0, 90.0), dilation=0.2),
     ),
     "border": Recipe(
         "a contact that the border of the frame cuts",
-        motion.Programme(_sphere, place=(0.965, 0.5), wander=(25.0, 180.0)),
+        Programme(_sphere, place=(0.965, 0.5), wander=(25.0, 180.0)),
     ),
     "tap": Recipe(
         "contacts of a single frame",
-        motion.Programme(_sphere, period=30, rise=0, hold=1, depths=(1.0, 0.6)),
-    ),
-    "spike": Recipe(
-        "contacts that come and go within five frames", motion.Programme(_sphere, period=24, rise=1, hold=3)
+        Programme(_sphere, period=30, rise=0, hold=1, depths=(1.0, 0.6)),
     ),
     "creep": Recipe(
         "one long contact that drags the gel by 0.02 px a frame",
-        motion.Programme(_sphere, contacts=1, period=300, rise=15, hold=225, depths=(0.9,), creep=0.02),
-    ),
-    "hold": Recipe(
-        "one long contact that does not move",
-        motion.Programme(_sphere, contacts=1, period=300, rise=15, hold=225, depths=(0.9,)),
-        {"shear": 0.0},
+        Programme(_sphere, contacts=1, period=300, rise=15, hold=225, depths=(0.9,), creep=0.02),
     ),
     "drift": Recipe("presses while the lights warm up", _PRESS, {"drift": 0.18}),
     "flicker": Recipe("presses under flickering light", _PRESS, {"flicker": 0.06, "gain": 0.03}),
     "jumps": Recipe(
         "a contact that drags the markers by up to 0.9 pitch between two frames",
-        motion.Programme(
-            _one(shapes.box), wander=(120.0, 80.0), jumps=True, hold=36, period=72, dilation=0.1
-        ),
+        Programme(_box, wander=(120.0, 80.0), jumps=True, hold=36, period=72, dilation=0.1),
     ),
     "worn": Recipe(
         "faded, missing and vanishing markers, and dirt",
@@ -161,17 +134,9 @@ SCENES: dict[str, Recipe] = {
         _PRESS,
         {"noise": 6.0, "shot": 3.0, "hot": 40, "jpeg": 70, "blur": 1.0},
     ),
-    "soft_rim": Recipe(
-        "a deep gel, whose surface shows no crease at the edge of a contact",
-        _PRESS,
-        {"sink": 0.5, "rim": 1.0},
-    ),
-    "stutter": Recipe("a camera that drops and repeats frames", _PRESS, {"dropped": 0.1, "repeated": 0.1}),
     "strong_shear": Recipe(
         "a ball that moves markers by up to 1.5 pitches",
-        motion.Programme(
-            _sphere, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2
-        ),
+        Programme(_sphere, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2),
         {"shear": 1.3},
     ),
     "warm_up": Recipe(
@@ -182,7 +147,7 @@ SCENES: dict[str, Recipe] = {
     ),
     "lamp": Recipe(
         "a lamp is switched on between two presses",
-        motion.Programme(_sphere, contacts=2, rise=5, depths=(1.0, 0.7)),
+        Programme(_sphere, contacts=2, rise=5, depths=(1.0, 0.7)),
         {"lamp": 0.25},
     ),
     "round_gel": Recipe(
@@ -190,28 +155,22 @@ SCENES: dict[str, Recipe] = {
         _PRESS,
         {"aperture": 0.95, "vignette": 0.7, "drift": 0.18},
     ),
-    "block": Recipe(
-        "a grooved block that covers a quarter of the gel",
-        motion.Programme(_one(shapes.block), wander=(60.0, 50.0), angles=(-40.0, 40.0), dilation=0.1),
-    ),
     "coin": Recipe(
         "a coin: a large disc with a raised rim and figures",
-        motion.Programme(_one(shapes.coin), wander=(120.0, 80.0), angles=(-90.0, 90.0), dilation=0.1),
-    ),
-    "key": Recipe(
-        "a flat key",
-        motion.Programme(_one(shapes.key), wander=(90.0, 60.0), angles=(-40.0, 40.0), dilation=0.1),
+        Programme(lambda _: (shapes.coin(),), wander=(120.0, 80.0), angles=(-90.0, 90.0), dilation=0.1),
     ),
     "long_edge": Recipe(
         "the edge of a box, one flank steep and one flat, at several angles",
-        motion.Programme(
-            _one(shapes.edge, half_length=250.0, lean=0.5), wander=(80.0, 80.0), angles=(-90.0, 90.0),
+        Programme(
+            lambda _: (shapes.edge(half_length=250.0, lean=0.5),), wander=(80.0, 80.0), angles=(-90.0, 90.0),
             dilation=0.15,
         ),
     ),
     "finger": Recipe(
         "a fingertip at the border of the frame, in a gel without a crease at the edge of a contact",
-        motion.Programme(_one(shapes.finger), place=(0.93, 0.5), wander=(40.0, 150.0), angles=(-40.0, 40.0)),
+        Programme(
+            lambda _: (shapes.finger(),), place=(0.93, 0.5), wander=(40.0, 150.0), angles=(-40.0, 40.0)
+        ),
         {"sink": 0.5, "rim": 1.0},
     ),
     "dark_channel": Recipe(
@@ -222,16 +181,5 @@ SCENES: dict[str, Recipe] = {
         _PRESS,
         {"light": "darkening", "markers": (0, 0)},
     ),
-    "painted": Recipe(
-        "markers of many sizes in no regular grid, seen by a tilted camera",
-        _PRESS,
-        {"markers": (13, 10), "sizes": 0.7, "jitter": 0.06, "perspective": 0.12},
-    ),
     "speckle": Recipe("random blotches instead of markers", _PRESS, {"markers": (0, 0), "speckle": 0.6}),
-    "leds": Recipe(
-        "faint bright markers, and six glaring LEDs beside them",
-        _PRESS,
-        {"polarity": "bright", "worn": 1.0, "leds": 6, "markers": (13, 10)},
-    ),
-    "stray": Recipe("presses that throw a reflection on the far side of the gel", _PRESS, {"stray": 0.8}),
 }  # fmt: skip

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.sim.camera import Camera
+from tactflow.sim.camera import Camera, Points
 from tactflow.sim.elastic import force
 from tactflow.sim.gel import Press, displacement, in_contact, reached, surface
 
@@ -24,6 +24,38 @@ FLOW_FINE = 0.5
 NO_DIRECTION = 0.02
 """Anisotropy (difference over sum of the principal second moments) below which a region has no direction.
 Chosen by hand: an axis ratio of 1.02."""
+
+
+@dataclass(frozen=True)
+class View:
+    """The pixels in which a truth is given.
+
+    camera : makes the raw frame. mapping : `PixelMapping` to the processed frame; None: raw pixels.
+    """
+
+    camera: Camera
+    mapping: Any
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height), px."""
+        size: tuple[int, int] = self.camera.size if self.mapping is None else self.mapping.size
+        return size
+
+    def to_raw(self, points: Points) -> Points:
+        """Raw pixels of points (N, 2)."""
+        return points if self.mapping is None else np.asarray(self.mapping.to_raw(points), np.float64)
+
+    def from_raw(self, raw: Points) -> Points:
+        """Points (N, 2) of raw pixels."""
+        return raw if self.mapping is None else np.asarray(self.mapping.to_processed(raw), np.float64)
+
+    @property
+    def grid(self) -> Points:
+        """(H * W, 2): x and y of every pixel, line by line."""
+        width, height = self.size
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,31 +77,34 @@ class Truth:
     visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, lit, not vanished.
     inside : (N,) bool, whether a marker is visible and its centre lies in the contact.
     mean_flow : (dx, dy), mean displacement of the markers inside, px; None where there are none.
+
+    What takes long is computed when it is first asked for.
     """
 
     touching: bool
     contact_mask: NDArray[np.bool_]
     center: tuple[float, float] | None
     angle: float | None
-    hull: NDArray[np.float64]
+    hull: Points
     area: float
-    origin: NDArray[np.float64]
-    position: NDArray[np.float64]
+    origin: Points
+    position: Points
     visible: NDArray[np.bool_]
     inside: NDArray[np.bool_]
     mean_flow: tuple[float, float] | None
     depth: float
     stick_ratio: float | None
     slipping: bool
-    _render: Callable[[], NDArray[np.uint8]] = field(repr=False)
-    _lower: Callable[[], NDArray[np.float32]] = field(repr=False)
-    _move: Callable[[NDArray[np.float64]], NDArray[np.float64]] = field(repr=False)
-    _touched: Callable[[NDArray[np.float64]], NDArray[np.bool_]] = field(repr=False)
-    _push: Callable[[], tuple[float, float, float]] = field(repr=False)
+    _pressed: Sequence[Press] = field(repr=False)
+    _view: View = field(repr=False)
+    _process: Any = field(repr=False)
+    _clean: Callable[[], NDArray[np.uint8]] = field(repr=False)
 
-    def displacement(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def displacement(self, points: Points) -> Points:
         """(N, 2) float64: how far the gel has moved that rests at points (N, 2), px."""
-        return self._move(points) - points
+        camera = self._view.camera
+        rest = camera.to_gel(self._view.to_raw(points))
+        return self._view.from_raw(camera.to_raw(rest + displacement(self._pressed, rest))) - points
 
     @cached_property
     def contact_flow(self) -> tuple[float, float] | None:
@@ -97,25 +132,98 @@ class Truth:
         dx, dy = moved[inside].mean(axis=0)
         return float(dx), float(dy)
 
+    def _touched(self, points: Points) -> NDArray[np.bool_]:
+        """(rows, columns): which points (rows, columns, 2) show gel in contact, inside of the picture."""
+        raw = self._view.to_raw(points.reshape(-1, 2))
+        gel = self._view.camera.to_gel(raw).astype(np.float32).reshape(points.shape)
+        seen = self._view.camera.sees(raw).reshape(points.shape[:2])
+        return seen & in_contact(self._pressed, gel[..., 0], gel[..., 1])
+
     @cached_property
     def unmarked(self) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 BGR: the frame without markers, dirt and noise. Rendered when first asked for."""
-        return self._render()
+        """(H, W, 3) uint8 BGR: the frame without markers, dirt and noise."""
+        image = self._clean()
+        if self._process is None:
+            return image
+        if callable(self._process):
+            return np.array(self._process(image), dtype=np.uint8)
+        return _resampled(image, self._process)
 
     @cached_property
     def sunk(self) -> NDArray[np.float32]:
-        """(H, W) float32, raw px: how far the gel's surface has sunk. Computed when first asked for."""
-        return self._lower()
+        """(H, W) float32, raw px: how far the gel's surface has sunk, by the deepest of all presses."""
+        gel_x, gel_y, seen = _pixel_centres(self._view)
+        lowest = np.zeros(gel_x.shape, np.float32)
+        for press in self._pressed:
+            if press.touching:
+                np.maximum(lowest, surface(press, reached(press, gel_x, gel_y)), out=lowest)
+        return np.where(seen, lowest, np.float32(0))
 
     @cached_property
     def force(self) -> tuple[float, float, float]:
-        """(x, y, z), N, on the gel: x right and y down in the picture, z presses (`tactflow.sim.elastic`)."""
-        return self._push()
+        """(x, y, z), N, on the gel: x right and y down in the picture, z presses (`tactflow.sim.elastic`).
+
+        x and y along the axes of the picture where the first indenter presses.
+        """
+        x, y, z = force(self._pressed)
+        if not self._pressed or not (x or y):
+            return x, y, z
+        here = np.array([[self._pressed[0].x, self._pressed[0].y]])
+        raw = self._view.camera.to_raw(np.concatenate([here, here + np.array([x, y]) / np.hypot(x, y)]))
+        start, end = self._view.from_raw(raw)
+        along = (end - start) * (np.hypot(x, y) / np.hypot(*(end - start)))
+        return float(along[0]), float(along[1]), z
 
 
-def pixel_mapping(mapping: Any) -> Any:
-    """The coordinate mapping itself, from a mapping or from a preprocessor that has one."""
-    return getattr(mapping, "mapping", mapping)
+def measure(
+    pressed: Sequence[Press],
+    camera: Camera,
+    origin: Points,
+    position: Points,
+    shown: NDArray[np.bool_],
+    process: Any,
+    clean: Callable[[], NDArray[np.uint8]],
+) -> Truth:
+    """Put the truth together.
+
+    origin, position : (N, 2) float64 raw pixels. shown : (N,) bool, false where a marker has vanished.
+    process : the `mapping` of `Scene.truth`. clean : renders the raw frame without markers and noise.
+    """
+    view = View(camera, getattr(process, "mapping", process))
+    mask, columns, rows = _contact(pressed, view)
+    touching = len(rows) > 0
+    hull = np.empty((0, 2))
+    if touching:
+        points = np.stack([columns, rows], axis=1).astype(np.int32)
+        hull = cv2.convexHull(points).reshape(-1, 2).astype(np.float64)
+    raw = position
+    origin, position = view.from_raw(origin), view.from_raw(position)
+    nearest = np.rint(position).astype(np.int64)
+    lit = camera.aperture(raw) >= 0.5
+    visible = shown & lit & np.all((nearest >= 0) & (nearest < mask.shape[::-1]), axis=1)
+    gel = camera.to_gel(raw).astype(np.float32)
+    inside = visible & in_contact(pressed, gel[:, 0], gel[:, 1])
+    dx, dy = (position - origin)[inside].mean(axis=0) if inside.any() else (0.0, 0.0)
+    return Truth(
+        touching=touching,
+        contact_mask=mask,
+        center=(float(columns.mean()), float(rows.mean())) if touching else None,
+        angle=principal_angle(columns, rows) if touching else None,
+        hull=hull,
+        area=float(cv2.contourArea(hull.astype(np.float32))) if touching else 0.0,
+        origin=origin,
+        position=position,
+        visible=visible,
+        inside=inside,
+        mean_flow=(float(dx), float(dy)) if inside.any() else None,
+        depth=max((press.depth for press in pressed), default=0.0) if touching else 0.0,
+        stick_ratio=min((press.stick_ratio for press in pressed), default=None) if touching else None,
+        slipping=touching and any(press.sliding for press in pressed),
+        _pressed=pressed,
+        _view=view,
+        _process=process,
+        _clean=clean,
+    )
 
 
 def principal_angle(columns: NDArray[np.int64], rows: NDArray[np.int64]) -> float | None:
@@ -132,39 +240,21 @@ def principal_angle(columns: NDArray[np.int64], rows: NDArray[np.int64]) -> floa
     return 90.0 if angle <= -90.0 else angle
 
 
-def _pixels(width: int, height: int) -> NDArray[np.float64]:
-    """(H * W, 2): x and y of every pixel, line by line."""
-    return (
-        np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
-    )
-
-
 @lru_cache(maxsize=8)
-def _pixel_centres(
-    camera: Camera, size: tuple[int, int], mapping: Any
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Gel coordinates (H, W) of each pixel's centre, and whether the raw frame covers it."""
-    width, height = size if mapping is None else mapping.size
-    grid = _pixels(width, height)
-    raw = grid if mapping is None else np.asarray(mapping.to_raw(grid), dtype=np.float64)
-    seen = np.all((raw >= -0.5) & (raw <= np.array(size) - 0.5), axis=1) & _lit(camera, raw)
-    mapped = camera.to_gel(raw).astype(np.float32).reshape(height, width, 2)
-    return (
-        np.ascontiguousarray(mapped[..., 0]),
-        np.ascontiguousarray(mapped[..., 1]),
-        seen.reshape(height, width),
-    )
+def _pixel_centres(view: View) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Gel coordinates x and y (H, W) of each pixel's centre, and whether the raw frame covers it."""
+    width, height = view.size
+    raw = view.to_raw(view.grid)
+    mapped = view.camera.to_gel(raw).astype(np.float32).reshape(height, width, 2)
+    x, y = (np.ascontiguousarray(mapped[..., axis]) for axis in (0, 1))
+    return x, y, view.camera.sees(raw).reshape(height, width)
 
 
-def _lit(camera: Camera, raw: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,): which raw pixel positions (N, 2) are not in the black frame around the picture."""
-    return camera.aperture(raw) >= 0.5
-
-
-def _window(
-    pressed: Sequence[Press], gel_x: NDArray[np.float32], gel_y: NDArray[np.float32]
-) -> tuple[int, int, int, int]:
-    """Rows and columns that hold every pixel within the reach of an indenter; empty where there is none."""
+def _contact(
+    pressed: Sequence[Press], view: View
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """The contact mask (H, W), and x and y (n,) of its pixels, line by line."""
+    gel_x, gel_y, seen = _pixel_centres(view)
     near = np.zeros(gel_x.shape, dtype=np.bool_)
     for press in pressed:
         if press.touching:
@@ -172,134 +262,12 @@ def _window(
             near |= (np.abs(gel_x - np.float32(press.x)) < reach) & (
                 np.abs(gel_y - np.float32(press.y)) < reach
             )
-    rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    if not len(rows):
-        return 0, 0, 0, 0
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
-
-
-def measure(
-    pressed: Sequence[Press],
-    camera: Camera,
-    origin: NDArray[np.float64],
-    position: NDArray[np.float64],
-    shown: NDArray[np.bool_],
-    size: tuple[int, int],
-    mapping: Any,
-    clean: Callable[[], NDArray[np.uint8]],
-) -> Truth:
-    """Put the truth together.
-
-    origin, position : (N, 2) float64 raw pixels. shown : (N,) bool, false where a marker has vanished.
-    mapping : see `Scene.truth`. clean : renders the raw frame without markers and noise.
-    """
-    to = pixel_mapping(mapping)
-    mask, columns, rows = _contact(pressed, camera, size, to)
-    touching = len(rows) > 0
-    hull = np.empty((0, 2))
-    if touching:
-        points = np.stack([columns, rows], axis=1).astype(np.int32)
-        hull = cv2.convexHull(points).reshape(-1, 2).astype(np.float64)
-    raw = position
-    if to is not None:
-        origin = np.asarray(to.to_processed(origin), dtype=np.float64)
-        position = np.asarray(to.to_processed(position), dtype=np.float64)
-    nearest = np.rint(position).astype(np.int64)
-    height, width = mask.shape
-    visible = shown & _lit(camera, raw) & np.all((nearest >= 0) & (nearest < (width, height)), axis=1)
-    gel = camera.to_gel(raw).astype(np.float32)
-    inside = visible & in_contact(pressed, gel[:, 0], gel[:, 1])
-    mean_flow = None
-    if inside.any():
-        moved = (position - origin)[inside].mean(axis=0)
-        mean_flow = (float(moved[0]), float(moved[1]))
-    return Truth(
-        touching=touching,
-        contact_mask=mask,
-        center=(float(columns.mean()), float(rows.mean())) if touching else None,
-        angle=principal_angle(columns, rows) if touching else None,
-        hull=hull,
-        area=float(cv2.contourArea(hull.astype(np.float32))) if touching else 0.0,
-        origin=origin,
-        position=position,
-        visible=visible,
-        inside=inside,
-        mean_flow=mean_flow,
-        depth=max((press.depth for press in pressed), default=0.0) if touching else 0.0,
-        stick_ratio=min((press.stick_ratio for press in pressed), default=None) if touching else None,
-        slipping=touching and any(press.sliding for press in pressed),
-        _render=partial(_processed, clean, mapping),
-        _lower=partial(_sunk, pressed, camera, size, to),
-        _move=partial(_moved, pressed, camera, to),
-        _touched=partial(_touched, pressed, camera, to, size),
-        _push=partial(_pushed, pressed, camera, to),
-    )
-
-
-def _moved(
-    pressed: Sequence[Press], camera: Camera, to: Any, points: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(N, 2): where the gel is now that rests at points (N, 2), in the truth's coordinates."""
-    rest = camera.to_gel(points if to is None else np.asarray(to.to_raw(points), np.float64))
-    now = camera.to_raw(rest + displacement(pressed, rest))
-    return now if to is None else np.asarray(to.to_processed(now), np.float64)
-
-
-def _pushed(pressed: Sequence[Press], camera: Camera, to: Any) -> tuple[float, float, float]:
-    """The force, with x and y along the axes of the truth's coordinates where the first indenter presses."""
-    x, y, z = force(pressed)
-    if not pressed or not (x or y):
-        return x, y, z
-    here = np.array([[pressed[0].x, pressed[0].y]])
-    raw = camera.to_raw(np.concatenate([here, here + np.array([x, y]) / np.hypot(x, y)]))
-    start, end = raw if to is None else np.asarray(to.to_processed(raw), np.float64)
-    along = (end - start) * (np.hypot(x, y) / np.hypot(*(end - start)))
-    return float(along[0]), float(along[1]), z
-
-
-def _touched(
-    pressed: Sequence[Press], camera: Camera, to: Any, size: tuple[int, int], points: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """(rows, columns): which points (rows, columns, 2) show gel in contact; none outside of the picture."""
-    flat = points.reshape(-1, 2)
-    raw = flat if to is None else np.asarray(to.to_raw(flat), np.float64)
-    gel = camera.to_gel(raw).astype(np.float32).reshape(points.shape)
-    seen = np.all((raw >= -0.5) & (raw <= np.array(size) - 0.5), axis=1) & _lit(camera, raw)
-    return np.asarray(seen.reshape(points.shape[:2]) & in_contact(pressed, gel[..., 0], gel[..., 1]))
-
-
-def _sunk(pressed: Sequence[Press], camera: Camera, size: tuple[int, int], to: Any) -> NDArray[np.float32]:
-    """How far the surface has sunk at each pixel's centre, (H, W) raw px: the deepest of all presses."""
-    gel_x, gel_y, seen = _pixel_centres(camera, size, to)
-    lowest = np.zeros(gel_x.shape, np.float32)
-    for press in pressed:
-        if press.touching:
-            np.maximum(lowest, surface(press, reached(press, gel_x, gel_y)), out=lowest)
-    return np.where(seen, lowest, np.float32(0))
-
-
-def _contact(
-    pressed: Sequence[Press], camera: Camera, size: tuple[int, int], to: Any
-) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """The contact mask (H, W), and x and y (n,) of its pixels, line by line."""
-    gel_x, gel_y, seen = _pixel_centres(camera, size, to)
+    left, top, width, height = cv2.boundingRect(near.astype(np.uint8))
+    part = slice(top, top + height), slice(left, left + width)
     mask = np.zeros(gel_x.shape, dtype=np.bool_)
-    top, bottom, left, right = _window(pressed, gel_x, gel_y)
-    part = in_contact(pressed, gel_x[top:bottom, left:right], gel_y[top:bottom, left:right])
-    part &= seen[top:bottom, left:right]
-    mask[top:bottom, left:right] = part
-    rows, columns = np.nonzero(part)
-    return mask, columns + left, rows + top
-
-
-def _processed(clean: Callable[[], NDArray[np.uint8]], mapping: Any) -> NDArray[np.uint8]:
-    """The frame that `clean` renders, in processed pixels."""
-    image = clean()
-    if mapping is None:
-        return image
-    if callable(mapping):
-        return np.array(mapping(image), dtype=np.uint8)
-    return _resampled(image, mapping)
+    mask[part] = in_contact(pressed, gel_x[part], gel_y[part]) & seen[part]
+    rows, columns = np.nonzero(mask)
+    return mask, columns, rows
 
 
 def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
@@ -315,7 +283,7 @@ def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
 def _sample_places(mapping: Any) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Raw coordinates (H, W) of the four samples of each processed pixel."""
     width, height = mapping.size
-    grid = _pixels(width, height)
+    grid = View(Camera(), mapping).grid
     places = []
     for shift in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         raw = np.asarray(mapping.to_raw(grid + shift), dtype=np.float32).reshape(height, width, 2)

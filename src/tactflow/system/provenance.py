@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from tactflow import __version__
-from tactflow.calibration.file import stored_arrays, stored_text
+from tactflow.calibration.stored import stored_arrays, stored_text
 from tactflow.engine.control import Control
 from tactflow.system.redaction import without_secrets
 from tactflow.vision import compiled

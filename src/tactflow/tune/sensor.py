@@ -16,7 +16,7 @@ from tactflow.doctor import measures
 from tactflow.doctor.observation import Observation
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.sim import Truth, open_scene
-from tactflow.sim.scenes import SIZE
+from tactflow.sim.camera import SIZE
 from tactflow.tune.recording import Recording, change_between
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.markers import NoMarkersError, detect_markers

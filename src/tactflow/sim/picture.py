@@ -1,0 +1,291 @@
+"""Renders the frames of a simulated scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.sim import camera as optics
+from tactflow.sim import gel, light, markers
+from tactflow.sim.camera import SIZE, Camera
+from tactflow.sim.settings import Settings
+
+FIXED_POINT = markers.FIXED_POINT
+Canvas = NDArray[np.int16]
+"""(H, W, 3) grey levels times `FIXED_POINT`."""
+
+_STEP = 2
+"""The gel's surface is computed at every second pixel of the raw frame; the light on it is smooth. Chosen
+by hand."""
+_SPECKLE_STEP = 20
+"""How far blotches are carried along is computed at every so many pixels; the gel stretches smoothly. Chosen
+by hand."""
+_INVERSIONS = 4
+"""Steps of the fixed-point iteration that finds where a point of the gel came from. Chosen by hand: the
+pattern need not be exact, only carried along."""
+_LAMP_AT = 0.475
+"""Part of a recording after which the lamp is on: between two contacts that share its length."""
+_BRIGHT_MARKER = 225.0
+"""Grey level of a bright marker; chosen by hand, below saturation."""
+_FPS = 60.0
+"""Frames a second, by which lights drift and flicker."""
+
+
+class Painter:
+    """Draws what the camera sees of the gel at a moment.
+
+    settings : of the scene. camera : see `Camera`. layout : the markers as printed.
+    """
+
+    def __init__(self, settings: Settings, camera: Camera, layout: markers.Layout) -> None:
+        self._settings = settings
+        self._camera = camera
+        self._layout = layout
+        self._light = light.LIGHTS[settings.light]
+        widened = 1.0 if camera.identity else 1.6 if settings.perspective else 1.2
+        self._half = markers.half_patch(layout.radius, settings.shape, widened)
+
+    def frame(
+        self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_]
+    ) -> NDArray[np.uint8]:
+        """The raw frame, (600, 800, 3) uint8 BGR, fresh.
+
+        index : of the frame. moment : of the scene that it shows. shown : (N,), false for invisible markers.
+        """
+        settings = self._settings
+        canvas = self._canvas(index, moment, pressed, shown)
+        scale = self._gain(moment) / FIXED_POINT
+        noise = optics.sensor_noise(settings.seed, moment, canvas.shape)
+        if settings.shot:
+            noisy = np.asarray(canvas, np.float32) * np.float32(scale)
+            spread = np.sqrt(settings.noise**2 + settings.shot**2 * np.maximum(noisy, 0) / np.float32(128.0))
+            noisy += spread * (noise * np.float32(1.0 / optics.NOISE_UNIT))
+            image = cv2.convertScaleAbs(np.maximum(noisy, 0, out=noisy))
+        else:
+            level = settings.noise / optics.NOISE_UNIT
+            image = cv2.addWeighted(canvas, scale, noise, level, 0.0, dtype=cv2.CV_8U)
+        if settings.hot:
+            x, y, value = self._hot_pixels
+            image[y, x] = value
+        if settings.jpeg:
+            image = optics.compressed(np.asarray(image, np.uint8), settings.jpeg)
+        return np.asarray(image, dtype=np.uint8)
+
+    def clean(self, index: int, moment: int, pressed: Sequence[gel.Press]) -> NDArray[np.uint8]:
+        """The raw frame without markers, dirt and noise, (600, 800, 3) uint8 BGR, fresh."""
+        canvas = self._canvas(index, moment, pressed, None)
+        scale = self._gain(moment) / FIXED_POINT
+        return np.asarray(cv2.addWeighted(canvas, scale, canvas, 0.0, 0.0, dtype=cv2.CV_8U), dtype=np.uint8)
+
+    def _gain(self, moment: int) -> float:
+        settings = self._settings
+        seconds = moment / _FPS
+        warm = 1.0 + settings.drift * (1.0 - float(np.exp(-seconds / 5.0)))
+        return warm * (1.0 + settings.flicker * float(np.sin(2 * np.pi * 100.0 * seconds)))
+
+    def _canvas(
+        self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_] | None
+    ) -> Canvas:
+        """A frame before gain and noise; a view or fresh. shown : None to leave markers and dirt out."""
+        settings = self._settings
+        if not pressed:
+            padded = self._resting if shown is None else self._resting_marked
+        else:
+            padded = self._resting.copy()
+            for press in pressed:
+                self._shade(padded, press)
+            if shown is not None:
+                self._mark(padded, pressed, shown)
+        half = self._half
+        canvas = padded[half:-half, half:-half]
+        if settings.speckle:
+            shade = self._speckle(pressed) if pressed else self._resting_speckle
+            canvas = np.asarray(cv2.multiply(canvas, cv2.merge([shade] * 3), dtype=cv2.CV_16S), np.int16)
+        if settings.blur:
+            canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), settings.blur), dtype=np.int16)
+        if settings.gain:
+            rows = np.arange(SIZE[1], dtype=np.float32) / SIZE[1]
+            wave = np.sin(2 * np.pi * (2.0 * rows - 0.37 * moment)).astype(np.float32)
+            banded = canvas * (np.float32(1.0) + np.float32(settings.gain) * wave)[:, None, None]
+            canvas = np.rint(banded, out=banded).astype(np.int16)
+        if index < settings.settle:
+            gains = np.append(light.settling(index, settings.settle), 1.0)
+            canvas = np.asarray(cv2.multiply(canvas, gains, dtype=cv2.CV_16S), np.int16)
+        if settings.lamp and moment >= _LAMP_AT * settings.frames:
+            canvas = np.asarray(cv2.multiply(canvas, self._lamp, dtype=cv2.CV_16S), np.int16)
+        return canvas
+
+    @cached_property
+    def _lamp(self) -> NDArray[np.float32]:
+        return light.lamp(SIZE, self._settings.lamp)
+
+    @cached_property
+    def _hot_pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]]:
+        rng = np.random.default_rng([self._settings.seed, 0x686F])
+        count = self._settings.hot
+        x, y = rng.integers(0, SIZE[0], count), rng.integers(0, SIZE[1], count)
+        return x, y, rng.integers(200, 256, (count, 3)).astype(np.uint8)
+
+    def _gel_blocks(self, step: int) -> NDArray[np.float64]:
+        """Gel coordinates (600 // step, 800 // step, 2) of the centres of blocks of so many raw pixels."""
+        width, height = SIZE
+        across = np.arange(width // step) * step + (step - 1) / 2.0
+        down = np.arange(height // step) * step + (step - 1) / 2.0
+        points = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        return self._camera.to_gel(points).reshape(height // step, width // step, 2)
+
+    @cached_property
+    def _coarse(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Gel coordinates of the centres of blocks of `_STEP` x `_STEP` raw pixels."""
+        mapped = self._gel_blocks(_STEP).astype(np.float32)
+        return np.ascontiguousarray(mapped[..., 0]), np.ascontiguousarray(mapped[..., 1])
+
+    @cached_property
+    def _resting(self) -> Canvas:
+        """The untouched gel without markers, padded."""
+        settings = self._settings
+        width, height = SIZE
+        raw_x, raw_y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        center = ((width - 1) / 2.0, (height - 1) / 2.0)
+        half_diagonal = float(np.hypot(width, height)) / 2.0
+        dim = 0.65 if settings.polarity == "bright" else 1.0
+        image = light.untouched_gel(self._light, raw_x, raw_y, center, half_diagonal, dim)
+        if settings.texture:
+            image *= light.texture((height, width), settings.texture, settings.seed)
+        if settings.specular:
+            light.add_mirror_spots(image, raw_x, raw_y, settings.specular, settings.seed)
+        if settings.vignette:
+            radius = ((raw_x - center[0]) ** 2 + (raw_y - center[1]) ** 2) / np.float32(half_diagonal**2)
+            image *= (np.float32(1.0) - np.float32(settings.vignette) * radius)[..., None]
+        if settings.perspective:
+            image *= self._gel_window()
+        if settings.aperture:
+            image *= self._framed[..., None]
+        np.clip(image, 0, 500, out=image)
+        fixed = np.rint(image * np.float32(FIXED_POINT)).astype(np.int16)
+        half = self._half
+        return np.asarray(cv2.copyMakeBorder(fixed, half, half, half, half, cv2.BORDER_REPLICATE), np.int16)
+
+    @cached_property
+    def _framed(self) -> NDArray[np.float32]:
+        """(H, W): the share of the light that the aperture lets through."""
+        width, height = SIZE
+        raw = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+        return self._camera.aperture(raw).astype(np.float32)
+
+    def _gel_window(self) -> NDArray[np.float32]:
+        """(H, W, 1): 1 on the gel, nearly dark around it, where a tilted camera sees past its border."""
+        x, y = np.moveaxis(self._gel_blocks(1), -1, 0)
+        width, height = SIZE
+        inside = np.minimum.reduce([x + 0.5, width - 0.5 - x, y + 0.5, height - 0.5 - y])
+        window = 0.06 + 0.94 / (1.0 + np.exp(-np.clip(inside, -40, 40) / 2.0))
+        return np.asarray(window[..., None], dtype=np.float32)
+
+    @cached_property
+    def _resting_marked(self) -> Canvas:
+        canvas = self._resting.copy()
+        self._mark(canvas, (), np.ones(len(self._layout.rest), np.bool_))
+        return canvas
+
+    def _mark(self, canvas: Canvas, pressed: Sequence[gel.Press], shown: NDArray[np.bool_]) -> None:
+        """Paint dirt and markers onto a padded canvas, in place."""
+        layout, camera, settings = self._layout, self._camera, self._settings
+        if settings.dirty and len(layout.rest):
+            rest, strength, deform = self._dirt
+            places = camera.to_raw(rest + gel.displacement(pressed, rest))
+            # One at a time: nothing keeps two specks apart.
+            alone = np.arange(len(rest))
+            markers.draw(canvas, places, strength, alone, layout.radius, half=self._half, deform=deform)
+        now = layout.rest + gel.displacement(pressed, layout.rest)
+        raw = camera.to_raw(now)
+        markers.draw(
+            canvas,
+            raw,
+            layout.contrast * shown * camera.aperture(raw),
+            layout.group,
+            layout.radius,
+            shape=settings.shape,
+            bright=_BRIGHT_MARKER if settings.polarity == "bright" else None,
+            half=self._half,
+            deform=None if camera.identity else camera.local_inverse(now),
+        )
+
+    @cached_property
+    def _dirt(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Specks on the gel: rest positions (N, 2), strengths (N,), deformations (N, 2, 2)."""
+        rng = np.random.default_rng([self._settings.seed, 0x6469])
+        count = round(self._settings.dirty * len(self._layout.rest))
+        rest = rng.uniform((0, 0), SIZE, (count, 2))
+        squeeze = rng.uniform(1.4, 3.2, (count, 2))
+        angle = rng.uniform(0, np.pi, count)
+        cos, sin = np.cos(angle), np.sin(angle)
+        axes = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], 1)
+        return rest, rng.uniform(0.2, 0.75, count), axes * squeeze[:, :, None]
+
+    @cached_property
+    def _resting_speckle(self) -> NDArray[np.float32]:
+        return self._speckle(())
+
+    def _speckle(self, pressed: Sequence[gel.Press]) -> NDArray[np.float32]:
+        """(H, W): the share of the light that the blotches let through."""
+        blocks = self._gel_blocks(_SPECKLE_STEP).reshape(-1, 2)
+        origin = blocks
+        for _ in range(_INVERSIONS if pressed else 0):
+            origin = blocks - gel.displacement(pressed, origin)
+        width, height = SIZE
+        moved = (blocks - origin).reshape(height // _SPECKLE_STEP, width // _SPECKLE_STEP, 2)
+        place = self._gel_blocks(1) - cv2.resize(moved, SIZE, interpolation=cv2.INTER_LINEAR)
+        pattern = light.blotches(SIZE, self._settings.speckle, self._settings.seed)
+        x, y = place[..., 0].astype(np.float32), place[..., 1].astype(np.float32)
+        shade = cv2.remap(pattern, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(shade, dtype=np.float32)
+
+    def _shade(self, padded: Canvas, press: gel.Press) -> None:
+        """Change the light of a padded canvas where a contact deforms the gel, in place."""
+        if press.depth <= 0:
+            return
+        window = self._window(press)
+        if window is None:
+            return
+        rows, columns = window
+        x, y = self._coarse
+        depth = gel.reached(press, x[window], y[window])
+        sunk = gel.surface(press, depth)
+        half = self._half
+        region = padded[
+            half + _STEP * rows.start : half + _STEP * rows.stop,
+            half + _STEP * columns.start : half + _STEP * columns.stop,
+        ]
+        full = (region.shape[1], region.shape[0])
+        fine = cv2.resize(light.shading(self._light, sunk, _STEP), full, interpolation=cv2.INTER_LINEAR)
+        lit = cv2.multiply(region, fine, dtype=cv2.CV_32F)
+        extra = light.brightness(self._light, press, depth) if self._light.brightening else None
+        if self._settings.specular:
+            spots = light.highlight(sunk, _STEP, self._settings.specular)
+            extra = spots if extra is None else extra + spots
+        if extra is not None:
+            wide = cv2.resize(extra, full, interpolation=cv2.INTER_LINEAR) * np.float32(FIXED_POINT)
+            if self._settings.aperture:
+                wide *= self._framed[
+                    _STEP * rows.start : _STEP * rows.stop, _STEP * columns.start : _STEP * columns.stop
+                ]
+            lit = cv2.add(lit, cv2.merge([wide, wide, wide]))
+        np.clip(lit, 0, 32000, out=lit)
+        region[...] = np.rint(lit, out=lit)
+
+    def _window(self, press: gel.Press) -> tuple[slice, slice] | None:
+        """Rows and columns of the coarse grid that a contact reaches, or None."""
+        reach = press.shape.reach
+        turn = np.linspace(0, 2 * np.pi, 33)
+        ring = np.stack([press.x + reach * np.cos(turn), press.y + reach * np.sin(turn)], axis=1)
+        if not self._camera.identity:
+            ring = self._camera.to_raw(np.clip(ring, (-60.0, -60.0), (SIZE[0] + 60.0, SIZE[1] + 60.0)))
+        low = np.floor(ring.min(axis=0) / _STEP).astype(int) - 2
+        high = np.ceil(ring.max(axis=0) / _STEP).astype(int) + 3
+        left, top = max(int(low[0]), 0), max(int(low[1]), 0)
+        right, bottom = min(int(high[0]), SIZE[0] // _STEP), min(int(high[1]), SIZE[1] // _STEP)
+        return None if right - left < 3 or bottom - top < 3 else (slice(top, bottom), slice(left, right))
