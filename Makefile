@@ -3,7 +3,6 @@
 # make soak         what takes longer: faults in running processes, a million frames (two hours)
 # make load         results, drops, latency and memory against the load (five minutes)
 # make fuzz         damaged input to every parser, SECONDS for each
-# make reliability  lets every fault happen, and writes that into docs/reliability.md
 # make audit        known weaknesses of the packages that are used, where the list can be reached
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
 # make kernels      measures what compiling gains, and writes docs/kernels.md
@@ -22,7 +21,7 @@ SYSTEM_DEPS := chromium ffmpeg
 # For the script for ROS 1; Debian 12 has them, later ones do not, and its test says so.
 ROS1_DEPS := python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs python3-zmq
 
-.PHONY: run test soak load fuzz reliability audit lock lint types kernels ros-env system-deps clean
+.PHONY: run test soak load fuzz audit lock lint types kernels ros-env system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -50,9 +49,6 @@ types: $(VENV)/.installed-test
 	$(PY) -m mypy
 	$(PY) -m mypy --platform darwin
 	$(PY) -m mypy --platform win32
-
-reliability: $(VENV)/.installed-test
-	$(PY) -m tests.faults
 
 kernels: $(VENV)/.installed-test
 	$(PY) -m tests.oracles

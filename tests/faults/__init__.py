@@ -1,1 +1,2 @@
-"""What goes wrong around a run, what is promised then, and what is seen: `table.py` has the cases."""
+"""Faults around a run: each test lets one happen and compares the exit code, messages and files with the
+promise."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import shutil
 import subprocess
 import tempfile
@@ -21,8 +22,6 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.contract import Sink
 from tactflow.engine.frame import Tick
 from tactflow.engine.run import Runner
-from tactflow.stages.capture import Capture
-from tests.sources.flaky import Flaky
 
 FRAMES = 120
 FAULT_AT = 60
@@ -39,6 +38,12 @@ class Seen:
     said: str
     kept: str = ""
 
+    def must_be(self, exit_: int, said: str = "^$", kept: str = "") -> None:
+        """said, kept : regular expressions."""
+        assert self.exit == exit_, self
+        assert re.search(said, self.said, re.DOTALL), self
+        assert re.search(kept, self.kept, re.DOTALL), self
+
 
 class At(Sink):
     """Lets the fault come, once."""
@@ -50,22 +55,6 @@ class At(Sink):
         if fault is not None and tick.frame.seq >= FAULT_AT:
             type(self).fault = None
             fault()
-
-
-class Scripted(Capture):
-    """A camera that follows a script."""
-
-    device = Flaky()
-
-    def __init__(self, params: Any) -> None:
-        from tactflow.sources import Watch, Watched
-        from tests.sources.test_watch import QUICK
-
-        def opener(*_: object, watch: Watch, **__: object) -> Watched:
-            times = {**QUICK, "no_frame_timeout": watch.no_frame_timeout, "reconnect": watch.reconnect}
-            return Watched(self.device.open, Watch(**times), "flaky", self.device.clock)  # type: ignore[arg-type]
-
-        super().__init__(params, opener=opener)
 
 
 def array(folder: Path, frames: int = FRAMES) -> Path:
@@ -110,10 +99,10 @@ def run(
     with heard() as said:
         runner = Runner(load_pipeline(file), max_frames=max_frames)
         At.fault = lambda: fault(runner)
-        other = threading.Thread(target=beside, args=(runner,))
-        other.start()
+        thread = threading.Thread(target=beside, args=(runner,))
+        thread.start()
         result = runner.run()
-        other.join()
+        thread.join()
     return runner, Seen(result.exit_code, "\n".join([*said, result.error or ""]).strip())
 
 

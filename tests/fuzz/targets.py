@@ -316,7 +316,6 @@ def messages(folder: Path) -> Iterator[Parser]:
         with suppress(ValueError):
             result = Result.from_message(data)
             listen.describe(result)
-            listen._cells(result)
 
     yield Parser([message(), nothing], feed)
 

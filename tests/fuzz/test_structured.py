@@ -75,7 +75,6 @@ def test_a_result_message_with_any_value_anywhere_is_shown_or_passed_over(
     except ValueError:
         return
     assert listen.describe(result)
-    assert listen._cells(result)
 
 
 @few

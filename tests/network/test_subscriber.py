@@ -17,7 +17,7 @@ import pytest
 import zmq
 
 from tactflow.cli import listen
-from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.result import encode_message
 from tactflow.network.remote_control import RemoteControl
@@ -260,34 +260,15 @@ def test_listen_reports_that_nothing_came(publisher: Publisher) -> None:
         listen.run(parse(publisher.endpoint, "--timeout", "0.05"))
 
 
-def test_listen_refuses_a_table_without_a_terminal() -> None:
-    with pytest.raises(ConfigError, match="--table needs a terminal"):
-        listen.run(parse("--table"))
-
-
 @pytest.mark.parametrize(
     "words",
-    [("--count", "0"), ("--count", "x"), ("--timeout", "0"), ("--timeout", "nan"), ("--json", "--table")],
+    [("--count", "0"), ("--count", "x"), ("--timeout", "0"), ("--timeout", "nan")],
 )
 def test_listen_refuses_wrong_options(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as raised:
         parse(*words)
     assert raised.value.code == 2
     assert words[0] in capsys.readouterr().err
-
-
-def test_the_table_shows_the_latest_values(
-    publisher: Publisher, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-
-    def send() -> None:
-        publisher.send(0, 3, contact=CONTACT)
-
-    assert run_listen(publisher, "--table", "--count", "2", "--timeout", str(LONG), send=send) == 0
-    out = capsys.readouterr().out
-    for words in ("main", "5124", "-12.3", "+1.21", "2/3", "2 received, 2 lost"):
-        assert words in out
 
 
 def test_a_contact_without_direction_is_described_without_one(publisher: Publisher) -> None:

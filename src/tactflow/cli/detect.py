@@ -1,4 +1,4 @@
-"""`tactflow detect`: which marks of a gel are found, and why, in words and in one picture."""
+"""`tactflow detect`: which marks of a gel are found and why, in words and in one picture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.cli.options import refuse_output
+from tactflow.cli.options import add_overwrite, refuse_output
 from tactflow.cli.terminal import printable
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
@@ -21,11 +21,9 @@ from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers
 
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
-"""Endings of files that a picture can be written to."""
-
-
+"""File extensions of pictures that can be written."""
 SHOWN: Final = 0.25
-"""Score of the next best spots over that of the marks, from which on they are shown. Chosen by hand."""
+"""Score of the runner-up, relative to that of the marks, above which it is shown. Chosen by hand."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--picture", type=Path, metavar="FILE", help="write what was found and why, to look at or to send"
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
+    add_overwrite(parser)
     parser.add_argument("--frame", type=int, default=0, metavar="N", help="which frame, the first is 0")
     parser.add_argument("--rotate", type=int, default=0, choices=(0, 90, 180, 270), help="as in preprocess")
     parser.add_argument(

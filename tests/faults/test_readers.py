@@ -1,4 +1,4 @@
-"""Faults of those who read what a run sends: pipes, ZeroMQ, the live page."""
+"""Faults of those who read what a run sends: pipes, ZeroMQ, the live page. They cost the run nothing."""
 
 from __future__ import annotations
 
@@ -28,9 +28,26 @@ FAST = 100.0
 """Rate of a recording that is played as if it were live, Hz."""
 
 
-def pipe(reader_does: str, folder: Path, *, live: bool) -> Seen:
-    """Lines go to a pipe, whose reader never comes, hangs or leaves; a signal may come meanwhile."""
-    path = folder / "pipe"
+@pytest.mark.parametrize(
+    ("reader_does", "live", "code", "said", "kept"),
+    [
+        ("never comes, and a signal comes", False, 0, "^$", "some lines"),
+        ("hangs, and a signal comes", False, 3, "are lost", ""),
+        ("leaves", False, 3, "Broken pipe", "some lines"),
+        ("hangs", True, 0, "too slow", "some dropped"),
+        ("leaves", True, 3, "Broken pipe", "some lines"),
+    ],
+)
+def test_the_reader_of_a_pipe(
+    reader_does: str,
+    live: bool,
+    code: int,
+    said: str,
+    kept: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = tmp_path / "pipe"
     os.mkfifo(path)
     reader = None
     if "never comes" not in reader_does:
@@ -38,42 +55,34 @@ def pipe(reader_does: str, folder: Path, *, live: bool) -> Seen:
         if "hangs" in reader_does:
             fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, SMALLEST_PIPE)
 
-    def fault(_: Runner) -> None:
+    def leave(_: Runner) -> None:
         if reader_does == "leaves" and reader is not None:
             os.close(reader)
 
-    def signal(runner: Runner) -> None:
+    def send_signal(runner: Runner) -> None:
+        if "hangs, and a signal" in reader_does:
+            # More than the pipe takes.
+            until(lambda: runner.progress().frames >= 20)
+        elif "signal" in reader_does:
+            time.sleep(0.3)
         if "signal" in reader_does:
-            if "hangs" in reader_does:
-                # More than the pipe takes.
-                until(lambda: runner.progress().frames >= 20)
-            else:
-                time.sleep(0.3)
             runner.stop("signal")
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lines, "MOST_WAITING", 10)
-        runner, seen = run(
-            folder,
-            {"jsonl": {"path": str(path), "flush": 0}},
-            fault,
-            signal,
-            source=str(array(folder)),
-            realtime=live,
-            fps=FAST if live else 30.0,
-        )
+    monkeypatch.setattr(lines, "MOST_WAITING", 10)
+    pace = {"realtime": live, "fps": FAST if live else 30.0}
+    sinks = {"jsonl": {"path": str(path), "flush": 0}}
+    runner, seen = run(tmp_path, sinks, leave, send_signal, source=str(array(tmp_path)), **pace)
     if reader is not None and reader_does != "leaves":
         os.close(reader)
     node = runner.nodes.get("jsonl")
     counts = dict(node.sink.counters()) if node is not None and node.sink is not None else {}
-    some = "some" if counts.get("dropped") else "no"
-    return Seen(
-        seen.exit, seen.said, f"{'all' if counts.get('lines') == FRAMES else 'some'} lines, {some} dropped"
-    )
+    dropped = "some" if counts.get("dropped") else "no"
+    left = f"{'all' if counts.get('lines') == FRAMES else 'some'} lines, {dropped} dropped"
+    Seen(seen.exit, seen.said, left).must_be(code, said, kept)
 
 
-def zeromq(subscriber_does: str, folder: Path) -> Seen:
-    """One good subscriber, and one that reads nothing, leaves at once, or sends what it should not."""
+@pytest.mark.parametrize("bad_one", ["reads nothing", "subscribes to 100 kB", "sends noise"])
+def test_a_bad_subscriber_harms_no_other(bad_one: str, tmp_path: Path) -> None:
     with ExitStack() as stack:
         context = stack.enter_context(zmq.Context())
         context.setsockopt(zmq.LINGER, 0)
@@ -81,21 +90,18 @@ def zeromq(subscriber_does: str, folder: Path) -> Seen:
         received = stack.enter_context(_subscribed(context, address))
 
         def fault(_: Runner) -> None:
-            if subscriber_does == "reads nothing":
-                idle = stack.enter_context(context.socket(zmq.SUB))
-                idle.rcvhwm = 1
-                idle.subscribe("")
-                idle.connect(address)
-            elif subscriber_does == "subscribes to 100 kB":
-                loud = stack.enter_context(context.socket(zmq.SUB))
-                loud.subscribe(bytes(100_000))
-                loud.connect(address)
-            else:
+            if bad_one == "sends noise":
                 _send_noise(address, 20)
+                return
+            bad = stack.enter_context(context.socket(zmq.SUB))
+            bad.rcvhwm = 1
+            bad.subscribe(b"" if bad_one == "reads nothing" else bytes(100_000))
+            bad.connect(address)
 
         settings = {"endpoint": address, "wait_for_subscriber": PATIENCE, "backlog": 1000, "linger": 60}
-        _, seen = run(folder, {"zmq": settings}, fault, source=str(array(folder)))
-    return Seen(seen.exit, seen.said, f"the good one got {len(received)} messages")
+        _, seen = run(tmp_path, {"zmq": settings}, fault, source=str(array(tmp_path)))
+    seen.must_be(0)
+    assert len(received) == FRAMES
 
 
 @contextmanager
@@ -121,29 +127,31 @@ def _subscribed(context: zmq.Context[zmq.Socket[bytes]], address: str) -> Iterat
         thread.join()
 
 
-def page(visitor_does: str, folder: Path) -> Seen:
-    """The live page is served while a visitor behaves badly."""
+@pytest.mark.parametrize("visitor", ["connects and is silent", "leaves in mid-request", "sends noise"])
+def test_a_bad_visitor_of_the_page_harms_no_other(visitor: str, tmp_path: Path) -> None:
     answers: list[int] = []
     with ExitStack() as stack:
 
         def fault(runner: Runner) -> None:
-            node = runner.nodes["view"]
-            address = str(node.sink and node.sink.description)
+            sink = runner.nodes["view"].sink
+            address = str(sink and sink.description)
             where = urlsplit(address)
-            if visitor_does == "connects and is silent":
-                for _ in range(20):
-                    stack.enter_context(socket.create_connection((where.hostname, where.port)))
-            elif visitor_does == "leaves in mid-request":
-                for _ in range(20):
-                    with socket.create_connection((where.hostname, where.port)) as visit:
-                        visit.sendall(b"GET / HTTP/1.1\r\nHost: 127")
-            else:
+            if visitor == "sends noise":
                 _send_noise(f"tcp://{where.netloc}", 20)
+            else:
+                for _ in range(20):
+                    visit = socket.create_connection((where.hostname, where.port))
+                    if visitor == "leaves in mid-request":
+                        visit.sendall(b"GET / HTTP/1.1\r\nHost: 127")
+                        visit.close()
+                    else:
+                        stack.enter_context(visit)
             with urlopen(address, timeout=PATIENCE) as answer:
                 answers.append(answer.status)
 
-        _, seen = run(folder, {"view": {"port": 0}}, fault, source=str(array(folder)))
-    return Seen(seen.exit, seen.said, f"the page answers {answers[0]}" if answers else "no answer")
+        _, seen = run(tmp_path, {"view": {"port": 0}}, fault, source=str(array(tmp_path)))
+    seen.must_be(0)
+    assert answers == [200]
 
 
 def _send_noise(address: str, connections: int) -> None:

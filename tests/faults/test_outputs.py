@@ -1,0 +1,163 @@
+"""Faults of what sinks write to: what was written before stays, and the run says what is missing."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import shutil
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from tactflow.cli.main import main
+from tests.faults.outputs import KINDS, settings_of
+from tests.faults.rig import At, Seen, array, fill, run, small_disk, write_pipeline
+
+THEIRS = "somebody else's"
+
+
+def _remove(output: Path) -> None:
+    output.rename(output.with_name("moved-away"))
+
+
+def _replace(output: Path) -> None:
+    other = output.with_name("other")
+    other.write_text(THEIRS)
+    other.replace(output)
+
+
+IN_MID_RUN: dict[str, Callable[[Path], None]] = {
+    "disk full": lambda output: fill(output.parent),
+    "removed": _remove,
+    "replaced": _replace,
+    "cut to nothing": lambda output: os.truncate(output, 0),
+}
+
+
+def check_promise(kind: str, output: Path, seen: Seen) -> str:
+    """What is there; it must be as much as the message says."""
+    kept = KINDS[kind].look(output)
+    said = re.search(r"the (\d+ (?:lines|pictures|frames)) written before", seen.said)
+    assert said is None or kept.startswith(said[1]), f"{seen.said}, but there are {kept}"
+    return kept
+
+
+@pytest.mark.parametrize(
+    ("kind", "fault", "code", "said", "kept"),
+    [
+        ("jsonl", "disk full", 3, "No space left.* lines written before", "lines"),
+        ("jsonl", "removed", 3, "was removed by another program", "nothing"),
+        ("jsonl", "replaced", 3, "was replaced by another", "theirs"),
+        ("jsonl", "cut to nothing", 0, "was cut by another", r"\d\d lines"),
+        ("images", "disk full", 3, "No space left.* pictures written", "pictures"),
+        ("images", "removed", 3, "cannot be written: No such file", "nothing"),
+        ("video .avi", "disk full", 3, "the disk is full; ", "can be played"),
+        ("video .avi", "removed", 3, "was removed by another program", "nothing"),
+        ("video .avi", "replaced", 3, "was replaced by another", "theirs"),
+        ("video .avi", "cut to nothing", 3, "it ends before its 120 frames", "can be played"),
+        ("video .mkv", "disk full", 3, "the disk is full; ", "can be played"),
+        ("video .mp4", "disk full", 3, "the disk is full; ", "can be played"),
+        ("record", "disk full", 3, "No space left.*tactflow repair", "frames can be"),
+        ("record", "removed", 3, "was removed by another program", "nothing"),
+        ("record", "replaced", 3, "was replaced by another", "theirs"),
+        ("record", "cut to nothing", 3, "was cut by another program", "not an MCAP file"),
+        ("parquet", "disk full", 3, "No space left.* written before", "can be read"),
+        ("parquet", "removed", 3, "cannot be written into: No such file", "nothing"),
+    ],
+)
+def test_something_happens_to_an_output_in_mid_run(
+    kind: str, fault: str, code: int, said: str, kept: str, tmp_path: Path
+) -> None:
+    with ExitStack() as stack:
+        place = stack.enter_context(small_disk()) if fault == "disk full" else tmp_path
+        output = place / KINDS[kind].output
+        sinks, source = settings_of(kind, output), str(array(tmp_path))
+        _, seen = run(tmp_path, sinks, lambda _: IN_MID_RUN[fault](output), source=source)
+        if fault == "removed":
+            left = "something" if output.exists() else "nothing"
+        elif fault == "replaced":
+            left = "theirs" if output.read_text() == THEIRS else "ours"
+        else:
+            left = check_promise(kind, output, seen)
+    Seen(seen.exit, seen.said, left).must_be(code, said, kept)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said", "kept"),
+    [
+        ("jsonl", "File too large", "[1-9].* lines"),
+        ("images", "File too large", "[1-9].* pictures"),
+        ("video .avi", "it ends before its 120 frames", "can be played"),
+        ("video .mkv", "it ends before its 120 frames", "can be played"),
+        ("video .mp4", "it cannot be played", "no frame"),
+        ("record", "File too large", "[1-9].* frames can be played"),
+    ],
+)
+def test_the_system_limits_the_size_of_files(kind: str, said: str, kept: str, tmp_path: Path) -> None:
+    output = tmp_path / KINDS[kind].output
+    # Below what each of them writes in a run; the pictures are larger than that one by one.
+    limit = 10_000 if kind == "jsonl" else 50_000
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    set_limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit, before[1]))
+    source = str(array(tmp_path))
+    try:
+        _, seen = run(tmp_path, settings_of(kind, output), lambda _: set_limit(), source=source)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    Seen(seen.exit, seen.said, check_promise(kind, output, seen)).must_be(3, said, kept)
+
+
+@pytest.mark.parametrize("kind", ["jsonl", "images", "video .avi", "record", "parquet"])
+def test_a_folder_that_is_read_only_is_refused_at_the_start(kind: str, tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        if os.geteuid() == 0:
+            # Permissions do not bind an administrator.
+            place = stack.enter_context(small_disk("ro"))
+        else:
+            place = tmp_path / "locked"
+            place.mkdir(mode=0o555)
+        _, seen = run(tmp_path, settings_of(kind, place / KINDS[kind].output), source=str(array(tmp_path)))
+        seen.must_be(3, "Read-only|denied")
+        assert not list(place.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["jsonl", "images", "video .avi", "record", "parquet"])
+def test_an_older_file_is_not_replaced(kind: str, tmp_path: Path) -> None:
+    output = tmp_path / KINDS[kind].output
+    inside = {"images": "frame-000000.png", "parquet": "frames/part-00000.parquet"}
+    older = output / inside[kind] if kind in inside else output
+    older.parent.mkdir(parents=True, exist_ok=True)
+    older.write_text(THEIRS)
+    _, seen = run(tmp_path, settings_of(kind, output), source=str(array(tmp_path)))
+    seen.must_be(3, "over")
+    assert older.read_text() == THEIRS
+
+
+@pytest.mark.parametrize("option", ["--stats", "--trace"])
+@pytest.mark.parametrize("source_fails", [False, True])
+def test_a_report_that_does_not_fit_the_disk_is_said_and_left_empty(
+    option: str, source_fails: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = _damaged_recording(tmp_path) if source_fails else array(tmp_path)
+    file = write_pipeline(tmp_path, {"at": {"use": "tests.faults.rig:At"}}, source=str(source))
+    with small_disk() as place:
+        report = place / "report.json"
+        At.fault = partial(fill, place)
+        code = main(["run", str(file), "--quiet", option, str(report)])
+        assert report.read_text() == ""
+    words = "damaged.*" if source_fails else ""
+    Seen(code, capsys.readouterr().err).must_be(4 if source_fails else 3, f"{words}{option}.*No space")
+
+
+def _damaged_recording(folder: Path) -> Path:
+    """A recording whose 61st frame and all after it are damaged."""
+    path = folder / "whole.mcap"
+    run(folder, {"record": {"path": str(path), "preview": 0}}, source=str(array(folder)))
+    data = bytearray(path.read_bytes())
+    data[len(data) * 6 // 10] ^= 1
+    path.write_bytes(data)
+    return Path(shutil.copy(path, folder / "damaged.mcap"))
