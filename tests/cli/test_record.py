@@ -113,14 +113,6 @@ def test_a_wrong_file_is_refused_before_anything_starts(
     assert (tmp_path / "there.mcap").read_bytes() == b"precious"
 
 
-def test_overwrite_replaces_the_file(tmp_path: Path) -> None:
-    out = tmp_path / "a.mcap"
-    out.write_bytes(b"old")
-    source = ["--source", "sim:press?frames=3"]
-    assert main(["record", *QUIET, *source, "--out", str(out), "--overwrite"]) == 0
-    assert len(stamps(out)) == 3
-
-
 def test_number_records_beside_what_is_there(tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
     command = ["record", *QUIET, "--source", "sim:press?frames=2", "--out", str(out), "--number"]
@@ -223,8 +215,3 @@ def test_repair_refuses_what_is_no_recording(
     assert main(["repair", str(path)]) == 4
     assert words in capsys.readouterr().err
     assert len(list(tmp_path.iterdir())) == (content is not None)
-
-
-def test_repair_of_no_name_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["repair", ""]) == 4
-    assert "no such file" in capsys.readouterr().err

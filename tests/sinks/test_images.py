@@ -77,15 +77,3 @@ def test_other_files_in_the_folder_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     run(tmp_path, [0])
     assert names(tmp_path) == ["frame-000000.png", "notes.txt"]
-
-
-def test_a_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(StageError, match=r"cannot be written into: .*file is a file, not a folder"):
-        run(tmp_path / "file" / "images", [0])
-
-
-def test_a_file_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "frame-000003.png").mkdir()
-    with pytest.raises(StageError, match=r"frame-000003\.png: cannot be written"):
-        run(tmp_path, [3], overwrite=True)
