@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
@@ -16,21 +14,9 @@ from pydantic import Field, field_validator
 from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
-from tactflow.sources import (
-    KINDS,
-    Arrival,
-    CameraRequest,
-    FrameReader,
-    StampedReader,
-    Watch,
-    Watched,
-    open_source,
-)
-from tactflow.sources.files import ImageFiles, load_image
-from tactflow.sources.first import FirstFrames
-from tactflow.sources.pace import Pace
-
-logger = logging.getLogger("tactflow")
+from tactflow.sources import KINDS, CameraRequest, FrameReader, Watch, Watched, open_source
+from tactflow.sources.captured import CapturedFrames
+from tactflow.sources.files import load_image
 
 
 class Capture(Source):
@@ -132,16 +118,15 @@ class Capture(Source):
         directory : where relative paths are looked for if they are not in the current directory.
         opener : opens the source; called like `open_source`.
         """
-        self.params = params
+        super().__init__(params)
         self.live = params.realtime
-        self.total: int | None = None
         self.description = params.source
         self._sensor = sensor
         self._directory = directory
         self._opener = opener
         self._source: FrameReader | None = None
+        self._frames: CapturedFrames | None = None
         self._reference_image: NDArray[np.uint8] | None = None
-        self._looked_at = 0
         self._stop = threading.Event()
         self._retake = threading.Event()
 
@@ -187,8 +172,9 @@ class Capture(Source):
 
     @property
     def missed(self) -> int:
-        """Frames of a live source that a newer one overtook, or that were only looked at: gaps in `seq`."""
-        return self._source.missed + self._looked_at if isinstance(self._source, Watched) else 0
+        """Frames of a live source that a newer one overtook, or that were only examined: gaps in `seq`."""
+        examined = 0 if self._frames is None else self._frames.left_out
+        return self._source.missed + examined if isinstance(self._source, Watched) else 0
 
     @property
     def live_threads(self) -> Sequence[int]:
@@ -201,175 +187,27 @@ class Capture(Source):
         self._retake.set()
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame of the source, in order, until its end or `stop()`.
-
-        The first frames of a recording are looked at ahead: if one of them is a better reference than the
-        very first, it comes before all others, with number -1. Those of a live source are left out until it
-        is steady. A recording of tactflow's own knows its references; `reference`, `settle` and `skip` do
-        not apply to it.
+        """Every frame of the source, in order, until its end or `stop()`; see `CapturedFrames`.
 
         Raises
         ------
         SourceError
             If a frame cannot be read, or the reference image is not as large as the frames.
         """
-        source = self._source
-        if source is None:
+        if self._source is None:
             raise SourceError(f"{self.description}: is not open")
-        count = self.params.reference if isinstance(self.params.reference, int) else 1
-        pace = Pace(self._stop) if self.params.realtime and not source.live else None
-        if isinstance(source, StampedReader):
-            yield from self._replay(source, pace, count)
-            return
-        if isinstance(source, Watched):
-            yield from self._watch(source, count)
-            return
-        yield from self._play(source, pace, count)
-
-    def _play(self, source: FrameReader, pace: Pace | None, count: int) -> Iterator[Frame]:
-        """Frames of a recording, behind those that show the untouched gel if these are not the first ones."""
-        for _ in range(self.params.skip):
-            if self._stop.is_set() or source.read() is None:
-                return
-        shown, marked = self._choose(source, count)
-        references = _References(self._retake, count, marked)
-        seq = self.params.skip
-        while not self._stop.is_set():
-            if pace is not None and not pace.wait_to_read():
-                return
-            item = source.read()
-            if item is None or (pace is not None and not pace.wait_for(item[1])):
-                return
-            image, t = _read_only(item[0]), item[1]
-            for picture in shown:
-                yield self._shown_before(picture, image, t)
-            shown = []
-            reference, epoch = references.next()
-            yield Frame(self._sensor, seq, t, image, time.perf_counter(), reference, epoch)
-            seq += 1
-
-    def _choose(self, source: FrameReader, count: int) -> tuple[list[NDArray[np.uint8]], int]:
-        """Pictures to show before the first frame, and how many of the first frames are references."""
-        if self._reference_image is not None:
-            return [self._reference_image], 0
-        if self.params.settle == 0 or source.live:
-            return [], count
-        first = FirstFrames(self.params.source, self.params.settle, count)
-        pictures: list[NDArray[np.uint8]] = []
-        while not self._stop.is_set() and (item := source.peek()) is not None:
-            pictures.append(item[0])
-            if first.look(*item):
-                break
-        chosen = first.references() if pictures else []
-        if isinstance(self._source, ImageFiles) and first.separate and chosen[0] == 0:
-            logger.info(
-                "%s: separate pictures; %s, the first by name, is taken for the untouched gel. "
-                "If another one shows that, name it: stages.capture.reference",
-                self.params.source,
-                self._source.first,
-            )
-        if chosen == list(range(len(chosen))):
-            return [], len(chosen)
-        return [pictures[index] for index in chosen], 0
-
-    def _replay(self, source: StampedReader, pace: Pace | None, count: int) -> Iterator[Frame]:
-        """Frames as they were captured the first time; references that are retaken now come on top."""
-        references = _References(self._retake, count, 0)
-        while not self._stop.is_set():
-            if pace is not None and not pace.wait_to_read():
-                return
-            item = source.read_stamped()
-            if item is None:
-                return
-            image, t, stamp = item
-            if pace is not None and stamp.paced and not pace.wait_for(t):
-                return
-            again, retaken = references.next(retake=stamp.seq >= 0)
-            reference, epoch = stamp.reference or again, stamp.epoch + retaken
-            yield Frame(self._sensor, stamp.seq, t, _read_only(image), time.perf_counter(), reference, epoch)
-
-    def _watch(self, source: Watched, count: int) -> Iterator[Frame]:
-        """Frames of a source that numbers them where they arrive, and that may go and come back."""
         p = self.params
-        image = self._reference_image
-        references = _References(self._retake, count, count if image is None else 0)
-        first = self._first_frames(count) if image is None else None
-        kept: list[Arrival] = []
-        connection, begins = 0, p.skip
-        while not self._stop.is_set():
-            arrival = source.read_arrival()
-            if arrival is None:
-                return
-            if arrival.connection != connection:
-                connection, begins = arrival.connection, arrival.seq + p.skip
-                if p.on_reconnect == "retake":
-                    self._retake.set()
-                    first, kept = self._first_frames(count), []
-            if arrival.seq < begins:
-                continue
-            if image is not None:
-                yield self._shown_before(image, arrival.image, arrival.t)
-                image = None
-            kept.append(arrival)
-            if first is not None:
-                if not first.look(arrival.image, arrival.t):
-                    continue
-                chosen = first.references()
-                self._looked_at += len(kept) - len(chosen)
-                kept = [kept[index] for index in chosen]
-                references.begin(len(chosen))
-                first = None
-            for arrival in kept:
-                reference, epoch = references.next()
-                picture = _read_only(arrival.image)
-                yield Frame(self._sensor, arrival.seq, arrival.t, picture, arrival.captured, reference, epoch)
-            kept = []
-
-    def _first_frames(self, count: int) -> FirstFrames | None:
-        """What looks at the first frames of a live source; None if they are handed out at once."""
-        settle = self.params.settle
-        return FirstFrames(self.params.source, settle, count) if settle > 0 else None
-
-    def _shown_before(self, image: NDArray[np.uint8], first: NDArray[np.uint8], t: float) -> Frame:
-        """A reference that comes before the first frame, which was taken at t."""
-        if image.shape != first.shape:
-            raise SourceError(
-                f"{self.params.reference}: the reference is {image.shape[1]} x {image.shape[0]} pixels, the "
-                f"frames of {self.params.source} are {first.shape[1]} x {first.shape[0]}; "
-                "they must be equally large"
-            )
-        return Frame(self._sensor, -1, t, _read_only(image), time.perf_counter(), reference=True)
-
-
-class _References:
-    """Which frames are references, and in which epoch: the first ones, and as many whenever they are retaken.
-
-    retake : set from any thread to take new ones. count : how many then. left : how many at the start.
-    """
-
-    def __init__(self, retake: threading.Event, count: int, left: int) -> None:
-        self._retake = retake
-        self._count = count
-        self._left = left
-        self._epoch = 0
-
-    def begin(self, left: int) -> None:
-        """Make the next `left` frames references, whatever was asked for before."""
-        self.next()
-        self._left = left
-
-    def next(self, *, retake: bool = True) -> tuple[bool, int]:
-        """Whether the next frame is a reference, and its epoch. With `retake` False none begins with it."""
-        if retake and self._retake.is_set():
-            self._retake.clear()
-            self._epoch += 1
-            self._left = self._count
-        reference = self._left > 0
-        self._left -= reference
-        return reference, self._epoch
-
-
-def _read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    image = image.view()
-    image.setflags(write=False)
-    return image
+        self._frames = CapturedFrames(
+            source=self._source,
+            name=p.source,
+            sensor=self._sensor,
+            count=p.reference if isinstance(p.reference, int) else 1,
+            image=self._reference_image,
+            settle=p.settle,
+            skip=p.skip,
+            retake_on_reconnect=p.on_reconnect == "retake",
+            realtime=p.realtime,
+            stop=self._stop,
+            retake=self._retake,
+        )
+        yield from self._frames

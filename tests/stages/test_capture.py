@@ -80,7 +80,7 @@ def test_a_reference_image_of_another_size_is_an_error_that_names_both(
 ) -> None:
     cv2.imwrite(str(tmp_path / "gel.png"), np.full((5, 6), 99, np.uint8))
     stage = capture(recording, reference=str(tmp_path / "gel.png"))
-    with pytest.raises(SourceError, match=r"gel\.png.* 6 x 5 pixels.*recording\.npy are 6 x 4"):
+    with pytest.raises(SourceError, match=r"reference .* 6 x 5 pixels.*recording\.npy have 6 x 4"):
         next(stage.frames())
 
 
