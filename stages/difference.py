@@ -22,14 +22,13 @@ class ContactPorts(NamedTuple):
 class Difference(Stage):
     """Compare the unmarked frame with the untouched gel.
 
-    All frames marked as reference are learned from (`colour`: from the last one); the first frame
-    serves where there is none.
+    It learns from all frames marked as reference (`colour`: from the last one), or else from the first frame.
     """
 
     memory = "stateful"
 
     class Params(StageParams):
-        """method : how contact is told from no contact. The others belong to one method each."""
+        """How contact is detected; each parameter but `method` belongs to one method."""
 
         method: Literal["noise", "colour"] = Field(
             "noise",
@@ -37,7 +36,7 @@ class Difference(Stage):
             "colour; colour is a plain distance of colours",
         )
         false_alarms: float = Field(
-            1e-6, gt=0, lt=1, description="noise: frames of the untouched gel called contact, per frame"
+            1e-6, gt=0, lt=1, description="noise: false contacts of the untouched gel, per frame"
         )
         repeatability: float = Field(
             0.025, ge=0, le=1, description="noise: how far the light of the gel itself varies, relative"

@@ -19,7 +19,7 @@ logger = logging.getLogger("tactflow")
 class Force(Stage):
     """Force in N, by the force part of the sensor's calibration; nothing without it.
 
-    A contact larger than those that the calibration was fitted to is warned of, once.
+    A contact larger than those that the calibration was fitted to is a warning, once.
     """
 
     memory = "pure"
@@ -28,7 +28,7 @@ class Force(Stage):
         """Prepare. calibration : the file."""
         super().__init__(params)
         known = None if calibration is None else Calibration.load(calibration).force
-        self._known = known
+        self._entry = known
         self._model = None if known is None else known.model()
         self._warned = False
 
@@ -42,7 +42,7 @@ class Force(Stage):
         flow: Flow | None = None,
     ) -> ForceOnGel | Absent:
         """The force of this frame's contact."""
-        model, known = self._model, self._known
+        model, known = self._model, self._entry
         if model is None or known is None:
             return Absent("no_calibration")
         change = 0.0

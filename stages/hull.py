@@ -31,7 +31,7 @@ class Hull(Stage):
         merge: Literal["all", "largest", "near"] = Field(
             "all",
             description="all: everything that touches is one contact; largest: the one with the most pixels; "
-            "near: the same, where those up to max_gap apart are one. The separate ones are told as well",
+            "near: the same, where those up to max_gap apart are one. The separate ones are reported as well",
         )
         max_gap: float | None = Field(
             None,

@@ -92,12 +92,12 @@ class Preprocess(Stage):
             height, width = frame.image.shape[:2]
             self._preprocessor = self._build(width, height)
             image = self._preprocessor(frame.image)
-            self._told((width, height), (image.shape[1], image.shape[0]))
+            self._report((width, height), (image.shape[1], image.shape[0]))
             return Preprocessed(image, self._preprocessor.mapping)
         return Preprocessed(self._preprocessor(frame.image), self._preprocessor.mapping)
 
-    def _told(self, before: tuple[int, int], after: tuple[int, int]) -> None:
-        """Say what becomes of the picture, once. before, after : (width, height), px."""
+    def _report(self, before: tuple[int, int], after: tuple[int, int]) -> None:
+        """Log how the picture is changed, once. before, after : (width, height), px."""
         params = self._params
         steps = [
             *(["straightened"] if params.undistort else []),

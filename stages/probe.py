@@ -15,7 +15,7 @@ from tactflow.vision.geometry.valid_area import bounding_box, valid_area
 
 
 class ProbePorts(NamedTuple):
-    """What the probe tells."""
+    """changed : whether the frame differs from the last one that was worked on."""
 
     changed: Changed
 

@@ -19,8 +19,8 @@ logger = logging.getLogger("tactflow")
 class Scale(Stage):
     """Millimetres per pixel, as `calibration` of the pipeline file says; nothing without it.
 
-    A calibration that was made with frames of another size, or with another preprocess, ends the run; one
-    of a gel that looks different is warned of.
+    A calibration made with frames of another size or another preprocess ends the run; a gel that looks
+    different from the calibrated one is a warning.
     """
 
     memory = "pure"
@@ -30,7 +30,7 @@ class Scale(Stage):
         super().__init__(params)
         self._calibration = None if calibration is None else Calibration.load(calibration)
         self._recorded = calibration is not None and calibration.suffix == ".mcap"
-        self._looked_at: Untouched | None = None
+        self._checked: Untouched | None = None
 
     def process(
         self, untouched: Untouched, mapping: PixelMapping | None = None
@@ -42,20 +42,20 @@ class Scale(Stage):
         size = (untouched.shape[1], untouched.shape[0])
         misfit = calibration.misfit(mapping or PixelMapping.identity(size))
         if misfit is not None and self._recorded:
-            # Nobody asked for it: it came with the recording.
-            if self._looked_at is None:
+            # It came with the recording; nobody asked for it.
+            if self._checked is None:
                 logger.warning("scale: the calibration in the recording is not used: %s", misfit)
-            self._looked_at = untouched
+            self._checked = untouched
             return Absent("no_calibration")
         if misfit is not None:
             raise StageError(f"{misfit}; use the pipeline that it was made with, or calibrate anew")
-        if self._looked_at is not untouched:
-            self._looked_at = untouched
-            _look_at(untouched, calibration)
+        if self._checked is not untouched:
+            self._checked = untouched
+            _warn_if_unlike(untouched, calibration)
         return calibration.scale
 
 
-def _look_at(untouched: Untouched, calibration: Calibration) -> None:
+def _warn_if_unlike(untouched: Untouched, calibration: Calibration) -> None:
     unlike = calibration.unlikeness(untouched)
     if unlike > UNLIKE:
         logger.warning(

@@ -11,7 +11,7 @@ from tactflow.vision.types import Slip
 
 
 class SlipPorts(NamedTuple):
-    """slipping : whether the contact slides over the gel. slip : the same, and how much of it sticks."""
+    """slipping : whether the contact slides over the gel. slip : that, and the part of it that sticks."""
 
     slipping: Slipping
     slip: Slip | None
@@ -20,7 +20,7 @@ class SlipPorts(NamedTuple):
 class SlipStage(Stage):
     """Gross slip from the gel that a contact leaves behind, incipient slip from how the gel moves below it.
 
-    `when: slipping` gates other stages. This one needs no gate: without a contact it only forgets the last.
+    `when: slipping` gates other stages. This stage needs no gate: without a contact it does next to nothing.
     """
 
     memory = "stateful"

@@ -52,7 +52,7 @@ class Smooth(Stage):
         self._smoother.reset()
 
     def process(self, contact: Contact | None, frame: Frame) -> Contact | Absent:
-        """The smoothed contact; where there is none, the next one starts afresh."""
+        """The smoothed contact; after a frame without contact, the filter starts afresh."""
         if contact is None:
             self._smoother.reset()
             return Absent("no_contact")

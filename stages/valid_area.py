@@ -19,7 +19,7 @@ Polygon = Annotated[list[Point], Field(min_length=3)]
 
 
 class ValidArea(Stage):
-    """Find the gel in the reference frame; what is black or saturated around it is none."""
+    """Find the gel in the reference frame; a black or saturated surround is excluded."""
 
     memory = "stateful"
 
@@ -30,13 +30,13 @@ class ValidArea(Stage):
             "auto",
             min_length=1,
             description="auto finds it in the reference frame; all is the whole picture; or its corners "
-            "[[x, y], ...], processed px; or an image file of the processed frame's size, black where no "
-            "gel is",
+            "[[x, y], ...], processed px; or an image file of the processed frame's size, black where "
+            "there is no gel",
         )
 
     def __init__(self, params: Params, directory: Path | None = None) -> None:
         """Prepare. directory : where a relative path is looked for if not in the current directory."""
-        self._area = params.area
+        super().__init__(params)
         self._directory = directory
         self._valid: Valid | None = None
 
@@ -52,21 +52,22 @@ class ValidArea(Stage):
 
     def _find(self, image: Image) -> Valid:
         height, width = image.shape[:2]
-        if self._area == "auto":
+        area = self.params.area
+        if area == "auto":
             return valid_area(image)
-        if self._area == "all":
+        if area == "all":
             return np.full((height, width), 255, np.uint8)
-        if not isinstance(self._area, str):
+        if not isinstance(area, str):
             try:
-                return polygon_mask(self._area, width, height)
+                return polygon_mask(area, width, height)
             except ValueError as problem:
                 raise StageError(f"area: {problem}") from None
-        mask = np.where(load_image(self._area, self._directory).any(axis=2), 255, 0).astype(np.uint8)
+        mask = np.where(load_image(area, self._directory).any(axis=2), 255, 0).astype(np.uint8)
         if mask.shape != (height, width):
             raise StageError(
-                f"area: {self._area} is {mask.shape[1]} x {mask.shape[0]} pixels, required "
-                f"{width} x {height}, those of the processed frame"
+                f"area: {area} is {mask.shape[1]} x {mask.shape[0]} pixels; required {width} x {height}, the "
+                "size of the processed frame"
             )
         if not mask.any():
-            raise StageError(f"area: {self._area} is black everywhere, so there would be no gel")
+            raise StageError(f"area: {area} is black everywhere, so there would be no gel")
         return mask

@@ -40,11 +40,11 @@ class Visualize(Stage):
         )
 
         def needed_inputs(self) -> Mapping[str, str]:
-            """Heights, to show them."""
+            """View depth shows heights."""
             return {"depth": "view", "scale": "view"} if self.view == "depth" else {}
 
         def unused_inputs(self) -> set[str]:
-            """What is not shown need not be computed."""
+            """Inputs that are not shown need not be computed."""
             return ({"depth", "scale"} if self.view != "depth" else set()) | (
                 set() if self.field else {"field"}
             )

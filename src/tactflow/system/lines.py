@@ -122,8 +122,22 @@ class LineStream:
                     self._file.close()
 
     def _write(self, patience: float) -> None:
+        """Write what the reader takes; where nobody waits for it, for `patience` s at most."""
+        until = time.monotonic() + patience
         try:
-            self._write_while_read(patience)
+            while self._lines:
+                if not self._takes_more(0.0):
+                    if (self._live() or self._hurried()) and time.monotonic() >= until:
+                        return
+                    self._takes_more(LOOK_EVERY)
+                    continue
+                line = self._lines[0]
+                self._sent += self._file.write(line[self._sent : self._sent + select.PIPE_BUF])
+                self._file.flush()
+                if self._sent >= len(line):
+                    self._lines.popleft()
+                    self._sent = 0
+                    self.delivered += 1
         except OSError as error:
             if self._file is sys.stdout.buffer and error.errno in (errno.EPIPE, errno.ECONNRESET):
                 self.ended = True
@@ -131,23 +145,6 @@ class LineStream:
                 return
             kept = f"the {self.delivered} lines written before are complete"
             raise cannot_write(self._name, error, kept) from error
-
-    def _write_while_read(self, patience: float) -> None:
-        until = time.monotonic() + patience
-        while self._lines:
-            if not self._takes_more(0.0):
-                waits = not self._live() and not self._hurried()
-                if not waits and time.monotonic() >= until:
-                    return
-                self._takes_more(LOOK_EVERY)
-                continue
-            line = self._lines[0]
-            self._sent += self._file.write(line[self._sent : self._sent + select.PIPE_BUF])
-            self._file.flush()
-            if self._sent >= len(line):
-                self._lines.popleft()
-                self._sent = 0
-                self.delivered += 1
 
     def _takes_more(self, seconds: float) -> bool:
         """Whether a write of up to `PIPE_BUF` bytes returns at once, perhaps with an error."""
@@ -174,17 +171,6 @@ class LineFile:
     Attributes
     ----------
     delivered : lines.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder, "numbers.txt")
-    ...     file = LineFile(path)
-    ...     file.send(b"first")
-    ...     file.close()
-    ...     path.read_text()
-    'first\\n'
     """
 
     ended = False
