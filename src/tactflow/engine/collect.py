@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.frame import Tick
 from tactflow.engine.graph import Component, Mark, Node, Pipeline, Ref
-from tactflow.engine.ports import ArrayPort, Parameter, Port, Ports, port_type, ports_of
+from tactflow.engine.ports import ArrayPort, Port, Ports, ResultParameter, port_type, ports_of
 
 T = TypeVar("T", bound=Tick)
 
@@ -80,7 +80,7 @@ def with_collector(
     inputs = {port: ref for port, ref in outputs.items() if port in known or ref not in read}
     passive = {port: ref for port, ref in outputs.items() if port not in inputs}
     # Any value: whether it is what its port promises is checked where it is made.
-    ports = Ports([Parameter("result", [Port(port, object, True) for port in inputs], kind)], ())
+    ports = Ports([Port(port, object, True) for port in inputs], (), ResultParameter(0, len(inputs), kind))
     cls = CollectInBackground if background else CollectReferences if references else Collect
     component = Component(name, "sink", cls, cls.Params, ports, "pure", "tactflow")
     nodes[name] = Node(

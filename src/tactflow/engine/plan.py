@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from tactflow.engine.contract import Sink
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline
+from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline, Ref
 
 CAPTURE = "capture"
 COMPUTE = "compute"
@@ -60,6 +60,11 @@ class Plan:
         """The segment that runs a node."""
         return next(name for name, nodes in self.segments.items() if node_id in nodes)
 
+    def is_known(self, signal: Ref, segment: str) -> bool:
+        """Whether a signal is known in a segment: it is made there, or in a segment before it."""
+        maker = self.segment_of(signal.node)
+        return maker == segment or maker in self.ancestors[segment]
+
     @property
     def idle(self) -> list[Node]:
         """Stages that no sink needs, without those that wait for a sink: perhaps a mistake."""
@@ -74,6 +79,27 @@ class Plan:
 def dependencies(node: Node) -> set[str]:
     """Ids of the nodes whose outputs a node reads, as inputs or as gates."""
     return {ref.node for ref in node.inputs.values() if ref} | {gate.signal.node for gate in node.gates}
+
+
+def remembers(node: Node, pipeline: Pipeline) -> bool:
+    """Whether a node must see every tick: it has memory, or a gate that repeats its last outputs."""
+    repeats = pipeline.skipping and any(gate.otherwise == "repeat" for gate in node.gates)
+    return node.component.memory == "stateful" or repeats
+
+
+def demand(pipeline: Pipeline) -> dict[str, frozenset[str] | None]:
+    """Node -> the sinks that need it; None where it is needed in every tick, for a stage that remembers."""
+    needs: dict[str, frozenset[str] | None] = {}
+    # Every input comes before its user, so that going backwards all users of a node are known.
+    for id_, node in reversed(list(pipeline.nodes.items())):
+        own = frozenset({id_}) if node.component.kind == "sink" else frozenset[str]()
+        before = needs.get(id_, frozenset())
+        need = None if before is None or remembers(node, pipeline) else before | own
+        needs[id_] = need
+        for maker in dependencies(node):
+            so_far = needs.get(maker, frozenset[str]())
+            needs[maker] = None if so_far is None or need is None else so_far | need
+    return needs
 
 
 def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:

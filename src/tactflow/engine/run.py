@@ -17,10 +17,9 @@ from tactflow.engine.errors import ConfigError, SourceError, StageError, Tactflo
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.link import Link
-from tactflow.engine.node import UNCONNECTED, RunningNode, TickState
+from tactflow.engine.node import UNCONNECTED, RunningNode, Slots, TickState
 from tactflow.engine.plan import Plan, make_plan
 from tactflow.engine.priority import ask_for_realtime
-from tactflow.engine.schedule import make_schedule
 from tactflow.engine.segment import NewReferences, NodeFailedError, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.engine.trace import Trace
@@ -29,13 +28,11 @@ from tactflow.system.signals import INTERRUPTED
 logger = logging.getLogger("tactflow")
 
 CLOSE_SECONDS = 10.0
-"""How long, s, no stage and no link may get on after the run was stopped or has failed, before the one that
-hangs is named. Chosen by hand: the slowest stage takes a second."""
+"""Time without progress, s, after which a run that was stopped names the stage that hangs. Chosen by hand:
+the slowest stage takes a second."""
 LEAVE_SECONDS = 1.0
-"""How long the threads get, s, to come out of what they are in when a run ends at once. Chosen by hand: the
-slowest stage takes as long."""
-MOST_STEPS = 1000
-"""Steps that may wait while a run is paused. Chosen by hand: more than anybody presses a key."""
+"""Time for the threads to leave the code they are in when a run ends at once, s. Chosen by hand: the slowest
+stage takes as long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +86,9 @@ class Runner:
         self.trace = trace
         self.latency = Durations()
         self.nodes: dict[str, RunningNode] = {}
-        self._slots: dict[tuple[str, str], int] = {}
         self.plan: Plan = make_plan(pipeline)
+        ports = [(id_, port.name) for id_, n in pipeline.nodes.items() for port in n.component.ports.outputs]
+        self.slots: Slots = {port: slot for slot, port in enumerate(ports, start=UNCONNECTED + 1)}
         self._links: list[Link[TickState]] = []
         self._segments: dict[str, Segment] = {}
         self._threads: dict[str, threading.Thread] = {}
@@ -124,7 +122,7 @@ class Runner:
         self._began = time.perf_counter()
         try:
             self._open()
-            # Opening may take long: a camera that wakes up, kernels that are compiled.
+            # Opening may take long: a camera that wakes up.
             self._began = time.perf_counter()
             if not self._stopping.is_set():
                 self._start()
@@ -134,13 +132,15 @@ class Runner:
         except KeyboardInterrupt:
             self._interrupted = True
             self.stop("signal")
-            for link in self._links:
-                link.abort()
-            self._let_threads_end()
+            self._abort_links()
+            until = time.perf_counter() + LEAVE_SECONDS
+            for thread in self._threads.values():
+                # An interrupt may have come before it was started.
+                if thread.is_alive():
+                    thread.join(max(0.0, until - time.perf_counter()))
         finally:
             self._close()
-        stats = self._stats(time.perf_counter() - self._began)
-        error = self._error
+        stats, error = self.snapshot(), self._error
         if self._interrupted:
             return RunResult(INTERRUPTED, None, stats)
         if error is not None:
@@ -194,12 +194,8 @@ class Runner:
     def step(self) -> None:
         """While paused, let one frame through; steps that wait are forgotten at the end. From any thread."""
         with self._turn:
-            self._steps = min(self._steps + self._paused, MOST_STEPS)
+            self._steps += self._paused
             self._turn.notify_all()
-
-    def snapshot(self) -> dict[str, Any]:
-        """The statistics so far. From any thread."""
-        return self._stats(time.perf_counter() - self._began)
 
     @property
     def source(self) -> Source | None:
@@ -220,6 +216,8 @@ class Runner:
         dropped = self._dropped() + self._missed()
         return Progress(self._frames, dropped, time.perf_counter() - self._began)
 
+    # -- opening and closing ------------------------------------------------------------------------------
+
     def _open(self) -> None:
         """Build and open the source first, then stages, then sinks: a missing recording truncates no file."""
         pipeline = self.pipeline
@@ -228,8 +226,6 @@ class Runner:
         self._source = source
         self.plan = make_plan(pipeline, live=source.live)
         pruned = {node.id for node in self.plan.pruned}
-        ports = [(id_, port.name) for id_, n in pipeline.nodes.items() for port in n.component.ports.outputs]
-        self._slots = {port: slot for slot, port in enumerate(ports, start=UNCONNECTED + 1)}
         for node in pipeline.nodes.values():
             if self._stopping.is_set():
                 # Nothing that is not open yet is opened now: no file is emptied for a run without a frame.
@@ -238,16 +234,15 @@ class Runner:
                 continue
             instance = self._build(node, StageError)
             self.nodes[node.id] = RunningNode(
-                node, instance, self._slots, skipping=pipeline.skipping, check=self.check
+                node, instance, self.slots, skipping=pipeline.skipping, check=self.check
             )
 
     def _build(self, node: Node, kind: type[TactflowError]) -> Part:
         """Construct a node's class with what its constructor asks for, and open it."""
         pipeline = self.pipeline
         values = (pipeline.sensor, pipeline.directory, pipeline.skipping, self, pipeline.calibration)
-        offered = dict(zip(OFFERED, values, strict=True))
         try:
-            instance = build(node.component.cls, node.params, offered)
+            instance = build(node.component.cls, node.params, dict(zip(OFFERED, values, strict=True)))
             self._opened.append((node.id, instance))
             instance.open()
         except kind as error:
@@ -264,77 +259,52 @@ class Runner:
 
     def _start(self) -> None:
         """Connect the segments and start their threads."""
-        self._connect()
+        for name in self.plan.segments:
+            track = None if self.trace is None else self.trace.track(name)
+            self._segments[name] = Segment(name, self, track)
+        for link_plan in self.plan.links:
+            link: Link[TickState] = Link(link_plan.name, link_plan.capacity, link_plan.when_full)
+            self._links.append(link)
+            consumer = self._segments[link_plan.consumer]
+            consumer.inputs.append(link)
+            sinks = frozenset(node.id for node in consumer.nodes) if consumer.only_sinks else None
+            self._segments[link_plan.producer].outputs.append((link, sinks))
+        self._lead_new_references()
         for name, segment in self._segments.items():
-            target = self._capture_loop if name == self._source_segment else segment.loop
+            target = self._capture if name == self._source_segment else segment.loop
             self._threads[name] = threading.Thread(target=target, name=f"tactflow-{name}", daemon=True)
         for thread in self._threads.values():
             thread.start()
         if self._is_live and self.pipeline.realtime_priority:
             self._go_first()
 
-    def _connect(self) -> None:
-        for name, steps in make_schedule(self.plan).items():
-            track = None if self.trace is None else self.trace.track(name)
-            self._segments[name] = Segment(name, self, steps, self._slots, track)
-        for link_plan in self.plan.links:
-            link: Link[TickState] = Link(link_plan.name, link_plan.capacity, link_plan.when_full)
-            self._links.append(link)
-            consumer = self._segments[link_plan.consumer]
-            consumer.inputs.append(link)
-            only_sinks = None
-            if all(node.sink for node in consumer.nodes):
-                only_sinks = frozenset(node.id for node in consumer.nodes)
-            self._segments[link_plan.producer].outputs.append((link, only_sinks))
-        self._lead_new_references()
-
     def _lead_new_references(self) -> None:
         """Let the segment that sees each frame before all other stages do make frames references."""
         first = self._segments[self._source_segment]
-        if all(node.sink for node in first.nodes):
+        if first.only_sinks:
             consumers = [link.consumer for link in self.plan.links if link.producer == first.name]
-            stages = [s for s in map(self._segments.get, consumers) if s and not all(n.sink for n in s.nodes)]
-            if len(stages) != 1:
+            with_stages = [s for s in map(self._segments.get, consumers) if s and not s.only_sinks]
+            if len(with_stages) != 1:
                 return
-            first = stages[0]
-        source = self.pipeline.source
-        slot = self._slots[source.id, source.component.ports.outputs[0].name]
+            first = with_stages[0]
         takers = [id_ for id_, node in self.nodes.items() if node.sink and node.sink.takes_references]
-        first.references = NewReferences(slot, takers)
+        first.references = NewReferences(self._source_slot, takers)
 
     @property
     def _source_segment(self) -> str:
         return self.plan.segment_of(self.pipeline.source.id)
 
-    def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
-        """Wait for the threads: as long as it takes until the source has ended, not for ever after a stop."""
-        headway: list[int] | None = None
-        since = time.perf_counter()
-        while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
-            self._threads[alive[0]].join(interval_s)
-            if on_progress is not None:
-                on_progress(self.progress())
-            if not self._hurried:
-                continue
-            now, before, headway = time.perf_counter(), headway, self._headway()
-            if headway != before:
-                since = now
-            if now - since > CLOSE_SECONDS:
-                hanging = ", ".join(
-                    f"{name} (in {self._segments[name].current or 'its source'})" for name in alive
-                )
-                for link in self._links:
-                    link.abort()
-                raise StageError(
-                    f"the run was stopped, but nothing has got on for {CLOSE_SECONDS:g} s: {hanging} hangs"
-                )
+    @property
+    def _source_slot(self) -> int:
+        source = self.pipeline.source
+        return self.slots[source.id, source.component.ports.outputs[0].name]
 
     @property
     def _is_live(self) -> bool:
         return self._source is not None and self._source.live
 
     def _go_first(self) -> None:
-        """Ask for real-time priority for the threads that a live frame's results wait for; say what came."""
+        """Ask for real-time priority for the threads that a live frame's results wait for."""
         urgent = {self._source_segment, *(name for name, s in self._segments.items() if s.urgent)}
         own = [self._threads[name].native_id for name in urgent]
         theirs = [id_ for _, instance in self._opened for id_ in instance.live_threads]
@@ -345,18 +315,30 @@ class Runner:
         else:
             logger.warning("realtime_priority: not granted: %s", refused)
 
-    def _headway(self) -> list[int]:
-        """Changes when a link delivers or a stage or sink has run: draining a long queue is not hanging."""
-        delivered = [link.stats().delivered for link in self._links]
-        return delivered + [node.stats.runs for node in self.nodes.values()]
+    def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
+        """Wait for the threads: as long as it takes until the source has ended, not for ever after a stop."""
+        done, since = -1, time.perf_counter()
+        while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
+            self._threads[alive[0]].join(interval_s)
+            if on_progress is not None:
+                on_progress(self.progress())
+            # Draining a long queue is not hanging.
+            before, done = done, sum(s.calls for s in self._segments.values())
+            done += sum(link.delivered for link in self._links)
+            now = time.perf_counter()
+            if done != before or not self._hurried:
+                since = now
+            elif now - since > CLOSE_SECONDS:
+                places = [f"{name} (in {self._segments[name].current or 'its source'})" for name in alive]
+                self._abort_links()
+                raise StageError(
+                    f"the run was stopped, but nothing has got on for {CLOSE_SECONDS:g} s: "
+                    f"{', '.join(places)} hangs"
+                )
 
-    def _let_threads_end(self) -> None:
-        """Give the threads a moment to end, so that nothing is closed while one of them uses it."""
-        until = time.perf_counter() + LEAVE_SECONDS
-        for thread in self._threads.values():
-            # An interrupt may have come before it was started.
-            if thread.is_alive():
-                thread.join(max(0.0, until - time.perf_counter()))
+    def _abort_links(self) -> None:
+        for link in self._links:
+            link.abort()
 
     def _close(self) -> None:
         """Close whatever was opened, last opened first; every one gets its turn.
@@ -364,8 +346,7 @@ class Runner:
         What a thread still is in is left as it is: to close a video while it is read, or a file while it is
         written, may wait for ever.
         """
-        alive = [name for name, thread in self._threads.items() if thread.is_alive()]
-        in_use = {self._segments[name].current for name in alive}
+        in_use = {self._segments[name].current for name, t in self._threads.items() if t.is_alive()}
         opened, self._opened = self._opened, []
         # An interrupt ends what one of them does, and is raised when the others are closed.
         with ExitStack() as stack:
@@ -381,41 +362,11 @@ class Runner:
 
     # -- the source's thread ------------------------------------------------------------------------------
 
-    def _capture_loop(self) -> None:
-        segment = self._segments[self._source_segment]
-        node = self.pipeline.source
-        slot = self._slots[node.id, node.component.ports.outputs[0].name]
-        table = UNCONNECTED + 1 + len(self._slots)
-        sinks = [node for node in self.nodes.values() if node.sink is not None]
-        index = 0
+    def _capture(self) -> None:
+        """Body of the source's thread."""
+        segment, node = self._segments[self._source_segment], self.pipeline.source
         try:
-            assert self._source is not None
-            frames = iter(self._source.frames())
-            while not self._stopping.is_set():
-                segment.current = node.id
-                began = time.perf_counter()
-                try:
-                    frame = next(frames, None)
-                finally:
-                    segment.current = None
-                if frame is None:
-                    break
-                if self._paused and not self._may_go_on():
-                    continue
-                ended = time.perf_counter()
-                if not frame.captured:
-                    frame = replace(frame, captured=ended)
-                self._source_stats.durations.add(ended - began)
-                if segment.track is not None:
-                    segment.track.add(node.id, began, ended, {"seq": frame.seq})
-                if frame.seq >= 0:
-                    self._frames += 1
-                tick = TickState(index, frame, _demand(sinks, frame), table)
-                tick.values[slot] = frame
-                index += 1
-                segment.handle(tick)
-                if self.max_frames is not None and self._frames >= self.max_frames:
-                    self.stop("max_frames")
+            self._capture_frames(segment)
         except NodeFailedError:
             pass
         except TactflowError as error:
@@ -429,6 +380,37 @@ class Runner:
             for link, _ in segment.outputs:
                 link.close()
 
+    def _capture_frames(self, segment: Segment) -> None:
+        assert self._source is not None
+        name, slot, slots = self.pipeline.source.id, self._source_slot, UNCONNECTED + 1 + len(self.slots)
+        sinks = [node for node in self.nodes.values() if node.sink is not None]
+        frames = iter(self._source.frames())
+        index = 0
+        while not self._stopping.is_set():
+            segment.current = name
+            began = time.perf_counter()
+            try:
+                frame = next(frames, None)
+            finally:
+                segment.current = None
+            if frame is None:
+                return
+            if self._paused and not self._may_go_on():
+                continue
+            ended = time.perf_counter()
+            if not frame.captured:
+                frame = replace(frame, captured=ended)
+            self._source_stats.durations.add(ended - began)
+            if segment.track is not None:
+                segment.track.add(name, began, ended, {"seq": frame.seq})
+            self._frames += frame.seq >= 0
+            tick = TickState(index, frame, _demand(sinks, frame), slots)
+            tick.values[slot] = frame
+            index += 1
+            segment.handle(tick)
+            if self.max_frames is not None and self._frames >= self.max_frames:
+                self.stop("max_frames")
+
     def _may_go_on(self) -> bool:
         """While paused: whether the frame just captured is to be handled; waits for that, or lets it go."""
         with self._turn:
@@ -441,65 +423,41 @@ class Runner:
     # -- statistics ---------------------------------------------------------------------------------------
 
     def _dropped(self) -> int:
+        """Frames dropped in front of the first segment of stages."""
         source = self._segments.get(self._source_segment) if self._segments else None
-        if source is None:
-            return 0
-        return max(
-            (link.stats().drops for link, only_sinks in source.outputs if only_sinks is None), default=0
-        )
+        links = [link for link, only_sinks in source.outputs if only_sinks is None] if source else []
+        return max((link.drops for link in links), default=0)
 
     def _missed(self) -> int:
         """Frames of a live source that were overtaken before they could be taken."""
         return 0 if self._source is None else self._source.missed
 
-    def _stats(self, wall_s: float) -> dict[str, Any]:
-        stages: dict[str, Any] = {self.pipeline.source.id: _node_stats(self._source_stats)}
-        sinks: dict[str, Any] = {}
-        signals: dict[str, Any] = {}
+    def snapshot(self) -> dict[str, Any]:
+        """The statistics so far. From any thread."""
         # A sink may ask while others are still being opened.
-        for node in list(self.nodes.values()):
-            entry = _node_stats(node.stats)
-            if node.sink is not None:
-                sinks[node.id] = entry | {"counters": dict(node.sink.counters())}
-            else:
-                stages[node.id] = entry
-            signals.update({f"{node.id}.{name}": dict(signal) for name, (_, signal) in node.signals.items()})
-        links = {}
-        for link in self._links:
-            s = link.stats()
-            links[link.name] = {
-                "policy": s.policy,
-                "capacity": s.capacity,
-                "high_water": s.high_water,
-                "drops": s.drops,
-                "blocked_s": round(s.blocked_s, 6),
-                "offered": s.offered,
-                "delivered": s.delivered,
-            }
+        nodes = list(self.nodes.values())
         dropped = self._dropped()
+        stages = {node.id: node.stats.entry() for node in nodes if node.sink is None}
         return {
             "frames": self._frames - dropped,
             "dropped": dropped + self._missed(),
-            "wall_s": round(wall_s, 6),
+            "wall_s": round(time.perf_counter() - self._began, 6),
             "end": self._end or "eos",
-            "stages": stages,
-            "sinks": sinks,
-            "signals": signals,
-            "links": links,
+            "stages": {self.pipeline.source.id: self._source_stats.entry(), **stages},
+            "sinks": {
+                node.id: node.stats.entry() | {"counters": dict(node.sink.counters())}
+                for node in nodes
+                if node.sink is not None
+            },
+            "signals": {
+                f"{node.id}.{port}": signal.entry()
+                for node in nodes
+                for port, (_, signal) in node.signals.items()
+            },
+            "links": {link.name: link.stats() for link in self._links},
             "priority": "real-time" if self._has_priority else "ordinary",
             "latency_ms": {"p50": self.latency.milliseconds(0.5), "p99": self.latency.milliseconds(0.99)},
         }
-
-
-def _node_stats(stats: NodeStats) -> dict[str, Any]:
-    return {
-        "runs": stats.runs,
-        "skips": dict(stats.skips),
-        "errors": stats.errors,
-        "total_ms": round(stats.durations.total * 1000, 4),
-        "p50_ms": stats.durations.milliseconds(0.5),
-        "p99_ms": stats.durations.milliseconds(0.99),
-    }
 
 
 def _demand(sinks: Sequence[RunningNode], frame: Frame) -> frozenset[str]:

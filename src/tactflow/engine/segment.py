@@ -1,20 +1,27 @@
-"""What runs in one thread: the steps of a segment, evaluated for one tick after another."""
+"""What runs in one thread: the nodes of a segment, evaluated for one tick after another.
+
+A value is computed only when somebody asks for it: a sink that wants the frame, or a stage that must see every
+frame because it remembers. These are the roots; from each, what it needs is pulled, and nothing twice in a
+tick. The makers of a node's gate signals are pulled first, its inputs only if the gates are open, so that a
+closed gate runs none of the work before it.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Protocol
 
-from tactflow.engine.contract import Sink, Stage
+from tactflow.engine.contract import Stage
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.engine.failure import describe_failure
 from tactflow.engine.frame import Absent, Frame
+from tactflow.engine.graph import Ref
 from tactflow.engine.link import Link
 from tactflow.engine.node import RunningNode, Slots, TickState
-from tactflow.engine.schedule import Step
+from tactflow.engine.plan import Plan, demand, dependencies, remembers
 from tactflow.engine.stats import Durations
 from tactflow.engine.trace import Track
 
@@ -27,6 +34,8 @@ _ERROR = Absent("error")
 class Run(Protocol):
     """What a segment needs to know of the run it belongs to."""
 
+    plan: Plan
+    slots: Slots
     nodes: dict[str, RunningNode]
     latency: Durations
 
@@ -37,30 +46,6 @@ class Run(Protocol):
 
 class NodeFailedError(Exception):
     """Ends a segment because one of its nodes failed for good."""
-
-
-class _RunningStep:
-    """A node and when it is needed: in every tick, or when one of its needs holds."""
-
-    __slots__ = ("always", "needs", "node")
-
-    def __init__(self, step: Step, node: RunningNode, slots: Slots) -> None:
-        self.node = node
-        self.needs = [
-            (need.sinks, [slots[signal.node, signal.port] for signal in need.signals]) for need in step.needs
-        ]
-        self.always = any(sinks is None and not signals for sinks, signals in self.needs)
-
-    def needed(self, tick: TickState) -> bool:
-        """Whether somebody asks for it in this tick."""
-        if self.always:
-            return True
-        table, demand = tick.values, tick.demand
-        for sinks, signals in self.needs:
-            asked = sinks is None or not sinks.isdisjoint(demand)
-            if asked and (not signals or all(table[s] is True for s in signals)):
-                return True
-        return False
 
 
 class NewReferences:
@@ -94,32 +79,45 @@ class NewReferences:
             tick.values[self._slot] = tick.frame
 
 
+@dataclass(frozen=True, slots=True)
+class _Root:
+    """A node from which pulling begins.
+
+    sinks : needed if one of them wants the tick; None: in every tick. signals : (slot, who makes it in this
+    segment) of those that must be True as well.
+    """
+
+    node: RunningNode
+    sinks: frozenset[str] | None
+    signals: Sequence[tuple[int, RunningNode | None]] = ()
+
+
 class Segment:
     """Evaluates the nodes of one segment for a tick.
 
-    steps : its part of the schedule. slots : of all outputs. track : where to note what is done when, if
-    anywhere.
+    name, run : of the plan, and whose segment it is. track : where to note what is done when, if anywhere.
 
     Attributes
     ----------
     inputs, outputs : links; an output with the ids of the sinks that it leads to, or None where it leads to
-    stages too. nodes : in the order of the steps. data_sinks : those that do not only look on. current : id
-    of the node that runs just now. calls : how many calls of nodes were begun. urgent : whether somebody
-    waits for what it does, rather than only looking on or reading it later. epoch : of the last tick; a new
-    one makes all nodes forget. references : makes frames references that its stages ask for; None where other
-    stages may have seen those frames already.
+    stages too. nodes : in order of evaluation. current : id of the node that runs just now. calls : how many
+    calls of nodes were begun. epoch : of the last tick; a new one makes all nodes forget. references : makes
+    frames references that its stages ask for; None where other stages may have seen those frames already.
     """
 
-    def __init__(
-        self, name: str, run: Run, steps: Sequence[Step], slots: Slots, track: Track | None = None
-    ) -> None:
+    def __init__(self, name: str, run: Run, track: Track | None = None) -> None:
         self.name = name
         self.run = run
         self.track = track
-        self.steps = [_RunningStep(step, run.nodes[step.node.id], slots) for step in steps]
-        self.nodes = [step.node for step in self.steps]
-        self.data_sinks = [n for n in self.nodes if n.sink is not None and not n.sink.observer]
-        self.urgent = any(n.sink is None or _hands_out(n.sink) for n in self.nodes)
+        ids = run.plan.segments[name]
+        self.nodes = [run.nodes[id_] for id_ in ids if id_ in run.nodes]
+        mine = {node.id: node for node in self.nodes}
+        for node in self.nodes:
+            node.makers = _of(mine, [ref.node for ref in node.node.inputs.values() if ref])
+            if node.gates:
+                node.signal_makers = _of(mine, [gate.signal.node for gate in node.node.gates])
+        self._roots = _roots(run, name, mine)
+        self._data_sinks = [n for n in self.nodes if n.sink is not None and not n.sink.observer]
         self.inputs: list[Link[TickState]] = []
         self.outputs: list[tuple[Link[TickState], frozenset[str] | None]] = []
         self.epoch = 0
@@ -133,6 +131,18 @@ class Segment:
         current = self.current
         return current in self.run.nodes and self.run.nodes[current].sink is None
 
+    @property
+    def only_sinks(self) -> bool:
+        """Whether it holds no stage."""
+        return all(node.sink is not None for node in self.nodes)
+
+    @property
+    def urgent(self) -> bool:
+        """Whether somebody waits for what it does, rather than only looking on or reading it later."""
+        return any(
+            n.sink is None or (n.sink.when_live == "latest" and not n.sink.observer) for n in self.nodes
+        )
+
     def handle(self, tick: TickState) -> None:
         """Compute this segment's part of a tick and hand the tick on."""
         track = self.track
@@ -140,15 +150,15 @@ class Segment:
         if track is not None:
             for link in self.inputs:
                 track.arrives((link.name, tick.index), began)
-        self.execute(tick)
-        self.forward(tick)
+        self._execute(tick)
+        self._forward(tick)
         if track is not None:
             mine = {slot: node.id for node in self.nodes for slot in node.slots}
             skipped = {mine[slot]: reason for slot, reason in list(tick.reasons.items()) if slot in mine}
             name = f"frame {tick.frame.seq}" if tick.frame.seq >= 0 else "reference image"
             track.add(name, began, perf_counter(), {"seq": tick.frame.seq, "skipped": skipped})
 
-    def execute(self, tick: TickState) -> None:
+    def _execute(self, tick: TickState) -> None:
         """Compute what this tick needs from this segment."""
         if self.references is not None:
             self.references.enter(tick)
@@ -156,26 +166,48 @@ class Segment:
             self.epoch = tick.frame.epoch
             for node in self.nodes:
                 node.reset()
-        for step in self.steps:
-            if step.needed(tick):
-                self._evaluate(step.node, tick)
-            else:
-                step.node.stats.skips["no_demand"] += 1
+        for root in self._roots:
+            if root.node.pulled != tick.index and self._is_needed(root, tick):
+                self._pull(root.node, tick)
+        for node in self.nodes:
+            if node.pulled != tick.index:
+                node.stats.skips["no_demand"] += 1
         self.current = None
-        if tick.demand and self.data_sinks:
+        if tick.demand and self._data_sinks:
             self.run.latency.add(perf_counter() - tick.frame.captured)
 
-    def _evaluate(self, node: RunningNode, tick: TickState) -> None:
-        """Run a node, unless a gate, an absent input or unchanged inputs make that unnecessary."""
-        gate = node.closed_gate(tick.values) if node.gates else None
-        if gate is not None:
-            if not gate.repeats:
-                # There is nothing: what was before that is not repeated after it either.
-                node.forget()
-            signal = tick.values[gate.slot]
-            node.skip(tick, signal if isinstance(signal, Absent) else gate.absent, repeat=gate.repeats)
+    def _is_needed(self, root: _Root, tick: TickState) -> bool:
+        if root.sinks is not None and root.sinks.isdisjoint(tick.demand):
+            return False
+        for slot, maker in root.signals:
+            if maker is not None and maker.pulled != tick.index:
+                self._pull(maker, tick)
+            if tick.values[slot] is not True:
+                return False
+        return True
+
+    def _pull(self, node: RunningNode, tick: TickState) -> None:
+        """Run a node after what it needs, unless a gate, an absent input or unchanged inputs spare that."""
+        index = node.pulled = tick.index
+        if node.gates:
+            for maker in node.signal_makers:
+                if maker.pulled != index:
+                    self._pull(maker, tick)
+            gate = node.closed_gate(tick.values)
+            if gate is not None:
+                if not gate.repeats:
+                    # There is nothing: what was before must not be repeated after it either.
+                    node.forget()
+                signal = tick.values[gate.slot]
+                node.skip(tick, signal if isinstance(signal, Absent) else gate.absent, repeat=gate.repeats)
+                return
+        if node.disabled:
+            node.skip(tick, _DISABLED)
             return
-        inputs = _DISABLED if node.disabled else node.inputs(tick)
+        for maker in node.makers:
+            if maker.pulled != index:
+                self._pull(maker, tick)
+        inputs = node.inputs(tick)
         if isinstance(inputs, Absent):
             node.skip(tick, inputs)
         elif node.had(inputs):
@@ -233,7 +265,7 @@ class Segment:
             self.run.fail(failure, error)
             raise NodeFailedError
 
-    def forward(self, tick: TickState) -> None:
+    def _forward(self, tick: TickState) -> None:
         """Hand the tick to the next segments. One that holds only sinks gets it only if one of them asked."""
         for link, only_sinks in self.outputs:
             if only_sinks is None or not only_sinks.isdisjoint(tick.demand):
@@ -241,7 +273,7 @@ class Segment:
                     self.track.leaves((link.name, tick.index))
                 link.put(tick, keep=tick.frame.reference)
 
-    def next_tick(self) -> TickState | None:
+    def _next_tick(self) -> TickState | None:
         """The next tick that all links into this segment have; None at the end of the stream."""
         if len(self.inputs) == 1:
             return self.inputs[0].get()
@@ -264,7 +296,7 @@ class Segment:
     def loop(self) -> None:
         """Body of the segment's thread."""
         try:
-            while (tick := self.next_tick()) is not None:
+            while (tick := self._next_tick()) is not None:
                 self.handle(tick)
         except NodeFailedError:
             for link in self.inputs:
@@ -278,6 +310,29 @@ class Segment:
                 link.close()
 
 
-def _hands_out(sink: Sink) -> bool:
-    """Whether somebody waits for what a sink sends."""
-    return sink.when_live == "latest" and not sink.observer
+def _of(mine: Mapping[str, RunningNode], ids: Sequence[str]) -> list[RunningNode]:
+    """Those of the nodes that are among `mine`, each once."""
+    return [mine[id_] for id_ in dict.fromkeys(ids) if id_ in mine]
+
+
+def _roots(run: Run, name: str, mine: Mapping[str, RunningNode]) -> list[_Root]:
+    """Sinks, stages that remember, and what other segments take.
+
+    What only a gated stage of another segment takes is needed while that gate is open, if its signal is known
+    here; else the gate is taken for open: too much may be computed, never too little.
+    """
+    plan = run.plan
+    needs = demand(plan.pipeline)
+    roots = [_Root(n, needs[id_]) for id_, n in mine.items() if n.sink or remembers(n.node, plan.pipeline)]
+    wanted: dict[tuple[str, frozenset[Ref]], frozenset[str] | None] = {}
+    for consumer in run.nodes.values():
+        gates = {gate.signal for gate in consumer.node.gates} if consumer.gates else set()
+        for maker in dependencies(consumer.node) & mine.keys() if consumer.id not in mine else ():
+            inputs_only = maker not in {signal.node for signal in gates}
+            known = frozenset(signal for signal in gates if inputs_only and plan.is_known(signal, name))
+            before, need = wanted.get((maker, known), frozenset[str]()), needs[consumer.id]
+            wanted[maker, known] = None if before is None or need is None else before | need
+    for (maker, signals), sinks in wanted.items():
+        slots = [(run.slots[signal.node, signal.port], mine.get(signal.node)) for signal in signals]
+        roots.append(_Root(mine[maker], sinks, slots))
+    return roots
