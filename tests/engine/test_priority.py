@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import sys
-import threading
 
 import pytest
 
@@ -44,18 +43,3 @@ def test_a_refusal_says_why_and_who_may(monkeypatch: pytest.MonkeyPatch) -> None
 def test_another_system_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
     assert ask_for_realtime([1]) == "there is none on darwin"
-
-
-def test_a_real_thread_has_the_policy_afterwards() -> None:
-    done = threading.Event()
-    thread = threading.Thread(target=done.wait, daemon=True)
-    thread.start()
-    assert thread.native_id is not None
-    try:
-        refused = ask_for_realtime([thread.native_id])
-        if refused is not None:
-            pytest.skip(refused)
-        assert os.sched_getscheduler(thread.native_id) & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR
-    finally:
-        done.set()
-        thread.join()

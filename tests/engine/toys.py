@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,29 +220,6 @@ class Rare(Counted, Stage):
         return Absent("third") if level.value % 3 == 0 else level
 
 
-class ByName(Counted, Stage):
-    """Takes its inputs by name only."""
-
-    def process(self, *, level: Number, total: Number) -> Number:
-        return Number(level.value - total.value)
-
-
-class Turned(Counted, Stage):
-    """Its function is wrapped in one that takes everything by name, and shows the inner one's annotations."""
-
-    @staticmethod
-    def turned(function: Callable[..., Number]) -> Callable[..., Number]:
-        @functools.wraps(function)
-        def call(self: Turned, **inputs: Number) -> Number:
-            return Number(-function(self, **inputs).value)
-
-        return call
-
-    @turned
-    def process(self, level: Number, total: Number) -> Number:
-        return Number(level.value - total.value)
-
-
 class LateTick(Counted, Sink):
     """A sink that asks for the tick behind its inputs."""
 
@@ -288,15 +264,6 @@ class BadShape(Counted, Stage):
         self, grid: Grid
     ) -> Annotated[NDArray[np.uint8], ArrayPort("half", ("H", "W"), "uint8", "1")]:
         return grid[:2].copy()
-
-
-class BadKind(Counted, Stage):
-    """Gives another dtype than its port promises."""
-
-    def process(self, grid: Grid) -> Grid:
-        wrong: Any = grid > 0
-        wrong.flags.writeable = False
-        return wrong
 
 
 class Collect(Counted, Sink):

@@ -155,9 +155,8 @@ class RunningNode:
         check = self._check
         arguments = inputs if check is None else [check.read_only(value) for value in inputs]
         if self._result is not None:
-            place, skipped, kind = self._result
-            result = self._tick(kind, tick)
-            arguments = [*arguments[:place], result, *arguments[place + skipped :]]
+            place, end = self._result.place, self._result.place + self._result.count
+            arguments = [*arguments[:place], self._tick(self._result.kind, tick), *arguments[end:]]
         outputs = _outputs(self._function(*arguments), len(self.slots))
         if check is not None:
             check.values(inputs, outputs)

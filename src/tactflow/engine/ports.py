@@ -12,7 +12,7 @@ import re
 import types
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -60,7 +60,8 @@ class Port:
     optional: bool = False
 
 
-class ResultParameter(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class ResultParameter:
     """The parameter of a sink that takes a result: `count` of the inputs, from `place` on, as a `kind`."""
 
     place: int
@@ -245,7 +246,7 @@ def _refuse_bare_array(what: str, annotation: Any) -> None:
     if inspect.isclass(origin) and issubclass(origin, np.ndarray):
         raise _PortError(
             f"{what}: a bare array does not say what it holds; use a type of tactflow.ports (Image, "
-            'ContactMask, ...) or Annotated[NDArray[np.uint8], ArrayPort("name", ("H", "W"), "uint8", "unit")]'
+            'ContactMask) or Annotated[NDArray[np.uint8], ArrayPort("name", ("H", "W"), "uint8", "unit")]'
         )
 
 

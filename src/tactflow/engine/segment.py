@@ -1,9 +1,9 @@
 """What runs in one thread: the nodes of a segment, evaluated for one tick after another.
 
-A value is computed only when somebody asks for it: a sink that wants the frame, or a stage that must see every
-frame because it remembers. These are the roots; from each, what it needs is pulled, and nothing twice in a
-tick. The makers of a node's gate signals are pulled first, its inputs only if the gates are open, so that a
-closed gate runs none of the work before it.
+A value is computed only when somebody asks for it: a sink that wants the frame, or a stage that must see
+every frame because it remembers. These are the roots; from each, what it needs is pulled, and nothing twice
+in a tick. The makers of a node's gate signals are pulled first, its inputs only if the gates are open, so
+that a closed gate runs none of the work before it.
 """
 
 from __future__ import annotations
