@@ -140,7 +140,7 @@ def test_an_unforeseen_error_reaches_the_loop(monkeypatch: pytest.MonkeyPatch) -
     def fail(*_: object) -> None:
         raise RuntimeError("not foreseen")
 
-    monkeypatch.setattr("tactflow.engine.run.make_schedule", fail)
+    monkeypatch.setattr("tactflow.engine.run.Segment", fail)
     with pytest.raises(RuntimeError, match="not foreseen"):
         list(tactflow.stream())
 
