@@ -211,21 +211,6 @@ class Slow(Stage):
 """A stage that works on, also when the run is told to end."""
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_one_signal_while_a_run_starts_ends_it_well(number: int, tmp_path: Path) -> None:
-    (tmp_path / "late.py").write_text(f"open('began', 'w').close()\nimport time\ntime.sleep({PATIENCE})\n")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tactflow", "run", "--set", "stages.late={use: './late.py:Late'}"],
-        cwd=tmp_path,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    until(lambda: process.poll() is not None or (tmp_path / "began").exists())
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, errors) == (0, "")
-
-
 def test_a_second_signal_ends_at_once_with_130(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(SLOW)
     (tmp_path / "pipeline.yaml").write_text(
@@ -279,30 +264,6 @@ def test_a_thread_that_is_in_opencv_does_not_change_the_exit_code(tmp_path: Path
     assert (process.returncode, errors) == (130, "")
 
 
-LATE = """
-import atexit
-from pathlib import Path
-from threading import Event, Thread
-from tactflow.engine.contract import Sink
-from tactflow.engine.frame import Tick
-
-class Late(Sink):
-    def open(self):
-        Thread(target=Event().wait, daemon=True).start()
-        atexit.register(Path("written").touch)
-    def write(self, tick: Tick) -> None:
-        pass
-"""
-
-
-def test_what_a_sink_of_ones_own_leaves_to_the_end_of_python_is_done(tmp_path: Path) -> None:
-    (tmp_path / "late.py").write_text(LATE)
-    words = ["--source", "sim:idle?frames=1", "--set", "sinks={late: {use: './late.py:Late'}}"]
-    command = [sys.executable, "-m", "tactflow", "run", "--quiet", *words]
-    subprocess.run(command, cwd=tmp_path, check=True, timeout=PATIENCE)
-    assert (tmp_path / "written").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
@@ -336,16 +297,6 @@ def test_a_user_mistake_ends_with_its_code_and_advice(
     assert out == ""
 
 
-def test_an_existing_result_is_not_overwritten(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "out.jsonl").write_text("precious\n")
-    assert main(["run", *NO_SINKS, "--jsonl", "out.jsonl", "--max-frames", "3"]) == 3
-    assert "overwrite" in capsys.readouterr().err
-    assert (tmp_path / "out.jsonl").read_text() == "precious\n"
-
-
 def test_realtime_plays_a_recording_at_its_own_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     source = ("--source", "sim:idle?frames=30", "--realtime")
@@ -362,11 +313,3 @@ def test_importing_tactflow_does_not_import_opencv() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
     )
     assert done.stdout.strip() == "False"
-
-
-def test_a_failure_keeps_its_exit_code_though_nobody_reads_standard_error(tmp_path: Path) -> None:
-    reading, writing = os.pipe()
-    os.close(reading)
-    command = [sys.executable, "-m", "tactflow", "run", "--source", "missing.mp4"]
-    with os.fdopen(writing, "wb") as unread:
-        assert subprocess.run(command, cwd=tmp_path, stderr=unread, timeout=PATIENCE).returncode == 4

@@ -812,7 +812,7 @@ def test_without_a_record_sink_the_button_says_so(watched: Run, open_page: Calla
     page = open_page(watched.url)
     watch(page)
     assert page.is_disabled("#record")
-    assert page.get_attribute("#record", "title") == "no record sink in this pipeline"
+    assert page.get_attribute("#record", "title").startswith("no record sink in this pipeline")
 
 
 def test_two_browsers_watch_one_run(watched: Run, open_page: Callable[..., Any]) -> None:

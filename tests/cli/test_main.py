@@ -53,7 +53,7 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["run", "--max-fames=6"], "unrecognized arguments: --max-fames=6; did you mean --max-frames?"),
         (["check", "a.yaml", "b.yaml"], "unrecognized arguments: b.yaml"),
         (["run", "x.yaml", "--source", "1.png", __file__, "3.png"], "quote the pattern: --source 'FOLDER"),
-        (["run", "--stats-every", "0.01"], "required seconds from 0.1 to 86400, got '0.01'"),
+        (["run", "--stats-every", "0"], "required a time such as 90s, 2min or 1h, got '0'"),
         (["check", "--set"], "expected one argument"),
         (["schema", "sensor"], "invalid choice"),
         (["stages", "hul"], "there is no stage or sink 'hul'; did you mean hull?"),

@@ -19,14 +19,12 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.run import Runner
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
-from tactflow.network.keys import make_keys
 from tactflow.network.remote_control import RemoteControl
 from tactflow.sinks.record import Record
 from tactflow.sinks.zmq import Zmq
 from tactflow.sources import open_source
 from tactflow.sources.mcap import Recording
 from tests.clock import PATIENCE, until
-from tests.conftest import REPOSITORY
 
 ANY_PORT = "tcp://127.0.0.1:*"
 PIPELINE = """
@@ -36,9 +34,6 @@ sinks:
   record: {path: touch.mcap, trigger: button}
   zmq: {endpoint: "tcp://127.0.0.1:*", control: "tcp://127.0.0.1:*"}
 """
-
-
-PAGE = (REPOSITORY / "docs" / "control.md").read_text().split("```python\n")[1].split("```")[0]
 
 
 @pytest.fixture
@@ -53,9 +48,7 @@ def remote(endpoint: str, **options: Any) -> RemoteControl:
     return RemoteControl(endpoint, **{"timeout": PATIENCE, **options})
 
 
-def test_a_run_does_what_it_is_told_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_does_what_it_is_told_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "pipeline.yaml").write_text(PIPELINE)
     monkeypatch.chdir(tmp_path)
     runner = Runner(load_pipeline(tmp_path / "pipeline.yaml"))
@@ -72,22 +65,12 @@ def test_a_run_does_what_it_is_told_and_says_so(
             # On a busy machine, frames from before wait in front of the sink.
             waited = run.stats()["stats"]["sinks"]["record"]["counters"]["frames"] + Record.queue_capacity + 5
             until(lambda: run.stats()["stats"]["sinks"]["record"]["counters"]["frames"] > waited)
-            assert run.pause()["state"] == {
-                "sensor": "main",
-                "paused": True,
-                "recording": True,
-                "source": "running",
-            }
-            assert run.record_stop() | {"state": None} == {
-                "ok": True,
-                "message": "recorded to touch-001.mcap",
-                "path": "touch-001.mcap",
-                "state": None,
-            }
+            state = {"sensor": "main", "paused": True, "recording": True, "source": "running"}
+            assert run.pause()["state"] == state
+            answer = run.record_stop()
+            assert (answer["message"], answer["path"]) == ("recorded to touch-001.mcap", "touch-001.mcap")
             assert run.record_stop()["message"] == "nothing was being recorded"
             assert run.resume()["message"] == "running"
-            exec(PAGE.replace("tcp://127.0.0.1:5557", run.endpoint), {})
-            assert " frames\n" in capsys.readouterr().out
     finally:
         runner.stop()
         thread.join()
@@ -102,14 +85,12 @@ def test_a_run_does_what_it_is_told_and_says_so(
 @pytest.mark.parametrize(
     ("request_", "words"),
     [
-        (b"", "required one JSON object"),
         (b"pause", "required one JSON object"),
         (b"[]", "required one JSON object"),
+        (b"[" * 4000, "required one JSON object"),
         (b'{"do": ["pause"]}', "there is no command"),
         (b'{"do": "stop"}', "there is no command 'stop'; there are ping, stats"),
         (b'{"do": "pause"}', "the run cannot be controlled"),
-        (b'{"do": "record_start"}', "the run cannot be controlled"),
-        (b"[" * 4000, "required one JSON object"),
     ],
 )
 def test_what_cannot_be_done_is_answered_with_a_reason(
@@ -157,25 +138,6 @@ def test_what_is_too_long_or_no_request_is_dropped(bare: ControlSocket) -> None:
             junk.send_multipart(parts)
         with remote(bare.endpoint) as run:
             assert run.ping()["ok"]
-
-
-def test_only_who_has_a_key_is_obeyed(tmp_path: Path) -> None:
-    own, laptop = make_keys(tmp_path / "keys", "laptop")
-    _, stranger = make_keys(tmp_path / "other", "laptop")
-    (stranger / "publisher.key").write_bytes((laptop / "publisher.key").read_bytes())
-    sink = Zmq(Zmq.Params(endpoint=ANY_PORT, control=ANY_PORT, keys=str(own)))
-    sink.open()
-    assert sink.control_endpoint is not None
-    try:
-        for keys, reason in ((stranger, "does not admit these keys"), (None, "requires keys")):
-            with remote(sink.control_endpoint, keys=keys) as run:
-                for _ in range(2):
-                    with pytest.raises(PermissionError, match=reason):
-                        run.ping()
-        with remote(sink.control_endpoint, keys=laptop) as run:
-            assert run.ping()["ok"]
-    finally:
-        sink.close()
 
 
 def test_an_address_that_is_taken_is_named_with_what_to_do(bare: ControlSocket) -> None:

@@ -18,6 +18,7 @@ from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import clash_problems
 from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.network.publisher import Publisher
+from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import Subscriber
 from tactflow.sinks.zmq import Zmq
 from tests.clock import PATIENCE
@@ -76,6 +77,24 @@ def test_another_process_reads_with_the_right_keys_and_not_with_wrong_ones_or_no
         subscriber = Subscriber(publisher, timeout=PATIENCE, keys=keys)
         with subscriber, pytest.raises(PermissionError, match=reason):
             subscriber.receive()
+
+
+def test_only_commands_with_a_key_are_obeyed(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    own, laptop = folders
+    stranger = strangers_keys(tmp_path / "other", laptop)
+    sink = Zmq(Zmq.Params(endpoint=ANY_PORT, control=ANY_PORT, keys=str(own)))
+    sink.open()
+    assert sink.control_endpoint is not None
+    try:
+        for keys, reason in ((stranger, "does not admit these keys"), (None, "requires keys")):
+            with RemoteControl(sink.control_endpoint, PATIENCE, keys=keys) as run:
+                for _ in range(2):
+                    with pytest.raises(PermissionError, match=reason):
+                        run.ping()
+        with RemoteControl(sink.control_endpoint, PATIENCE, keys=laptop) as run:
+            assert run.ping()["ok"]
+    finally:
+        sink.close()
 
 
 def test_a_subscriber_takes_nothing_from_a_publisher_whose_key_it_does_not_have(

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import logging
-
 import pytest
 
 from tactflow.cli.main import main
-from tactflow.cli.terminal import notes
 from tactflow.system.redaction import public_address, without_secrets
 
 SECRET = "a-secret-of-some-length"
@@ -50,13 +47,6 @@ def test_no_error_message_tells_a_secret_of_the_command_line(
     said = capsys.readouterr().err
     assert SECRET not in said
     assert said
-
-
-def test_a_note_tells_the_address_of_the_page_with_its_token(capsys: pytest.CaptureFixture[str]) -> None:
-    address = f"http://127.0.0.1:8765/?token={SECRET}"
-    with notes():
-        logging.getLogger("tactflow").info("view: %s", address)
-    assert address in capsys.readouterr().err
 
 
 def test_what_is_no_secret_stays() -> None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
 import pytest
 
-from tactflow.api import ended_by_signals, load, make_runner
 from tactflow.system.signals import ENDING, ending_handled, ending_held_back, interrupt
 from tests.clock import PATIENCE, until
 
@@ -129,30 +127,6 @@ def test_a_third_signal_is_not_caught() -> None:
             signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-
-
-def test_the_third_signal_is_not_caught_also_where_the_first_ends_a_run_at_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("tactflow.vision.compiled.is_loading", lambda: True)
-    pipeline = load(source="sim:idle?frames=2", settings={"sinks": {}})
-    with ended_by_signals(make_runner(pipeline)) as caught:
-        for _ in range(2):
-            assert signal.getsignal(signal.SIGINT) is not signal.SIG_DFL
-            with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
-        assert [signal.getsignal(number) for number in ENDING] == [signal.SIG_DFL] * len(ENDING)
-        assert len(caught) == 2
-
-
-def test_a_run_is_told_to_end_also_where_python_drops_what_is_raised(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("tactflow.vision.compiled.is_loading", lambda: True)
-    runner = make_runner(load(source="sim:idle?frames=2", settings={"sinks": {}}))
-    with ended_by_signals(runner), suppress(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
-    assert runner.hurried
 
 
 def test_a_signal_while_nobody_takes_the_last_of_the_output(tmp_path: Path) -> None:

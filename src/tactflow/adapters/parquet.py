@@ -20,9 +20,9 @@ from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
 from tactflow.message.result import SCHEMA, Result, encode_message
+from tactflow.recording.provenance import facts, texts
 from tactflow.system.extras import missing
 from tactflow.system.files import claim_path, expanded, make_folder
-from tactflow.system.provenance import facts, texts
 
 if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]

@@ -7,30 +7,11 @@ from collections.abc import Iterator
 
 import shtab
 
-_PIPELINES = {
-    "bash": "_tactflow_files",
-    "zsh": "_files -g '*.yaml'",
-    "tcsh": "f:*.yaml",
-    "fish": "(__fish_complete_suffix .yaml)",
-}
-_PREAMBLE = {
-    "bash": """
-_tactflow_files() {
-  compgen -d -- "$1"
-  compgen -f -X '!*.yaml' -- "$1"
-}
-"""
-}
 _COMPLETED = {
-    "PIPELINE": _PIPELINES,
-    "SRC": shtab.FILE,
-    "PATH": shtab.FILE,
-    "FILE": shtab.FILE,
-    "FILE.mcap": shtab.FILE,
-    "run.json": shtab.FILE,
+    **dict.fromkeys(("PIPELINE", "SRC", "PATH", "FILE", "FILE.mcap", "run.json"), shtab.FILE),
     "DIR": shtab.DIRECTORY,
 }
-"""What an argument is called in the help -> shell -> how it is completed."""
+"""Name of an argument in the help -> how it is completed."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     for action in _actions(parser):
         if action.metavar in _COMPLETED and action.choices is None:
             action.complete = _COMPLETED[action.metavar]  # type: ignore[attr-defined]
-    print(shtab.complete(parser, args.shell, preamble=_PREAMBLE.get(args.shell, "")))
+    print(shtab.complete(parser, args.shell))
     return 0
 
 

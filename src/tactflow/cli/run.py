@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stats", metavar="PATH", help="write run statistics as JSON at exit")
     parser.add_argument(
         "--stats-every",
-        type=_seconds,
+        type=seconds,
         metavar="SECONDS",
         help="a line on standard error every so often: rate, drops, latency, and what each stage cost since",
     )
@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--hang-after",
-        type=_seconds,
+        type=seconds,
         default=HANG_AFTER,
         metavar="SECONDS",
         help="of several sensors, kill and start again one that has given no sign of life for so long "
@@ -253,13 +253,6 @@ def _stop_at_end_of_input(runner: Runner) -> None:
     if compiled.is_loading():
         # It does not look at the runner.
         signal.raise_signal(signal.SIGTERM)
-
-
-def _seconds(text: str) -> float:
-    value = seconds(text)
-    if not 0.1 <= value <= 86400:
-        raise argparse.ArgumentTypeError(f"required seconds from 0.1 to 86400, got {text!r}")
-    return value
 
 
 def add_arguments_record(parser: argparse.ArgumentParser) -> None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from tactflow.engine.contract import Recorder, Source
+from tactflow.engine.contract import Source
 from tactflow.engine.control import Control
+
+Answer = dict[str, Any]
+"""`message`, what was done, in words; of recordings also `path`."""
 
 
 class RefusedError(Exception):
@@ -39,33 +42,40 @@ class Commands:
         if name == "reference" and (source is None or type(source).retake is Source.retake):
             return "this source cannot take a new reference"
         if name == "record" and control.recorder() is None:
-            return "no record sink in this pipeline"
+            return "no record sink in this pipeline; --set 'sinks.record={trigger: button}' adds one"
         return None
 
-    def pause(self, paused: bool) -> None:
+    def pause(self, paused: bool) -> Answer:
         """Hold capturing, or go on."""
         self._admitted("pause").pause(paused)
+        return {"message": "paused" if paused else "running"}
 
     def step(self) -> None:
         """While paused, let one frame through."""
         self._admitted("step").step()
 
-    def take_reference(self) -> None:
+    def take_reference(self) -> Answer:
         """Take the next frames as a new reference."""
         self._admitted("reference").retake_reference()
+        return {"message": "the next frame is taken as the reference"}
 
-    def record(self, on: bool) -> Recorder:
-        """Begin or finish a recording; returns the sink that records.
+    def record(self, on: bool) -> Answer:
+        """Begin or finish a recording.
 
         It touches the disk, so it may take a while. Raises StageError if the file cannot be written.
         """
         recorder = self._admitted("record").recorder()
         assert recorder is not None
+        was_recording = recorder.recording
         if on:
             recorder.start_recording()
+            text = "is recording already" if was_recording else "recording"
         else:
             recorder.stop_recording()
-        return recorder
+            text = "recorded"
+            if not was_recording:
+                return {"message": "nothing was being recorded"}
+        return {"message": f"{text} to {recorder.description}", "path": recorder.description}
 
     def stop(self) -> None:
         """End the run."""

@@ -11,14 +11,13 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any
 
 import orjson
 import zmq
 
 from tactflow.engine.errors import StageError
 from tactflow.network.bound_socket import BoundSocket
-from tactflow.network.commands import Commands, RefusedError
+from tactflow.network.commands import Answer, Commands, RefusedError
 
 log = logging.getLogger("tactflow")
 
@@ -33,8 +32,6 @@ _HINT = (
     "(--set sinks.zmq.control=tcp://127.0.0.1:5558); several sensors need one each, such as "
     "ipc:///tmp/tactflow-{sensor}"
 )
-
-Answer = dict[str, Any]
 
 
 class ControlSocket:
@@ -60,11 +57,11 @@ class ControlSocket:
         self._by_name: Mapping[str, Callable[[], Answer]] = {
             "ping": lambda: {"message": "here"},
             "stats": lambda: {"message": "statistics so far", "stats": commands.snapshot()},
-            "take_reference": self._take_reference,
-            "pause": lambda: self._pause(True),
-            "resume": lambda: self._pause(False),
-            "record_start": self._record_start,
-            "record_stop": self._record_stop,
+            "take_reference": commands.take_reference,
+            "pause": lambda: commands.pause(True),
+            "resume": lambda: commands.pause(False),
+            "record_start": lambda: commands.record(True),
+            "record_stop": lambda: commands.record(False),
         }
         self._closing = threading.Event()
         # Not REP, which answers nobody any more after a client has left in the middle of a request.
@@ -114,27 +111,3 @@ class ControlSocket:
             known = ", ".join(self._by_name)
             raise RefusedError(f"there is no command {name[:LONGEST_QUOTE]!r}; there are {known}")
         return self._by_name[name]()
-
-    def _take_reference(self) -> Answer:
-        self._commands.take_reference()
-        return {"message": "the next frame is taken as the reference"}
-
-    def _pause(self, paused: bool) -> Answer:
-        self._commands.pause(paused)
-        return {"message": "paused" if paused else "running"}
-
-    def _record_start(self) -> Answer:
-        was_recording = self._commands.state()["recording"]
-        try:
-            path = self._commands.record(True).description
-        except RefusedError as error:
-            raise RefusedError(f"{error}; --set 'sinks.record={{trigger: button}}' adds one") from None
-        verb = "is recording already" if was_recording else "recording"
-        return {"message": f"{verb} to {path}", "path": path}
-
-    def _record_stop(self) -> Answer:
-        was_recording = self._commands.state()["recording"]
-        path = self._commands.record(False).description
-        if not was_recording:
-            return {"message": "nothing was being recorded"}
-        return {"message": f"recorded to {path}", "path": path}

@@ -16,9 +16,9 @@ from mcap.writer import CompressionType, Writer
 
 from tactflow.engine.control import Control
 from tactflow.message.schema import message_schema
+from tactflow.recording import provenance
 from tactflow.recording.frames import RawFrame
 from tactflow.recording.schemas import channel_type, channel_types
-from tactflow.system import provenance
 from tactflow.system.outputs import cannot_write, create, refuse_interference
 
 NEVER = 1 << 62

@@ -1,4 +1,4 @@
-"""How results came about, for files that outlive the run: versions, source, pipeline, calibration."""
+"""Where results come from, for files that outlive the run: versions, source, pipeline, calibration."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def facts(sensor: str, control: Control | None) -> dict[str, str]:
     >>> facts("main", None)["sensor"]
     'main'
     """
-    told = {
+    found = {
         "tactflow": __version__,
         "numpy": np.__version__,
         "numba": compiled.numba_version(),
@@ -35,8 +35,8 @@ def facts(sensor: str, control: Control | None) -> dict[str, str]:
         "sensor": sensor,
     }
     if control is not None:
-        told["source"] = str((control.source and control.source.description) or "")
-    return told
+        found["source"] = str((control.source and control.source.description) or "")
+    return found
 
 
 def arrays(control: Control | None) -> dict[str, bytes]:
