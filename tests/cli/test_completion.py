@@ -63,7 +63,7 @@ def test_bash_completes_commands_options_and_pipeline_files(
 @pytest.mark.parametrize("shell", ["zsh", "tcsh"])
 def test_there_is_a_script_for_other_shells(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
-    assert "--max-frames" in capsys.readouterr().out
+    assert "pipelines" in capsys.readouterr().out
 
 
 def test_a_shell_that_is_not_known_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
