@@ -1,9 +1,7 @@
 """What a stage, a sink and a source are: the classes that a pipeline is built of inherit from these.
 
 This file is the reference. Each class attribute below may be set and each method overridden; everything has
-the default that stands here. When a pipeline is loaded, every class is checked against it: a wrong value, a
-missing method, or a name that is nearly one of these, is an error with its place (see
-`tactflow.engine.conformance`).
+the default that stands here.
 
 A stage that swaps dark and bright::
 
@@ -108,8 +106,7 @@ class Stage(Part):
 
     Its ports are read from the annotations of `process`, which every stage defines:
 
-    - an input for each parameter, named like it; `X | None` marks an input that may be absent. A parameter
-      annotated with a NamedTuple stands for one input per field.
+    - an input for each parameter, named like it; `X | None` marks an input that may be absent.
     - one output named after the type returned, or one for each field of a NamedTuple (a number is a field
       such as `brightness: float`). `process` may return `Absent("reason")` instead; `None` is
       `Absent("none")`.
@@ -131,15 +128,13 @@ class Stage(Part):
     nobody asks for, and results may be reused. "stateful": it sees every accepted frame, in order."""
 
     on_demand: ClassVar[bool] = False
-    """Whether it waits in pipelines for a sink that may be added: that nothing needs it is then no mistake,
-    and nothing is said of it."""
+    """Whether it waits in pipelines for a sink that may be added. That nothing needs it is then not worth a
+    warning, and collecting every port leaves it out."""
 
     wants_reference: str | None = None
-    """Why the gel must be looked at anew, a short snake_case word; None: it need not. `process` sets it on
-    `self`; the engine takes it back and makes the next frame a reference, in a new epoch, as
-    `Source.retake` does, so that all stages are reset. With the stages in one segment, as they are unless
-    the pipeline says otherwise, it is the very next one, so that a recording gives the same again; else the
-    source is asked, whose next frame may be a few later."""
+    """Why a new reference is needed, a short snake_case word, or None. `process` sets it on `self`; the
+    engine clears it and makes the next frame a reference in a new epoch, so that all stages are reset. With
+    all stages in one segment, the default, it is the very next frame; else the source is asked to retake."""
 
     def reset(self) -> None:
         """Forget everything: a new reference follows (`Frame.epoch` has grown)."""
@@ -209,8 +204,7 @@ class Sink(Part):
     def wants(self) -> bool:
         """Whether the next frame is of interest. What no sink wants is not computed.
 
-        Asked once a frame, by the capturing thread, before `write` is called in the sink's own: it must be
-        quick and safe to call from any thread.
+        Asked once a frame by the capturing thread: it must be quick and safe to call from any thread.
         """
         return True
 

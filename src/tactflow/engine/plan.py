@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from tactflow.engine.contract import Sink
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline, Ref
+from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline
 
 CAPTURE = "capture"
 COMPUTE = "compute"
@@ -47,23 +47,16 @@ class Plan:
 
     segments : name -> node ids in order of evaluation; the source's segment comes first.
     links : between segments. pruned : stages that are not built because no sink needs them.
-    ancestors : segment -> all segments whose values it can rely on.
     """
 
     pipeline: Pipeline
     segments: Mapping[str, Sequence[str]]
     links: Sequence[LinkPlan]
     pruned: Sequence[Node]
-    ancestors: Mapping[str, frozenset[str]]
 
     def segment_of(self, node_id: str) -> str:
         """The segment that runs a node."""
         return next(name for name, nodes in self.segments.items() if node_id in nodes)
-
-    def is_known(self, signal: Ref, segment: str) -> bool:
-        """Whether a signal is known in a segment: it is made there, or in a segment before it."""
-        maker = self.segment_of(signal.node)
-        return maker == segment or maker in self.ancestors[segment]
 
     @property
     def idle(self) -> list[Node]:
@@ -118,15 +111,14 @@ def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
         raise ConfigError("\n".join(f"{mark}  {message}" for mark, message in problems))
     pruned, names, members, before = _cut(pipeline)
     source = names[pipeline.source.id]
-    ancestors = {name: frozenset(_ancestors(name, before)) for name in members}
     links: list[LinkPlan] = []
     for consumer, producers in before.items():
-        direct = producers - {a for producer in producers for a in ancestors[producer]}
+        direct = producers - {a for producer in producers for a in _ancestors(producer, before)}
         links.extend(
             _link(pipeline, producer, consumer, members[consumer], source, live=live)
             for producer in sorted(direct, key=list(members).index)
         )
-    return Plan(pipeline, members, links, pruned, ancestors)
+    return Plan(pipeline, members, links, pruned)
 
 
 def plan_problems(pipeline: Pipeline) -> list[tuple[Mark, str]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, Protocol
 
@@ -18,9 +18,8 @@ from tactflow.engine.contract import Stage
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.engine.failure import describe_failure
 from tactflow.engine.frame import Absent, Frame
-from tactflow.engine.graph import Ref
 from tactflow.engine.link import Link
-from tactflow.engine.node import RunningNode, Slots, TickState
+from tactflow.engine.node import RunningNode, TickState
 from tactflow.engine.plan import Plan, demand, dependencies, remembers
 from tactflow.engine.stats import Durations
 from tactflow.engine.trace import Track
@@ -35,7 +34,6 @@ class Run(Protocol):
     """What a segment needs to know of the run it belongs to."""
 
     plan: Plan
-    slots: Slots
     nodes: dict[str, RunningNode]
     latency: Durations
 
@@ -79,19 +77,6 @@ class NewReferences:
             tick.values[self._slot] = tick.frame
 
 
-@dataclass(frozen=True, slots=True)
-class _Root:
-    """A node from which pulling begins.
-
-    sinks : needed if one of them wants the tick; None: in every tick. signals : (slot, who makes it in this
-    segment) of those that must be True as well.
-    """
-
-    node: RunningNode
-    sinks: frozenset[str] | None
-    signals: Sequence[tuple[int, RunningNode | None]] = ()
-
-
 class Segment:
     """Evaluates the nodes of one segment for a tick.
 
@@ -116,7 +101,7 @@ class Segment:
             node.makers = _of(mine, [ref.node for ref in node.node.inputs.values() if ref])
             if node.gates:
                 node.signal_makers = _of(mine, [gate.signal.node for gate in node.node.gates])
-        self._roots = _roots(run, name, mine)
+        self._roots = _roots(run, mine)
         self._data_sinks = [n for n in self.nodes if n.sink is not None and not n.sink.observer]
         self.inputs: list[Link[TickState]] = []
         self.outputs: list[tuple[Link[TickState], frozenset[str] | None]] = []
@@ -166,25 +151,15 @@ class Segment:
             self.epoch = tick.frame.epoch
             for node in self.nodes:
                 node.reset()
-        for root in self._roots:
-            if root.node.pulled != tick.index and self._is_needed(root, tick):
-                self._pull(root.node, tick)
+        for node, sinks in self._roots:
+            if node.pulled != tick.index and (sinks is None or not sinks.isdisjoint(tick.demand)):
+                self._pull(node, tick)
         for node in self.nodes:
             if node.pulled != tick.index:
                 node.stats.skips["no_demand"] += 1
         self.current = None
         if tick.demand and self._data_sinks:
             self.run.latency.add(perf_counter() - tick.frame.captured)
-
-    def _is_needed(self, root: _Root, tick: TickState) -> bool:
-        if root.sinks is not None and root.sinks.isdisjoint(tick.demand):
-            return False
-        for slot, maker in root.signals:
-            if maker is not None and maker.pulled != tick.index:
-                self._pull(maker, tick)
-            if tick.values[slot] is not True:
-                return False
-        return True
 
     def _pull(self, node: RunningNode, tick: TickState) -> None:
         """Run a node after what it needs, unless a gate, an absent input or unchanged inputs spare that."""
@@ -315,24 +290,17 @@ def _of(mine: Mapping[str, RunningNode], ids: Sequence[str]) -> list[RunningNode
     return [mine[id_] for id_ in dict.fromkeys(ids) if id_ in mine]
 
 
-def _roots(run: Run, name: str, mine: Mapping[str, RunningNode]) -> list[_Root]:
-    """Sinks, stages that remember, and what other segments take.
+def _roots(run: Run, mine: Mapping[str, RunningNode]) -> list[tuple[RunningNode, frozenset[str] | None]]:
+    """Sinks, stages that remember, and what other segments take; each with the sinks that need it, or None.
 
-    What only a gated stage of another segment takes is needed while that gate is open, if its signal is known
-    here; else the gate is taken for open: too much may be computed, never too little.
+    Gates of other segments are taken for open: too much may be computed, never too little.
     """
-    plan = run.plan
-    needs = demand(plan.pipeline)
-    roots = [_Root(n, needs[id_]) for id_, n in mine.items() if n.sink or remembers(n.node, plan.pipeline)]
-    wanted: dict[tuple[str, frozenset[Ref]], frozenset[str] | None] = {}
+    pipeline = run.plan.pipeline
+    needs = demand(pipeline)
+    roots = [id_ for id_, node in mine.items() if node.sink or remembers(node.node, pipeline)]
+    exported: dict[str, frozenset[str] | None] = {id_: needs[id_] for id_ in roots}
     for consumer in run.nodes.values():
-        gates = {gate.signal for gate in consumer.node.gates} if consumer.gates else set()
         for maker in dependencies(consumer.node) & mine.keys() if consumer.id not in mine else ():
-            inputs_only = maker not in {signal.node for signal in gates}
-            known = frozenset(signal for signal in gates if inputs_only and plan.is_known(signal, name))
-            before, need = wanted.get((maker, known), frozenset[str]()), needs[consumer.id]
-            wanted[maker, known] = None if before is None or need is None else before | need
-    for (maker, signals), sinks in wanted.items():
-        slots = [(run.slots[signal.node, signal.port], mine.get(signal.node)) for signal in signals]
-        roots.append(_Root(mine[maker], sinks, slots))
-    return roots
+            before, need = exported.get(maker, frozenset[str]()), needs[consumer.id]
+            exported[maker] = None if before is None or need is None else before | need
+    return [(mine[id_], sinks) for id_, sinks in exported.items()]
