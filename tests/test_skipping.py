@@ -37,9 +37,8 @@ def published(result: Result) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("pipeline", "scene", "repeated"),
     [
-        ("default", "hold", 0.3),
+        ("default", "press", 0.2),
         ("default", "tap", 0.2),
-        ("default", "stutter", 0.1),
         ("default", "creep", 0.0),
         ("markerless", "unmarked", 0.1),
     ],

@@ -72,8 +72,6 @@ def test_the_outlines_of_the_bench_belong_to_known_recordings(tmp_path: Path) ->
     drawn = outlines_by_eye(tmp_path)
     assert {name.split("/")[0] for name in drawn} <= {gel.folder for gel in GELS}
     assert sum(len(frames) for frames in drawn.values()) == 20
-    for frames in drawn.values():
-        assert all(len(polygon) >= 3 for _, polygon in frames.values())
 
 
 def test_rest_and_touch_are_told_by_the_dots_whatever_the_light_does() -> None:
@@ -107,9 +105,7 @@ def test_what_is_missing_and_what_is_unknown_is_said(tmp_path: Path) -> None:
     for name in ("mini_ball", "another"):
         (tmp_path / "gels" / name).mkdir(parents=True)
     (tmp_path / "gels" / "mini_ball" / "000.png").touch()
-    words = left_out(tmp_path)
-    missing, unknown = words
-    assert "missing: " in missing
+    missing, unknown = left_out(tmp_path)
     assert "seu_a" in missing
     assert "mini_ball" not in missing
     assert unknown == "gels: left out, because unknown: another"

@@ -1,36 +1,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import pytest
-from pydantic import Field
 
-from tactflow.bench.methods import alternatives, measure_methods, methods_of
+from tactflow.bench.methods import alternatives, measure_methods
 from tactflow.bench.pipelines import Bench
 from tactflow.bench.results import BenchResult
 from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, Rendered
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
-from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import scene_descriptions
-from tactflow.vision.geometry import PixelMapping, Preprocessor
-
-
-class WithMethods(StageParams):
-    method: Literal["a", "b"] = Field("a", description="")
+from tactflow.vision.geometry import PixelMapping
 
 
 @pytest.fixture(scope="module")
 def pipelines() -> dict[str, Pipeline]:
     return {name: load_pipeline(find_pipeline(name)) for name in ("default", "classic")}
-
-
-def test_methods_are_read_from_the_parameter_of_that_name() -> None:
-    assert methods_of(WithMethods) == ["a", "b"]
-    assert methods_of(StageParams) == []
 
 
 def test_every_method_of_a_stage_is_an_alternative_with_the_parameters_of_the_pipeline_that_uses_it(
@@ -93,13 +81,10 @@ def test_all_scenes_exist_and_have_names_of_their_own() -> None:
     assert len(labels) == len(set(labels))
 
 
-def test_frames_and_truth_of_a_rendered_scene(tmp_path: Path) -> None:
+def test_half_depth_is_reached_only_in_contact(tmp_path: Path) -> None:
     rendered = Rendered(Case("press", 40), tmp_path)
     assert (rendered.frames[2] == rendered.scene.frame(2)).all()
-    processed = rendered.truths(Preprocessor((800, 600), rotate=90, downsample=2).mapping)
     raw = rendered.truths(PixelMapping.identity((800, 600)))
-    assert processed[0].contact_mask.shape == (400, 300)
-    assert raw[0].contact_mask.shape == (600, 800)
     deep = [rendered.deep(index) for index in range(len(rendered))]
     assert any(deep)
     assert not any(d and not t.touching for d, t in zip(deep, raw, strict=True))

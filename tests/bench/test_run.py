@@ -9,7 +9,7 @@ import pytest
 
 from tactflow.bench.results import BenchResult, load_errors, regressions
 from tactflow.bench.run import Plan, run_bench
-from tactflow.bench.scenes import FULL, QUICK, TROUBLES, Case
+from tactflow.bench.scenes import QUICK, Case
 from tactflow.cli.bench import packaged_files
 from tactflow.cli.main import main
 
@@ -72,14 +72,8 @@ def test_pictures_show_the_worst_frame_of_every_pipeline(pictures: Path) -> None
     picture = cv2.imread(str(pictures / names[0]))
     assert picture is not None
     assert picture.shape == (2 * 400, 2 * 300, 3)
-    # The truth's outline is drawn in cyan.
-    assert np.any(np.all(picture == (255, 255, 0), axis=2))
-
-
-def test_scenes_can_be_chosen() -> None:
-    whole, alone = Plan(packaged_files(), scenes=frozenset({"press"})).chosen()
-    assert [case.label for case in whole] == [case.label for case in alone] == ["press"]
-    assert Plan(packaged_files()).chosen()[0] == [*FULL, *TROUBLES]
+    # The truth's outline is drawn in red.
+    assert np.any(np.all(picture == (0, 0, 255), axis=2))
 
 
 @pytest.mark.parametrize(
@@ -118,7 +112,7 @@ def test_the_command_writes_results_and_fails_when_something_got_worse(
     assert "Whole pipelines" in out
     assert "b.html" in err
     stored = json.loads((tmp_path / "b.json").read_text())
-    assert stored["schema"] == "tactflow.bench/1"
+    assert stored["schema"] == "tactflow.bench/2"
     assert len(stored["rows"]) == len(result.rows)
     assert "Whole pipelines" in (tmp_path / "b.html").read_text()
     assert "| press | default |" in (tmp_path / "b.md").read_text()

@@ -70,18 +70,16 @@ def test_a_shifted_and_turned_contact_is_off_by_as_much(truth: Truth, tally: Tal
     assert errors["area_error"] == pytest.approx(10)
 
 
-def test_a_deep_contact_that_is_missed_has_no_overlap(truth: Truth, tally: Tally) -> None:
+def test_missed_contacts_have_no_overlap_if_they_are_deep_and_contact_on_an_idle_gel_is_false(
+    truth: Truth, tally: Tally
+) -> None:
+    idle = open_scene("idle?frames=2").truth(1, PREPROCESSOR)
     assert not score.add_decision(tally, False, truth, deep=True)
     assert not score.add_decision(tally, False, truth, deep=False)
-    errors = {"hull_iou": 0, "contact_iou": 0, "missed_contacts": 100, "missed_half_depth": 100}
-    assert tally.errors() == errors
-
-
-def test_contact_on_an_idle_gel_is_false(tally: Tally) -> None:
-    idle = open_scene("idle?frames=2").truth(1, PREPROCESSOR)
     assert not score.add_decision(tally, True, idle, deep=False)
     assert not score.add_decision(tally, False, idle, deep=False)
-    assert tally.errors() == {"false_contacts": 50.0}
+    errors = {"hull_iou": 0, "contact_iou": 0, "missed_contacts": 100, "missed_half_depth": 100}
+    assert tally.errors() == errors | {"false_contacts": 50}
 
 
 def test_a_direction_is_invented_for_a_disc_and_missing_only_where_the_contact_is_long(
@@ -112,11 +110,6 @@ def test_markers_at_their_true_places_score_perfectly_in_any_order(truth: Truth)
             "markers_missed": 0,
             "markers_false": 0,
         }
-
-
-def test_a_constant_error_of_the_reference_is_part_of_the_displacement_error(truth: Truth) -> None:
-    errors = marker_errors(truth, markers(truth, origin=truth.origin + np.array((0.03, 0.04))))
-    assert errors["displacement_rms"] == pytest.approx(0.05)
 
 
 def test_markers_that_were_never_found_are_lost(truth: Truth) -> None:
@@ -155,11 +148,6 @@ def test_a_marker_declared_lost_is_not_judged_by_its_position(truth: Truth) -> N
     assert errors["lost_percent"] == pytest.approx(100 / len(position))
 
 
-def test_a_gel_without_markers_gives_no_marker_errors() -> None:
-    bare = open_scene("unmarked?frames=2").truth(0, PREPROCESSOR)
-    assert marker_errors(bare, markers(bare)) == {}
-
-
 def test_flow_is_compared_where_both_know_it_and_with_its_own_standard_error(
     truth: Truth, tally: Tally
 ) -> None:
@@ -171,10 +159,3 @@ def test_flow_is_compared_where_both_know_it_and_with_its_own_standard_error(
     score.add_flow(tally, None, truth)
     within = {"flow_within_one": 50, "flow_within_two": pytest.approx(75)}
     assert tally.errors() == {"flow_error": pytest.approx(0.5), "flow_rms": pytest.approx(0.5)} | within
-
-
-def test_detected_dots_are_compared_with_visible_ones(truth: Truth, tally: Tally) -> None:
-    score.add_detection(tally, truth.position[truth.visible] + np.array((0.6, 0.8)), truth)
-    errors = tally.errors()
-    assert errors["marker_recall"] == errors["marker_precision"] == 1
-    assert errors["localisation_rms"] == pytest.approx(1)

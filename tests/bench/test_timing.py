@@ -24,9 +24,3 @@ def test_measuring_uses_one_opencv_thread_and_restores_the_setting() -> None:
     timing.interleaved({"a": lambda _: during.append(cv2.getNumThreads())}, [("k", 0)])
     assert during == [1]
     assert cv2.getNumThreads() == before
-
-
-def test_the_unit_is_the_time_of_a_real_copy() -> None:
-    unit = timing.CopyUnit()
-    unit.take(2)
-    assert unit.copy_ms > 0

@@ -28,14 +28,14 @@ class WorstFrame:
             self._region = np.asarray(region, dtype=np.uint8)
 
     def write(self, folder: Path, name: str) -> None:
-        """Write FOLDER/NAME.png: what was found as the live page draws it, the true outline in cyan."""
+        """Write FOLDER/NAME.png: what was found as the live page draws it, the true outline in red."""
         if self._result is None:
             return
         size = tuple(2 * side for side in self._result.size)
         picture = cv2.resize(draw(self._result, text=False), size, interpolation=cv2.INTER_CUBIC)
         region = cv2.resize(self._region, size, interpolation=cv2.INTER_NEAREST)
         outline, _ = cv2.findContours(region, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(picture, outline, -1, (255, 255, 0), 1)
+        cv2.drawContours(picture, outline, -1, (0, 0, 255), 1)
         caption = f"{name}, frame {self._result.seq}: overlap {self._overlap:.2f}"
         cv2.putText(
             picture, caption, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -92,11 +93,13 @@ def _plot(candidates: Sequence[Point], quantity: Quantity, what: str) -> Html:
         axes.plot(point.cost, point.error, "o", color=color)
         axes.annotate(point.method, (point.cost, point.error), (5, 4), textcoords="offset points", fontsize=8)
     axes.set_xscale("log")
+    costs = [math.log10(p.cost) for p in candidates]
+    axes.set_xlim(10 ** math.floor(min(costs) - 0.1), 10 ** math.ceil(max(costs) + 0.1))
     # Errors of zero stand on the axis.
-    least = min((p.error for p in candidates if p.error > 0), default=1.0)
-    axes.set_yscale("symlog", linthresh=least / 2)
-    axes.set_ylim(bottom=0)
+    errors = [error for p in candidates for error in (p.least, p.error, p.worst) if error > 0]
+    axes.set_yscale("symlog", linthresh=min(errors, default=1.0))
+    axes.set_ylim(0, 1.5 * max(errors, default=1.0))
     axes.set_xlabel(f"time of a frame of this {what}, copies of a raw frame")
     away = "" if quantity.best == 0 else f", away from {quantity.best:g}"
-    axes.set_ylabel(quantity.unit or "1")
+    axes.set_ylabel(quantity.unit)
     return picture(drawing, quantity.title + away)

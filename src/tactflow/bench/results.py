@@ -13,7 +13,8 @@ from typing import Any
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.engine.errors import ConfigError
 
-SCHEMA = "tactflow.bench/1"
+SCHEMA, ERRORS_SCHEMA = "tactflow.bench/2", "tactflow.bench/1"
+"""Of a whole run, and of one that was stored with its errors alone."""
 
 RECORDING = "data:"
 """What the scene name of a real recording starts with."""
@@ -121,7 +122,7 @@ class BenchResult:
             key: {name: float(f"{value:.6g}") for name, value in sorted(values.items())}
             for key, values in self.errors().items()
         }
-        _write(path, {"schema": SCHEMA, "quick": self.quick, "errors": errors})
+        _write(path, {"schema": ERRORS_SCHEMA, "quick": self.quick, "errors": errors})
 
 
 def _write(path: Path, content: Mapping[str, Any]) -> None:
@@ -143,7 +144,8 @@ def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise ConfigError(f"{path}: not JSON: {error}") from error
-    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or not {"errors", "rows"} & set(stored):
+    numbers = {SCHEMA: "rows", ERRORS_SCHEMA: "errors"}
+    if not isinstance(stored, dict) or numbers.get(str(stored.get("schema"))) not in stored:
         raise ConfigError(f'{path}: not a result of `tactflow bench` (required "schema": "{SCHEMA}")')
     if stored["quick"] != quick:
         kind = "quick" if stored["quick"] else "full"

@@ -27,7 +27,6 @@ TITLES = {
     "tracker": "Marker tracking",
     "flow_in_mask": "Flow inside the contact",
     "depth": "Heights in mm, by light",
-    "motion": "Motion of the gel between the dots, and slip",
 }
 """Group -> heading."""
 
