@@ -37,7 +37,7 @@ def published(result: Result) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("pipeline", "scene", "repeated"),
     [
-        ("default", "press", 0.2),
+        ("default", "press", 0.1),
         ("default", "tap", 0.2),
         ("default", "creep", 0.0),
         ("markerless", "unmarked", 0.1),
