@@ -25,9 +25,6 @@ class Source(contract.Source):
         source: str | int = Field("sim:press", description="where frames come from")
         realtime: bool = Field(False, description="at its own pace")
 
-    def __init__(self, params: Params) -> None:
-        self.params = params
-
     def frames(self) -> Iterator[Frame]:
         yield from ()
 
@@ -69,18 +66,12 @@ class Prepare(Stage):
                 raise ValueError("size needs corners")
             return self
 
-    def __init__(self, params: Params) -> None:
-        self.params = params
-
     def process(self, frame: Frame) -> Image:
         return frame.image
 
 
 class Invert(Stage):
     memory = "pure"
-
-    def __init__(self, params: StageParams) -> None:
-        self.params = params
 
     def process(self, image: Image) -> Image:
         return 255 - image
@@ -97,9 +88,6 @@ class Compare(Stage):
     class Params(StageParams):
         threshold: int = Field(14, ge=0, le=255, description="grey levels")
 
-    def __init__(self, params: Params) -> None:
-        self.params = params
-
     def process(self, image: Image, frame: Frame) -> Masks | Absent:
         return Masks(image[:, :, 0], frame.seq > 0)
 
@@ -110,9 +98,6 @@ class Outline(Stage):
     class Params(StageParams):
         min_area: int = Field(5, ge=0, description="px^2")
         name: str = Field("", max_length=8, description="of the shape")
-
-    def __init__(self, params: Params) -> None:
-        self.params = params
 
     def process(self, contact_mask: ContactMask) -> Contact | Absent:
         return (
@@ -125,21 +110,8 @@ class Outline(Stage):
 class Refine(Stage):
     memory = "pure"
 
-    def __init__(self, params: StageParams) -> None:
-        self.params = params
-
     def process(self, contact: Contact, flow: Flow | None) -> Contact:
         return contact if flow is None else Contact(float(flow.count), contact.center, None, None, ZERO, None)
-
-
-class Spot(Stage):
-    memory = "pure"
-
-    def __init__(self, params: StageParams) -> None:
-        self.params = params
-
-    def process(self, picture: Image) -> Flow:
-        return Flow(None, int(picture[0, 0, 0]))
 
 
 class Needy(Stage):
@@ -147,9 +119,6 @@ class Needy(Stage):
 
     class Params(StageParams):
         path: str = Field(description="required")
-
-    def __init__(self, params: Params) -> None:
-        self.params = params
 
     def process(self, image: Image) -> Flow:
         return Flow(None, int(image[0, 0, 0]))
@@ -159,17 +128,11 @@ class Publish(Sink):
     class Params(StageParams):
         path: str = Field("out", description="file")
 
-    def __init__(self, params: Params) -> None:
-        self.params = params
-
     def write(self, tick: Tick, image: Image | None, contact: Contact | None) -> None:
         pass
 
 
 class Require(Sink):
-    def __init__(self, params: StageParams) -> None:
-        self.params = params
-
     def write(self, contact: Contact) -> None:
         pass
 
@@ -177,17 +140,11 @@ class Require(Sink):
 class Viewer(Sink):
     observer = True
 
-    def __init__(self, params: StageParams) -> None:
-        self.params = params
-
     def write(self, image: Image | None) -> None:
         pass
 
 
 class Forgetful(Stage):
-    def __init__(self, params: StageParams) -> None:
-        self.params = params
-
     def process(self, image: Image) -> Contact:
         raise NotImplementedError
 
@@ -195,18 +152,12 @@ class Forgetful(Stage):
 class Bare(Stage):
     memory = "pure"
 
-    def __init__(self, params: StageParams) -> None:
-        self.params = params
-
     def process(self, image) -> Contact:  # type: ignore[no-untyped-def]
         raise NotImplementedError
 
 
 class Both(Sink):
     memory = "pure"
-
-    def __init__(self, params: StageParams) -> None:
-        self.params = params
 
     def process(self, image: Image) -> Contact:
         raise NotImplementedError

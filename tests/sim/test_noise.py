@@ -25,16 +25,6 @@ def test_noise_has_mean_zero_and_deviation_one() -> None:
     assert abs((drawn**4).mean() / drawn.var() ** 2 - 3) < 5 * (24 / COUNT) ** 0.5
 
 
-def test_neighbouring_pixels_and_channels_are_independent() -> None:
-    drawn = frame_noise(7, 3)
-    for first, second in (
-        (drawn[:, :-1], drawn[:, 1:]),
-        (drawn[:-1], drawn[1:]),
-        (drawn[..., 0], drawn[..., 1]),
-    ):
-        assert abs((first * second).mean()) < 5 * first.size**-0.5
-
-
 @pytest.mark.parametrize(("first", "second"), [(0, 1), (0, 2), (5, 6), (10, 299), (0, 1000), (3, 99_999)])
 def test_frames_are_independent_at_every_pixel_and_at_small_shifts(first: int, second: int) -> None:
     one, other = frame_noise(7, first), frame_noise(7, second)
@@ -42,14 +32,6 @@ def test_frames_are_independent_at_every_pixel_and_at_small_shifts(first: int, s
         shifted = np.roll(other, (dy, dx), axis=(0, 1))
         # Derived: the standard error of a correlation is 1 / sqrt(n); five of them, over 42 tests.
         assert abs((one * shifted).mean()) < 5 * COUNT**-0.5
-
-
-def test_the_mean_of_many_frames_has_the_noise_that_independence_gives() -> None:
-    total = np.zeros(SHAPE)
-    for index in range(64):
-        total += frame_noise(2, index)
-    # Derived: 1 / sqrt(64); the standard error of that deviation is 8e-5 and five of them are 4e-4.
-    assert (total / 64).std() == pytest.approx(1 / 8, abs=5e-4)
 
 
 def test_the_difference_of_two_frames_at_rest_shows_the_noise_asked_for() -> None:

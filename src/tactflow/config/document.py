@@ -19,8 +19,6 @@ MAX_BYTES: Final = 256 * 1024
 MAX_VALUES: Final = 100_000
 """Limit on the values of a document with its aliases written out, so that aliases of aliases cannot fill the
 memory. A file of `MAX_BYTES` without aliases hardly reaches it."""
-MAX_SHOWN: Final = 150
-"""Longest source line that is shown whole, in characters: a longer one would wrap and misplace the caret."""
 
 
 def shown(value: Any) -> str:
@@ -146,9 +144,7 @@ class Document:
         head = f"{mark}  {message}" if mark.line else f"{_printable(mark.file)}: {message}"
         if not 0 < mark.line <= len(self.lines):
             return head
-        line, column = _printable(self.lines[mark.line - 1]), mark.column - 1
-        start = max(0, column - MAX_SHOWN // 2) if len(line) > MAX_SHOWN else 0
-        return f"{head}\n    {line[start : start + MAX_SHOWN]}\n    {' ' * (column - start)}^"
+        return f"{head}\n    {_printable(self.lines[mark.line - 1])}\n    {' ' * (mark.column - 1)}^"
 
 
 def _index(parent: Any, key: str | int, place: Keys) -> str | int:
