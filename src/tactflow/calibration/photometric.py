@@ -50,18 +50,16 @@ RIDGE: Final = 1e-6
 """Ridge penalty, as a part of a coefficient's own weight. Chosen by hand."""
 PLACE_RIDGE: Final = 1e-3
 """The same of coefficients that change with the place, so that a colour means much the same where nothing was
-pressed. Chosen on the simulator, where 8 presses leave normals of others 12, 55 and 54 degrees off with 1e-6
-(`photometric`, `mixed`, `dark_channel`), 5, 13 and 10 with 1e-4, and 2, 7 and 5 with 1e-3. With 1e-2 heights
-of a box under `mixed` are off by 9 % after 26 presses, instead of 7."""
+pressed. Chosen on the simulator: after 8 presses normals under `mixed` are 55 degrees off with 1e-6, 13 with
+1e-4, 7 with 1e-3; with 1e-2 heights of a box are off by 9 % after 26 presses, instead of 7."""
 SMOOTHED: Final = 0.02
 """Standard deviation of the Gaussian over which colours are averaged to be learned, in radii of the ball.
-Noise makes learned slopes too small, most of all those that the ball has hardly shown: without it a box under
-`mixed` has errors of 8 % instead of 4. On wedge_ball 0.07 makes balls 1.5 % smaller than 0.03."""
+Noise makes learned slopes too small: without it a box under `mixed` has errors of 8 % instead of 4. On
+wedge_ball 0.07 makes balls 1.5 % smaller than 0.03."""
 DARK: Final = 20.0
-"""Grey levels: where a channel of a press is darker, its light does not reach the surface, and the slope
-shows in the two others alone. There colours are learned with their noise: what noise leaves open is then
-drawn to the mean, and not taken for a slope. With averages there, too, cables under `dark_channel` have
-errors of 5.6 % instead of 3.8, and those of edges are no smaller; with 12, coins have 19 % instead of 18."""
+"""Grey level below which a channel's light does not reach the surface, so that the slope shows in the two
+others alone. There colours are learned with their noise, which draws to the mean what it leaves open: with
+averages there, too, cables under `dark_channel` have errors of 5.6 % instead of 3.8."""
 TURNS: Final = 3
 """How often fit and centres take turns; later ones move centres by less than 0.05 px on wedge_ball."""
 OUTLIER: Final = 4.0

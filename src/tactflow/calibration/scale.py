@@ -18,9 +18,6 @@ LONGER: Final = 1.35
 """How much longer than the typical one a distance between neighbours may be: less than the diagonal of a
 square, 1.41."""
 
-MAD_TO_SIGMA: Final = 1.4826
-"""Standard deviation of a normal variable in units of its median absolute deviation."""
-
 
 def centre(size: tuple[int, int]) -> tuple[float, float]:
     """The middle of a picture of size (width, height), px: where its mm coordinates are 0.
@@ -44,14 +41,13 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
 
     Returns
     -------
-    The scale, with standard errors from how the links scatter (that of their mean, where the middle of the
-    picture stands for all of it), and from how far the dots are from a square grid: what x and y differ by,
-    since the dots alone cannot tell a picture that is stretched from a grid that is not square; and what
-    single links differ in length from their mean, as those of rings do, which point everywhere.
+    The scale. Its standard errors come from the scatter of the links and from how far the dots are from a
+    square grid: by the difference of x and y, since the dots alone cannot tell a stretched picture from a
+    grid that is not square; and by the lengths of single links, which differ from their mean in rings.
 
     Raises
     ------
-    ValueError : too few dots in a grid, or a pitch that is none.
+    ValueError : too few dots in a grid, or a pitch that is not > 0.
 
     Examples
     --------
@@ -62,6 +58,8 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
     >>> round(scale.stderr[0], 3)
     0.016
     """
+    from scipy.stats import median_abs_deviation
+
     if not (np.isfinite(pitch) and pitch > 0):
         raise ValueError(f"pitch: required > 0 mm, got {pitch:g}")
     groups = _links(np.asarray(dots, np.float64).reshape(-1, 2))
@@ -73,15 +71,14 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
         )
     means = np.array([np.median(group, axis=0) for group in groups])
     x, y = _square(means, pitch)
-    deviations = [np.median(np.abs(g - m), axis=0) for g, m in zip(groups, means, strict=True)]
-    spread = MAD_TO_SIGMA * np.array(deviations)
+    spread = np.array([median_abs_deviation(group, axis=0, scale="normal") for group in groups])
     error = spread / np.sqrt([[len(group)] for group in groups])
     # Along an axis the relative error of the scale is that of the links that run along it.
     along = np.argmax(np.abs(means), axis=0)
     scattered = np.array([error[along[k], k] / abs(means[along[k], k]) for k in (0, 1)])
     lengths = np.array([np.median(np.hypot(*(group * (x, y)).T)) for group in groups])
     bent = lengths[along] / pitch - 1
-    # Of the difference, what the scatter explains is no second error.
+    # The scatter explains a part of the difference, which must not count twice.
     apart = max((2 * (x - y) / (x + y)) ** 2 - float((scattered**2).sum()), 0.0) / 2
     relative = np.sqrt(scattered**2 + bent**2 + apart)
     return Scale(x, y, (float(x * relative[0]), float(y * relative[1])), centre(size))
