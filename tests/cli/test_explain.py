@@ -94,10 +94,6 @@ def test_each_stage_says_when_it_is_skipped(capsys: pytest.CaptureFixture[str]) 
     assert facts["refine"]["skipped when"] == "outline gives no contact"
     assert "skipped when" not in facts["prepare"]
     assert "skipped when" not in facts["out"]
-
-
-@pytest.mark.usefixtures("pipeline")
-def test_without_skipping_no_gate_is_mentioned(capsys: pytest.CaptureFixture[str]) -> None:
     main(["explain", "--set", "skipping=false"])
     out = capsys.readouterr().out
     assert "skipping is off" in out
@@ -170,15 +166,6 @@ def test_check_counts_and_warns_on_standard_error(capsys: pytest.CaptureFixture[
     assert (
         err == "tactflow: warning: pipeline.yaml:4:3  unused: not run, because no sink needs what it makes\n"
     )
-
-
-def test_of_a_stage_that_waits_for_a_sink_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", "default"]) == 0
-    out, err = capsys.readouterr()
-    assert out.endswith("segments)\n")
-    assert err == ""
-    assert main(["explain", "default"]) == 0
-    assert "pruned because  no sink needs what it makes" in capsys.readouterr().out
 
 
 def test_statistics_stand_on_the_nodes_of_the_graph(

@@ -113,16 +113,19 @@ def test_a_wrong_file_is_refused_before_anything_starts(
     assert (tmp_path / "there.mcap").read_bytes() == b"precious"
 
 
-def test_number_records_beside_what_is_there(tmp_path: Path) -> None:
+def test_number_records_beside_what_is_there_and_overwrite_replaces_it(tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
     command = ["record", *QUIET, "--source", "sim:press?frames=2", "--out", str(out), "--number"]
     for _ in range(3):
         assert main(command) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a-001.mcap", "a-002.mcap", "a.mcap"]
+    out.write_bytes(b"old")
+    assert main([*command[:-1], "--overwrite"]) == 0
+    assert len(stamps(out)) == 2
 
 
 def test_a_kill_at_any_moment_loses_no_frame_that_was_written(tmp_path: Path) -> None:
-    """20 processes are killed at random moments. Repaired, each file opens with the seeking reader."""
+    """10 processes are killed at random moments. Repaired, each file opens with the seeking reader."""
     root = Path(__file__).resolve().parents[2]
     moments = random.Random(6)
     helper = subprocess.Popen(
@@ -135,7 +138,7 @@ def test_a_kill_at_any_moment_loses_no_frame_that_was_written(tmp_path: Path) ->
     assert helper.stdin is not None
     assert helper.stdout is not None
     with helper:
-        for number in range(20):
+        for number in range(10):
             path, counter = tmp_path / f"{number}.mcap", tmp_path / f"{number}.count"
             print(path, counter, file=helper.stdin, flush=True)
             child = int(helper.stdout.readline())

@@ -112,15 +112,16 @@ def claim_path(path: Path) -> int | None:
     """
     if sys.platform == "win32":
         return None
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it") from None
-    except OSError:
-        pass
-    return descriptor
+    else:  # noqa: RET505 (mypy knows branches)
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it") from None
+        except OSError:
+            pass
+        return descriptor
 
 
 class LossyStream(io.TextIOWrapper):
