@@ -82,7 +82,7 @@ def sections(result: BenchResult) -> list[Section]:
     found = [Section("Machine", summary), *(methods(result, group) for group in groups)]
     found += [_scenes(result), *_recordings(result), *_gels(result)]
     if result.failures:
-        rows = [[key, why] for key, why in result.failures.items()]
+        rows = [[key, why.partition("\n")[0]] for key, why in result.failures.items()]
         found.append(Section("Failures", tables=[Table(["group/method/scene", "why"], rows)]))
     return found
 
