@@ -114,7 +114,10 @@ def test_a_calibrated_recording_has_millimetres_and_newtons(tmp_path: Path) -> N
         assert np.allclose(stats[feature]["mean"], np.mean(values, 0))
 
 
-@pytest.mark.parametrize(("first", "said"), [(True, "has no calibration"), (False, "has a calibration")])
+@pytest.mark.parametrize(
+    ("first", "said"),
+    [(True, "without calibration; those before"), (False, "with calibration; those before")],
+)
 def test_a_dataset_is_not_calibrated_in_part(tmp_path: Path, first: bool, said: str) -> None:
     scale = Scale(0.1, 0.1, (0.001, 0.001), (31.5, 23.5))
     writer = DatasetWriter(tmp_path, 10, "press")
@@ -194,7 +197,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
         (
             [first, small],
             3,
-            "small.npy: observation.images.main with pictures of 24 x 16 pixels; those before",
+            "small.npy: observation.images.main, 24 x 16 pixels, without calibration; those before",
         ),
         ([odd], 3, "a video needs even numbers; give --pictures png"),
         ([first, "--fps", "0"], 2, "--fps: required 1 to 1000"),

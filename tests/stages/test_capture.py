@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.pace import GRACE, Pace
+from tactflow.sources.pace import REST, Pace
 from tactflow.stages.capture import Capture
 from tests.clock import PATIENCE, ManualClock
 
@@ -237,30 +237,31 @@ def test_after_a_long_interruption_the_recording_continues_instead_of_rushing() 
     assert clock.now() - resumed == pytest.approx(0.1, abs=1e-9)
 
 
-def _played(times: list[float], reading: list[float]) -> tuple[list[float], list[float]]:
+def _played(times: list[float], reading: float) -> tuple[list[float], list[float]]:
     """When reading of each frame began, and when it was shown; nothing but reading and waiting takes time."""
     clock = ManualClock()
     pace = Pace(threading.Event(), clock)
     begun, shown = [], []
-    for t, duration in zip(times, reading, strict=True):
+    for t in times:
         assert pace.wait_to_read()
         begun.append(clock.now())
-        clock.advance(duration)
+        clock.advance(reading)
         assert pace.wait_for(t)
         shown.append(clock.now())
     return begun, shown
 
 
-@pytest.mark.parametrize("reading", [0.0, 0.004, 0.011])
-def test_a_frame_is_read_just_before_it_is_due(reading: float) -> None:
-    times = [index / 60 for index in range(200)]
-    begun, shown = _played(times, [reading] * 200)
+@pytest.mark.parametrize("reading", [0.0, 0.004, 0.008])
+def test_a_frame_is_read_some_time_after_the_last_and_shown_when_it_is_due(reading: float) -> None:
+    times = [*(index / 60 for index in range(100)), *(9 + index / 60 for index in range(30))]
+    begun, shown = _played(times, reading)
     np.testing.assert_allclose(np.array(shown) - shown[0], times, atol=1e-9)
-    early = np.array(shown[2:]) - begun[2:]
-    # What reading takes, a quarter of it and a millisecond: or, where that leaves less than a rest for the
-    # work on the last frame, what is left.
-    rest = min(GRACE / 60, (1 / 60 - reading) / 2)
-    np.testing.assert_allclose(early, min(1.25 * reading + 0.001, 1 / 60 - rest), atol=1e-9)
+    np.testing.assert_allclose(np.array(begun[2:]) - shown[1:-1], REST / 60, atol=1e-9)
+
+
+def test_reading_that_cannot_keep_up_is_not_slowed_down() -> None:
+    begun, shown = _played([index / 60 for index in range(100)], 0.020)
+    np.testing.assert_allclose(begun[4:], shown[3:-1], atol=1e-9)
 
 
 def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(recording: str) -> None:

@@ -27,8 +27,8 @@ BACKLOG = 32
 class Foxglove(Sink):
     """Serves the channels of a recording live: `/main/image`, `/main/annotations`, `/main/results`.
 
-    In Foxglove: *Open connection*, *Foxglove WebSocket*, `ws://localhost:8765`. What nobody looks at is not
-    encoded, and a viewer who is slow loses messages; the run never waits.
+    In Foxglove: *Open connection*, *Foxglove WebSocket*, `ws://localhost:8765`. Channels that nobody looks at
+    are not encoded, and a slow viewer loses messages; the run never waits.
     """
 
     threaded = True
@@ -43,18 +43,18 @@ class Foxglove(Sink):
         )
         port: int = Field(8765, ge=0, le=65535, description="0 picks a free one")
         open_to_all: bool = Field(
-            False, description="serve other machines: everybody there may look, since Foxglove asks nobody"
+            False, description="serve other machines: Foxglove's protocol knows no keys, anybody may look"
         )
         quality: int = Field(
             80, ge=1, le=100, description="of the JPEG pictures; higher is sharper and larger"
         )
 
         @model_validator(mode="after")
-        def _guarded(self) -> Foxglove.Params:
+        def _local(self) -> Foxglove.Params:
             if not self.open_to_all and not is_loopback(self.host):
                 raise ValueError(
                     f"{self.host} can be reached from other machines, and Foxglove's protocol knows no keys: "
-                    "set host to 127.0.0.1, or open_to_all: true to let everybody look"
+                    "set host to 127.0.0.1, or open_to_all: true to let anybody look"
                 )
             return self
 
@@ -79,7 +79,7 @@ class Foxglove(Sink):
         Raises
         ------
         StageError
-            If a package is missing, or the address is taken or none of this machine.
+            If a package is missing, or the address is taken or not one of this machine.
         """
         needed = ["foxglove", "mcap_protobuf", "foxglove_schemas_protobuf"]
         problem = missing("live views in Foxglove", "foxglove", needed)
@@ -89,7 +89,7 @@ class Foxglove(Sink):
 
         from tactflow.recording.schemas import channel_types
 
-        # Kept, for channels end with it.
+        # Kept, as channels end with it.
         self._context = context = foxglove.Context()
         for name, kind in channel_types().items():
             encoding, data = kind.schema
@@ -112,7 +112,7 @@ class Foxglove(Sink):
         log.info("foxglove: %s", self.address)
 
     def wants(self) -> bool:
-        """Whether anybody looks at any channel. From any thread."""
+        """Whether anybody looks at a channel. From any thread."""
         return any(channel.has_sinks() for channel in list(self._channels.values()))
 
     def counters(self) -> dict[str, int]:
@@ -120,7 +120,7 @@ class Foxglove(Sink):
         return {"messages": self._sent}
 
     def write(self, result: Result) -> None:
-        """Send what is looked at of one frame; never waits."""
+        """Send the channels that somebody looks at; never waits."""
         from tactflow.recording.frames import nanoseconds
         from tactflow.recording.schemas import encode_annotations, encode_picture
 
@@ -137,7 +137,7 @@ class Foxglove(Sink):
                 self._sent += 1
 
     def close(self) -> None:
-        """End the server; viewers see that the connection is gone."""
+        """Stop the server; viewers see that the connection is closed."""
         server, self._server = self._server, None
         if server is not None:
             server.stop()

@@ -97,7 +97,7 @@ class DatasetWriter:
         self._folder, self._fps, self._task, self._is_video = folder, fps, task, video
         self._episodes: list[dict[str, Any]] = []
         self._frames = 0
-        self._camera = ""
+        self._kind = self._camera = ""
         self._shape: tuple[int, ...] = ()
         self._features: dict[str, list[str]] = {}
         self._numbers: dict[str, list[NDArray[np.float64]]] = {}
@@ -160,25 +160,17 @@ class DatasetWriter:
         image = result.image
         if image is None:
             raise StageError("the pipeline makes no picture: it needs a stage preprocess")
-        camera = f"observation.images.{result.sensor}"
-        features = PIXELS if result.scale is None else PIXELS | CALIBRATED
-        size = f"{image.shape[1]} x {image.shape[0]}"
-        if not self._camera:
-            self._camera, self._shape, self._features = camera, image.shape, features
-            self._numbers = {name: [] for name in features}
-        if (camera, image.shape) != (self._camera, self._shape):
-            raise StageError(
-                f"{camera} with pictures of {size} pixels; those before are "
-                f"{self._camera}, {self._shape[1]} x {self._shape[0]}: make two datasets"
-            )
-        if features != self._features:
-            own, before = ("no", "one") if result.scale is None else ("a", "none")
-            raise StageError(
-                f"has {own} calibration, those before have {before}: name one in the pipeline file, or make "
-                "two datasets"
-            )
+        camera, size = f"observation.images.{result.sensor}", f"{image.shape[1]} x {image.shape[0]} pixels"
+        calibrated = result.scale is not None
+        kind = f"{camera}, {size}, with{'' if calibrated else 'out'} calibration"
+        if not self._kind:
+            self._kind, self._camera, self._shape = kind, camera, image.shape
+            self._features = PIXELS | CALIBRATED if calibrated else PIXELS
+            self._numbers = {name: [] for name in self._features}
+        if kind != self._kind:
+            raise StageError(f"{kind}; those before are {self._kind}: make two datasets")
         if self._is_video and (image.shape[0] % 2 or image.shape[1] % 2):
-            raise StageError(f"pictures of {size} pixels: a video needs even numbers; give --pictures png")
+            raise StageError(f"pictures of {size}: a video needs even numbers; give --pictures png")
         return image
 
     def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:

@@ -37,21 +37,19 @@ class LerobotCamera(Sink):
     class Params(StageParams):
         """Where to publish, and how good the pictures are."""
 
-        endpoint: str = Field(
-            "tcp://127.0.0.1:5555",
-            description="address to bind; LeRobot's camera knows no keys, so that others than this machine "
-            "take open_to_all",
+        endpoint: str = Field("tcp://127.0.0.1:5555", description="address to bind")
+        open_to_all: bool = Field(
+            False,
+            description="publish to other machines: LeRobot's camera knows no keys, so anybody may look",
         )
-        open_to_all: bool = Field(False, description="publish to other machines: everybody there may look")
         quality: int = Field(90, ge=1, le=100, description="of the JPEG; higher is sharper and larger")
 
         @model_validator(mode="after")
-        def _guarded(self) -> LerobotCamera.Params:
-            address = Address.parse(self.endpoint)
-            if not self.open_to_all and not address.is_local:
+        def _local(self) -> LerobotCamera.Params:
+            if not self.open_to_all and not Address.parse(self.endpoint).is_local:
                 raise ValueError(
                     f"{self.endpoint} can be reached from other machines, and LeRobot's camera knows no "
-                    "keys: set endpoint to tcp://127.0.0.1:5555, or open_to_all: true to let everybody look"
+                    "keys: set endpoint to tcp://127.0.0.1:5555, or open_to_all: true to let anybody look"
                 )
             return self
 
@@ -82,11 +80,14 @@ class LerobotCamera(Sink):
     def write(self, tick: Tick, image: Image) -> None:
         """Send one picture to whoever reads; never waits."""
         publisher = self._publisher
-        if publisher is None or not self._is_read(publisher):
+        if publisher is None:
             return
-        # LeRobot takes what it decodes for red, green, blue, whereas a JPEG is decoded to blue, green, red.
-        swapped = np.ascontiguousarray(image[:, :, ::-1])
-        jpeg = encode_jpeg(swapped, self.params.quality)
+        while (event := publisher.next_event()) is not None:
+            self._readers += 1 if event[:1] == b"\x01" else -1
+        if self._readers <= 0:
+            return
+        # LeRobot takes what it decodes for RGB, whereas a JPEG is decoded to BGR.
+        jpeg = encode_jpeg(np.ascontiguousarray(image[:, :, ::-1]), self.params.quality)
         images = {self._sensor: base64.b64encode(jpeg).decode()}
         message = {"timestamps": {self._sensor: tick.frame.t}, "images": images}
         publisher.socket.send(orjson.dumps(message), zmq.NOBLOCK)
@@ -97,9 +98,3 @@ class LerobotCamera(Sink):
         publisher, self._publisher = self._publisher, None
         if publisher is not None:
             publisher.close(0)
-
-    def _is_read(self, publisher: Publisher) -> bool:
-        """Whether anybody has subscribed."""
-        while (event := publisher.next_event()) is not None:
-            self._readers += 1 if event[:1] == b"\x01" else -1
-        return self._readers > 0

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -22,19 +20,17 @@ from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, fr
 from tactflow.message.result import SCHEMA, Result, encode_message
 from tactflow.recording.provenance import facts, texts
 from tactflow.system.extras import missing
-from tactflow.system.files import claim_path, expanded, make_folder
+from tactflow.system.files import completed, expanded, make_folder
+from tactflow.system.outputs import cannot_write
+from tactflow.recording.provenance import facts, texts
 
 if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]
-
-log = logging.getLogger("tactflow")
 
 SEQ = Column("seq", ("seq",), "integer", "the frame's seq in the table frames")
 CONTACT = Column("contact", (), "integer", "0 is the contact with the most pixels")
 TABLES = ("markers", "contacts", "frames")
 """In the order in which they are written: what belongs to a frame of `frames` is there before it."""
-UNFINISHED = ".unfinished"
-"""Prefix of a part that is being written: readers of folders leave out names that begin with a dot."""
 PART_BYTES = 64_000_000
 """A part is written early when its messages take so much memory, bytes: some ten thousand frames."""
 
@@ -79,10 +75,8 @@ class Parquet(Sink):
         self.description = params.path
         self._sensor = sensor
         self._control = control
-        self._claim: int | None = None
         self._schemas: dict[str, pa.Schema] = {}
         self._pending: list[bytes] = []
-        self._bytes = 0
         self._flushed = 0.0
         self._next = 0
         self._counts = {"frames": 0, "parts": 0}
@@ -104,8 +98,8 @@ class Parquet(Sink):
         Raises
         ------
         StageError
-            If there are tables and neither `overwrite` nor `append` is set, the folder cannot be written,
-            another run writes into it, or a package is missing.
+            If there are tables and neither `overwrite` nor `append` is set, the folder cannot be written, or
+            a package is missing.
         """
         problem = missing("Parquet tables", "parquet", ["pyarrow"])
         if problem is not None:
@@ -116,13 +110,11 @@ class Parquet(Sink):
         try:
             for name in TABLES:
                 make_folder(self._folder / name)
-            self._claim = claim_path(self._folder)
             self._check_existing()
         except OSError as error:
-            raise StageError(f"{self._folder}: cannot be written into: {error.strerror or error}") from error
-        self._schemas = schemas(
-            {"schema": SCHEMA, **facts(self._sensor, self._control), **texts(self._control)}
-        )
+            raise cannot_write(self._folder, error) from error
+        about = {"schema": SCHEMA, **facts(self._sensor, self._control), **texts(self._control)}
+        self._schemas = make_schemas(about)
         self._flushed = time.monotonic()
 
     def counters(self) -> Mapping[str, int]:
@@ -137,21 +129,17 @@ class Parquet(Sink):
         StageError
             If the part cannot be written, for instance because the disk is full. The parts before stay.
         """
-        message = encode_message(result, detail=True)
-        self._pending.append(message)
-        self._bytes += len(message)
-        if time.monotonic() - self._flushed >= self.params.flush or self._bytes >= PART_BYTES:
+        self._pending.append(encode_message(result, detail=True))
+        due = time.monotonic() - self._flushed >= self.params.flush
+        if due or len(self._pending) * len(self._pending[-1]) >= PART_BYTES:
             self._flush()
 
     def close(self) -> None:
-        """Write the last part, and let others write into the folder. Raises as `write`."""
+        """Write the last part. Raises as `write`."""
         try:
             self._flush()
         finally:
             self._schemas = {}
-            if self._claim is not None:
-                os.close(self._claim)
-                self._claim = None
 
     def _check_existing(self) -> None:
         """Refuse existing tables, remove them, or continue behind them."""
@@ -170,46 +158,35 @@ class Parquet(Sink):
         self._next = max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
 
     def _flush(self) -> None:
-        messages, self._pending, self._bytes = self._pending, [], 0
+        import pyarrow.parquet as pq
+
+        messages, self._pending = self._pending, []
         self._flushed = time.monotonic()
         if not messages or not self._schemas:
             return
-        tables = build_tables([orjson.loads(message) for message in messages], self._schemas)
+        tables = make_tables([orjson.loads(message) for message in messages], self._schemas)
         try:
             for name in TABLES:
-                self._write_part(name, tables[name])
+                with completed(self._folder / name / f"part-{self._next:05d}.parquet") as partial:
+                    pq.write_table(tables[name], partial, compression="zstd")
+                    # On the disk before it gets its name, so that a power cut leaves no empty part.
+                    with partial.open("rb") as file:
+                        os.fsync(file.fileno())
         except OSError as error:
             hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-            raise StageError(
-                f"{self._folder}: cannot be written into: {error.strerror or error}; "
+            kept = (
                 f"the {self._counts['frames']} frames written before are complete; "
                 f"not written: {len(messages)}{hint}"
-            ) from error
+            )
+            raise cannot_write(self._folder, error, kept) from error
         self._next += 1
         self._counts = {"frames": self._counts["frames"] + len(messages), "parts": self._counts["parts"] + 1}
 
-    def _write_part(self, name: str, table: pa.Table) -> None:
-        import pyarrow.parquet as pq
 
-        part = self._folder / name / f"part-{self._next:05d}.parquet"
-        unfinished = part.with_name(f"{UNFINISHED}-{part.name}")
-        try:
-            with unfinished.open("wb") as file:
-                pq.write_table(table, file, compression="zstd")
-                file.flush()
-                # On the disk before it gets its name, so that a power cut leaves no empty part.
-                os.fsync(file.fileno())
-            unfinished.replace(part)
-        except OSError:
-            with suppress(OSError):
-                unfinished.unlink()
-            raise
-
-
-def schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
+def make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
     """The Arrow schema of each table. metadata : of every table.
 
-    >>> schemas({})["markers"].names[:4]
+    >>> make_schemas({})["markers"].names[:4]
     ['seq', 'marker', 'x', 'y']
     """
     import pyarrow as pa
@@ -236,7 +213,7 @@ def schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
     }
 
 
-def build_tables(
+def make_tables(
     messages: Sequence[Mapping[str, Any]], schemas: Mapping[str, pa.Schema]
 ) -> dict[str, pa.Table]:
     """The tables `frames`, `contacts` and `markers` of parsed result messages."""
@@ -249,23 +226,14 @@ def build_tables(
         for message in messages
         for index, contact in enumerate(message["contacts"])
     ]
-    return {
-        "frames": pa.Table.from_pylist(frames, schemas["frames"]),
-        "contacts": pa.Table.from_pylist(contacts, schemas["contacts"]),
-        "markers": _markers(messages, schemas["markers"]),
-    }
-
-
-def _markers(messages: Sequence[Mapping[str, Any]], schema: pa.Schema) -> pa.Table:
-    """A row for each dot of each frame; by columns, as there are thousands of rows a second."""
-    import pyarrow as pa
-
+    # By columns, as there are thousands of rows a second.
     seen = [(m["seq"], m["markers"]) for m in messages if m["markers"] and m["markers"]["position"]]
     counts = [len(markers["position"]) for _, markers in seen]
     position, origin = (
         np.concatenate([np.empty((0, 2)), *(np.array(markers[key]) for _, markers in seen)])
         for key in ("position", "origin")
     )
+    errors = (m.get("stderr", [None] * count) for (_, m), count in zip(seen, counts, strict=True))
     columns = [
         np.repeat(np.array([seq for seq, _ in seen], np.int64), counts),
         list(chain.from_iterable(map(range, counts))),
@@ -273,12 +241,12 @@ def _markers(messages: Sequence[Mapping[str, Any]], schema: pa.Schema) -> pa.Tab
         *(position - origin).T,
         *origin.T,
         list(chain.from_iterable(markers["status"] for _, markers in seen)),
-        list(
-            chain.from_iterable(
-                markers.get("stderr", [None] * count)
-                for (_, markers), count in zip(seen, counts, strict=True)
-            )
-        ),
+        list(chain.from_iterable(errors)),
     ]
+    schema = schemas["markers"]
     arrays = [pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)]
-    return pa.Table.from_arrays(arrays, schema=schema)
+    return {
+        "frames": pa.Table.from_pylist(frames, schemas["frames"]),
+        "contacts": pa.Table.from_pylist(contacts, schemas["contacts"]),
+        "markers": pa.Table.from_arrays(arrays, schema=schema),
+    }

@@ -1,6 +1,6 @@
 """The cameras of this machine, under names that stay the same.
 
-`/dev/videoN` is given out in the order of plugging in. udev's links `/dev/v4l/by-id/...` name the device (two
+`/dev/videoN` is numbered in the order of plugging in. udev's links `/dev/v4l/by-id/...` name the device (two
 of the same model without serial numbers share one), `/dev/v4l/by-path/...` the socket it is plugged into.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -20,29 +20,24 @@ else:
 
     def ioctl(*_: object) -> int:
         """Stands in for Linux's call."""
-        raise OSError(LINUX_ONLY)
+        raise OSError("the driver can only be asked on Linux")
 
 
-LINUX_ONLY = "its driver can only be asked on Linux"
 VIDIOC_QUERYCAP = 0x80685600
 VIDIOC_ENUM_FMT = 0xC0405602
 VIDIOC_ENUM_FRAMESIZES = 0xC02C564A
-"""Requests to a driver, as `linux/videodev2.h` defines them."""
+"""Requests to a driver, as `linux/videodev2.h` defines them; bits 16 to 29 are the length of the answer."""
 CAN_CAPTURE = 0x1
-CAN_CAPTURE_MANY_PLANES = 0x1000
+CAN_CAPTURE_PLANES = 0x1000
 HAS_DEVICE_CAPS = 0x80000000
-"""Bits of its answer, from the same file."""
+"""Bits of the answer to the first one, from the same file."""
 BUFFER_CAPTURE = 1
-BUFFER_CAPTURE_MANY_PLANES = 9
+BUFFER_CAPTURE_PLANES = 9
 """Kinds of buffers that pictures come in, from the same file."""
 DISCRETE_SIZES = 1
-"""A driver that lists sizes one by one, not as a range."""
-CAPABILITY_BYTES = 104
-FORMAT_BYTES = 64
-FRAME_SIZE_BYTES = 44
-"""Lengths of the structures `v4l2_capability`, `v4l2_fmtdesc` and `v4l2_frmsizeenum`."""
+"""The driver lists sizes one by one, not as a range."""
 MAX_ENTRIES = 64
-"""Entries of a list after which a driver is not listened to any more. Chosen by hand."""
+"""Entries of a list that are read at most, in case a driver never ends it. Chosen by hand."""
 
 
 class Abilities(NamedTuple):
@@ -62,7 +57,7 @@ class Abilities(NamedTuple):
 class CameraInfo:
     """A camera of this machine.
 
-    source : the steadiest name it has, to be used as a source. device : `/dev/videoN`. index : N.
+    source : its most stable name, to be used as a source. device : `/dev/videoN`. index : N.
     names : all links to it. abilities : what its driver says, or None where it cannot be asked; `problem`
     then says why.
     """
@@ -78,20 +73,17 @@ class CameraInfo:
 def list_cameras(
     dev: Path = Path("/dev"), ask: Callable[[Path], Abilities] | None = None
 ) -> list[CameraInfo]:
-    """The cameras that are plugged in, in the order of their indices; nothing is opened for reading pictures.
+    """The cameras that are plugged in, by index; none of them is started.
 
     Parameters
     ----------
     dev : the folder of devices.
     ask : asks a driver; Linux's V4L2 if not given.
     """
-    ask = ask or ask_driver
     links: dict[str, list[str]] = {}
-    for kind in ("by-id", "by-path"):
-        folder = dev / "v4l" / kind
-        for link in sorted(folder.iterdir()) if folder.is_dir() else []:
-            links.setdefault(os.path.realpath(link), []).append(str(link))
-    found = []
+    for link in sorted(dev.glob("v4l/by-*/*")):
+        links.setdefault(os.path.realpath(link), []).append(str(link))
+    cameras = []
     for device in dev.glob("video*"):
         number = device.name.removeprefix("video")
         if not number.isdecimal():
@@ -99,14 +91,14 @@ def list_cameras(
         names = tuple(links.get(os.path.realpath(device), ()))
         abilities, problem = None, ""
         try:
-            abilities = ask(device)
+            abilities = (ask or ask_driver)(device)
         except PermissionError:
             problem = "no permission: sudo usermod -aG video $USER, then log in again"
         except OSError as error:
             problem = error.strerror or str(error)
         source = names[0] if names else str(device)
-        found.append(CameraInfo(source, str(device), int(number), names, abilities, problem))
-    return sorted(found, key=lambda camera: camera.index)
+        cameras.append(CameraInfo(source, str(device), int(number), names, abilities, problem))
+    return sorted(cameras, key=lambda camera: camera.index)
 
 
 def ask_driver(device: Path) -> Abilities:
@@ -115,48 +107,42 @@ def ask_driver(device: Path) -> Abilities:
     Raises
     ------
     OSError
-        If the device cannot be opened, or is none of V4L2.
+        If the device cannot be opened, or is not one of V4L2.
     """
-    if sys.platform != "linux":
-        raise OSError(LINUX_ONLY)
-    handle = os.open(device, os.O_RDWR | os.O_NONBLOCK)
+    handle = os.open(device, os.O_RDWR | getattr(os, "O_NONBLOCK", 0))
     try:
-        reply = bytearray(CAPABILITY_BYTES)
-        ioctl(handle, VIDIOC_QUERYCAP, reply)
-        name = _text(reply[16:48])
-        whole, own = struct.unpack_from("=II", reply, 84)
-        can = own if whole & HAS_DEVICE_CAPS else whole
-        pictures = bool(can & (CAN_CAPTURE | CAN_CAPTURE_MANY_PLANES))
-        kind = BUFFER_CAPTURE if can & CAN_CAPTURE else BUFFER_CAPTURE_MANY_PLANES
-        formats: dict[str, list[tuple[int, int]]] = {}
-        for index in range(MAX_ENTRIES if pictures else 0):
-            entry = bytearray(struct.pack("=II", index, kind).ljust(FORMAT_BYTES, b"\0"))
-            try:
-                ioctl(handle, VIDIOC_ENUM_FMT, entry)
-            except OSError:
-                break
-            code = bytes(entry[44:48])
-            formats[_text(code)] = _sizes(handle, code)
-        return Abilities(name, pictures, formats)
+        answer = _request(handle, VIDIOC_QUERYCAP)
+        driver, own = struct.unpack_from("=II", answer, 84)
+        capabilities = own if driver & HAS_DEVICE_CAPS else driver
+        pictures = bool(capabilities & (CAN_CAPTURE | CAN_CAPTURE_PLANES))
+        kind = BUFFER_CAPTURE if capabilities & CAN_CAPTURE else BUFFER_CAPTURE_PLANES
+        codes = [entry[44:48] for entry in _list(handle, VIDIOC_ENUM_FMT, struct.pack("=I", kind))]
+        formats = {_text(code): _sizes(handle, code) for code in codes if pictures}
+        return Abilities(_text(answer[16:48]), pictures, formats)
     finally:
         os.close(handle)
 
 
 def _sizes(handle: int, code: bytes) -> list[tuple[int, int]]:
-    sizes: list[tuple[int, int]] = []
+    entries = (struct.unpack_from("=III", entry, 8) for entry in _list(handle, VIDIOC_ENUM_FRAMESIZES, code))
+    return list(dict.fromkeys((width, height) for kind, width, height in entries if kind == DISCRETE_SIZES))
+
+
+def _list(handle: int, request: int, what: bytes) -> Iterator[bytes]:
+    """The entries of a list. what : of what, behind the index of the entry."""
     for index in range(MAX_ENTRIES):
-        entry = bytearray((struct.pack("=I", index) + code).ljust(FRAME_SIZE_BYTES, b"\0"))
         try:
-            ioctl(handle, VIDIOC_ENUM_FRAMESIZES, entry)
+            yield _request(handle, request, struct.pack("=I", index) + what)
         except OSError:
-            break
-        kind, width, height = struct.unpack_from("=III", entry, 8)
-        if kind != DISCRETE_SIZES:
-            break
-        if (width, height) not in sizes:
-            sizes.append((width, height))
-    return sizes
+            return
 
 
-def _text(raw: bytes | bytearray) -> str:
-    return bytes(raw).partition(b"\0")[0].decode("utf-8", "replace").strip()
+def _request(handle: int, request: int, question: bytes = b"") -> bytes:
+    """The driver's answer. Raises OSError."""
+    data = bytearray(question.ljust(request >> 16 & 0x3FFF, b"\0"))
+    ioctl(handle, request, data)
+    return bytes(data)
+
+
+def _text(raw: bytes) -> str:
+    return raw.partition(b"\0")[0].decode("utf-8", "replace").strip()
