@@ -31,7 +31,6 @@ LONG_FILES = (
     "browser/test_view_page.py",
     "fleet/test_fleet.py",
     "test_main_job.py",
-    "sources/test_streams.py",
     "test_install.py",
     "cli/test_calibrate.py",
     "cli/test_record.py",

@@ -24,6 +24,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message.schema import message_schema
 from tactflow.vision.types import Depth, Force, Scale, Slip
 from tests.clock import PATIENCE, until
+from tests.faults.rig import array, run
 from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, Results, build_message, result_of
 
 pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
@@ -123,22 +124,6 @@ def test_every_value_of_the_message_has_a_column_with_its_description(tmp_path: 
     assert {b"tactflow", b"numpy", b"opencv", b"sensor"} <= set(schema.metadata)
 
 
-def test_pandas_reads_the_same_numbers(tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
-    sink = opened(tmp_path)
-    messages = write(sink, range(8))
-    sink.close()
-    frames = pandas.read_parquet(tmp_path / "frames").set_index("seq")
-    dots = pandas.read_parquet(tmp_path / "markers")
-    for message in messages:
-        row, contact = frames.loc[message["seq"]], message["contact"]
-        assert pandas.isna(row.contact_area) if contact is None else row.contact_area == contact["area"]
-        if contact is not None:
-            assert np.vstack(row.contact_hull).tolist() == contact["hull"]
-            position = dots[dots.seq == message["seq"]][["x", "y"]].to_numpy().tolist()
-            assert position == message["markers"]["position"]
-
-
 def test_a_part_is_written_at_the_interval_and_can_be_read_while_the_run_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -172,19 +157,6 @@ def test_without_pyarrow_the_error_has_the_command_that_installs_it(
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(StageError, match=r"need pyarrow: pip install 'tactflow\[parquet\]'"):
         opened(tmp_path)
-
-
-def test_the_calibration_of_the_run_is_in_every_table(tmp_path: Path) -> None:
-    (tmp_path / "left.yaml").write_text("sensor: left\n")
-    pipeline = SimpleNamespace(settings={}, file=tmp_path / "no.yaml", calibration=tmp_path / "left.yaml")
-    control: Any = SimpleNamespace(pipeline=pipeline, source=None)
-    sink = Parquet(Parquet.Params(path=str(tmp_path / "out")), "left", control)
-    sink.open()
-    write(sink, range(1))
-    sink.close()
-    for name in TABLES:
-        facts = pq.read_schema(tmp_path / "out" / name / "part-00000.parquet").metadata
-        assert facts[b"calibration.yaml"] == b"sensor: left\n"
 
 
 def test_the_example_of_the_page_runs(
@@ -250,14 +222,20 @@ def test_what_was_written_can_be_read_after_kill_9_at_twenty_random_moments(tmp_
         process.wait(PATIENCE)
 
 
-def test_a_run_puts_the_pipeline_into_every_table(tmp_path: Path) -> None:
-    from tests.faults.rig import array, run
-
-    folder = tmp_path / "out"
-    _, seen = run(tmp_path, {"parquet": {"path": str(folder)}}, source=str(array(tmp_path, 12)))
+def test_a_run_puts_its_pipeline_and_calibration_into_every_table(tmp_path: Path) -> None:
+    (tmp_path / "left.yaml").write_text("sensor: left\n")
+    pipeline = SimpleNamespace(settings={}, file=tmp_path / "no.yaml", calibration=tmp_path / "left.yaml")
+    control: Any = SimpleNamespace(pipeline=pipeline, source=None)
+    sink = Parquet(Parquet.Params(path=str(tmp_path / "calibrated")), "left", control)
+    sink.open()
+    write(sink, range(1))
+    sink.close()
+    _, seen = run(tmp_path, {"parquet": {"path": str(tmp_path / "out")}}, source=str(array(tmp_path, 12)))
     assert seen.exit == 0
     for name in TABLES:
-        facts = pq.read_schema(folder / name / "part-00000.parquet").metadata
+        facts = pq.read_schema(tmp_path / "calibrated" / name / "part-00000.parquet").metadata
+        assert facts[b"calibration.yaml"] == b"sensor: left\n"
+        facts = pq.read_schema(tmp_path / "out" / name / "part-00000.parquet").metadata
         assert b"noise.npy" in facts[b"source"]
         assert b"preprocess" in facts[b"pipeline.yaml"]
-    assert len(rows(folder, "frames")) == 12
+    assert len(rows(tmp_path / "out", "frames")) == 12

@@ -368,7 +368,7 @@ def test_a_sink_never_writes_over_what_a_stage_reads(tmp_path: Path, link: str, 
         (os.symlink if link == "symbolic" else os.link)(source, target)
     text = f"""
 stages:
-  capture: {{source: "{name}?loop=2"}}
+  capture: {{source: "{name}?start=0"}}
 sinks:
   jsonl: {{path: "{target}", overwrite: true}}
 """

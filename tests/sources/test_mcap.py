@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -129,36 +128,6 @@ def test_start_skips_ahead_but_shows_the_references_that_are_in_force(tmp_path: 
         captured(f"{path}?start=4")
 
 
-@pytest.mark.parametrize("query", ["loop=3", "loop=3&start=0.5"])
-def test_laps_repeat_the_frames_while_seq_and_time_grow(tmp_path: Path, query: str) -> None:
-    made = frames([0, 1, 4, 5, 6, 7, 8], references=(0, 6))
-    path = record(tmp_path / "a.mcap", made)
-    once = captured(f"{path}?{query.replace('loop=3', 'loop=1')}")
-    found = captured(f"{path}?{query}")
-    assert len(found) == 3 * len(once)
-    assert facts(found[: len(once)]) == facts(once)
-    for before, after in pairwise(found):
-        assert after.seq > before.seq
-        assert after.t >= before.t
-        assert after.epoch >= before.epoch
-    for lap in range(3):
-        part = found[lap * len(once) : (lap + 1) * len(once)]
-        for frame, first in zip(part, once, strict=True):
-            np.testing.assert_array_equal(frame.image, first.image)
-            assert (frame.reference, frame.epoch) == (first.reference, first.epoch + 2 * lap)
-        assert np.diff([f.t for f in part[-3:]]) == pytest.approx([0.1, 0.1])
-
-
-def test_a_loop_without_end_goes_on(tmp_path: Path) -> None:
-    path = record(tmp_path / "a.mcap", frames(range(3)))
-    source = open_source(f"{path}?loop=0")
-    assert source.total is None
-    seqs = [stamp.seq for _, _, stamp in (source.read_stamped() for _ in range(20))]  # type: ignore[attr-defined]
-    assert seqs == list(range(20))
-    source.close()
-    assert source.read() is None
-
-
 def test_at_its_own_pace_references_of_before_are_not_waited_for(tmp_path: Path) -> None:
     made = frames([0, *range(10_000, 10_003)])
     sink = Record(Record.Params(path=str(tmp_path / "a.mcap"), trigger="button"))
@@ -192,7 +161,6 @@ def test_a_new_reference_can_be_taken_during_replay(tmp_path: Path) -> None:
         ("start=-1", "start=-1: required start=SECONDS"),
         ("start=soon", "required start=SECONDS"),
         ("start=1e300", "required start=SECONDS"),
-        ("loop=1.5", "required .*loop=N"),
         ("speed=2", "speed=2: required"),
         ("start=nan", "required"),
     ],

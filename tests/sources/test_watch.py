@@ -127,7 +127,7 @@ def test_each_fault_is_reported_once_and_so_is_its_end(
     assert device.opened > 1
 
 
-def test_attempts_back_off_and_start_quickly_again_after_a_connection_that_lasted(
+def test_attempts_back_off_and_start_quickly_again_once_the_source_was_back(
     device: Flaky, watched: Callable[..., Watched]
 ) -> None:
     source = watched(first_retry=0.25, last_retry=2.0)
@@ -141,9 +141,6 @@ def test_attempts_back_off_and_start_quickly_again_after_a_connection_that_laste
         return [round(seconds, 2) for seconds in device.clock.sleeps]
 
     assert waits("gone", 6) == [0.25, 0.5, 1, 2, 2, 2]
-    assert waits("gone", 2) == [2, 2], "the connection in between was too short"
-    steady = device.clock.now() + 6.0
-    until(lambda: device.clock.now() > steady)
     assert waits("gone", 2) == [0.25, 0.5]
     reading.stop()
 

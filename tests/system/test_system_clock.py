@@ -8,32 +8,9 @@ from itertools import pairwise
 
 import pytest
 
-from tactflow.sources.devices import ArrivalClock
 from tactflow.sources.simulated import Simulated
 from tactflow.sources.watch import Watch, Watched
-from tests.clock import ManualClock
 from tests.conftest import REPOSITORY
-
-
-class SteppedClock(ManualClock):
-    """Its Unix time jumps by a year to and fro with each look."""
-
-    looks = 0
-
-    def unix(self) -> float:
-        self.looks += 1
-        return super().unix() + (-1) ** self.looks * 3.2e7
-
-
-def test_times_of_live_frames_are_unix_time_at_the_start_and_monotonic_from_there() -> None:
-    clock = SteppedClock()
-    arrival = ArrivalClock(clock)
-    began = arrival.now()
-    assert began == pytest.approx(1e9 + clock.now() - 3.2e7)
-    clock.advance(0.5)
-    assert arrival.now() - began == pytest.approx(0.5)
-    clock.advance(0.5)
-    assert arrival.now() - began == pytest.approx(1.0)
 
 
 def test_a_watched_source_takes_no_step_for_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:

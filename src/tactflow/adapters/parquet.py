@@ -6,6 +6,7 @@ import errno
 import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, fr
 from tactflow.message.result import SCHEMA, Result, encode_message
 from tactflow.recording.provenance import facts, texts
 from tactflow.system.extras import missing
-from tactflow.system.files import completed, expanded, make_folder
+from tactflow.system.files import expanded, make_folder
 from tactflow.system.outputs import cannot_write
 from tactflow.recording.provenance import facts, texts
 
@@ -31,6 +32,8 @@ SEQ = Column("seq", ("seq",), "integer", "the frame's seq in the table frames")
 CONTACT = Column("contact", (), "integer", "0 is the contact with the most pixels")
 TABLES = ("markers", "contacts", "frames")
 """In the order in which they are written: what belongs to a frame of `frames` is there before it."""
+UNFINISHED = ".unfinished"
+"""Prefix of a part that is being written: readers of folders leave out names that begin with a dot."""
 PART_BYTES = 64_000_000
 """A part is written early when its messages take so much memory, bytes: some ten thousand frames."""
 
@@ -165,14 +168,20 @@ class Parquet(Sink):
         if not messages or not self._schemas:
             return
         tables = make_tables([orjson.loads(message) for message in messages], self._schemas)
+        unfinished = self._folder / UNFINISHED
         try:
             for name in TABLES:
-                with completed(self._folder / name / f"part-{self._next:05d}.parquet") as partial:
-                    pq.write_table(tables[name], partial, compression="zstd")
+                part = self._folder / name / f"part-{self._next:05d}.parquet"
+                unfinished = part.with_name(f"{UNFINISHED}-{part.name}")
+                with unfinished.open("wb") as file:
+                    pq.write_table(tables[name], file, compression="zstd")
+                    file.flush()
                     # On the disk before it gets its name, so that a power cut leaves no empty part.
-                    with partial.open("rb") as file:
-                        os.fsync(file.fileno())
+                    os.fsync(file.fileno())
+                unfinished.replace(part)
         except OSError as error:
+            with suppress(OSError):
+                unfinished.unlink()
             hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
             kept = (
                 f"the {self._counts['frames']} frames written before are complete; "

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-import threading
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import cv2
@@ -18,6 +16,12 @@ from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
 
 log = logging.getLogger("tactflow")
+
+# OpenCV's and FFmpeg's own messages do not belong on standard error: ours say the same more clearly. FFmpeg
+# reads its level once, when OpenCV opens the first file with it; OpenCV 5 keeps its own elsewhere than 4.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+if "OPENCV_LOG_LEVEL" not in os.environ:
+    (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)
 
 SPARSE_PEAK = 4096
 """A 16-bit frame without a value from here on comes from a sensor with 12 bits or fewer, grey levels."""
@@ -164,8 +168,7 @@ class CaptureReader(FrameReader):
 
     def __init__(self, name: str, failure: str, *arguments: Any) -> None:
         super().__init__(name)
-        with quiet_opencv():
-            self._capture: cv2.VideoCapture | None = cv2.VideoCapture(*arguments)
+        self._capture: cv2.VideoCapture | None = cv2.VideoCapture(*arguments)
         if not self._capture.isOpened():
             raise SourceError(failure)
         self._update_size()
@@ -184,8 +187,7 @@ class CaptureReader(FrameReader):
         """Decode the next picture; None if there is none."""
         if self._capture is None:
             return None
-        with quiet_opencv():
-            arrived, image = self._capture.read()
+        arrived, image = self._capture.read()
         return image if arrived else None
 
     def close(self) -> None:
@@ -299,31 +301,3 @@ def damaged(name: str, error: Exception) -> SourceError:
         return SourceError(f"{name}: cannot be read: {error.strerror}")
     message = str(error).strip().partition("\n")[0]
     return SourceError(f"{name}: is damaged or cut off ({message or type(error).__name__})")
-
-
-SILENT = 0
-"""OpenCV's log level at which it says nothing."""
-
-_silence_lock = threading.Lock()
-_silencers = [0, 0]
-"""How many threads want OpenCV silent, and the log level to go back to."""
-
-
-@contextmanager
-def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV's and FFmpeg's own messages off standard error: ours say the same more clearly."""
-    # FFmpeg reads this once, when OpenCV opens the first file with it.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    # OpenCV 5 keeps the function elsewhere than 4.
-    set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
-    with _silence_lock:
-        if _silencers[0] == 0:
-            _silencers[1] = int(set_level(SILENT))
-        _silencers[0] += 1
-    try:
-        yield
-    finally:
-        with _silence_lock:
-            _silencers[0] -= 1
-            if _silencers[0] == 0:
-                set_level(_silencers[1])

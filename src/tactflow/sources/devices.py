@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import CaptureReader, log
-from tactflow.system.clock import SYSTEM, Clock
+from tactflow.system.clock import SYSTEM
 from tactflow.system.redaction import public_address
 
 HIGHEST_INDEX = 2**31 - 1
@@ -26,6 +26,8 @@ READ_TIMEOUT = 2.0
 30."""
 OPEN_TIMEOUT = 10.0
 """Seconds to wait for the first answer of a stream."""
+EPOCH = SYSTEM.unix() - SYSTEM.now()
+"""Unix time when the monotonic clock was 0, s: looked up once, so that times of frames never step back."""
 TOLERANCE = 0.01
 """A size or rate this close to the requested one, as a fraction, is what was asked for: 29.97 is 30."""
 
@@ -43,18 +45,6 @@ class CameraRequest:
     format: str | None = None
 
 
-class ArrivalClock:
-    """Unix time that never steps back: the system's clock at the start plus a monotonic clock."""
-
-    def __init__(self, clock: Clock = SYSTEM) -> None:
-        self._clock = clock
-        self._offset = clock.unix() - clock.now()
-
-    def now(self) -> float:
-        """Unix time, s."""
-        return self._offset + self._clock.now()
-
-
 class Camera(CaptureReader):
     """A camera of this machine. Frames are stamped on arrival.
 
@@ -62,7 +52,6 @@ class Camera(CaptureReader):
     ----------
     device : an index ("0") or a path ("/dev/video0", "/dev/v4l/by-id/...").
     request : size, rate and format to ask for. A camera may ignore it; that is reported.
-    clock : stamps the frames; its own if not given.
 
     Raises
     ------
@@ -72,9 +61,7 @@ class Camera(CaptureReader):
 
     live = True
 
-    def __init__(
-        self, device: str, request: CameraRequest | None = None, clock: ArrivalClock | None = None
-    ) -> None:
+    def __init__(self, device: str, request: CameraRequest | None = None) -> None:
         name = f"camera {device}"
         # OpenCV reads this once, at its first camera.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", f"{READ_TIMEOUT:.0f}")
@@ -84,7 +71,6 @@ class Camera(CaptureReader):
         backend = cv2.CAP_V4L2 if sys.platform == "linux" else cv2.CAP_ANY
         address = int(device) if device.isdecimal() else os.path.realpath(device)
         super().__init__(name, failure, address, backend)
-        self._clock = clock or ArrivalClock()
         self._configure(request or CameraRequest())
 
     def _configure(self, request: CameraRequest) -> None:
@@ -122,7 +108,7 @@ class Camera(CaptureReader):
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         while (image := self._grab()) is not None:
-            yield image, self._clock.now()
+            yield image, EPOCH + SYSTEM.now()
         raise SourceError(f"{self.name}: delivers no more frames; unplugged, or in use by another program?")
 
     def delay(self) -> float | None:
@@ -164,7 +150,6 @@ class Stream(CaptureReader):
     Parameters
     ----------
     url : what OpenCV's FFmpeg is to open.
-    clock : stamps the frames; its own if not given.
 
     Raises
     ------
@@ -174,7 +159,7 @@ class Stream(CaptureReader):
 
     live = True
 
-    def __init__(self, url: str, clock: ArrivalClock | None = None) -> None:
+    def __init__(self, url: str) -> None:
         name = public_address(url)
         timeouts = {
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: OPEN_TIMEOUT,
@@ -183,14 +168,13 @@ class Stream(CaptureReader):
         options = [number for key, seconds in timeouts.items() for number in (key, int(seconds * 1000))]
         failure = f"{name}: no stream can be opened there; {_stream_hint(url)}"
         super().__init__(name, failure, url, cv2.CAP_FFMPEG, options)
-        self._clock = clock or ArrivalClock()
         self.description = f"{name}, {self._size_text}"
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         if (image := self._grab()) is None:
             raise SourceError(f"{self.name}: the stream was opened but delivers no frames")
         while image is not None:
-            yield image, self._clock.now()
+            yield image, EPOCH + SYSTEM.now()
             image = self._grab()
 
 

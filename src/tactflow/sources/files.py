@@ -23,7 +23,6 @@ from tactflow.sources.base import (
     check_pixel_count,
     damaged,
     log,
-    quiet_opencv,
 )
 from tactflow.sources.paths import find_path
 from tactflow.system.files import expanded
@@ -90,8 +89,7 @@ def decode_image(data: bytes, name: str) -> NDArray[Any]:
         raise SourceError(f"{name}: the image is cut off ({len(data)} bytes); copy it again or remove it")
     image: NDArray[Any] | None = None
     try:
-        with quiet_opencv():
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         if "MAX_IMAGE" in str(error):
             raise SourceError(
@@ -163,8 +161,7 @@ def _warn_about_pages(path: Path) -> None:
     """Warn that only the first picture of a TIFF is read: some programs write a whole recording into one."""
     if path.suffix.lower() not in (".tif", ".tiff"):
         return
-    with quiet_opencv():
-        pages = cv2.imcount(str(path))
+    pages = cv2.imcount(str(path))
     if pages > 1:
         log.warning(
             "%s: holds %d pictures, of which only the first is read; save each as a file of its own",

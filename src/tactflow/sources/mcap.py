@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tactflow.recording.frames import StoredFrame
     from tactflow.recording.reader import Contents
 
-SETTINGS = {"start": "SECONDS (from the beginning)", "loop": "N (play N times; 0 is for ever)"}
+SETTINGS = {"start": "SECONDS (from the beginning)"}
 
 LATEST_START = 1e9
 """A start beyond this, s, lies behind the end of every recording: 30 years. Chosen by hand."""
@@ -30,12 +30,9 @@ class Recording(StampedReader):
     A recording brings its own references: capture's parameters `reference` and `skip` do not apply. With
     `start`, the references that were in force at that time come first.
 
-    With `loop`, seq and t keep growing from lap to lap, and every lap is an epoch of its own: it takes its
-    references again, so that it gives the same results as the first.
-
     Parameters
     ----------
-    spec : `file.mcap`, or `file.mcap?start=2.5&loop=2`.
+    spec : `file.mcap`, or `file.mcap?start=2.5`.
     directory : where a relative path is looked for if it is not in the current directory.
 
     Raises
@@ -48,7 +45,7 @@ class Recording(StampedReader):
         problem = missing_packages()
         if problem is not None:
             raise SourceError(f"{spec}: {problem}")
-        name, start, self._laps = _parse(spec, directory)
+        name, start = _parse(spec, directory)
         self._path = find_path(name, directory)
         super().__init__(str(self._path))
         contents = self._contents = _look_into(self._path)
@@ -58,7 +55,7 @@ class Recording(StampedReader):
         self._read_first(f"there is no frame {f'after {start:g} s{length}' if start else 'in it'}")
         if contents.frames is not None:
             self.fps = (contents.frames - 1) / seconds if seconds > 0 else None
-            self.total = contents.frames * self._laps if self._laps and self._start is None else None
+            self.total = contents.frames if self._start is None else None
         frames = "an unknown number of" if contents.frames is None else str(contents.frames)
         self.description = f"{spec}, {frames} frames, {'{} x {}'.format(*self.size or (0, 0))}"
         if not contents.finished:
@@ -69,60 +66,44 @@ class Recording(StampedReader):
             )
 
     def _frames(self) -> Iterator[tuple[BgrImage, float, Stamp]]:
-        """All laps: each frame, its time, and its stamp."""
-        lap = seqs = epochs = 0
-        seconds = latest = 0.0
-        while not self._laps or lap < self._laps:
-            lap += 1
-            times: list[float] = []
-            last_seq = last_epoch = -1
-            for frame, due in self._lap():
-                seq = frame.seq if frame.seq < 0 else frame.seq + seqs
-                if due:
-                    times = [times[0] if times else frame.t, *times[-1:], frame.t]
-                last_seq, last_epoch = max(last_seq, frame.seq), max(last_epoch, frame.epoch)
-                t = latest = frame.t if lap == 1 else max(frame.t + seconds, latest)
-                yield self._decode(frame), t, Stamp(seq, frame.reference, frame.epoch + epochs, due)
-            if not times:
-                return
-            # The last frame lasts as long as the one before it.
-            seconds += times[-1] - times[0] + (times[-1] - times[-2])
-            seqs += last_seq + 1
-            epochs += last_epoch + 1
-
-    def _decode(self, frame: StoredFrame) -> BgrImage:
-        try:
-            return frame.image()
-        except ValueError as error:
-            raise SourceError(f"{self._path}, frame {frame.seq}: {error}") from error
-
-    def _lap(self) -> Iterator[tuple[StoredFrame, bool]]:
-        """The frames of one lap, and whether each comes at its time (True) or ahead of it."""
-        from tactflow.recording.frames import nanoseconds
-        from tactflow.recording.reader import messages
+        """Each frame, its time, and its stamp."""
         from tactflow.recording.records import DAMAGE
 
-        contents, start = self._contents, self._start
-        topics = {contents.frame_topic, contents.reference_topic}
         try:
-            played = messages(self._path, contents, topics, start=start)
-            if start is not None:
-                first = next(played, None)
-                if first is None:
-                    return
-                before = messages(self._path, contents, {contents.reference_topic}, end=start)
-                yield from ((frame, False) for frame in _in_force([self._stored(m) for m in before]))
-                played = chain([first], played)
-            for message in played:
-                frame = self._stored(message)
-                # A recording begun late brings the references of before, at the time it began.
-                late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
-                yield frame, not late and frame.seq >= 0
+            for frame, paced in self._stored_frames():
+                try:
+                    image = frame.image()
+                except ValueError as error:
+                    raise SourceError(f"{self._path}, frame {frame.seq}: {error}") from error
+                yield image, frame.t, Stamp(frame.seq, frame.reference, frame.epoch, paced)
         except DAMAGE as error:
             raise SourceError(
                 f"{self._path}: is damaged ({error or type(error).__name__}); "
                 "tactflow repair keeps all that is intact"
             ) from error
+
+    def _stored_frames(self) -> Iterator[tuple[StoredFrame, bool]]:
+        """The frames, and whether each comes at its time (True) or ahead of it."""
+        from tactflow.recording.frames import nanoseconds
+        from tactflow.recording.reader import messages
+
+        contents, start = self._contents, self._start
+        topics = {contents.frame_topic, contents.reference_topic}
+        played = messages(self._path, contents, topics, start=start)
+        if start is not None:
+            first = next(played, None)
+            if first is None:
+                return
+            before = messages(self._path, contents, {contents.reference_topic}, end=start)
+            references = [self._stored(message) for message in before]
+            epoch = max((frame.epoch for frame in references), default=0)
+            yield from ((frame, False) for frame in references if frame.epoch == epoch)
+            played = chain([first], played)
+        for message in played:
+            frame = self._stored(message)
+            # A recording begun late brings the references of before, at the time it began.
+            late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
+            yield frame, not late and frame.seq >= 0
 
     def _stored(self, message: Message) -> StoredFrame:
         from tactflow.recording.frames import StoredFrame
@@ -145,18 +126,13 @@ def _look_into(path: Path) -> Contents:
         raise damaged(str(path), error) from error
 
 
-def _in_force(references: list[StoredFrame]) -> list[StoredFrame]:
-    epoch = max((frame.epoch for frame in references), default=0)
-    return [frame for frame in references if frame.epoch == epoch]
-
-
-def _parse(spec: str, directory: Path | None) -> tuple[str, float, int]:
-    """Path, start in s, and number of laps."""
+def _parse(spec: str, directory: Path | None) -> tuple[str, float]:
+    """Path, and start in s."""
     name, settings = split_query(spec, directory, SETTINGS)
     try:
-        start, laps = float(settings.get("start", 0)), int(settings.get("loop", 1))
+        start = float(settings.get("start", 0))
     except ValueError:
-        start, laps = -1.0, 1
-    if not 0 <= start <= LATEST_START or laps < 0:
+        start = -1.0
+    if not 0 <= start <= LATEST_START:
         raise SourceError(f"{spec}: required {describe_settings(SETTINGS)}")
-    return name, start, laps
+    return name, start

@@ -24,17 +24,12 @@ BLACK_LEVEL = 4.0
 """Mean gray level at and below which a picture counts as black; a lit gel has 30 and more."""
 BLACK_STEP = 8
 """The mean is taken over every so many rows and columns, px: a mean needs no more pixels. Chosen by hand."""
-COMPARED_STEP = 64
-"""Pictures are first compared in every so many rows, px: noise shows there already. Chosen by hand."""
 FIRST_FRAME_SECONDS = 3.0
 """A device may take so long to its first frame before that is reported, s. Chosen by hand."""
 SILENT_INTERVALS = 3.0
 """A gap shorter than so many usual times between frames is no stall. Chosen by hand."""
 INTERVAL_DECAY = 0.9
 """By this factor a long gap counts less with each frame after it. Chosen by hand."""
-STEADY_SECONDS = 5.0
-"""After a connection that delivered for so long, the back-off starts at its shortest again, s. Chosen by
-hand."""
 OPEN_TIMEOUT = 15.0
 """Opening that takes longer hangs, s: more than drivers and streams allow themselves. Chosen by hand."""
 MAX_HUNG = 4
@@ -84,24 +79,16 @@ class Arrival(NamedTuple):
 
 @dataclass(slots=True)
 class _Fault:
-    """since : on the clock, s. unix : the same as Unix time, s. attempts : to open the source again.
+    """since : on the clock, s. hour : the same for people. attempts : to open the source again.
 
     detail : the last error.
     """
 
     what: str
     since: float
-    unix: float
+    hour: str
     detail: str = ""
     attempts: int = 0
-
-    @property
-    def hour(self) -> str:
-        return time.strftime("%H:%M:%S", time.localtime(self.unix))
-
-
-class _EndOfStreamError(Exception):
-    """The source says that there are no more frames."""
 
 
 class Watched(FrameReader):
@@ -149,12 +136,13 @@ class Watched(FrameReader):
         """Good frames that a newer one replaced before they were read."""
         self._changed = threading.Condition()
         self._stopped = threading.Event()
-        self._end: Exception | None = None
+        self._ended = False
+        self._failure: Exception | None = None
         self._newest: Arrival | None = None
         self._seq, self._t, self._connection = -1, -math.inf, 0
         self._fault: _Fault | None = None
         self._interval = 1.0 / source.fps if source.fps else 0.0
-        self._arrived_at = self._good_at = self._steady_since = clock.now()
+        self._arrived_at = self._good_at = clock.now()
         self._pictures = _PictureCheck(watch, clock.now())
         self._failures, self._retry_at, self._hangs_at = 0, 0.0, math.inf
         self._hung: list[threading.Thread] = []
@@ -178,12 +166,12 @@ class Watched(FrameReader):
                 arrival, self._newest = self._newest, None
                 if arrival is not None:
                     return arrival
-                if isinstance(self._end, _EndOfStreamError):
+                if self._failure is not None:
+                    raise self._failure
+                if self._ended:
                     return None
-                if self._end is not None:
-                    raise self._end
                 self._check_time(self._clock.now())
-                if self._end is None:
+                if self._failure is None:
                     self._clock.wait(POLL_SECONDS, self._changed)
         return None
 
@@ -213,12 +201,11 @@ class Watched(FrameReader):
         if self._fault is None and now - self._arrived_at >= max(usual, SILENT_INTERVALS * self._interval):
             self._report("no frames", self._arrived_at, now)
         if watch.no_frame_timeout and now - self._good_at >= watch.no_frame_timeout:
-            self._end = self._timeout_error(now)
+            self._failure = self._timeout_error(now)
         elif watch.reconnect and now >= self._hangs_at:
             self._hung = [thread for thread in self._hung if thread.is_alive()]
             if len(self._hung) < MAX_HUNG:
                 self._hung.append(self.reader)
-                self._note("it hangs")
                 self.reader = self._start(None)
 
     def _timeout_error(self, now: float) -> SourceError:
@@ -232,23 +219,17 @@ class Watched(FrameReader):
         )
 
     def _report(self, what: str, since: float, now: float, detail: str = "") -> None:
-        fault = self._fault = _Fault(what, since, self._clock.unix() - (now - since), detail)
-        if now - self._steady_since >= STEADY_SECONDS:
-            self._failures = 0
+        hour = time.strftime("%H:%M:%S", time.localtime(self._clock.unix() - (now - since)))
+        self._fault = _Fault(what, since, hour, detail)
         then = "" if not self._watch.reconnect else "; waiting" if what == "no frames" else "; reconnecting"
         words = f"is {what}" if what == "gone" else what
         reason = f": {detail}" if detail else ""
-        log.warning("%s: %s since %s (%.1f s)%s%s", self.name, words, fault.hour, now - since, reason, then)
+        log.warning("%s: %s since %s (%.1f s)%s%s", self.name, words, hour, now - since, reason, then)
 
     def _recover(self, fault: _Fault, now: float) -> None:
-        self._fault, self._steady_since = None, now
+        self._fault, self._failures = None, 0
         tries = f" and {fault.attempts} attempt{'s'[: fault.attempts > 1]}" if fault.attempts else ""
         log.warning("%s: is back after %.1f s%s (%s)", self.name, now - fault.since, tries, fault.what)
-
-    def _note(self, detail: str) -> None:
-        """Remember the last error for the message that may follow."""
-        if self._fault is not None:
-            self._fault.detail = detail
 
     def _back_off(self) -> None:
         delay = min(self._watch.first_retry * 2.0 ** min(self._failures, 30), self._watch.last_retry)
@@ -268,42 +249,37 @@ class Watched(FrameReader):
         while source is not None or (source := self._reconnect()) is not None:
             try:
                 with closing(source):
-                    self._read_until_fault(source)
+                    while self._enter(self._watch.hang_after + SILENT_INTERVALS * self._interval):
+                        item = source.read()
+                        if item is None:
+                            self._fail(None)
+                            break
+                        if self._take(*item):
+                            break
             except Exception as error:
                 self._fail(error)
             source = None
 
-    def _read_until_fault(self, source: FrameReader) -> None:
-        """Read until a picture is faulty, or this thread is no longer the reader."""
-        while self._enter(self._watch.hang_after + SILENT_INTERVALS * self._interval):
-            item = source.read()
-            if item is None:
-                raise _EndOfStreamError("it ended")
-            if self._take(*item):
-                return
-
     def _reconnect(self) -> FrameReader | None:
         """Try to open the source until it works, with back-off; None if stopped meanwhile."""
         while self._enter(math.inf):
-            if self._clock.sleep(self._retry_at - self._clock.now(), self._stopped):
-                return None
-            if not self._enter(OPEN_TIMEOUT):
+            wait = self._retry_at - self._clock.now()
+            if self._clock.sleep(wait, self._stopped) or not self._enter(OPEN_TIMEOUT):
                 return None
             source, detail = None, "it was opened, but gave no good frame"
             try:
                 source = self._opener()
+                if self.size and source.size and source.size != self.size:
+                    source.close()
+                    sizes = ("{} x {}".format(*size) for size in (source.size, self.size))
+                    raise SourceError("it came back with {} pixels instead of {}".format(*sizes))
             except Exception as error:
-                detail = self._text(error)
-            if source is not None and self.size and source.size and source.size != self.size:
-                came, was = ("{} x {}".format(*size) for size in (source.size, self.size))
-                detail = f"it came back with {came} pixels instead of {was}"
-                source.close()
-                source = None
+                source, detail = None, self._text(error)
             with self._changed:
                 if self._is_reader():
-                    self._note(detail)
                     if self._fault is not None:
                         self._fault.attempts += 1
+                        self._fault.detail = detail
                     self._connection += source is not None
                     self._back_off()
             if source is not None:
@@ -311,7 +287,8 @@ class Watched(FrameReader):
         return None
 
     def _is_reader(self) -> bool:
-        return self.reader is threading.current_thread() and not self._stopped.is_set() and not self._end
+        ended = self._ended or self._failure is not None or self._stopped.is_set()
+        return self.reader is threading.current_thread() and not ended
 
     def _enter(self, limit: float) -> bool:
         """Begin something that hangs if it takes longer than `limit`, s; False if this thread is to end."""
@@ -348,29 +325,29 @@ class Watched(FrameReader):
             self._changed.notify_all()
             return False
 
-    def _fail(self, error: Exception) -> None:
-        """Reading failed, or said that it is the end."""
+    def _fail(self, error: Exception | None) -> None:
+        """Reading failed, or, if there is no error, the source says that it is the end."""
         now = self._clock.now()
+        detail = "it ended" if error is None else self._text(error)
         with self._changed:
             if not self._is_reader():
                 return
-            if self._watch.reconnect and self._fault is None:
-                self._report("gone", self._arrived_at, now, self._text(error))
-                self._back_off()
-            elif self._watch.reconnect:
-                self._note(self._text(error))
-            else:
-                if isinstance(error, _EndOfStreamError):
+            if not self._watch.reconnect:
+                self._ended = True
+                if error is None:
                     log.warning("%s: the stream ended after %d frames", self.name, self._seq + 1)
-                elif not isinstance(error, SourceError):
-                    error = SourceError(f"{self.name}: {self._text(error)}")
-                self._end = error
+                else:
+                    self._failure = SourceError(f"{self.name}: {detail}")
+            elif self._fault is None:
+                self._report("gone", self._arrived_at, now, detail)
+                self._back_off()
+            else:
+                self._fault.detail = detail
             self._changed.notify_all()
 
     def _text(self, error: Exception) -> str:
         text = str(error).removeprefix(f"{self.name}: ")
-        known = isinstance(error, SourceError | _EndOfStreamError)
-        return text if known else f"{type(error).__name__}: {text}"
+        return text if isinstance(error, SourceError) else f"{type(error).__name__}: {text}"
 
 
 class _PictureCheck:
@@ -398,15 +375,8 @@ class _PictureCheck:
             if self._lit_at != now and (lasts or not self._lit):
                 return "black pictures", self._lit_at, lasts
         if watch.frozen_after is not None:
-            if self._previous is None or not _is_equal(image, self._previous):
+            if self._previous is None or image.data != self._previous.data:
                 self._previous, self._changed_at = image, now
             elif now - self._changed_at >= watch.frozen_after:
                 return "a frozen picture", self._changed_at, True
         return None
-
-
-def _is_equal(a: BgrImage, b: BgrImage) -> bool:
-    """Whether two pictures are identical; noise is found in the first few rows compared."""
-    return (
-        a.shape == b.shape and np.array_equal(a[::COMPARED_STEP], b[::COMPARED_STEP]) and np.array_equal(a, b)
-    )
