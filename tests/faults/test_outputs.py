@@ -66,7 +66,7 @@ def check_promise(kind: str, output: Path, seen: Seen) -> str:
         ("record", "replaced", 3, "was replaced by another", "theirs"),
         ("record", "cut to nothing", 3, "was cut by another program", "not an MCAP file"),
         ("parquet", "disk full", 3, "No space left.* written before", "can be read"),
-        ("parquet", "removed", 3, "cannot be written into: No such file", "nothing"),
+        ("parquet", "removed", 3, "cannot be written: No such file", "nothing"),
     ],
 )
 def test_something_happens_to_an_output_in_mid_run(

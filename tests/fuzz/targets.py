@@ -6,20 +6,18 @@ import asyncio
 import io
 import json
 import secrets
-import socket
-import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
+import zmq
 from mcap.writer import CompressionType, Writer
 
-from tactflow.adapters.bags import Bag
-from tactflow.adapters.lerobot_source import LeRobotEpisode
-from tactflow.calibration.file import Calibration
+from tactflow.calibration.file import Calibration, ScaleEntry
 from tactflow.cli import explain, listen
 from tactflow.cli.statistics import Statistics
 from tactflow.config.load import load_pipeline
@@ -35,13 +33,10 @@ from tactflow.recording.repair import repair
 from tactflow.recording.schemas import channel_type
 from tactflow.recording.writer import Entry, RecordingWriter
 from tactflow.sinks.zmq import Zmq
-from tactflow.sources.base import FrameReader, Normaliser
-from tactflow.sources.files import ArrayFile, VideoFile, read_image
-from tactflow.sources.mcap import Recording
-from tactflow.view.address import bind
+from tactflow.sources import open_source
 from tactflow.view.hub import Hub, Wire
-from tactflow.view.server import Server
 from tactflow.vision.types import Contact, Flow, Markers, Scale
+from tests.adapters.bags import TOPIC, write_bag, write_foxglove
 from tests.adapters.test_datasets import KEY, write_lerobot
 from tests.conftest import REPOSITORY
 from tests.messages import Results, result_of
@@ -49,8 +44,6 @@ from tests.messages import Results, result_of
 IMAGE = np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8)
 FRAMES = 20
 """Frames of an input that are read at most."""
-ANSWER_SECONDS = 30.0
-"""How long a server may take to answer, s. Nothing depends on its length."""
 
 
 class Parser(NamedTuple):
@@ -61,406 +54,240 @@ class Parser(NamedTuple):
     refusals: tuple[type[Exception], ...] = (TactflowError,)
 
 
-def _read_all(reader: FrameReader) -> None:
+def play(spec: str) -> None:
+    """Read the first frames of a source."""
+    source = open_source(spec)
     try:
         for _ in range(FRAMES):
-            if reader.read() is None:
+            if source.read() is None:
                 break
     finally:
-        reader.close()
+        source.close()
 
 
-@contextmanager
-def pipelines(folder: Path) -> Iterator[Parser]:
+def pipelines(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     """A pipeline file, read and checked."""
     files = [REPOSITORY / "pipeline.yaml", *sorted((REPOSITORY / "pipelines").glob("*.yaml"))]
-    several = b"sensors: {left: {stages.capture.source: sim:press}, right: {}}\n"
     samples = [file.read_bytes() for file in files]
-    path = folder / "pipeline.yaml"
-
-    def feed(data: bytes) -> None:
-        path.write_bytes(data)
-        load_pipeline(path)
-
-    yield Parser([*samples, several + samples[0]], feed)
+    several = b"sensors: {left: {stages.capture.source: sim:press}, right: {}}\n"
+    return [*samples, several + samples[0]], load_pipeline
 
 
-@contextmanager
-def overrides(folder: Path) -> Iterator[Parser]:
-    """What `--set` takes."""
-    del folder
-    samples = [
-        b"stages.hull=null",
-        b"sinks.zmq.endpoint=tcp://127.0.0.1:*",
-        b"sinks.images={in: {annotated: [1, 2]}, folder: &a out, overwrite: true}",
-        b"sensors.left.stages.capture.source=sim:press",
-    ]
-
-    def feed(data: bytes) -> None:
-        load_pipeline(REPOSITORY / "pipeline.yaml", [data.decode("utf-8", "surrogateescape")])
-
-    yield Parser(samples, feed)
-
-
-@contextmanager
-def recordings(folder: Path) -> Iterator[Parser]:
+def recordings(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     """An .mcap file: played, played from the middle, and repaired."""
-    path, out = folder / "press.mcap", folder / "out.mcap"
     samples = [_recording(folder / "sample.mcap", finished=finished) for finished in (True, False)]
-    samples += [_other_recording(packing) for packing in CompressionType]
+    samples += [_recording_of_others(packing) for packing in CompressionType]
 
-    def feed(data: bytes) -> None:
-        path.write_bytes(data)
-        refused: list[Exception] = []
-        for spec in (str(path), f"{path}?start=0.1"):
-            try:
-                _read_all(Recording(spec))
-            except TactflowError as error:
-                refused.append(error)
+    def read(path: Path) -> None:
         with suppress(NotARecordingError):
-            repair(path, out)
-        if refused:
-            raise refused[0]
+            repair(path, folder / "out.mcap")
+        with suppress(TactflowError):
+            play(f"{path}?start=0.1")
+        play(str(path))
 
-    yield Parser(samples, feed)
+    return samples, read
 
 
 def _recording(path: Path, *, finished: bool) -> bytes:
     coder = FrameCoder()
     writer = RecordingWriter(path, "main", overwrite=True)
     for seq in range(4):
-        frame = Frame("main", seq, seq / 10, IMAGE, reference=seq == 0)
-        data = {"frames": coder.encode(frame), "results": b"{}"}
-        writer.write(Entry(round(seq * 1e8), seq, seq == 0, 0, data))
-    if finished:
-        writer.finish()
-    else:
-        writer.close()
+        data = {"frames": coder.encode(Frame("main", seq, seq / 10, IMAGE, reference=seq == 0))}
+        writer.write(Entry(round(seq * 1e8), seq, seq == 0, 0, {**data, "results": b"{}"}))
+    (writer.finish if finished else writer.close)()
     return path.read_bytes()
 
 
-def _other_recording(packing: CompressionType) -> bytes:
+def _recording_of_others(packing: CompressionType) -> bytes:
     """Frames of ours, in a file as other writers make them."""
     file = io.BytesIO()
     writer = Writer(file, chunk_size=1024, compression=packing)
     writer.start()
     kind = channel_type(RawFrame)
-    schema = writer.register_schema(kind.name, *kind.schema)
-    channel = writer.register_channel("/main/frames", "protobuf", schema)
-    coder = FrameCoder()
+    channel = writer.register_channel(
+        "/main/frames", "protobuf", writer.register_schema(kind.name, *kind.schema)
+    )
     for seq in range(4):
-        frame = Frame("main", seq, seq / 10, IMAGE)
-        writer.add_message(channel, round(seq * 1e8), coder.encode(frame), round(seq * 1e8), seq)
+        data = FrameCoder().encode(Frame("main", seq, seq / 10, IMAGE))
+        writer.add_message(channel, round(seq * 1e8), data, round(seq * 1e8), seq)
     writer.finish()
     return file.getvalue()
 
 
-@contextmanager
-def arrays(folder: Path) -> Iterator[Parser]:
+def arrays(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     """A .npy file."""
-    path = folder / "press.npy"
     samples = []
     for array in (IMAGE[None], IMAGE[None, :, :, 0], IMAGE[None].astype(np.uint16), IMAGE[None, :, ::-1]):
-        file = io.BytesIO()
-        np.save(file, array)
+        np.save(file := io.BytesIO(), array)
         samples.append(file.getvalue())
-    archive = io.BytesIO()
-    np.savez(archive, IMAGE)
-    samples.append(archive.getvalue())
-
-    def feed(data: bytes) -> None:
-        path.write_bytes(data)
-        _read_all(ArrayFile(path))
-
-    yield Parser(samples, feed)
+    np.savez(file := io.BytesIO(), IMAGE)
+    return [*samples, file.getvalue()], lambda path: play(str(path))
 
 
-@contextmanager
-def pictures(folder: Path) -> Iterator[Parser]:
+def pictures(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     """A picture of any kind."""
-    path = folder / "press.png"
-    kinds = (".png", ".jpg", ".bmp", ".tiff", ".webp", ".ppm", ".jp2")
     large = np.tile(IMAGE, (6, 6, 1))
-    samples = [cv2.imencode(kind, large)[1].tobytes() for kind in kinds]
-    samples += [cv2.imencode(kind, IMAGE[:, :, 0])[1].tobytes() for kind in (".png", ".pgm", ".tiff")]
-    samples.append(cv2.imencode(".png", IMAGE.astype(np.uint16) * 257)[1].tobytes())
-
-    def feed(data: bytes) -> None:
-        path.write_bytes(data)
-        Normaliser(str(path))(read_image(path))
-
-    yield Parser(samples, feed)
+    kinds = [(large, kind) for kind in (".png", ".jpg", ".bmp", ".tiff", ".webp", ".ppm", ".jp2")]
+    kinds += [(IMAGE[:, :, 0], kind) for kind in (".png", ".pgm", ".tiff")]
+    kinds.append((IMAGE.astype(np.uint16) * 257, ".png"))
+    return [cv2.imencode(kind, image)[1].tobytes() for image, kind in kinds], lambda path: play(str(path))
 
 
-@contextmanager
-def videos(folder: Path) -> Iterator[Parser]:
+def videos(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     """A video file, which FFmpeg reads."""
     samples = []
     for name, code in (("a.avi", "MJPG"), ("b.mp4", "mp4v")):
-        path = folder / name
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 30, (64, 48))
+        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*code), 30, (64, 48))
         for shade in range(4):
             writer.write(np.full((48, 64, 3), shade, np.uint8))
         writer.release()
-        samples.append(path.read_bytes())
-    path = folder / "press.mp4"
-
-    def feed(data: bytes) -> None:
-        path.write_bytes(data)
-        _read_all(VideoFile(path))
-
-    yield Parser([sample for sample in samples if sample], feed)
+        samples.append((folder / name).read_bytes())
+    return [sample for sample in samples if sample], lambda path: play(str(path))
 
 
-@contextmanager
-def bags(folder: Path) -> Iterator[Parser]:
+def bags(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     """Recordings of ROS and Foxglove: .mcap, .bag, .db3."""
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
-    from tests.adapters.bags import TOPIC, write_bag, write_foxglove
-
     png = CompressedImage(format="png", data=cv2.imencode(".png", IMAGE)[1].tobytes())
+    text = b'{"timestamp": {"sec": 1, "nsec": 2}, "data": "QQ=="}'
     files = [
         write_bag(folder / "one.bag", [IMAGE, IMAGE], "ros1"),
         next(write_bag(folder / "two", [IMAGE, IMAGE], "sqlite3").glob("*.db3")),
         next(write_bag(folder / "three", [IMAGE, IMAGE], "mcap", "jpeg").glob("*.mcap")),
         write_foxglove(folder / "four.mcap", [png], "protobuf"),
-        write_foxglove(
-            folder / "five.mcap", [b'{"timestamp": {"sec": 1, "nsec": 2}, "data": "QQ=="}'], "json"
-        ),
+        write_foxglove(folder / "five.mcap", [text], "json"),
     ]
     suffixes = {file.read_bytes()[:4]: file.suffix for file in files}
 
-    def feed(data: bytes) -> None:
-        path = folder / f"press{suffixes.get(data[:4], '.mcap')}"
-        path.write_bytes(data)
-        _read_all(Bag(f"{path}?topic={TOPIC}"))
+    def read(path: Path) -> None:
+        suffix = suffixes.get(path.read_bytes()[:4], ".mcap")
+        play(f"{path.rename(path.with_suffix(suffix))}?topic={TOPIC}")
 
-    yield Parser([file.read_bytes() for file in files], feed)
+    return [file.read_bytes() for file in files], read
 
 
-@contextmanager
-def lerobot(folder: Path) -> Iterator[Parser]:
+def lerobot(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     """What a LeRobot dataset says of itself."""
     root = write_lerobot(folder / "press", np.zeros((5, 48, 64, 3), np.uint8), "v3.0", "image")
     info = root / "meta" / "info.json"
-    sample = info.read_bytes()
 
-    def feed(data: bytes) -> None:
-        info.write_bytes(data)
-        _read_all(LeRobotEpisode(f"lerobot:{root}?camera={KEY}&episode=1"))
+    def read(path: Path) -> None:
+        path.replace(info)
+        play(f"lerobot:{root}?camera={KEY}&episode=1")
 
-    yield Parser([sample], feed)
+    return [info.read_bytes()], read
 
 
-@contextmanager
-def calibrations(folder: Path) -> Iterator[Parser]:
+def calibrations(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     """A calibration: its YAML, or the arrays beside it."""
-    path = folder / "left.yaml"
-    look = np.zeros((12, 16, 3), np.float32)
-    scale = Scale(0.05, 0.05, (0.001, 0.001), (0.0, 0.0))
-    known = Calibration("left", "sim:press", (16, 12), (16, 12), np.zeros((4, 2)), look, scale, "pitch")
-    known.save(path)
-    text, arrays = path.read_bytes(), path.with_suffix(".npz").read_bytes()
-
-    def feed(data: bytes) -> None:
-        path.write_bytes(text if data[:1] == b"Z" else data)
-        path.with_suffix(".npz").write_bytes(data[1:] if data[:1] == b"Z" else arrays)
-        Calibration.load(path)
-
-    yield Parser([text, b"Z" + arrays], feed)
-
-
-@contextmanager
-def statistics(folder: Path) -> Iterator[Parser]:
-    """A statistics file, as `explain` shows it."""
-    path = folder / "run.json"
-    node = {"runs": 3, "skips": {"no_contact": 2}, "p50_ms": 1.5, "p99_ms": 2.0, "total_ms": 4.5}
-    sample = {
-        "frames": 5,
-        "dropped": 0,
-        "wall_s": 1.0,
-        "end": "eos",
-        "latency_ms": {"p50": 1.0, "p99": None},
-        "stages": {"capture": node, "hull": node, "preprocess": {**node, "runs": 0, "total_ms": None}},
-        "sinks": {"zmq": node},
+    file = folder / "left.yaml"
+    known = {
+        "sensor": "left",
+        "made_from": "sim:press",
+        "raw_size": (16, 12),
+        "size": (16, 12),
+        "corners": [(0.0, 0.0)] * 4,
+        "scale": ScaleEntry.of(Scale(0.05, 0.05, (0.001, 0.001), (0.0, 0.0)), "pitch"),
+        "look": np.zeros((12, 16, 3), np.float32),
     }
+    Calibration.model_validate(known).save(file)
+    text, npz = file.read_bytes(), file.with_suffix(".npz").read_bytes()
+
+    def read(path: Path) -> None:
+        data = path.read_bytes()
+        file.write_bytes(text if data[:1] == b"Z" else data)
+        file.with_suffix(".npz").write_bytes(data[1:] if data[:1] == b"Z" else npz)
+        Calibration.load(file)
+
+    return [text, b"Z" + npz], read
+
+
+def statistics(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+    """A statistics file, as `explain` shows it."""
+    node = {"runs": 3, "skips": {"no_contact": 2}, "p50_ms": 1.5, "p99_ms": 2.0, "total_ms": 4.5}
+    stages = {"capture": node, "hull": node, "preprocess": {**node, "runs": 0, "total_ms": None}}
+    ended = {"frames": 5, "dropped": 0, "wall_s": 1.0, "end": "eos", "latency_ms": {"p50": 1.0, "p99": None}}
     pipeline = load_pipeline(REPOSITORY / "pipeline.yaml")
     plan = make_plan(pipeline)
+    sample = json.dumps({**ended, "stages": stages, "sinks": {"zmq": node}}).encode()
+    return [sample], lambda path: list(explain.explanation(pipeline, plan, Statistics.read(path)))
+
+
+@contextmanager
+def of_file(
+    make: Callable[[Path], tuple[Sequence[bytes], Callable[[Path], object]]], suffix: str, folder: Path
+) -> Iterator[Parser]:
+    """A parser of a file of a kind."""
+    samples, read = make(folder)
 
     def feed(data: bytes) -> None:
+        path = folder / f"input{suffix}"
         path.write_bytes(data)
-        list(explain.explanation(pipeline, plan, Statistics.read(path)))
+        read(path)
 
-    yield Parser([json.dumps(sample).encode()], feed)
+    yield Parser(samples, feed)
+
+
+@contextmanager
+def overrides(_: Path) -> Iterator[Parser]:
+    """What `--set` takes."""
+    samples = [
+        b"stages.hull=null",
+        b"sinks.zmq.endpoint=tcp://127.0.0.1:*",
+        b"sinks.images={in: {annotated: [1, 2]}, folder: &a out, overwrite: true}",
+        b"sensors.left.stages.capture.source=sim:press",
+    ]
+    file = REPOSITORY / "pipeline.yaml"
+    yield Parser(samples, lambda data: load_pipeline(file, [data.decode("utf-8", "surrogateescape")]))
 
 
 def message() -> bytes:
+    """A result message."""
     contact = Contact(12.5, (3.0, 4.0), 30.0, -0.577, np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]]), None)
     markers = Markers(np.zeros((2, 2)), np.ones((2, 2)), np.array([0, 2], np.uint8), np.ones(2))
-    flow = Flow((1.0, -1.0), 2)
-    return encode_message(
-        result_of(Tick(Frame("main", 3, 0.1, IMAGE)), Results(IMAGE, contact, flow, markers))
-    )
+    results = Results(IMAGE, contact, Flow((1.0, -1.0), 2), markers)
+    return encode_message(result_of(Tick(Frame("main", 3, 0.1, IMAGE)), results))
 
 
 @contextmanager
-def messages(folder: Path) -> Iterator[Parser]:
+def messages(_: Path) -> Iterator[Parser]:
     """A result message, as a Subscriber and `listen` take it."""
-    del folder
-    nothing = encode_message(
-        result_of(Tick(Frame("main", 4, 0.1, IMAGE), skipped={"contact": "no_contact"}), Results(IMAGE))
-    )
+    nothing = Tick(Frame("main", 4, 0.1, IMAGE), skipped={"contact": "no_contact"})
 
     def feed(data: bytes) -> None:
-        with suppress(ValueError):
-            result = Result.from_message(data)
-            listen.describe(result)
+        result = Result.from_message(data)
+        listen.describe(result)
+        listen._cells(result)
 
-    yield Parser([message(), nothing], feed)
-
-
-GREETING = b"\xff" + bytes(7) + b"\x01\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
-"""How a connection of ZMTP 3 begins (https://rfc.zeromq.org/spec/23/)."""
-READY = b"\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB\x08Identity\x00\x00\x00\x00"
-
-
-def _short(flags: int, body: bytes) -> bytes:
-    return bytes([flags, len(body)]) + body
+    samples = [message(), encode_message(result_of(nothing, Results(IMAGE)))]
+    yield Parser(samples, feed, (TactflowError, ValueError))
 
 
 @contextmanager
-def subscriptions(folder: Path) -> Iterator[Parser]:
-    """What a subscriber sends to a publisher, with or without the greeting of the protocol."""
-    del folder
+def subscriptions(_: Path) -> Iterator[Parser]:
+    """What a subscriber sends to a publisher."""
     sink = Zmq(Zmq.Params(endpoint="tcp://127.0.0.1:*", linger=0))
     sink.open()
-    port = int(sink.endpoint.rpartition(":")[2])
-    ready = _short(4, READY)
-    samples = [
-        ready + _short(0, b"\x01tactflow.main ") + _short(0, b"\x00tactflow.main "),
-        ready + _short(4, b"\x09SUBSCRIBEtactflow.stats") + _short(4, b"\x06CANCELtactflow.stats"),
-        ready + b"\x02" + (300).to_bytes(8, "big") + b"\x01" + bytes(299),
-        ready + _short(4, b"\x04PING\x00\x0ahello"),
-        ready + b"".join(_short(0, b"\x01tactflow.%d" % number) for number in range(50)),
-        GREETING + ready,
-    ]
-    tick = Tick(Frame("main", 0, 0.0, IMAGE))
-
-    def feed(data: bytes) -> None:
-        _exchange(port, data, first=b"" if data.startswith(GREETING[:1]) else GREETING)
-        sink.wants()
-        sink.write(result_of(tick, Results(IMAGE)))
-
-    try:
-        yield Parser(samples, feed)
-    finally:
-        sink.close()
-
-
-def _exchange(port: int, data: bytes, first: bytes = b"") -> bytes:
-    """Send, and read until the other side ends the connection, or says nothing for a moment."""
-    answer = b""
-    with socket.create_connection(("127.0.0.1", port), ANSWER_SECONDS) as connection, suppress(OSError):
-        if first:
-            connection.sendall(first)
-            answer = connection.recv(4096)
-        connection.sendall(data)
-        connection.shutdown(socket.SHUT_WR)
-        connection.settimeout(0.02)
-        while received := connection.recv(65536):
-            answer = (answer + received)[:4096]
-    return answer
-
-
-@contextmanager
-def _page() -> Iterator[int]:
-    """The port of a running page."""
-    listener = bind("127.0.0.1", 0)
-    port = int(listener.getsockname()[1])
-    server = Server(Hub(None, "main"), listener, "127.0.0.1", None)
-    server.start()
-    try:
-        yield port
-    finally:
-        server.close()
-
-
-def _expect_answer(port: int) -> None:
-    """The server still does its work."""
-    request = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n"
-    with socket.create_connection(("127.0.0.1", port), ANSWER_SECONDS) as connection:
-        connection.sendall(request)
-        answer = connection.recv(64)
-    assert answer.startswith(b"HTTP/1.1 200"), answer
-
-
-@contextmanager
-def requests(folder: Path) -> Iterator[Parser]:
-    """HTTP requests to the page."""
-    del folder
-    samples = [
-        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
-        b"GET /app.js?x=%2e%2e HTTP/1.1\r\nHost: localhost:8765\r\nAccept: */*\r\n\r\n",
-        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 5\r\n\r\nhello",
-        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n0\r\n\r\n",
-        b"HEAD http://127.0.0.1/ HTTP/1.1\r\nHost: 127.0.0.1\r\nExpect: 100-continue\r\n\r\n",
-        _upgrade(),
-    ]
-    with _page() as port:
+    result = result_of(Tick(Frame("main", 0, 0.0, IMAGE)), Results(IMAGE))
+    with zmq.Context() as context, context.socket(zmq.XSUB) as subscriber:
+        subscriber.linger = 0
+        subscriber.connect(sink.endpoint)
 
         def feed(data: bytes) -> None:
-            _exchange(port, data)
-            _expect_answer(port)
+            subscriber.send(data)
+            sink.wants()
+            sink.write(result)
 
-        yield Parser(samples, feed)
-
-
-def _upgrade() -> bytes:
-    return (
-        b"GET /live?token=abc HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://127.0.0.1\r\n"
-        b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-        b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-    )
-
-
-def _masked(opcode: int, payload: bytes) -> bytes:
-    key = b"\x01\x02\x03\x04"
-    masked = bytes(byte ^ key[index % 4] for index, byte in enumerate(payload))
-    size = bytes([0x80 | len(payload)]) if len(payload) < 126 else b"\xfe" + struct.pack(">H", len(payload))
-    return bytes([0x80 | opcode]) + size + key + masked
-
-
-COMMANDS = (
-    b'{"ack": 1, "late": false, "rest": 50}',
-    b'{"do": "pause", "value": true}',
-    b'{"do": "step"}',
-    b'{"show": ["surface", "field"]}',
-    b'{"do": "record", "value": [1, {"a": null}]}',
-)
-
-
-@contextmanager
-def websockets(folder: Path) -> Iterator[Parser]:
-    """Frames of the page's WebSocket."""
-    del folder
-    samples = [_masked(1, command) for command in COMMANDS]
-    samples += [_masked(9, b"ping"), _masked(8, b"\x03\xe8bye"), _masked(2, bytes(200)), _masked(0, b"x")]
-    with _page() as port:
-
-        def feed(data: bytes) -> None:
-            _exchange(port, data, _upgrade())
-            _expect_answer(port)
-
-        yield Parser(samples, feed)
+        yield Parser([b"\x01tactflow.main ", b"\x00tactflow.main ", b"\x02", b"\x01" + bytes(299)], feed)
+    sink.close()
 
 
 class OneMessage:
-    """A connection over which one message comes."""
+    """A connection to the page over which one message comes."""
 
     def __init__(self, text: str) -> None:
         self._texts = [text]
-        self.closed = False
 
     async def send_text(self, data: str) -> None: ...
 
@@ -475,40 +302,51 @@ class OneMessage:
 
 
 @contextmanager
-def commands(folder: Path) -> Iterator[Parser]:
+def commands(_: Path) -> Iterator[Parser]:
     """What a page asks for."""
-    del folder
+    samples = [
+        b'{"ack": 1, "late": false, "rest": 50}',
+        b'{"do": "pause", "value": true}',
+        b'{"show": ["surface", "field"]}',
+        b'{"do": "record", "value": [1, {"a": null}]}',
+    ]
 
     def feed(data: bytes) -> None:
         hub = Hub(None, "main")
         hub.run_id = secrets.token_hex(1)
-        wire = OneMessage(data.decode("utf-8", "replace"))
-        asyncio.run(hub.serve(cast(Wire, wire)))
+        asyncio.run(hub.serve(cast(Wire, OneMessage(data.decode("utf-8", "replace")))))
 
-    yield Parser(COMMANDS, feed)
+    yield Parser(samples, feed)
 
 
 @contextmanager
-def orders(folder: Path) -> Iterator[Parser]:
+def orders(_: Path) -> Iterator[Parser]:
     """What another program asks of a run."""
-    del folder
     control = ControlSocket("tcp://127.0.0.1:*", None, "main", Commands(None))
 
     def feed(data: bytes) -> None:
-        answer = json.loads(control._answer([data]))
-        assert answer["message"]
+        assert json.loads(control._answer([data]))["message"]
 
-    try:
-        yield Parser([b'{"do": "ping"}', b'{"do": "record_start"}'], feed)
-    finally:
-        control.close()
+    yield Parser([b'{"do": "ping"}', b'{"do": "record_start"}'], feed)
+    control.close()
 
 
 # No HDF5: its library hangs on some damaged files, as docs/security.md says.
+FILES = {
+    pipelines: ".yaml",
+    recordings: ".mcap",
+    arrays: ".npy",
+    pictures: ".png",
+    videos: ".mp4",
+    bags: ".mcap",
+    lerobot: ".json",
+    calibrations: ".yaml",
+    statistics: ".json",
+}
 TARGETS: dict[str, Callable[[Path], AbstractContextManager[Parser]]] = {
-    function.__name__: cast(Any, function)
-    for function in (
-        *(pipelines, overrides, recordings, arrays, pictures, videos, calibrations, statistics, messages),
-        *(bags, lerobot, subscriptions, requests, websockets, commands, orders),
-    )
+    **{make.__name__: partial(of_file, make, suffix) for make, suffix in FILES.items()},
+    **{
+        function.__name__: cast(Any, function)
+        for function in (overrides, messages, subscriptions, commands, orders)
+    },
 }

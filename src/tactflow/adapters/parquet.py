@@ -23,7 +23,6 @@ from tactflow.recording.provenance import facts, texts
 from tactflow.system.extras import missing
 from tactflow.system.files import expanded, make_folder
 from tactflow.system.outputs import cannot_write
-from tactflow.recording.provenance import facts, texts
 
 if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]

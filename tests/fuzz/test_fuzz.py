@@ -1,10 +1,13 @@
-"""Well-formed input that means nothing: right syntax, any values."""
+"""Damaged input to every parser, a little of it; and well-formed input with any values."""
 
 from __future__ import annotations
 
 import asyncio
 import copy
 import json
+import re
+import subprocess
+import sys
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +26,28 @@ from tactflow.sources import open_source
 from tactflow.view.hub import Hub, Wire
 from tests.conftest import REPOSITORY
 from tests.fuzz.targets import OneMessage, message
+
+INPUTS = 40
+"""Of each parser. Enough to run through each; finding something new takes `make fuzz`. Chosen by hand."""
+
+
+def fuzz(folder: Path, *options: str) -> str:
+    """In a process of its own, as what is wrong may end it; what it says at the end."""
+    command = [sys.executable, "-m", "tests.fuzz", "--folder", str(folder), *options]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-4000:]
+    return done.stdout
+
+
+def test_damaged_input_is_refused_and_never_crashes_hangs_or_fills_the_memory(tmp_path: Path) -> None:
+    said = fuzz(tmp_path, "--inputs", str(INPUTS))
+    assert re.fullmatch(r"\d{3,} inputs, \d{3,} refused, 0 findings .*\n", said)
+
+
+@pytest.mark.slow
+def test_much_damaged_input_is_refused_too(tmp_path: Path) -> None:
+    assert ", 0 findings " in fuzz(tmp_path, "--seconds", "15", "--seed", "7")
+
 
 few = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 scalars = (
