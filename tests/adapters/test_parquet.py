@@ -167,8 +167,8 @@ def test_the_example_of_the_page_runs(
     write(sink, range(8))
     sink.close()
     monkeypatch.chdir(tmp_path)
-    page = (REPOSITORY / "docs" / "tables.md").read_text()
-    exec(page.partition("```python\n")[2].partition("```")[0], {})
+    page = (REPOSITORY / "docs" / "recordings.md").read_text()
+    exec("import pandas" + page.partition("```python\nimport pandas")[2].partition("```")[0], {})
     assert "contact_center_x" in capsys.readouterr().out
 
 

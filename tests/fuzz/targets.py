@@ -258,7 +258,6 @@ def messages(_: Path) -> Iterator[Parser]:
     def feed(data: bytes) -> None:
         result = Result.from_message(data)
         listen.describe(result)
-        listen._cells(result)
 
     samples = [message(), encode_message(result_of(nothing, Results(IMAGE)))]
     yield Parser(samples, feed, (TactflowError, ValueError))
