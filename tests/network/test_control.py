@@ -202,4 +202,5 @@ def test_the_command_says_what_happened_and_what_did_not(
     assert "sinks.zmq.control" in capsys.readouterr().err
     assert main(["control", "explode", bare.endpoint]) == 2
     assert main(["control", "ping", "nowhere"]) == 2
-    assert main(["control", "ping", "--keys", str(tmp_path)]) == 2
+    for folder in (str(tmp_path), "~nobody-of-this-name/keys"):
+        assert main(["control", "ping", "--keys", folder]) == 2

@@ -105,7 +105,7 @@ def _found(marks: Detection, rival: Candidate | None) -> Iterator[str]:
 
 
 def _best(spots: Candidate | None, what: str = "best") -> Iterator[str]:
-    """A line on spots that are no marks, if there are any."""
+    """A line about the best spots that are not marks, if there are any."""
     if spots is not None:
         closed = f"{100 * spots.lattice:.0f} % of their parallelograms close"
         yield f"magenta: {what}, {spots}; {closed}; score {spots.score:.1f}"

@@ -15,6 +15,7 @@ import zmq
 from tactflow.engine.errors import StageError
 from tactflow.network.address import Address
 from tactflow.network.keys import require_keys
+from tactflow.system.files import expanded
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
@@ -73,7 +74,7 @@ class BoundSocket:
             self.socket.setsockopt(option, value)
         try:
             if keys is not None:
-                self._authenticator = require_keys(self.socket, self._context, Path(keys).expanduser())
+                self._authenticator = require_keys(self.socket, self._context, expanded(keys))
             self.socket.bind(endpoint)
         except (ValueError, zmq.ZMQError) as error:
             self.close()

@@ -14,6 +14,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from tactflow.network.address import Address
 from tactflow.network.keys import use_keys
+from tactflow.system.files import expanded
 
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
 """The other side does not admit us; ZeroMQ does not try again."""
@@ -57,7 +58,7 @@ class Connection:
         self._poller.register(self._handshakes, zmq.POLLIN)
         try:
             if keys is not None:
-                use_keys(self._socket, Path(keys).expanduser())
+                use_keys(self._socket, expanded(str(keys)))
             self._socket.connect(endpoint)
         except zmq.ZMQError as error:
             self.close()

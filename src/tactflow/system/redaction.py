@@ -1,4 +1,4 @@
-"""What must not stand in logs, error messages and recordings: passwords and tokens."""
+"""Removes passwords and tokens from logs, error messages and recordings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def public_address(text: str) -> str:
 
 
 def public_setting(text: str) -> str:
-    """What `--set` was given, without secrets.
+    """The argument of `--set` without secrets.
 
     >>> public_setting("sinks.view={token: abc, port: 80}"), public_setting("sinks.view.token=abc")
     ('sinks.view={token: removed, port: 80}', 'sinks.view.token=removed')
@@ -37,7 +37,7 @@ def public_setting(text: str) -> str:
 
 
 def without_secrets(text: str) -> str:
-    """The text of a pipeline without passwords in addresses and without tokens: a recording is handed on.
+    """The text of a pipeline without passwords in addresses and without tokens, for files that are shared.
 
     >>> print(without_secrets("{source: rtsp://me:pass@camera/1, token: abc, host: null}"))
     {source: rtsp://camera/1, token: removed, host: null}
@@ -46,7 +46,7 @@ def without_secrets(text: str) -> str:
         document = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError):
         return ""
-    # However it is written there: in quotes, on a line of its own, by an alias.
+    # However it is written: in quotes, on a line of its own, by an alias.
     for secret in sorted(set(_secrets(document)), key=len, reverse=True):
         text = text.replace(secret, "removed")
     return public_address(text)

@@ -1,4 +1,4 @@
-"""What a misspelled word was meant to be."""
+"""Suggestions for misspelled words."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from typing import Final
 
 MISSPELLED: Final = 0.75
-"""Similarity (`difflib`, 0 to 1) from which one word is taken for another one misspelled: one wrong letter of
-four, or two in the wrong order. Below are other words: threads and radius (0.62), depth and path (0.67)."""
+"""Similarity (`difflib`, 0 to 1) above which a word counts as misspelled: one wrong letter of four, or two in
+the wrong order. Different words are less similar: threads and radius 0.62, depth and path 0.67."""
 
 
 def closest(word: str, candidates: Iterable[str]) -> str | None:
@@ -23,9 +23,9 @@ def closest(word: str, candidates: Iterable[str]) -> str | None:
 
 
 def did_you_mean(word: str, candidates: Iterable[str], otherwise: str = "known: ") -> str:
-    """`; did you mean X?` for a misspelled word, else a list of what there is, if there is anything.
+    """`; did you mean X?` for a misspelled word, else the list of candidates, if there are any.
 
-    otherwise : what the list begins with.
+    otherwise : how the list begins.
     """
     candidates = list(candidates)
     guess = closest(word, candidates)
