@@ -108,12 +108,14 @@ class Tick(Mapping[str, Any]):
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         for port in vars(cls).get("__annotations__", {}):
-            setattr(cls, port, _property_of(port))
+            if not port.startswith("_"):
+                setattr(cls, port, _property_of(port))
 
     @classmethod
     def port_types(cls) -> dict[str, Any]:
         """Port that the class names -> its annotation."""
-        return get_type_hints(cls, include_extras=True)
+        hints = get_type_hints(cls, include_extras=True)
+        return {port: hint for port, hint in hints.items() if not port.startswith("_")}
 
     def __getitem__(self, port: str) -> Any:
         try:

@@ -178,12 +178,13 @@ class RunningNode:
 
     def publish(self, tick: TickState, outputs: Sequence[Any]) -> None:
         """Enter its outputs into the tick's table."""
-        inherited = self._inherited_reason(tick) if tick.reasons else None
-        for slot, value in zip(self.slots, outputs, strict=True):
-            tick.values[slot] = value
-            reason = value.reason if isinstance(value, Absent) else inherited
-            if reason is not None:
-                tick.reasons[slot] = reason
+        inherited = self._inherited_reason(tick) if tick.reasons and self._is_pure else None
+        for number, slot in enumerate(self.slots):
+            tick.values[slot] = value = outputs[number]
+            if isinstance(value, Absent):
+                tick.reasons[slot] = value.reason
+            elif inherited is not None:
+                tick.reasons[slot] = inherited
         if self.signals:
             self._read_signals(tick)
 
@@ -193,17 +194,19 @@ class RunningNode:
         This goes by the data alone, not by whether the node had run before, so that an observer changes no
         reason either.
         """
-        reasons = tick.reasons
-        if self._is_pure and all(slot in reasons for slot in self._connected_slots):
-            return next((reasons[slot] for slot in self._connected_slots), None)
-        return None
+        first, reasons = None, tick.reasons
+        for slot in self._connected_slots:
+            if slot not in reasons:
+                return None
+            first = first or reasons[slot]
+        return first
 
     def skip(self, tick: TickState, absent: Absent, *, repeat: bool = False) -> None:
         """Enter what its outputs are where it does not run: absent, or with `repeat` its last ones again."""
         self.stats.skips[absent.reason] += 1
-        outputs = self.last if repeat and self.last is not None else [absent] * len(self.slots)
-        for slot, value in zip(self.slots, outputs, strict=True):
-            tick.values[slot] = value
+        last = self.last if repeat else None
+        for number, slot in enumerate(self.slots):
+            tick.values[slot] = absent if last is None else last[number]
             tick.reasons[slot] = absent.reason
         if self.signals:
             self._read_signals(tick)
