@@ -87,13 +87,7 @@ def _drawn(scene: str, calibration: Path, first: int, last: int) -> NDArray[np.u
         (r for r in results if r.seq >= first and r.depth is not None),
         key=lambda r: 0.0 if r.depth is None else r.depth.greatest,
     )
-    above = tactflow.stage("visualize")
-    below = tactflow.stage("visualize", view="depth", deepest=DEEPEST)
-    pictures = (
-        above.process(r.image, r.contact, r.flow, r.markers, r.contact_mask),
-        below.process(r.image, r.contact, None, None, None, depth=r.depth, scale=r.scale),
-    )
-    return np.vstack(pictures)
+    return np.vstack([tactflow.draw(r), tactflow.draw(r, view="depth", deepest=DEEPEST)])
 
 
 def _pages(calibration: Path) -> None:
