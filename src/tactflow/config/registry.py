@@ -10,10 +10,9 @@ import re
 import sys
 import traceback
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType, TracebackType
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tactflow.config.models import RESERVED
 from tactflow.engine.conformance import component, kind_of
@@ -21,6 +20,9 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 from tactflow.system.plugins import plugins
 from tactflow.system.spelling import closest, did_you_mean
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 Section = Literal["stages", "sinks"]
 
@@ -116,7 +118,7 @@ def _named(name: str, section: Section) -> Component:
     )
 
 
-def _plugin_origin(entry: metadata.EntryPoint) -> str:
+def _plugin_origin(entry: EntryPoint) -> str:
     if entry.dist is None:
         return f"plug-in {entry.value}"
     return f"plug-in {entry.dist.name} {entry.dist.version}"

@@ -10,9 +10,8 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
-from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, StampedReader
@@ -23,6 +22,9 @@ from tactflow.sources.watch import Arrival, Watch, Watched
 from tactflow.system.files import expanded, is_utf8
 from tactflow.system.plugins import plugins
 from tactflow.system.redaction import public_address
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 __all__ = [
     "KINDS",
