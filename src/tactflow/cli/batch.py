@@ -8,9 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
 from tactflow.batch.compare import compare
 from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.report import Runs, require_pyarrow, write_page, write_runs
@@ -19,7 +16,7 @@ from tactflow.batch.store import Outcome, Store
 from tactflow.batch.work import Request, resolved
 from tactflow.batch.workers import DaskCluster, LocalProcesses
 from tactflow.cli.options import add_overrides, positive
-from tactflow.cli.terminal import printable
+from tactflow.cli.terminal import progress_bar, say
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
@@ -111,11 +108,10 @@ class _Call:
         self.signals = 0
         self._args = args
         self._recordings = recordings
-        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
 
     def _say(self, text: str) -> None:
         if not self._args.quiet:
-            self._console.print(printable(text), markup=False)
+            say(text)
 
     def _count_signal(self, _number: int, _frame: object) -> None:
         self.signals += 1
@@ -162,24 +158,18 @@ class _Call:
     @contextmanager
     def _progress(self, total: int) -> Iterator[Callable[[Outcome], None]]:
         """Names each recording that fails; on a terminal, shows how far the batch is."""
-        columns = (
-            TextColumn("{task.completed} of {task.total}, {task.fields[failed]} failed"),
-            BarColumn(),
-            TextColumn("{task.fields[frames]} frames"),
-            *(TimeElapsedColumn(), TextColumn("so far,"), TimeRemainingColumn(), TextColumn("to go")),
-        )
-        hidden = self._args.quiet or not self._console.is_terminal
-        with Progress(*columns, console=self._console, transient=True, disable=hidden) as display:
-            task = display.add_task("", total=total, failed=0, frames=0)
-            failed = frames = 0
+        with progress_bar("starting", total, shown=not self._args.quiet) as update:
+            done = failed = frames = 0
 
             def on_outcome(outcome: Outcome) -> None:
-                nonlocal failed, frames
+                nonlocal done, failed, frames
+                done += 1
                 failed += outcome.status != "done"
                 frames += outcome.frames
                 if outcome.status != "done":
                     self._say(f"failed: {outcome.name}: {_in_short(outcome)}")
-                display.update(task, advance=1, failed=failed, frames=frames)
+                text = f"{done} of {total}, {failed} failed, {frames} frames"
+                update(completed=done, description=text)
 
             yield on_outcome
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
+from tactflow.cli.terminal import progress_bar, say, table
 from tactflow.engine.errors import ConfigError, StageError
 
 
@@ -73,16 +70,20 @@ def run(args: argparse.Namespace) -> int:
         if path is None:
             continue
         try:
-            with _progress(path.name, len(scene), args.quiet) as report:
-                write(scene, path, report)
+            with progress_bar(path.name, len(scene), shown=not args.quiet) as update:
+                write(scene, path, partial(_show, update))
         except OSError as error:
             # Its text names the unfinished file.
             raise StageError(f"{option} {path}: cannot be written: {error.strerror or error}") from error
         except NotLosslessError as error:
             raise StageError(f"{option} {path}: {error}") from error
         if not args.quiet:
-            print(f"{path}: {len(scene)} frames of {scene.name}", file=sys.stderr)
+            say(f"{path}: {len(scene)} frames of {scene.name}")
     return 0
+
+
+def _show(update: Callable[..., None], done: int) -> None:
+    update(completed=done)
 
 
 def _check_place(option: str, path: Path, overwrite: bool) -> None:
@@ -109,14 +110,5 @@ def _list() -> None:
         ("settings, as in NAME?key=value&key=value:", setting_descriptions()),
     ):
         print(title)
-        for name, words in lines.items():
-            print(f"  {name:<{max(map(len, lines))}}  {words}")
-
-
-@contextlib.contextmanager
-def _progress(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as progress:
-        task = progress.add_task(title, total=total)
-        yield lambda done: progress.update(task, completed=done)
+        for line in table(list(lines.items())):
+            print(f"  {line}")
