@@ -146,10 +146,9 @@ class Tick(Mapping[str, Any]):
         return copied
 
     def __repr__(self) -> str:
-        there = [port for port in self if self.value(port) is not None]
-        frame = self.frame
-        held = ", ".join(there) or "nothing"
-        return f"<{type(self).__name__} {frame.sensor} {frame.seq} at {frame.t:.3f} s: {held}>"
+        frame, named = self.frame, vars(type(self)).get("__annotations__") or self
+        there = ", ".join(port for port in named if self.value(port) is not None)
+        return f"<{type(self).__name__} {frame.sensor} {frame.seq} at {frame.t:.3f} s: {there or 'nothing'}>"
 
 
 def _property_of(port: str) -> property:
