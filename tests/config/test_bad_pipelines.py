@@ -91,7 +91,7 @@ CASES = [
     (
         "source",
         "  a: {use: §@Both}",
-        "Both: a sink has no process() .. a class is one of stage, sink and source",
+        "is a sink; it belongs under sinks:",
     ),
     ("prepare", "  a: {use: §@Forgetful}", "must declare memory .. stateful"),
     ("prepare", "  a: {use: §@Bare}", "Bare.process .. parameter image has no annotation"),

@@ -14,8 +14,8 @@ from tactflow.calibration.presses import Press, usual_radius
 LIGHT: Final = 0.5
 """Radius of a contact over the usual one, below which a press is called light. Chosen by hand."""
 ROUND: Final = 1.7
-"""Longer over shorter axis of a contact, from which on it is not called a ball's. Chosen by hand: presses of
-a ball on a real gel (mini_ball) reach 1.57."""
+"""Longer over shorter axis of a contact above which it is not a ball's. Chosen by hand: presses of a ball on
+a real gel (mini_ball) reach 1.57."""
 PARTS: Final = 3
 """Columns and rows of parts of the gel that should each have presses. Chosen by hand."""
 _ROWS: Final = ("upper", "middle", "lower")
@@ -23,7 +23,7 @@ _COLUMNS: Final = ("left", "centre", "right")
 _FIRST: Final = ((1, 1), (0, 0), (2, 2), (0, 2), (2, 0), (0, 1), (2, 1), (1, 0), (1, 2))
 """The parts in the order in which they are asked for."""
 _DEPTHS: Final = ("firmly", "lightly", "half as deep")
-"""How to press where there are none, one, two presses: a calibration wants several depths."""
+"""How to press after zero, one, two presses at a place: a calibration wants several depths."""
 
 
 def fault(press: Press, usual: float) -> str | None:

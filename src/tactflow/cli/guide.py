@@ -1,4 +1,4 @@
-"""What `tactflow calibrate` says while a ball is pressed, and what can be typed meanwhile."""
+"""The messages of `tactflow calibrate` while a ball is pressed, and the keys that it understands."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _missing(presses: Sequence[Press]) -> str:
 
 
 def typed_lines() -> Callable[[], Sequence[str]]:
-    """What is typed at the terminal, line by line, without waiting; nothing where there is no terminal."""
+    """Lines typed at the terminal, without waiting for them; always empty without a terminal."""
     if not sys.stdin.isatty():
         return tuple
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()

@@ -81,7 +81,7 @@ class Document:
         return keys[-1] in self.mapping(*keys[:-1])
 
     def mark(self, *keys: str | int) -> Mark:
-        """Where a value was written; of one that is missing, where the mapping around it begins."""
+        """Where a value was written; for a missing value, where the mapping around it begins."""
         for target, origin in reversed(self._changes):
             if keys[: len(target)] == target:
                 return origin if isinstance(origin, Mark) else self.mark(*origin, *keys[len(target) :])

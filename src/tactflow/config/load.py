@@ -64,7 +64,7 @@ def load_pipeline(
     _check_needs(drafts, document)
     calibration = _calibration(document, path.parent)
     document.raise_if_mistaken()
-    assert file is not None, "what is wrong with it was raised"
+    assert file is not None, "its mistakes were raised"
     entries: dict[str, Entry] = {**file.stages, **file.sinks}
     pipeline = Pipeline(
         file=str(path),
@@ -90,7 +90,7 @@ def sensor_names(path: Path, overrides: Sequence[Override | str] = ()) -> list[s
 
     Raises
     ------
-    ConfigError : the file is no YAML mapping, or an override cannot be applied.
+    ConfigError : the file is not a YAML mapping, or an override cannot be applied.
     """
     document = _read(path, overrides)
     document.raise_if_mistaken()
@@ -135,7 +135,7 @@ def _resolve(draft: Draft, directory: Path, document: Document) -> None:
     if not isinstance(use, str):
         return
     place = (*draft.keys, "use") if "use" in draft.settings else draft.keys
-    # On the command line, and in a pipeline that nobody can put a file beside, it means the current folder.
+    # From the command line, and in a packaged pipeline, a loose file lies in the current folder.
     own = is_packaged(directory) or ("use" in draft.settings and not document.mark(*place).line)
     try:
         draft.component = resolve(use, draft.section, *([Path()] if own else []), directory)
@@ -144,7 +144,7 @@ def _resolve(draft: Draft, directory: Path, document: Document) -> None:
 
 
 def _source(document: Document, drafts: Sequence[Draft]) -> Draft | None:
-    """The source of frames; that there is none, or more than one, is a mistake."""
+    """The source of frames; a pipeline without one, or with several, is a mistake."""
     stages = [draft for draft in drafts if draft.section == "stages"]
     sources = [draft for draft in stages if draft.component and draft.component.kind == "source"]
     readable = document.has("stages") and isinstance(document.get("stages"), dict | None)
@@ -203,13 +203,13 @@ def _check_files(
 
 
 def _does_as_much(writer: Draft, added: Draft) -> bool:
-    """Whether a sink writes all that the added one would, which has no settings of its own."""
+    """Whether a sink writes everything that the added one, without settings of its own, would write."""
     classes = {draft.component.cls for draft in (writer, added) if draft.component}
     return len(classes) == 1 and "max_rate" not in writer.settings
 
 
 def _calibration(document: Document, directory: Path) -> Path | None:
-    """The calibration file that the pipeline names; that it is not there is a mistake."""
+    """The calibration file that the pipeline names; a missing file is a mistake."""
     name = document.get("calibration")
     if not isinstance(name, str):
         return None
@@ -269,7 +269,7 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
 
 
 def _settings(document: Document, sensor: str, drafts: Sequence[Draft]) -> dict[str, Any]:
-    """What the file and all that changes it come to, for one sensor."""
+    """The values of the file with all overrides, for one sensor."""
     sections: dict[str, dict[str, Any]] = {section: {} for section in _SECTIONS}
     for draft in drafts:
         sections[draft.section][draft.id] = document.get(*draft.keys)

@@ -60,7 +60,7 @@ def available() -> list[Component]:
 
 
 def catalogue() -> tuple[list[Component], list[str]]:
-    """Like `available`, and beside it one message for each built-in or plug-in that cannot be used."""
+    """Like `available`, with one message for each built-in or plug-in that cannot be used."""
     components: list[Component] = []
     problems: list[str] = []
     sections: tuple[Section, ...] = get_args(Section)

@@ -30,8 +30,8 @@ def described_pipelines() -> dict[str, str]:
 def find_pipeline(name: str | None) -> Path:
     """The file that PIPELINE names.
 
-    Without a name: `./pipeline.yaml` if it is there, else the packaged default. A name that is no file, such
-    as `classic` or `pipelines/classic.yaml`, finds the packaged pipeline of that name.
+    Without a name: `./pipeline.yaml` if it is there, else the packaged default. A name that is not a file,
+    such as `classic` or `pipelines/classic.yaml`, finds the packaged pipeline of that name.
 
     Raises ConfigError, with the names that there are, for a word that is neither.
     """

@@ -164,7 +164,7 @@ class _Wiring:
                 return ref
         giver = self._by_id.get(stage)
         if giver is None:
-            # A signal that nobody gives may be one of a stage that could not be found.
+            # An unknown signal may come from a stage that could not be found.
             if self._complete or dot or not by_port:
                 document.report(place, self._unknown(text, user, by_port))
         elif giver.section == "sinks":
@@ -248,7 +248,7 @@ class _Wiring:
         draft.edges.append((ref, self._document.mark(*place)))
 
     def _meaning(self, ref: Ref, signal: SignalPort, visited: Sequence[str] = ()) -> SignalPort:
-        """The signal that says what a closed gate means: for one that only holds another, that other one."""
+        """The signal that defines what a closed gate means: behind a stage that holds one, the held one."""
         giver = self._by_id[ref.node]
         for source in giver.inputs.values() if signal.closed is None and giver.id not in visited else ():
             held = self._signal(source) if source else None

@@ -58,7 +58,7 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
     """Write the truth about all frames, in raw pixel coordinates.
 
     path : `.jsonl` is one JSON object a frame: frame, t (s), touching, center, angle, hull, area, depth,
-        origin, position, visible, mean_flow, with null for what there is not. `.npz` holds the same as
+        origin, position, visible, mean_flow, with null for unknown values. `.npz` holds the same as
         arrays, with contact_mask (N, H, W) bool besides: center, angle and mean_flow are 0 where `touching`,
         `directed` and `has_flow` are false; the hull of frame i is hull[hull_start[i]:hull_start[i + 1]].
         All of it is held in memory until it is written.
@@ -75,7 +75,7 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
 
 
 def frames_kind(path: Path) -> str:
-    """`npy`, `video` or `folder`; ValueError where the suffix is none of theirs."""
+    """`npy`, `video` or `folder`; ValueError for any other suffix."""
     suffix = path.suffix.lower()
     if suffix == ".npy":
         return "npy"

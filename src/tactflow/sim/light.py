@@ -36,7 +36,6 @@ class Light:
     halo : grey levels by which the gel is brighter just outside a contact of full depth.
     """
 
-    description: str
     azimuth: tuple[float, float, float]
     level: tuple[float, float, float]
     falloff: float
@@ -54,26 +53,16 @@ class Light:
 
 
 LIGHTS = {
-    "photometric": Light(
-        "three coloured lights; a contact answers with colour",
-        (325.0, 80.0, 205.0), (122.0, 136.0, 118.0), 0.4, 1.9, 0.25, 0.0,
-    ),
-    "bright": Light(
-        "white light; a contact brightens in all channels",
-        (325.0, 80.0, 205.0), (98.0, 104.0, 100.0), 0.12, 0.10, 0.5, 58.0,
-    ),
-    "mixed": Light(
-        "coloured lights, and a contact brightens too",
-        (325.0, 80.0, 205.0), (106.0, 114.0, 104.0), 0.35, 0.7, 0.35, 46.0,
-    ),
-    "dark_channel": Light(
-        "three coloured lights; the red one grazes the gel, which is nearly dark in it until it is touched",
-        (325.0, 80.0, 205.0), (115.0, 132.0, 12.0), 0.4, (0.5, 1.9, 9.0), 0.25, 0.0,
-    ),
-    "darkening": Light(
-        "white light through a black coating; a contact darkens, with a bright halo around it",
-        (325.0, 80.0, 205.0), (150.0, 152.0, 154.0), 0.12, 0.10, 0.5, -75.0, 0.2, 26.0,
-    ),
+    # Three coloured lights; a contact answers with colour.
+    "photometric": Light((325.0, 80.0, 205.0), (122.0, 136.0, 118.0), 0.4, 1.9, 0.25, 0.0),
+    # White light; a contact brightens in all channels.
+    "bright": Light((325.0, 80.0, 205.0), (98.0, 104.0, 100.0), 0.12, 0.10, 0.5, 58.0),
+    # Coloured lights, and a contact brightens too.
+    "mixed": Light((325.0, 80.0, 205.0), (106.0, 114.0, 104.0), 0.35, 0.7, 0.35, 46.0),
+    # Three coloured lights; the red one grazes the gel, which is nearly dark in it until it is touched.
+    "dark_channel": Light((325.0, 80.0, 205.0), (115.0, 132.0, 12.0), 0.4, (0.5, 1.9, 9.0), 0.25, 0.0),
+    # White light through a black coating; a contact darkens, with a bright halo around it.
+    "darkening": Light((325.0, 80.0, 205.0), (150.0, 152.0, 154.0), 0.12, 0.10, 0.5, -75.0, 0.2, 26.0),
 }  # fmt: skip
 
 

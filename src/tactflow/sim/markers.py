@@ -110,7 +110,7 @@ def draw(
     padded_height, padded_width = canvas.shape[:2]
     anchor = np.rint(centers).astype(np.int64)
     # A marker whose centre is outside still shows if its edge reaches in. Where its patch leaves the padding,
-    # the indices are clamped to the outermost padding, which nobody sees.
+    # the indices are clamped to the outermost padding, which is cut off.
     reachable = np.all(anchor > -half, axis=1)
     reachable &= (anchor[:, 0] < padded_width - half) & (anchor[:, 1] < padded_height - half)
     span = np.arange(-half, half + 1)
