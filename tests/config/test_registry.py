@@ -155,7 +155,7 @@ def test_a_class_imported_into_a_loose_file_does_not_count_as_its_own(tmp_path: 
         (
             '    memory = "pure"\n',
             '    memory = "none"\n',
-            "memory: required 'pure' or .* got 'none'",
+            "must declare memory = .* got 'none'",
         ),
         ('    memory = "pure"\n', '    memory = "pure"\n    Params = dict\n', "must be a subclass of"),
         (
