@@ -158,19 +158,3 @@ def test_a_bag_of_real_frames_gives_the_results_of_the_folder_to_the_bit(
     assert lines[0].count(b"\n") == 20
     assert b'"area"' in lines[0]
     assert lines[1:] == lines[:1] * 3
-
-
-def test_without_a_topic_the_error_lists_what_is_inside(tmp_path: Path) -> None:
-    listed = r"one of: /gel/image \(sensor_msgs/msg/Image, 2\); topics without pictures: /chatter \(std_msgs"
-    for kind, name in KINDS.items():
-        bag = write_bag(tmp_path / name, pictures(2), kind)
-        with pytest.raises(SourceError, match=r"add \?topic= " + listed):
-            open_source(str(bag))
-        with pytest.raises(SourceError, match="there is no topic /image; required " + listed):
-            open_source(f"{bag}?topic=/image")
-        with pytest.raises(
-            SourceError, match="/chatter has messages of type std_msgs/msg/String, which hold no"
-        ):
-            open_source(f"{bag}?topic=/chatter")
-    with pytest.raises(SourceError, match="speed=2: required topic=name of a topic with pictures"):
-        open_source(f"{bag}?speed=2")

@@ -151,14 +151,6 @@ def test_tables_are_refused_replaced_or_added_to(tmp_path: Path) -> None:
         opened(tmp_path)
 
 
-def test_without_pyarrow_the_error_has_the_command_that_installs_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(StageError, match=r"need pyarrow: pip install 'tactflow\[parquet\]'"):
-        opened(tmp_path)
-
-
 def test_the_example_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

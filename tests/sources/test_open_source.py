@@ -106,7 +106,7 @@ def test_an_array_that_is_cut_during_the_run_is_an_error(order: Literal["C", "F"
 @pytest.mark.parametrize(
     ("pixels", "expected", "note"),
     [
-        (np.full((4, 6), 77, np.uint8), 77, "gray"),
+        (np.full((4, 6), 77, np.uint8), 77, ""),
         (np.full((4, 6, 4), 77, np.uint8), 77, "alpha"),
         (np.full((4, 6, 3), 77 * 257, np.uint16), 77, "16-bit"),
         (np.full((4, 6, 4), 65535, np.uint16), 255, "16-bit"),
@@ -120,7 +120,7 @@ def test_other_kinds_of_pixels_are_converted_with_one_note(
     with caplog.at_level(logging.INFO, "tactflow"):
         for image, _ in read_all(open_source(str(tmp_path))):
             np.testing.assert_array_equal(image, np.full((4, 6, 3), expected, np.uint8))
-    assert sum(note in record.message for record in caplog.records) == 1
+    assert sum(note in record.message for record in caplog.records) == bool(note)
 
 
 def test_16_bit_arrays_have_either_order_of_bytes_and_few_bits_are_pointed_out(

@@ -169,26 +169,6 @@ def test_a_reader_that_is_slow_gets_the_newest_frame_and_a_gap_in_seq(
     assert take(source, 1)[0].seq - first.seq >= 6
 
 
-@pytest.mark.parametrize(
-    ("does", "says"),
-    [
-        ("gone", "gone, no good frame .* the last attempt of .*: nothing is plugged in"),
-        ("hangs", "no frames, no good frame"),
-        ("frozen", "a frozen picture, no good frame"),
-        ("black", "black pictures, no good frame"),
-        ("other_size", "it came back with 32 x 24 pixels instead of 64 x 48"),
-    ],
-)
-def test_without_a_good_frame_for_too_long_the_error_says_what_to_try(
-    does: str, says: str, device: Flaky, watched: Callable[..., Watched]
-) -> None:
-    source = watched(no_frame_timeout=0.5)
-    take(source)
-    device.does = does
-    with pytest.raises(SourceError, match=f"{says}.*no_frame_timeout"):
-        take(source, 10_000)
-
-
 def test_black_pictures_at_the_start_are_not_handed_over(
     device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
 ) -> None:

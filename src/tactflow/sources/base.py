@@ -238,7 +238,6 @@ class Normaliser:
         if channels == 3:
             return image if image.flags.c_contiguous else np.ascontiguousarray(image)
         if channels == 1:
-            self._note("gray frames are given three equal channels")
             return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
         self._note("the fourth channel (alpha) is ignored")
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2BGR), np.uint8)
