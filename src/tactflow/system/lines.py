@@ -31,6 +31,30 @@ MOST_WAITING = 1000
 """Lines kept for a reader that takes none: 17 s at 60 Hz, 6 MB with 60 markers each. Chosen by hand."""
 
 
+if sys.platform == "win32":
+    _CHUNK = 512
+
+    def _open_pipe(path: Path) -> int:
+        return os.open(path, os.O_WRONLY)
+
+    def _writable(_number: int, _seconds: float) -> bool:
+        return True
+
+else:
+    _CHUNK = select.PIPE_BUF
+
+    def _open_pipe(path: Path) -> int:
+        """Open a pipe for writing; raises ENXIO instead of waiting while it has no reader."""
+        number = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+        os.set_blocking(number, True)
+        return number
+
+    def _writable(number: int, seconds: float) -> bool:
+        poll = select.poll()
+        poll.register(number, select.POLLOUT)
+        return bool(poll.poll(round(seconds * 1000)))
+
+
 class LineStream:
     """Writes whole lines to a pipe or standard output, or keeps them for a slow reader.
 
@@ -62,12 +86,11 @@ class LineStream:
         waiting = False
         while True:
             try:
-                number = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+                number = _open_pipe(path)
             except OSError as error:
                 if error.errno != errno.ENXIO or not stat.S_ISFIFO(path.stat().st_mode):
                     raise cannot_write(path, error) from error
             else:
-                os.set_blocking(number, True)
                 return os.fdopen(number, "wb", buffering=0)
             if not waiting:
                 waiting = True
@@ -132,7 +155,7 @@ class LineStream:
                     self._takes_more(LOOK_EVERY)
                     continue
                 line = self._lines[0]
-                self._sent += self._file.write(line[self._sent : self._sent + select.PIPE_BUF])
+                self._sent += self._file.write(line[self._sent : self._sent + _CHUNK])
                 self._file.flush()
                 if self._sent >= len(line):
                     self._lines.popleft()
@@ -147,15 +170,13 @@ class LineStream:
             raise cannot_write(self._name, error, kept) from error
 
     def _takes_more(self, seconds: float) -> bool:
-        """Whether a write of up to `PIPE_BUF` bytes returns at once, perhaps with an error."""
+        """Whether a write of up to `_CHUNK` bytes returns at once, perhaps with an error."""
         try:
             number = self._file.fileno()
         except (UnsupportedOperation, ValueError):
             # A program has replaced standard output by something of its own.
             return True
-        poll = select.poll()
-        poll.register(number, select.POLLOUT)
-        return bool(poll.poll(round(seconds * 1000)))
+        return _writable(number, seconds)
 
 
 class LineFile:
