@@ -39,7 +39,7 @@ def test_the_pipeline_is_the_script_in_the_places_of_the_built_in_stages() -> No
     assert classes["tracker"] is Tracker
     assert classes["flow_in_mask"] is FlowMask
     assert nodes["preprocess"].params.model_dump()["method"] == "pyramid"
-    assert nodes["inpaint"].params.model_dump() == {"method": "telea", "radius": functions.INPAINT_RADIUS}
+    assert nodes["inpaint"].params.model_dump() == {"method": "telea", "radius": 7.0}
 
 
 def test_the_marker_mask_is_that_of_the_function() -> None:

@@ -236,7 +236,7 @@ class ClassicDetector:
 
     def detect(self, image: Image) -> ContactResult:
         assert self._reference is not None
-        mask = classic.contact_mask(image, self._reference)
+        mask = classic.difference(image, self._reference)
         return ContactResult(mask, bool(mask.any()))
 
 

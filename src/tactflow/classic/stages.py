@@ -1,4 +1,4 @@
-"""The original script as stages, in the places of the built-in ones; `pipelines/classic.yaml` uses them."""
+"""The original script as stages that replace the built-in ones in `pipelines/classic.yaml`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tactflow.classic.functions import contact_mask, get_convex_hull_area, mask_marker, mean_flow
+from tactflow.classic.functions import difference, get_convex_hull_area, mask_marker, mean_flow
 from tactflow.classic.tracker import GridTracker
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent, Frame
@@ -27,14 +27,14 @@ class MaskMarker(Stage):
 
 
 class ContactPorts(NamedTuple):
-    """contact_mask : 255 in contact. touching : whether anything is."""
+    """contact_mask : 255 in contact. touching : whether any pixel is."""
 
     contact_mask: ContactMask
     touching: Touching
 
 
 class Difference(Stage):
-    """Where the gel is brighter than in the last reference frame, by the script's `difference`."""
+    """Contact where the gel is brighter than in the last reference frame, by the script's `difference`."""
 
     memory = "stateful"
 
@@ -43,33 +43,30 @@ class Difference(Stage):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the reference; a new one follows."""
+        """Forget the reference."""
         self._reference: NDArray[np.uint8] | None = None
 
     def process(self, unmarked: Unmarked, frame: Frame) -> ContactPorts:
-        """The contact mask of this frame; the first frame serves as reference where none is marked as one."""
+        """Compare with the last reference, or with the first frame if none is marked as a reference."""
         if frame.reference or self._reference is None:
             self._reference = unmarked.copy()
-        mask = contact_mask(unmarked, self._reference)
+        mask = difference(unmarked, self._reference)
         return ContactPorts(mask, bool(mask.any()))
 
 
 class ConvexHull(Stage):
-    """Hull and line of the contact, by the script's `get_convex_hull_area` and what it calls."""
+    """Hull, line and ellipse of the contact, by the script's `get_convex_hull_area`."""
 
     memory = "pure"
 
     def process(self, contact_mask: ContactMask) -> Contact | Absent:
-        """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
+        """Geometry of the contact, or Absent("no_contact") for an empty mask."""
         contact = get_convex_hull_area(contact_mask)
         return Absent("no_contact") if contact is None else contact
 
 
 class Tracker(Stage):
-    """Markers of the first frame, found again by the script's `marker_center` and its search `m`.
-
-    The search is limited in visits instead of milliseconds: its result does not depend on the machine.
-    """
+    """Tracks the markers of the first frame by the script's `marker_center` and its search `m`."""
 
     memory = "stateful"
 
@@ -78,7 +75,7 @@ class Tracker(Stage):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the grid of markers; the next frame shows it."""
+        """Forget the grid; the next frame defines it."""
         self._tracker: GridTracker | None = None
 
     def process(self, image: Image) -> Markers:
@@ -89,14 +86,14 @@ class Tracker(Stage):
 
 
 class FlowMask(Stage):
-    """Mean displacement of the markers inside the contact, as the script's `draw_flow_mask` writes it."""
+    """Mean displacement of the markers inside the contact, as in the script's `draw_flow_mask`."""
 
     memory = "pure"
 
     class Params(StageParams):
-        """How far around the contact markers count."""
+        """Margin around the contact."""
 
-        dilate: int = Field(8, ge=0, le=1000, description="the contact grows by a square of so many pixels")
+        dilate: int = Field(8, ge=0, le=1000, description="pixels by which a square dilates the contact")
 
     def process(self, markers: Markers, contact_mask: ContactMask) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside."""

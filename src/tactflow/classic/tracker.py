@@ -1,4 +1,4 @@
-"""The marker tracking of the original script: contour centres, matched to a grid by a search."""
+"""The original script's marker tracking: contour centres matched to a grid by depth-first search."""
 
 from __future__ import annotations
 
@@ -15,31 +15,30 @@ from tactflow.vision.types import Markers, MarkerStatus
 FloatArray = NDArray[np.float64]
 
 MAX_VISITS: Final = 5000
-"""Nodes that the search may visit per frame; about what the original's time limit of 33 ms allows in Python.
-A limit in visits instead of milliseconds gives the same answer on every run and every machine."""
-
+"""Nodes that the search may visit per frame, about as many as Python visits in the original's time limit of
+33 ms. Unlike a time limit, it gives the same result on every machine."""
 
 _REACH: Final = 0.6
-"""How far a centre may be from where the neighbours' motion expects it, as a part of the spacing; chosen by
-hand: beyond a half it may be the neighbour's."""
+"""Search radius around the position predicted from the neighbours, as a fraction of the spacing; chosen by
+hand: beyond a half, a centre may belong to the neighbour."""
 
-_TRIED: Final = 3
+_MAX_CANDIDATES: Final = 3
 """Centres that a node tries before it stays empty; chosen by hand."""
 
 _LONGEST_LINK: Final = 1.6
-"""Length of a link over the median distance of nearest centres, at most: more than the diagonal of a square,
-so that a bent grid stays linked, and less than two spacings."""
+"""Maximum link length in median nearest-neighbour distances: more than the diagonal of a square, so that a
+bent grid stays linked, and less than two spacings."""
 
 _OBLIQUE: Final = 0.6
-"""Shorter over longer component of a link, at most: the diagonal of a square has 1, a row tilted by 31
-degrees has 0.6."""
+"""Maximum ratio of a link's shorter to its longer component: 1 for the diagonal of a square, 0.6 for a row
+tilted by 31 degrees."""
 
 
 class GridFlow(NamedTuple):
     """The flow as the original returns it: five arrays of shape (rows, columns).
 
-    Ox, Oy : where the markers were, px. Cx, Cy : where they are, px. Occupied : number of the centre that was
-    matched, or -1 where none was.
+    Ox, Oy : original positions, px. Cx, Cy : current positions, px. Occupied : index of the matched centre,
+    or -1.
     """
 
     Ox: FloatArray
@@ -52,12 +51,12 @@ class GridFlow(NamedTuple):
 class Matcher:
     """Matches centres to a grid of rows and columns by depth-first search.
 
-    The script's `m.init`, `m.run` and `m.get_flow`. The grid is visited row by row. Each node tries the
-    free centres that continue the motion of its left and upper neighbours best, or stays empty at a price; a
-    branch is given up when it costs more than the best complete one so far.
+    The script's `m.init`, `m.run` and `m.get_flow`. Row by row, each node tries the free centres that best
+    continue the motion of its left and upper neighbours, or stays empty at a cost. A branch is pruned when it
+    costs more than the best complete assignment.
 
-    origin : (rows, columns, 2) float64, the grid, px; NaN where it has no marker.
-    spacing : typical distance of neighbours, px. max_visits : see `MAX_VISITS`.
+    origin : (rows, columns, 2) float64, px; NaN where the grid has no marker.
+    spacing : typical distance between neighbours, px. max_visits : see `MAX_VISITS`.
     """
 
     def __init__(self, origin: FloatArray, spacing: float, *, max_visits: int = MAX_VISITS) -> None:
@@ -88,11 +87,11 @@ class Matcher:
         self._moves: list[complex] = [0j] * len(self._nodes)
 
     def init(self, centers: FloatArray) -> None:
-        """Take the centres (N, 2), px, of a frame."""
+        """Set the centres (N, 2), px, of a frame."""
         self._centers = [complex(x, y) for x, y in centers]
 
     def run(self) -> None:
-        """Search for the cheapest assignment until it is found or the visits are used up."""
+        """Search for the cheapest assignment, within `max_visits`."""
         count = len(self._nodes)
         empty_price = self._spacing**2
         chosen = [-1] * count
@@ -133,18 +132,18 @@ class Matcher:
     def _options(
         self, node: int, moves: list[complex], used: set[int], empty_price: float
     ) -> list[tuple[float, int, complex]]:
-        """What a node may do, cheapest first: (cost, centre or -1, displacement)."""
-        near = [moves[other] for other in self._before[node]]
+        """Options of a node, cheapest first: (cost, centre or -1, displacement)."""
+        near = [moves[neighbour] for neighbour in self._before[node]]
         expected = sum(near) / len(near) if near else 0j
         place = self._places[node]
-        found = []
+        candidates = []
         for index, center in enumerate(self._centers):
             move = center - place
-            surprise = abs(move - expected)
-            if index not in used and surprise < _REACH * self._spacing:
-                found.append((surprise**2, index, move))
-        found.sort(key=lambda option: option[:2])
-        return [*found[:_TRIED], (empty_price, -1, expected)]
+            residual = abs(move - expected)
+            if index not in used and residual < _REACH * self._spacing:
+                candidates.append((residual**2, index, move))
+        candidates.sort(key=lambda option: option[:2])
+        return [*candidates[:_MAX_CANDIDATES], (empty_price, -1, expected)]
 
     def get_flow(self) -> GridFlow:
         """The result of the last `run`; nodes without a centre follow their neighbours."""
@@ -165,7 +164,7 @@ class Matcher:
 
 
 class GridTracker:
-    """The original tracker on a grid that is read off the reference frame instead of being typed in.
+    """The original tracker, on a grid found in the reference frame instead of typed in.
 
     reference : (H, W, 3) uint8, BGR.
     least_area, most_area : see `marker_center`.
@@ -173,7 +172,7 @@ class GridTracker:
     Raises
     ------
     NoMarkersError : fewer than four centres, or no grid in them.
-    ValueError : the areas are no finite range.
+    ValueError : the areas are not a finite range.
     """
 
     def __init__(
@@ -192,23 +191,22 @@ class GridTracker:
         self._matcher = Matcher(grid, spacing)
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
-        """Match one frame; markers without a centre are inferred. Standard errors are unknown (NaN)."""
+        """Match one frame; markers without a centre are inferred, standard errors are NaN."""
         least, most = self._areas
         self._matcher.init(marker_center(image, least_area=least, most_area=most))
         self._matcher.run()
         flow = self._matcher.get_flow()
-        here = self._present
-        status = np.where(flow.Occupied[here] >= 0, MarkerStatus.TRACKED, MarkerStatus.INFERRED)
+        status = np.where(flow.Occupied[self._present] >= 0, MarkerStatus.TRACKED, MarkerStatus.INFERRED)
         return Markers(
-            np.column_stack([flow.Ox[here], flow.Oy[here]]),
-            np.column_stack([flow.Cx[here], flow.Cy[here]]),
+            np.column_stack([flow.Ox[self._present], flow.Oy[self._present]]),
+            np.column_stack([flow.Cx[self._present], flow.Cy[self._present]]),
             status.astype(np.uint8),
-            np.full(int(here.sum()), np.nan),
+            np.full(int(self._present.sum()), np.nan),
         )
 
 
 def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
-    """Rows and columns of centres that lie on a (bent) grid.
+    """Arrange centres that lie on a (bent) grid in rows and columns.
 
     Parameters
     ----------
@@ -216,12 +214,12 @@ def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
 
     Returns
     -------
-    grid : (rows, columns, 2) float64, px, NaN where a node has no centre; centres that are not linked to the
-        grid are left out. spacing : median distance of linked centres, px.
+    grid : (rows, columns, 2) float64, px, NaN where a node has no centre; centres not linked to the grid are
+        left out. spacing : median distance between linked centres, px.
 
     Raises
     ------
-    NoMarkersError : fewer than four centres, or none of them linked.
+    NoMarkersError : fewer than four centres, or no links between them.
     """
     if len(centers) < 4:
         raise NoMarkersError(
@@ -246,22 +244,22 @@ def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
         raise NoMarkersError(
             "0 markers found in a grid: is the sensor marker-less? then use pipelines/markerless.yaml"
         )
-    place: dict[tuple[int, int], int] = {}
+    largest: dict[tuple[int, int], int] = {}
     for start in sorted(links, key=lambda center: -len(links[center])):
         reached = {start: (0, 0)}
         queue = [start]
         for center in queue:
             row, column = reached[center]
-            for other, down, right in links[center]:
-                if other not in reached:
-                    reached[other] = (row + down, column + right)
-                    queue.append(other)
-        parts = {node: center for center, node in reversed(reached.items())}
-        if len(parts) > len(place):
-            place = parts
-        if 2 * len(place) > len(centers):
+            for neighbour, down, right in links[center]:
+                if neighbour not in reached:
+                    reached[neighbour] = (row + down, column + right)
+                    queue.append(neighbour)
+        component = {node: center for center, node in reversed(reached.items())}
+        if len(component) > len(largest):
+            largest = component
+        if 2 * len(largest) > len(centers):
             break
-    rows, columns = np.array(list(place)).T
+    rows, columns = np.array(list(largest)).T
     grid = np.full((int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1, 2), np.nan)
-    grid[rows - rows.min(), columns - columns.min()] = centers[list(place.values())]
+    grid[rows - rows.min(), columns - columns.min()] = centers[list(largest.values())]
     return grid, float(np.median(lengths))
