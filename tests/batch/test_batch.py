@@ -83,7 +83,7 @@ def test_only_what_has_changed_is_done_again(call: Call) -> None:
     recording(call.folder / "rec" / "b" / "press.npy", brightness=250)
     call()
     assert "1 done now, 1 done before" in call.told
-    assert "1 done of another input, pipeline or version" in call.told
+    assert "1 outdated (input, pipeline or version changed)" in call.told
     call("--set", "stages.hull.min_area=7")
     assert "2 done now, 0 done before" in call.told
     recording(call.folder / "rec" / "c.npy")
@@ -103,7 +103,7 @@ def test_code_beside_the_pipeline_is_part_of_the_pipeline(call: Call) -> None:
     call()
     code.write_text(code.read_text().replace("// 2", "// 3 "))
     call()
-    assert "2 done of another input, pipeline or version" in call.told
+    assert "2 outdated (input, pipeline or version changed)" in call.told
 
 
 @pytest.mark.parametrize("damage", ["cut off", "gone", "no record", "damaged record"])
@@ -246,7 +246,7 @@ def test_two_calls_do_not_work_in_one_folder_but_two_shards_do(
     monkeypatch.setattr(InThisProcess, "submit", meanwhile)
     assert call() == 0
     assert codes == [2, 0]
-    assert "another tactflow batch is at work in it" in call.told
+    assert "another tactflow batch is using it" in call.told
 
 
 @pytest.mark.parametrize("format_", ["jsonl", "parquet"])
@@ -271,7 +271,7 @@ def test_two_pipelines_are_compared_frame_by_frame(call: Call, format_: str) -> 
         (["p.yaml", "nothing", "--out", "o"], "nothing: no such file or folder"),
         (["p.yaml", "--out", "o"], "there are no recordings"),
         (["q.yaml", "rec", "--out", "o"], "there is no file q.yaml"),
-        (["p.yaml", "rec", "--out", "p.yaml"], "cannot be written into"),
+        (["p.yaml", "rec", "--out", "p.yaml"], "is not writable"),
         (["p.yaml", "rec", "--out", "o", "--shard", "3/2"], "required I/N"),
     ],
 )

@@ -59,9 +59,9 @@ def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.Monkey
     [
         (["b/press-3.npy"], "did you mean b/press-2.npy"),
         (["nothing/*.mp4"], "no file matches"),
-        (["a/empty"], "no recording in this folder"),
-        (["0"], "is live"),
-        (["rtsp://camera/1"], "is live"),
+        (["a/empty"], "this folder contains no recordings"),
+        (["0"], "is a live source"),
+        (["rtsp://camera/1"], "is a live source"),
         (["pictures/1.png"], "name its folder"),
         (["list.txt"], "there are no recordings"),
     ],
@@ -82,7 +82,7 @@ def test_all_mistakes_are_told_at_once(data: Path) -> None:
 
 def test_a_list_does_not_name_lists(data: Path) -> None:
     (data / "b" / "list.txt").write_text("list.txt\npress-2.npy\n")
-    with pytest.raises(ConfigError, match="a list cannot name another one"):
+    with pytest.raises(ConfigError, match="lists cannot be nested"):
         find_recordings(["b/list.txt"])
 
 

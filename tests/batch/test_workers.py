@@ -73,7 +73,7 @@ def test_a_recording_that_kills_its_worker_fails_and_the_others_are_done(
 ) -> None:
     assert main(batch("a.npy", "deadly.npy", "unlucky.npy", "b.npy", "--workers", "2")) == 3
     assert statuses(folder) == {"a": "done", "deadly": "failed", "unlucky": "done", "b": "done"}
-    assert "failed: deadly.npy: it killed its worker twice" in capsys.readouterr().err
+    assert "failed: deadly.npy: killed its worker twice" in capsys.readouterr().err
     assert not list((folder / "out" / "unfinished").iterdir())
 
 

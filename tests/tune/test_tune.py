@@ -18,7 +18,7 @@ from tactflow.bench.scenes import Case
 from tactflow.cli.main import main
 from tactflow.config.shipped import find_pipeline
 from tactflow.tune import report, search, space
-from tactflow.tune.measure import ANY, Found, Interval, judge, mark_unsound
+from tactflow.tune.measure import ANY, Interval, Trial, judge, mark_unsound
 from tactflow.tune.recording import Recording, take
 from tactflow.tune.search import DEFAULT, Goal, Search, Tuned, front, impossible
 from tactflow.tune.sensor import Fitted, Look, fit
@@ -29,12 +29,12 @@ FUSION = {"fusion": {"fusion": {}, "no fusion": {"stages.fusion": None}, "withou
 FIELD = {"field": {"field": {}, "mean": {"stages.field": None, "stages.flow_in_mask.method": "mean"}}}
 
 
-def found(name: str, ms: float, error: float, **more: object) -> Found:
+def make_trial(name: str, ms: float, error: float, **more: object) -> Trial:
     interval = Interval(error, 0.9 * error, 1.1 * error)
-    one = Found(name, {"center": interval, ANY: interval}, ms=Interval(ms, ms, ms))
+    trial = Trial(name, {"center": interval, ANY: interval}, ms=Interval(ms, ms, ms))
     for key, value in more.items():
-        setattr(one, key, value)
-    return one
+        setattr(trial, key, value)
+    return trial
 
 
 @pytest.fixture(scope="module")
@@ -68,17 +68,19 @@ def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     budget = 1.5
     words = ["tune", "default", "--source", str(path), "--max-error", str(budget), "--budget", "1h", "--json"]
     assert main(words) == 0
-    told = json.loads(capsys.readouterr().out)
+    output = json.loads(capsys.readouterr().out)
     file = find_pipeline("default")
-    many = candidates(Candidate(DEFAULT).load(file), (320, 240), None)
-    found = judge(
-        {one.name: one.load(file) for one in many}, [Fitted(SMALL, Case("press", 24), tmp_path, 50)], 0
+    trials = candidates(Candidate(DEFAULT).load(file), (320, 240), None)
+    judged = judge(
+        {trial.name: trial.load(file) for trial in trials},
+        [Fitted(SMALL, Case("press", 24), tmp_path, 50)],
+        0,
     )
-    truth = {one.name: one for one in found}
+    truth = {trial.name: trial for trial in judged}
     # The mean over the dots is cheaper than the field, and far off: the budget forbids it.
-    assert told["chosen"].partition(",")[0] in ("field", DEFAULT)
+    assert output["chosen"].partition(",")[0] in ("field", DEFAULT)
     assert truth["field"].of(ANY) <= budget < truth["mean"].of(ANY)
-    (chosen,) = [one for one in told["candidates"] if one["name"] == told["chosen"]]
+    (chosen,) = [trial for trial in output["candidates"] if trial["name"] == output["chosen"]]
     assert chosen["checks"]["agreement"] == pytest.approx(100.0, abs=10.0)
     assert "field" in tactflow.load("tuned.yaml").nodes
     text = Path("tuned.yaml").read_text()
@@ -96,15 +98,15 @@ def test_a_budget_that_is_over_ends_the_search_after_a_group_of_candidates(
     assert tuned.rounds == [(2, 24)]
     assert tuned.chosen is not None
     assert tuned.notes == [
-        "the budget was over after 2 of 4 candidates",
-        "the budget was over after the first round",
-        "no time was left for the recording: times are of the simulated one",
+        "out of time after 2 of 4 candidates",
+        "out of time after the first round",
+        "no time left for the recording: times are of simulated frames",
     ]
-    assert not any(one.checks for one in tuned.found)
-    told = "\n".join(report.lines(tuned))
-    assert "time: CPU of a frame with contact, simulated" in told
-    assert "frames of the recording" not in told
-    assert all(one.ms.value > 0 for one in tuned.found)
+    assert not any(trial.checks for trial in tuned.trials)
+    output = "\n".join(report.lines(tuned))
+    assert "time: CPU of a frame with contact, simulated" in output
+    assert "frames of the recording" not in output
+    assert all(trial.ms.value > 0 for trial in tuned.trials)
 
 
 def test_errors_are_the_same_with_the_same_seed(tmp_path: Path) -> None:
@@ -116,33 +118,33 @@ def test_errors_are_the_same_with_the_same_seed(tmp_path: Path) -> None:
 
 
 def test_the_order_follows_the_goal() -> None:
-    many = [
-        found("slow", 9, 0.1),
-        found("fast", 1, 2.0),
-        found("middle", 3, 0.5),
-        found("wrong", 0.5, 0.1, unsound="% of dots lost: 50 (best 0)"),
-        found("fails", 0.1, 0.1, failure="tracker failed"),
+    trials = [
+        make_trial("slow", 9, 0.1),
+        make_trial("fast", 1, 2.0),
+        make_trial("middle", 3, 0.5),
+        make_trial("wrong", 0.5, 0.1, unsound="% of dots lost: 50 (best 0)"),
+        make_trial("fails", 0.1, 0.1, failure="tracker failed"),
     ]
-    assert [one.name for one in Goal(max_error=1.0).order(many)][:3] == ["middle", "slow", "fast"]
-    assert [one.name for one in Goal(max_ms=4.0).order(many)][:3] == ["middle", "fast", "slow"]
+    assert [trial.name for trial in Goal(max_error=1.0).order(trials)][:3] == ["middle", "slow", "fast"]
+    assert [trial.name for trial in Goal(max_ms=4.0).order(trials)][:3] == ["middle", "fast", "slow"]
     # Without a budget: the cheapest of those that are nearly as exact as the best.
-    assert Goal().order(many)[0].name == "slow"
-    assert front(many, ANY) == ["fast", "middle", "slow"]
+    assert Goal().order(trials)[0].name == "slow"
+    assert front(trials, ANY) == ["fast", "middle", "slow"]
 
 
 def test_an_impossible_budget_tells_what_is_possible(recorded: Recording) -> None:
-    many = [found("exact", 9, 0.1), found("fast", 1, 2.0)]
-    tuned = Tuned(recorded, SMALL, Goal(max_error=0.01), many, [], None)
-    assert impossible(tuned).endswith("Possible: 0.1 px in 9 ms (exact), or 1 ms with 2 px (fast)")
+    trials = [make_trial("exact", 9, 0.1), make_trial("fast", 1, 2.0)]
+    tuned = Tuned(recorded, SMALL, Goal(max_error=0.01), trials, [], None)
+    assert impossible(tuned).endswith("Possible: 0.1 px in 9 ms (exact), or 2 px in 1 ms (fast)")
 
 
 def test_a_pipeline_that_misses_contacts_is_not_sound() -> None:
-    many = [found("good", 1, 1.0), found("bad", 1, 0.1), found("unknown", 1, math.inf)]
-    many[0].quantities = {"missed_half_depth": 0.0}
-    many[1].quantities = {"missed_half_depth": 40.0}
-    mark_unsound(many)
-    assert [one.usable for one in many] == [True, False, True]
-    assert "40 (best 0)" in many[1].unsound
+    trials = [make_trial("good", 1, 1.0), make_trial("bad", 1, 0.1), make_trial("unknown", 1, math.inf)]
+    trials[0].quantities = {"missed_half_depth": 0.0}
+    trials[1].quantities = {"missed_half_depth": 40.0}
+    mark_unsound(trials)
+    assert [trial.usable for trial in trials] == [True, False, True]
+    assert "40 (best 0)" in trials[1].unsound
 
 
 def test_what_is_changed_stands_in_the_file_and_removed_stages_are_gone(
@@ -150,9 +152,9 @@ def test_what_is_changed_stands_in_the_file_and_removed_stages_are_gone(
 ) -> None:
     settings = (("stages.preprocess.downsample", 4), ("stages.fusion", None), ("skipping", False))
     chosen = Candidate("chosen", settings)
-    tuned = Tuned(recorded, SMALL, Goal(), [found("chosen", 1, 1)], ["chosen"], chosen)
+    tuned = Tuned(recorded, SMALL, Goal(), [make_trial("chosen", 1, 1)], ["chosen"], chosen)
     text = report.pipeline_text(tuned, find_pipeline("default"), tmp_path / "tuned.yaml")
-    assert "# stages.preprocess.downsample: 4, in place of 2" in text
+    assert "# stages.preprocess.downsample: 4, was 2" in text
     assert "# stages.fusion: removed" in text
     document = yaml.safe_load(text)
     assert document["stages"]["preprocess"]["downsample"] == 4
@@ -165,7 +167,7 @@ def test_no_line_of_a_recordings_name_becomes_part_of_the_pipeline(
 ) -> None:
     odd = replace(recorded, source="press\nsinks:\u2028evil: {}\n.npy")
     chosen = Candidate("chosen", ())
-    tuned = Tuned(odd, SMALL, Goal(), [found("chosen", 1, 1)], ["chosen"], chosen)
+    tuned = Tuned(odd, SMALL, Goal(), [make_trial("chosen", 1, 1)], ["chosen"], chosen)
     file = find_pipeline("default")
     text = report.pipeline_text(tuned, file, tmp_path / "tuned.yaml")
     assert yaml.safe_load(text) == yaml.safe_load(file.read_text())
@@ -175,7 +177,7 @@ def test_no_line_of_a_recordings_name_becomes_part_of_the_pipeline(
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        (["--source", "still"], 4, "nothing touches the gel in its 24 first frames"),
+        (["--source", "still"], 4, "no contact in the first 24 frames"),
         (["--source", "short"], 4, "5 frames are too few"),
         (["--source", "nowhere.avi"], 4, "no such file"),
         (["--source", "still", "--budget", "soon"], 2, "required a time such as 90s"),

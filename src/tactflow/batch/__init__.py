@@ -1,6 +1,6 @@
-"""A pipeline over many recordings, on the processors of this machine or on a Dask cluster.
+"""Run a pipeline over many recordings, on local processes or on a Dask cluster.
 
-`recordings` finds them, `run` decides what is missing and hands it to `workers`, `work` runs one recording,
-`summary` keeps curves and pictures of it, `store` is the folder of the results, `report` the table and the
-page of all runs, `compare` a table of how two pipelines differ.
+`recordings` finds the recordings, `run` submits outdated ones to `workers`, `work` processes one recording,
+`summary` collects its curves and pictures, `store` manages the output folder, `report` writes the table and
+page of all runs, `compare` tabulates how two pipelines differ.
 """

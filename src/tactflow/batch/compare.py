@@ -1,4 +1,4 @@
-"""How the results of two pipelines over the same recordings differ: a table, one row for each recording."""
+"""Tabulate how the results of two pipelines over the same recordings differ, one row per recording."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ QUANTITIES = {
     "angle, °": ("contact_angle",),
     "flow, px": ("flow_mean_x", "flow_mean_y"),
 }
-"""Heading -> columns of the table `frames`, of which the length of the difference is taken."""
+"""Heading -> columns of the table `frames`; the norm of their difference is compared."""
 HALF_TURN = 180.0
-"""Degrees after which the direction of an axis is the same again."""
+"""Period of an axis direction, degrees."""
 
 Frames = Mapping[int, Mapping[str, Any]]
 """seq -> row of the table `frames`: column -> value or None."""
@@ -31,8 +31,8 @@ Frames = Mapping[int, Mapping[str, Any]]
 def compare(results: Iterable[tuple[str, Path, Path]]) -> Table:
     """Compare two results of each recording, frame by frame.
 
-    results : name of the recording, result of the first pipeline, result of the second. Quantities are in
-    pixels of the processed frame, so both pipelines should give frames of one size.
+    results : name of the recording and the results of both pipelines. Quantities are in pixels of the
+    processed frame, so both pipelines should produce frames of the same size.
     """
     columns = ["recording", "frames in both", "contact in both", "in the first only", "in the second only"]
     columns += ["outlines, mean IoU"]
@@ -41,7 +41,7 @@ def compare(results: Iterable[tuple[str, Path, Path]]) -> Table:
 
 
 def read(result: Path) -> Frames:
-    """The frames of a result, a `.jsonl` file or a folder of Parquet tables."""
+    """Read the frames of a result, a `.jsonl` file or a folder of Parquet tables."""
     if result.is_dir():
         import pyarrow.parquet as pq  # type: ignore[import-untyped]
 
@@ -54,29 +54,29 @@ def read(result: Path) -> Frames:
 
 def _row(first: Frames, second: Frames) -> list[Any]:
     pairs = [(first[seq], second[seq]) for seq in sorted(first.keys() & second.keys())]
-    hulls = [(one["contact_hull"], other["contact_hull"]) for one, other in pairs]
-    both = [(one, other) for one, other in hulls if one and other]
+    hulls = [(a["contact_hull"], b["contact_hull"]) for a, b in pairs]
+    both = [(a, b) for a, b in hulls if a and b]
     row: list[Any] = [len(pairs), len(both)]
-    row += [sum(bool(one and not other) for one, other in hulls)]
-    row += [sum(bool(other and not one) for one, other in hulls)]
-    row.append(float(np.mean([_overlap(one, other) for one, other in both])) if both else None)
+    row += [sum(bool(a and not b) for a, b in hulls)]
+    row += [sum(bool(b and not a) for a, b in hulls)]
+    row.append(float(np.mean([_overlap(a, b) for a, b in both])) if both else None)
     for names in QUANTITIES.values():
         values = [[[frame[name] for name in names] for frame in pair] for pair in pairs]
         known = np.array([v for v in values if None not in v[0] + v[1]], float).reshape(-1, 2, len(names))
         difference = known[:, 1] - known[:, 0]
         if names[0].endswith("angle"):
             difference = (difference + HALF_TURN / 2) % HALF_TURN - HALF_TURN / 2
-        lengths = np.linalg.norm(difference, axis=1)
-        row += [float(np.median(lengths)), float(lengths.max())] if len(lengths) else [None, None]
+        norms = np.linalg.norm(difference, axis=1)
+        row += [float(np.median(norms)), float(norms.max())] if len(norms) else [None, None]
     return row
 
 
 def _overlap(first: list[list[float]], second: list[list[float]]) -> float:
     """Intersection over union of two convex outlines."""
-    one, other = (np.array(hull, np.float32) for hull in (first, second))
-    shared = float(cv2.intersectConvexConvex(one, other)[0])
-    union = _area(one) + _area(other) - shared
-    return shared / union if union > 0 else 0.0
+    a, b = (np.array(hull, np.float32) for hull in (first, second))
+    intersection = float(cv2.intersectConvexConvex(a, b)[0])
+    union = _area(a) + _area(b) - intersection
+    return intersection / union if union > 0 else 0.0
 
 
 def _area(hull: NDArray[np.float32]) -> float:

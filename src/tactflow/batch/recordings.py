@@ -1,4 +1,4 @@
-"""Which recordings the words of a command line mean: files, folders, patterns, lists of them."""
+"""Resolve the recordings named on a command line: files, folders, patterns, and lists of them."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ FILE_SUFFIXES = frozenset(
         *(".npy", ".ogv", ".webm", ".wmv"),
     ]
 )
-"""Files of a folder that are recordings; a file that is named is one whatever it is called."""
+"""Suffixes of recordings within a folder; a file named explicitly may have any suffix."""
 FOLDERS = frozenset([".zarr"])
-"""Folders that are one recording."""
+"""Suffixes of folders that are a single recording."""
 LISTS = frozenset([".txt", ".list"])
-"""Files that name recordings, one a line."""
-_SHOWN = 10
-"""Mistakes that are reported of one call: they fit on a terminal."""
+"""Suffixes of files that list recordings, one per line."""
+_MAX_MISTAKES = 10
+"""Mistakes reported per call: they fit on a terminal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
     """One recording.
 
-    source : what `tactflow run --source` takes, with an absolute path. name : short, for people; no two of a
-    call have the same.
+    source : as for `tactflow run --source`, with an absolute path. name : short display name, unique within a
+    call.
     """
 
     source: str
@@ -44,27 +44,27 @@ class Recording:
 
     @property
     def path(self) -> Path | None:
-        """The file, or the folder, also of a pattern; None for the simulated sensor."""
+        """File or folder, also that of a pattern; None for the simulated sensor."""
         if self.source.startswith("sim:"):
             return None
-        _, whole = split_prefix(self.source, None)
-        # A file may be named like a pattern, or as if options followed.
-        path = Path(whole) if os.path.exists(whole) else Path(whole.partition("?")[0])
+        _, name = split_prefix(self.source, None)
+        # The name of an existing file may contain wildcards or a question mark.
+        path = Path(name) if os.path.exists(name) else Path(name.partition("?")[0])
         while glob.has_magic(path.name) and not path.exists():
             path = path.parent
         return path
 
 
 def find_recordings(words: Sequence[str]) -> list[Recording]:
-    """The recordings that words name, each once, in natural order within a folder or pattern.
+    """Find the recordings that words name, without duplicates, in natural order within a folder or pattern.
 
-    words : each a file, a folder of pictures, a folder of recordings (with all folders in it), a pattern of
-        any of these, `sim:NAME?...`, or a text file of such words, one a line; `#` begins a comment.
+    words : each a file, a folder of pictures, a folder of recordings (searched recursively), a pattern of any
+        of these, `sim:NAME?...`, or a text file with one such word per line and `#` for comments.
 
     Raises
     ------
     ConfigError
-        If a word names nothing, or something live, or there is nothing at all; it has all mistakes.
+        A word matches nothing or names a live source, or there are no recordings; lists all mistakes.
 
     >>> [recording.name for recording in find_recordings(["sim:press?seed=1", "sim:press?seed=2"])]
     ['sim:press?seed=1', 'sim:press?seed=2']
@@ -77,9 +77,9 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
         except SourceError as error:
             mistakes.append(str(error))
     # Messages and tables are UTF-8.
-    mistakes += [f"{source}: its name is not UTF-8; rename it" for source in sources if not is_utf8(source)]
-    if len(mistakes) > _SHOWN:
-        mistakes[_SHOWN:] = [f"and {len(mistakes) - _SHOWN} more"]
+    mistakes += [f"{source}: the name is not UTF-8; rename it" for source in sources if not is_utf8(source)]
+    if len(mistakes) > _MAX_MISTAKES:
+        mistakes[_MAX_MISTAKES:] = [f"and {len(mistakes) - _MAX_MISTAKES} more"]
     if mistakes:
         raise ConfigError(*mistakes)
     if not sources:
@@ -90,7 +90,7 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
 
 
 def _with_lists(words: Iterable[str], mistakes: list[str]) -> Iterator[tuple[str, Path | None]]:
-    """The words, and in the place of a list those in it, with its folder."""
+    """Expand lists: yield each word, with the folder of the list it comes from."""
     for word in words:
         path = expanded(word)
         if path.suffix.lower() not in LISTS or not path.is_file():
@@ -101,52 +101,54 @@ def _with_lists(words: Iterable[str], mistakes: list[str]) -> Iterator[tuple[str
         except (OSError, UnicodeDecodeError) as error:
             mistakes.append(f"{path}: cannot be read as a list of recordings: {error}")
             continue
-        # In a name, `#` may stand for itself.
+        # A name may contain `#`: a comment follows a space or begins the line.
         kept = (re.sub(r"(^|\s)#.*", "", line).strip() for line in lines)
         yield from ((line, path.parent) for line in kept if line)
 
 
 def _sources(word: str, directory: Path | None) -> Iterator[str]:
-    """The sources that one word names; raises SourceError. directory : of the list that names it."""
+    """The sources that a word names; raises SourceError. directory : of the list that contains the word."""
     if word.startswith("sim:"):
         yield word
         return
     if word.isdecimal() or word.startswith("/dev/") or re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", word):
-        raise SourceError(f"{word}: is live; a batch takes recordings. `tactflow record` makes one")
+        raise SourceError(f"{word}: is a live source; a batch needs recordings: see `tactflow record`")
     scheme, word = split_prefix(word, directory)
     exists = any((base / expanded(word)).exists() for base in (Path(), directory or Path()))
-    # A file may be named like a pattern, or as if options followed.
+    # The name of an existing file may contain wildcards or a question mark.
     plain, mark, options = (word, "", "") if exists else word.partition("?")
     if glob.has_magic(plain) and not exists:
-        # In a pattern `?` stands for any character, unless options follow it.
+        # In a pattern, `?` is a wildcard unless options follow.
         pattern, tail = (plain, mark + options) if "=" in options else (word, "")
-        yield from (scheme + found + tail for found in _matching(pattern, directory))
+        yield from (scheme + match + tail for match in _matching(pattern, directory))
         return
     path = find_path(plain, directory)
     if path.suffix.lower() in LISTS and path.is_file():
-        raise SourceError(f"{word}: is a list of recordings; a list cannot name another one")
+        raise SourceError(f"{word}: is a list of recordings; lists cannot be nested")
     if path.is_dir() and not mark and path.suffix.lower() not in FOLDERS:
-        found = list(_inside(path))
-        if not found:
-            raise SourceError(f"{word}: there is no recording in this folder")
-        yield from found
+        recordings = list(_inside(path))
+        if not recordings:
+            raise SourceError(f"{word}: this folder contains no recordings")
+        yield from recordings
     elif path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
-        raise SourceError(f"{word}: is one picture; name its folder, or quote the pattern: '{path.parent}/*'")
+        raise SourceError(
+            f"{word}: is a single picture; name its folder, or quote a pattern: '{path.parent}/*'"
+        )
     else:
         yield scheme + os.path.abspath(path) + mark + options
 
 
 def _matching(pattern: str, directory: Path | None) -> Iterator[str]:
-    """The matches of a pattern: one recording if all are pictures, else each its own."""
-    whole = expanded(pattern)
-    paths = matching(whole)
+    """Matches of a pattern; if all are pictures, they form a single recording."""
+    full = expanded(pattern)
+    paths = matching(full)
     if not paths and directory is not None:
-        whole = directory / whole
-        paths = matching(whole)
+        full = directory / full
+        paths = matching(full)
     if not paths:
         raise SourceError(f"{pattern}: no file matches this pattern")
     if all(path.suffix.lower() in IMAGE_SUFFIXES for path in paths):
-        yield os.path.abspath(whole)
+        yield os.path.abspath(full)
         return
     for path in paths:
         if path.is_dir() and path.suffix.lower() not in FOLDERS:
@@ -156,19 +158,19 @@ def _matching(pattern: str, directory: Path | None) -> Iterator[str]:
 
 
 def _inside(folder: Path) -> Iterator[str]:
-    """The recordings in a folder and all folders in it; a folder with pictures is one."""
-    for place, folders, files in os.walk(folder):
-        whole = sorted((n for n in folders if Path(n).suffix.lower() in FOLDERS), key=natural_key)
-        folders[:] = sorted((n for n in folders if n[0] != "." and n not in whole), key=natural_key)
+    """Recordings in a folder and its subfolders; a folder of pictures is a single recording."""
+    for parent, folders, files in os.walk(folder):
+        stores = sorted((n for n in folders if Path(n).suffix.lower() in FOLDERS), key=natural_key)
+        folders[:] = sorted((n for n in folders if n[0] != "." and n not in stores), key=natural_key)
         names = sorted((name for name in files if name[0] != "."), key=natural_key)
         if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
-            yield os.path.abspath(place)
-        for name in (*whole, *(n for n in names if Path(n).suffix.lower() in FILE_SUFFIXES)):
-            yield os.path.abspath(Path(place, name))
+            yield os.path.abspath(parent)
+        for name in (*stores, *(n for n in names if Path(n).suffix.lower() in FILE_SUFFIXES)):
+            yield os.path.abspath(Path(parent, name))
 
 
 def _short_names(sources: Sequence[str]) -> list[str]:
-    """The last parts of each path, as many as tell it from the others."""
+    """Shortest unique tails of the paths."""
     names: dict[str, str] = {}
     for parts in count(1):
         left = [source for source in sources if source not in names]
@@ -182,7 +184,7 @@ def _short_names(sources: Sequence[str]) -> list[str]:
 
 
 def _tail(source: str, parts: int) -> str:
-    """The last parts of a path; anything else as it is."""
+    """The last parts of a path; simulated sources unchanged."""
     if source.startswith("sim:"):
         return source
     pieces = source.split(os.sep)

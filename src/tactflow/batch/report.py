@@ -1,4 +1,4 @@
-"""The table of all runs, for programs, and the page, for people."""
+"""Write the table of all runs, for programs, and the report page, for people."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from tactflow.report import Html, Section, Table, link, mark, write_report
 from tactflow.system.extras import missing
 from tactflow.system.files import completed
 
-MOST_SHOWN = 1000
-"""Recordings that the page shows in detail: it has some 60 kB for each, and browsers open 60 MB."""
+MAX_DETAILS = 1000
+"""Recordings shown in detail: each takes about 60 kB of the page, and browsers can open 60 MB."""
 NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full"}
-"""Fields of an outcome that only the command itself needs."""
+"""Internal fields of an outcome."""
 _TYPES = {"int": "int64", "float": "float64"}
-"""Python type -> Arrow type, where it is not a string."""
+"""Python type -> Arrow type; all others are strings."""
 
 Runs = Sequence[tuple[Recording, Outcome]]
 
 
 def require_pyarrow() -> None:
-    """Raise ConfigError with what to do where pyarrow is missing."""
+    """Raise ConfigError with installation instructions if pyarrow is missing."""
     if problem := missing("Parquet tables", "parquet", ["pyarrow"]):
-        raise ConfigError(f"{problem}; or give --format jsonl, which needs no package")
+        raise ConfigError(f"{problem}; or use --format jsonl, which needs no package")
 
 
 def write_runs(store: Store, runs: Runs, format_: Format) -> Path:
-    """Write the table of runs, replacing an earlier one; returns its path. Raises StageError."""
+    """Write the table of runs, overwriting an earlier one; return its path. Raises StageError."""
     path = store.path / f"runs.{format_}"
     columns = [field for field in fields(Outcome) if field.name not in NOT_IN_TABLE]
     rows = [{column.name: getattr(outcome, column.name) for column in columns} for _, outcome in runs]
@@ -54,7 +54,7 @@ def write_runs(store: Store, runs: Runs, format_: Format) -> Path:
 
 
 def write_page(store: Store, runs: Runs, title: str) -> Path:
-    """Write `index.html`, replacing an earlier one; returns its path. Raises StageError."""
+    """Write `index.html`, overwriting an earlier one; return its path. Raises StageError."""
     ordered = sorted(runs, key=lambda run: ("failed", "done", "not done").index(run[1].status))
     done = [outcome for _, outcome in runs if outcome.status == "done"]
     failed = sum(outcome.status == "failed" for _, outcome in runs)
@@ -65,9 +65,9 @@ def write_page(store: Store, runs: Runs, title: str) -> Path:
     )
     if problem := missing("plots", "plot", ["matplotlib"]):
         text += f"\n\nNo plots: {problem}"
-    shown = ordered[:MOST_SHOWN]
+    shown = ordered[:MAX_DETAILS]
     if len(shown) < len(ordered):
-        text += f"\n\nDetails of {len(shown)} of {len(ordered)} recordings, those that failed first."
+        text += f"\n\nDetails of {len(shown)} of {len(ordered)} recordings, failed ones first."
     sections = [Section("Runs", tables=[_table(ordered)]), *(_details(store, *run) for run in shown)]
     return write_report(store.path / "index.html", title, sections, text)
 
@@ -90,8 +90,8 @@ def _table(runs: Runs) -> Table:
 
 
 def _details(store: Store, recording: Recording, outcome: Outcome) -> Section:
-    """Why a recording failed, or its plot and pictures."""
-    place = recording.source if recording.source != recording.name else None
-    text = "\n\n".join(filter(None, (outcome.error, outcome.warnings, place)))
+    """Error of a failed recording, or plot and pictures of a finished one."""
+    path = recording.source if recording.source != recording.name else None
+    text = "\n\n".join(filter(None, (outcome.error, outcome.warnings, path)))
     pictures = [Html(store.preview(recording))] if outcome.status == "done" else []
     return Section(recording.name, text, pictures)

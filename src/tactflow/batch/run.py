@@ -1,4 +1,4 @@
-"""Decides what is missing, hands it to workers, and ends well."""
+"""Decide which recordings to process, submit them to workers, and handle failures and signals."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from tactflow.batch.work import Request, Task
 from tactflow.batch.workers import SCHEDULER_GONE, Workers
 from tactflow.engine.errors import StageError
 
-LOOK_EVERY = 0.2
-"""Time between two looks at signals, s: faster than people notice."""
-MOST_DEATHS = 3
-"""Recordings in a row that each kill a worker of their own: more likely is that no worker can run here."""
+POLL_SECONDS = 0.2
+"""Interval at which signals are checked, s: too short for people to notice."""
+MAX_DEATHS = 3
+"""Recordings in a row that may kill their worker; more suggest that no worker can run here."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """done : source -> outcome of an earlier call. left : what is to be done. changed : how many of these had
-    been done of another input, pipeline or version; the others are new or had failed."""
+    """done : source -> outcome of an earlier call. left : recordings to process. changed : number of these
+    that are done for another input, pipeline or version; the others are new or failed."""
 
     done: Mapping[str, Outcome]
     left: Sequence[Recording]
@@ -36,14 +36,14 @@ class Plan:
         if self.done:
             parts.append(f"{len(self.done)} done before")
         if self.changed:
-            parts.append(f"{self.changed} done of another input, pipeline or version")
+            parts.append(f"{self.changed} outdated (input, pipeline or version changed)")
         if self.done or self.changed:
             parts.append(f"{len(self.left) - self.changed} new or failed before")
         return ", ".join(parts)
 
 
 def make_plan(store: Store, recordings: Iterable[Recording], request: Request) -> Plan:
-    """Compare what is asked for with what is there."""
+    """Split recordings into those with a current result and those left to process."""
     done: dict[str, Outcome] = {}
     left: list[Recording] = []
     changed = 0
@@ -61,8 +61,8 @@ def make_plan(store: Store, recordings: Iterable[Recording], request: Request) -
 class Result:
     """How a batch ended.
 
-    outcomes : of every recording that was looked at, by source. undone : how many were not begun, or given
-    up. ended : why it ended early, or None.
+    outcomes : by source. undone : number of recordings not started or aborted. ended : reason for an early
+    end, or None.
     """
 
     outcomes: dict[str, Outcome]
@@ -71,7 +71,7 @@ class Result:
 
     @property
     def failed(self) -> list[Outcome]:
-        """Those that failed."""
+        """Outcomes of the recordings that failed."""
         return [outcome for outcome in self.outcomes.values() if outcome.status != "done"]
 
 
@@ -79,7 +79,7 @@ class Result:
 class Batch:
     """One call of a batch.
 
-    signals : tells how often the user has asked to end. fail_fast : begin nothing more after a failure.
+    signals : returns the number of stop signals received. fail_fast : start no recordings after a failure.
     on_outcome : called with each outcome.
     """
 
@@ -92,15 +92,15 @@ class Batch:
     on_outcome: Callable[[Outcome], None] = lambda _: None
 
     def run(self, plan: Plan) -> Result:
-        """Work on what a plan has left.
+        """Process the recordings that a plan has left.
 
-        After one signal no more is begun, after a second what runs is given up. A full disk, or workers that
-        are gone, end it; what is done stays done.
+        The first signal stops new recordings, the second aborts the running ones. A full disk or lost workers
+        end the batch; finished results are kept.
         """
         result = Result(dict(plan.done))
         self._waiting = deque(plan.left)
         self._running: dict[Future[Outcome], Recording] = {}
-        # Recordings of which one has killed a worker: they are tried again, each alone.
+        # Recordings that were running when a worker died: each is retried alone.
         self._suspects: deque[Recording] = deque()
         self._deaths = 0
         try:
@@ -109,7 +109,7 @@ class Batch:
                     self._begin_more()
                 if not self._running or self.signals() > 1:
                     break
-                for future in wait(self._running, LOOK_EVERY, FIRST_COMPLETED).done:
+                for future in wait(self._running, POLL_SECONDS, FIRST_COMPLETED).done:
                     self._finish(future, result)
         except StageError as error:
             result.ended = result.ended or str(error)
@@ -145,7 +145,7 @@ class Batch:
                 return
             self._deaths += 1
             outcome = self._failed(
-                recording, "it killed its worker twice. Is memory short, or the file harmful?"
+                recording, "killed its worker twice; is memory short, or the file damaged?"
             )
         except CancelledError:
             raise StageError(SCHEDULER_GONE) from None
@@ -169,11 +169,11 @@ class Batch:
             raise StageError(f"{self.store.records}: cannot be written: {error.strerror or error}") from error
 
     def _reason_to_end(self, outcome: Outcome) -> str | None:
-        """Why nothing more is begun after this outcome, or None."""
+        """Reason to start no more recordings after this outcome, or None."""
         if outcome.disk_full:
-            return "the disk is full; make room and call again: what is done stays done"
-        if self._deaths == MOST_DEATHS:
-            return f"{MOST_DEATHS} recordings in a row killed their workers; try fewer --workers"
+            return "the disk is full; free some space and run again: finished recordings are kept"
+        if self._deaths == MAX_DEATHS:
+            return f"{MAX_DEATHS} recordings in a row killed their workers; try fewer --workers"
         if self.fail_fast and outcome.status != "done":
             return "--fail-fast: a recording failed"
         return None

@@ -1,13 +1,13 @@
-"""The folder that a batch writes, `--out`.
+"""The output folder of a batch, `--out`.
 
-    results/NAME            of each recording: a folder of Parquet tables, or NAME.jsonl
+    results/NAME            per recording: a folder of Parquet tables, or NAME.jsonl
     records/NAME.json       its outcome, written after the result
-    records/NAME.html       its plot and pictures, for the page
-    unfinished/SHARD/       what is being written; removed at the end
+    records/NAME.html       its plot and pictures for the page
+    unfinished/SHARD/       results being written; removed at the end
     runs.parquet, index.html
 
-A recording is done if its record says so, its result has the size and time that the record names, and neither
-the recording nor the pipeline has changed since.
+A recording is done if its record says so, the result has the size and modification time in the record, and
+neither the recording nor the pipeline has changed since.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from tactflow.system.files import claim_path, completed, make_folder
 Format = Literal["parquet", "jsonl"]
 Status = Literal["done", "failed", "not done"]
 Fingerprint = tuple[int, int]
-"""Size, bytes, and time of the last change, ns."""
+"""Size, bytes, and modification time, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a recording: a row of the table of runs.
+    """Outcome of processing a recording: a row of the table of runs.
 
-    error : why it failed. frames : processed. duration_s : time of the last frame. contacts : how often
-    something touched the gel; touching_frames : in how many frames. largest_area_px2 : of a contact.
-    started_unix, took_s : when the work began, and how long it took. worker : host and process. result : path
-    below `--out`. warnings : one a line. tactflow : version. pipeline : `pipeline_digest`. recording_is,
-    result_is : fingerprints. disk_full : whether it failed for that.
+    error : reason for a failure. frames : number processed. duration_s : time of the last frame. contacts :
+    number of separate touches; touching_frames : frames with contact. largest_area_px2 : of all contacts.
+    started_unix, took_s : start time and processing time. worker : host and process. result : path relative
+    to `--out`. warnings : one per line. tactflow : version. pipeline : `pipeline_digest`. recording_is,
+    result_is : fingerprints. disk_full : whether a full disk caused the failure.
     """
 
     recording: str
@@ -73,23 +73,23 @@ _OUTCOME = TypeAdapter(Outcome)
 
 
 def fingerprint(path: Path) -> Fingerprint:
-    """Of a file, or of all files in a folder: total size and latest change.
+    """Total size and latest modification time of a file or of all files in a folder.
 
-    Raises OSError if it is not there, or if one of the files is a pipe or a device: reading it would not end.
+    Raises OSError if the path does not exist or contains a pipe or device, which would block the reader.
     """
     files = [path]
     if path.is_dir():
-        files = [Path(place, name) for place, _, names in os.walk(path) for name in names]
-    found = []
+        files = [Path(parent, name) for parent, _, names in os.walk(path) for name in names]
+    stats = []
     for file in files:
-        found.append(file.stat())
-        if not stat.S_ISREG(found[-1].st_mode):
+        stats.append(file.stat())
+        if not stat.S_ISREG(stats[-1].st_mode):
             raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(file))
-    return sum(f.st_size for f in found), max((f.st_mtime_ns for f in found), default=0)
+    return sum(s.st_size for s in stats), max((s.st_mtime_ns for s in stats), default=0)
 
 
 class Store:
-    """One `--out`. path : absolute."""
+    """The output folder of a batch. path : absolute."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -97,11 +97,11 @@ class Store:
 
     @contextmanager
     def claimed(self, shard: str) -> Iterator[Path]:
-        """Make the folders, and an empty one for unfinished work, which is removed at the end.
+        """Lock the shard and create the folders; yields an empty one for unfinished work, removed at the end.
 
         Raises
         ------
-        ConfigError : it cannot be written into, or another call works on the same shard.
+        ConfigError : the folder is not writable, or another call has locked the same shard.
         """
         scratch = self.path / "unfinished" / shard
         claim = None
@@ -113,11 +113,11 @@ class Store:
                 remove(path)
         except BlockingIOError:
             raise ConfigError(
-                f"--out {self.path}: another tactflow batch is at work in it; wait for it, or give each its "
-                "part with --shard 1/2, --shard 2/2"
+                f"--out {self.path}: another tactflow batch is using it; wait for it to finish, or divide "
+                "the recordings with --shard 1/2, --shard 2/2"
             ) from None
         except OSError as error:
-            raise ConfigError(f"--out {self.path}: cannot be written into: {error.strerror}") from None
+            raise ConfigError(f"--out {self.path}: is not writable: {error.strerror}") from None
         try:
             yield scratch
         finally:
@@ -126,14 +126,14 @@ class Store:
                 os.close(claim)
 
     def outcome(self, recording: Recording) -> Outcome | None:
-        """The last outcome of a recording; None if there is none, or its record is damaged."""
+        """The last outcome of a recording; None without a record, or if it is damaged."""
         try:
             return _OUTCOME.validate_json((self.records / f"{file_name(recording)}.json").read_bytes())
         except (OSError, ValueError):
             return None
 
     def is_done(self, recording: Recording, outcome: Outcome, pipeline: str) -> bool:
-        """Whether the result is there, and neither recording nor pipeline has changed since."""
+        """Whether the result exists and neither recording nor pipeline has changed since."""
         if outcome.status != "done" or outcome.pipeline != pipeline or outcome.result is None:
             return False
         try:
@@ -153,13 +153,13 @@ class Store:
                 partial.write_bytes(content)
 
     def preview(self, recording: Recording) -> str:
-        """Plot and pictures of a recording as HTML; empty if there are none."""
+        """Plot and pictures of a recording as HTML, possibly empty."""
         path = self.records / f"{file_name(recording)}.html"
         return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 def file_name(recording: Recording) -> str:
-    """Name of the files of a recording: readable, and the same in every call.
+    """Base name of a recording's files: readable and reproducible.
 
     >>> file_name(Recording("/data/press 1.avi", "press 1.avi"))
     'press_1.avi-3db9295a358c'
@@ -167,12 +167,12 @@ def file_name(recording: Recording) -> str:
     path = recording.path
     text = recording.source.removeprefix("sim:") if path is None else path.name
     safe = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in text).lstrip(".")
-    # 255 bytes is the longest name of a file; a letter takes four at most.
+    # File names are limited to 255 bytes; a letter takes up to four.
     return f"{safe[:50]}-{hashlib.sha256(recording.source.encode()).hexdigest()[:12]}"
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with its content, if it is there. Raises OSError."""
+    """Remove a file or a folder with its content, if it exists. Raises OSError."""
     if path.is_dir():
         shutil.rmtree(path)
     else:

@@ -1,4 +1,4 @@
-"""What the page shows of a recording: contact area, flow and angle over time, and pictures of contacts."""
+"""Content of the page for one recording: contact area, flow and angle over time, and contact pictures."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
 from tactflow.report import COLORS, Html, figure, picture
 
-MOST_POINTS = 480
-"""Points of a curve, before neighbours are merged: two a pixel of a plot."""
-MOST_PICTURES = 4
-"""Pictures of a recording: they fit beside its plot."""
+MAX_POINTS = 480
+"""Points of a curve after merging neighbours, about two per pixel of the plot; merged at twice as many."""
+MAX_PICTURES = 4
+"""Pictures per recording: they fit next to its plot."""
 PICTURE_SIDE = 240
 """Longer side of a picture, px: about the height of the plot."""
 _QUALITY = 70
-"""JPEG quality of a picture, 1 to 100: some 7 kB. Chosen by hand."""
+"""JPEG quality of a picture, 1 to 100: about 7 kB. Chosen by hand."""
 
 
 class Point(NamedTuple):
-    """A frame of a curve. t : s. area : of the contact, px^2. flow : length of its mean, px. angle : deg."""
+    """A point of the curves. t : s. area : px^2. flow : norm of the mean flow, px. angle : degrees."""
 
     t: float
     area: float
@@ -43,18 +43,18 @@ class _Picture(NamedTuple):
 
 
 class Summary:
-    """Collects the frames of a run; memory does not grow with the length of the recording."""
+    """Collects the frames of a run in bounded memory."""
 
     def __init__(self) -> None:
         self.frames = self.contacts = self.touching = 0
         self.largest = self.duration = 0.0
         self.points: list[Point] = []
-        self._frames_a_point = 1
+        self._frames_per_point = 1
         self._pictures: list[_Picture] = []
         self._best: Result | None = None
 
     def add(self, result: Result) -> None:
-        """Take one frame."""
+        """Add one frame."""
         contact, flow = result.contact, result.flow
         area = 0.0 if contact is None else float(contact.area)
         mean = math.nan if flow is None or flow.mean is None else math.hypot(*flow.mean)
@@ -72,34 +72,34 @@ class Summary:
             self._best = result
 
     def _add_point(self, point: Point) -> None:
-        """Of the frames of one point, keep the one with the largest contact: no contact gets lost."""
-        if self.frames % self._frames_a_point == 0:
+        """Keep the frame with the largest contact of each point, so that no contact is lost."""
+        if self.frames % self._frames_per_point == 0:
             self.points.append(point)
         elif point.area > self.points[-1].area:
             self.points[-1] = point
-        if len(self.points) == 2 * MOST_POINTS:
+        if len(self.points) == 2 * MAX_POINTS:
             pairs = zip(self.points[::2], self.points[1::2], strict=True)
             self.points = [max(pair, key=lambda p: p.area) for pair in pairs]
-            self._frames_a_point *= 2
+            self._frames_per_point *= 2
 
     def _end_contact(self) -> None:
-        """Keep a picture of the contact that is over, if it is one of the largest."""
+        """Keep a picture of the finished contact if it is among the largest."""
         if self._best is None:
             return
         result, self._best = self._best, None
         assert result.contact is not None
         area = float(result.contact.area)
-        if len(self._pictures) == MOST_PICTURES and area <= self._pictures[-1].area:
+        if len(self._pictures) == MAX_PICTURES and area <= self._pictures[-1].area:
             return
-        taken = _Picture(result.seq, result.t, area, _jpeg(result))
-        self._pictures = sorted([*self._pictures, taken], key=lambda p: -p.area)[:MOST_PICTURES]
+        new = _Picture(result.seq, result.t, area, _jpeg(result))
+        self._pictures = sorted([*self._pictures, new], key=lambda p: -p.area)[:MAX_PICTURES]
 
     def html(self) -> str:
-        """Plot and pictures, for the page. Without matplotlib, the pictures alone."""
+        """Plot and pictures for the page; only the pictures without matplotlib."""
         self._end_contact()
         pictures = [picture(p.jpeg, f"{p.t:.2f} s") for p in sorted(self._pictures)]
         try:
-            plot = picture(_drawn(np.array(self.points, float).reshape(-1, 4)))
+            plot = picture(_plot(np.array(self.points, float).reshape(-1, 4)))
         except ConfigError:
             plot = Html()
         return "".join([plot, *pictures])
@@ -107,7 +107,7 @@ class Summary:
 
 @functools.cache
 def _axes() -> tuple[Any, Any]:
-    """The figure of all recordings: a new one for each takes three times as long (0.2 s)."""
+    """A figure reused for all recordings: a new one for each takes three times as long (0.2 s)."""
     drawing, axes = figure(3, 1, size=(4.2, 2.8), sharex=True)
     for axis, label, color in zip(axes, ("area, px²", "flow, px", "angle, °"), COLORS[:3], strict=True):
         axis.plot([], [], color=color)
@@ -115,15 +115,15 @@ def _axes() -> tuple[Any, Any]:
         axis.tick_params(labelsize=8)
     axes[2].set_xlabel("time, s", fontsize=8)
     drawing.align_ylabels()
-    # The widest labels that there may be, px^2; the layout stays as they need it.
+    # Freeze the layout with the widest labels expected, px^2.
     axes[0].set_ylim(0, 90_000)
     drawing.draw_without_rendering()
     drawing.set_layout_engine("none")
     return drawing, axes
 
 
-def _drawn(points: NDArray[np.float64]) -> Any:
-    """The figure of a recording's points (N, 4)."""
+def _plot(points: NDArray[np.float64]) -> Any:
+    """Plot the points (N, 4) of a recording."""
     drawing, axes = _axes()
     for axis, curve in zip(axes, points.T[1:], strict=True):
         axis.lines[0].set_data(points[:, 0], curve)
@@ -134,7 +134,7 @@ def _drawn(points: NDArray[np.float64]) -> Any:
 
 
 def _jpeg(result: Result) -> bytes:
-    """A small picture of the processed frame, or else of the raw one, with what was found drawn on it."""
+    """A small picture of the processed (or else the raw) frame with the results drawn on it."""
     image = result.frame.image if result.image is None else result.image
     annotate = Annotator(text=False)
     drawn = annotate(image, contact=result.contact, flow=result.flow, markers=result.markers)

@@ -1,4 +1,4 @@
-"""Runs a pipeline over one recording, in any process."""
+"""Run a pipeline over one recording, in any process."""
 
 from __future__ import annotations
 
@@ -33,18 +33,19 @@ from tactflow.message.result import Result
 from tactflow.system.clock import SYSTEM
 
 _SRC = Mark("recording", 0, 0)
-"""Where the source is named: not in the pipeline file."""
-_MOST_WARNINGS = 5
-"""Warnings that are kept of one recording: the first ones say what the others repeat."""
-_WHERE_AND_WHEN = {"path", "overwrite", "append", "flush"}
-"""Parameters of a sink that do not change what it writes."""
+"""Position of the source in error messages: it is not in the pipeline file."""
+_MAX_WARNINGS = 5
+"""Warnings kept per recording; further ones are mostly repetitions."""
+_OUTPUT_ONLY = {"path", "overwrite", "append", "flush"}
+"""Sink parameters that do not change the content of the output."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A pipeline, as any process can load it.
+    """A pipeline that any process can load.
 
-    file : absolute. overrides : as for `--set`. sensor : of several; None is the only one. digest : expected.
+    file : absolute path. overrides : as for `--set`. sensor : None for a pipeline with a single sensor.
+    digest : expected `pipeline_digest`.
     """
 
     file: str
@@ -56,7 +57,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A recording to work on. out : the folder of results. scratch : the folder for unfinished ones."""
+    """A recording to process. out : output folder. scratch : folder for unfinished results."""
 
     recording: Recording
     request: Request
@@ -65,20 +66,20 @@ class Task:
 
 
 def resolved(file: Path, overrides: list[str], sensor: str | None, format_: Format) -> Request:
-    """The request for a pipeline, checked.
+    """Validate a pipeline and return its request.
 
     Raises
     ------
-    ConfigError : the pipeline is wrong, or its source takes no parameter `source`.
+    ConfigError : the pipeline is invalid, or its source has no parameter `source`.
     """
     request = Request(os.path.abspath(file), tuple(overrides), sensor, format_)
     return replace(request, digest=pipeline_digest(load(request)))
 
 
 def load(request: Request) -> Pipeline:
-    """The pipeline with one sink, which writes the results; raises ConfigError.
+    """Load the pipeline with a single sink, which writes the results; raises ConfigError.
 
-    A sink of the wanted format in the file is used with its settings, except for its path.
+    If the file has a sink of the requested format, its settings apply, except for the path.
     """
     file, format_ = Path(request.file), request.format
     pipeline = load_pipeline(file, request.overrides, sensor=request.sensor)
@@ -86,36 +87,36 @@ def load(request: Request) -> Pipeline:
         extra = {f"--{format_}": {"path": os.devnull}}
         pipeline = load_pipeline(file, request.overrides, extra, sensor=request.sensor)
     sink = next(node.id for node in pipeline.sinks if node.component.name == format_)
-    kept = {id_: n for id_, n in pipeline.nodes.items() if n.component.kind != "sink" or id_ == sink}
+    nodes = {id_: n for id_, n in pipeline.nodes.items() if n.component.kind != "sink" or id_ == sink}
     if "source" not in pipeline.source.component.params.model_fields:
         raise ConfigError(f"{pipeline.source.mark}: a batch needs a source with the parameter source")
-    return replace(pipeline, nodes=kept, opencv_threads=1)
+    return replace(pipeline, nodes=nodes, opencv_threads=1)
 
 
 _loaded = functools.lru_cache(maxsize=2)(load)
 
 
 def pipeline_digest(pipeline: Pipeline) -> str:
-    """Digest of the resolved settings, the files that they name, and tactflow's version.
+    """Digest of the resolved settings, the files they name, and tactflow's version.
 
-    Of files, such as a calibration or Python code, it takes size and time of the last change.
+    Files, such as a calibration or Python code, enter with size and modification time.
     """
     stages = {node.id: _settings(pipeline, node) for node in pipeline.nodes.values()}
     files = {path for node in pipeline.nodes.values() for path in _files(pipeline, node)}
-    described = {
+    content = {
         "settings": {k: v for k, v in pipeline.settings.items() if k not in ("sinks", "stages")},
-        # In the order of the file: an input comes from the nearest stage above.
+        # The order matters: an input comes from the nearest stage above.
         "nodes": list(stages.items()),
         "files": [[str(path), fingerprint(path)] for path in sorted(files)],
         "tactflow": tactflow.__version__,
     }
-    return hashlib.sha256(orjson.dumps(described, default=str)).hexdigest()[:16]
+    return hashlib.sha256(orjson.dumps(content, default=str)).hexdigest()[:16]
 
 
 def _settings(pipeline: Pipeline, node: Node) -> Any:
-    """What a node is set to, apart from where it reads and writes."""
+    """Settings of a node, without its input and output paths."""
     if node.component.kind == "sink":
-        return [node.component.name, node.params.model_dump(exclude=_WHERE_AND_WHEN)]
+        return [node.component.name, node.params.model_dump(exclude=_OUTPUT_ONLY)]
     settings = dict(pipeline.settings["stages"].get(node.id) or {})
     if node.id == pipeline.source.id:
         settings = {key: value for key, value in settings.items() if key not in ("source", "realtime")}
@@ -123,7 +124,7 @@ def _settings(pipeline: Pipeline, node: Node) -> Any:
 
 
 def _files(pipeline: Pipeline, node: Node) -> Iterator[Path]:
-    """Files that decide what a node computes."""
+    """Files on which the results of a node depend."""
     if pipeline.calibration is not None:
         yield pipeline.calibration
     if node.component.kind != "sink":
@@ -136,7 +137,7 @@ def _files(pipeline: Pipeline, node: Node) -> Iterator[Path]:
 
 
 def work(task: Task) -> Outcome:
-    """Run the pipeline over one recording, and save result and record; an error is in the outcome."""
+    """Process one recording and save its result and record; errors are returned in the outcome."""
     began = SYSTEM.now()
     outcome = Outcome(
         task.recording.source,
@@ -156,7 +157,7 @@ def work(task: Task) -> Outcome:
         with suppress(OSError):
             remove(unfinished)
         return replace(
-            outcome, error=_words(error), took_s=SYSTEM.now() - began, disk_full=_is_disk_full(error)
+            outcome, error=_describe(error), took_s=SYSTEM.now() - began, disk_full=_is_disk_full(error)
         )
     return done
 
@@ -165,7 +166,7 @@ def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, Summa
     """Run the pipeline into the scratch folder."""
     path = task.recording.path
     before = None if path is None else fingerprint(path)
-    # Of a worker that has died.
+    # A worker that died may have left files.
     remove(unfinished)
     summary = Summary()
     pipeline = _pipeline_for(task, unfinished)
@@ -175,7 +176,7 @@ def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, Summa
     if result.failure is not None:
         raise result.failure
     if path is not None and fingerprint(path) != before:
-        raise SourceError(f"{path}: was changed while it was read; call again")
+        raise SourceError(f"{path}: changed while being read; run again")
     done = replace(
         outcome,
         status="done",
@@ -194,45 +195,45 @@ def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, Summa
 
 
 def _publish(task: Task, outcome: Outcome, unfinished: Path, summary: Summary) -> None:
-    """Move a result to its place, then save its record: only with a record it is complete."""
-    place = Path(task.out, str(outcome.result))
-    if place.is_dir():
-        # No folder replaces another one.
-        remove(place)
-    unfinished.replace(place)
+    """Move a result to its final path, then save the record, which marks it as complete."""
+    path = Path(task.out, str(outcome.result))
+    if path.is_dir():
+        # A rename cannot overwrite a folder.
+        remove(path)
+    unfinished.replace(path)
     Store(Path(task.out)).save(task.recording, outcome, summary.html())
 
 
 def _pipeline_for(task: Task, path: Path) -> Pipeline:
-    """The pipeline that reads this recording and writes to this path."""
+    """The pipeline that reads the task's recording and writes to a path."""
     pipeline = _loaded(task.request)
     if pipeline_digest(pipeline) != task.request.digest:
         _loaded.cache_clear()
         raise StageError(
-            f"the worker {socket.gethostname()} would compute something else: it has tactflow "
-            f"{tactflow.__version__}, or {task.request.file} or a file that it names has changed; call again"
+            f"the worker {socket.gethostname()} has a different pipeline: it runs tactflow "
+            f"{tactflow.__version__}, or {task.request.file} or a file that it names has changed; run again"
         )
     (sink,) = pipeline.sinks
-    # One part for the whole table: the same recording gives the same files.
+    # One part per table, so that repeated runs write identical files.
     flush = {"flush": math.inf} if task.request.format == "parquet" else {}
     params = sink.params.changed(path=str(path), overwrite=True, **flush)
     source = pipeline.source
-    wanted = {"source": task.recording.source, "realtime": False}
-    wanted = {key: value for key, value in wanted.items() if key in type(source.params).model_fields}
+    input_ = {"source": task.recording.source, "realtime": False}
+    input_ = {key: value for key, value in input_.items() if key in type(source.params).model_fields}
     stages = dict(pipeline.settings["stages"])
-    stages[source.id] = {**(stages[source.id] or {}), **wanted}
-    # Results keep the settings as metadata.
+    stages[source.id] = {**(stages[source.id] or {}), **input_}
+    # Results store the settings as metadata.
     settings = {**pipeline.settings, "stages": stages, "sinks": {sink.component.name: {}}}
     nodes = {
         **pipeline.nodes,
-        source.id: replace(source, params=source.params.changed(**wanted), mark=_SRC),
+        source.id: replace(source, params=source.params.changed(**input_), mark=_SRC),
         sink.id: replace(sink, params=params),
     }
     return replace(pipeline, nodes=nodes, settings=settings)
 
 
-def _words(error: Exception) -> str:
-    """An error for people; one that nobody foresaw with the place in the code."""
+def _describe(error: Exception) -> str:
+    """Error message for users; unexpected errors include the line of code."""
     if isinstance(error, TactflowError):
         return str(error)
     if isinstance(error, OSError):
@@ -251,7 +252,7 @@ def _is_disk_full(error: BaseException | None) -> bool:
 
 @contextmanager
 def _warnings() -> Iterator[list[str]]:
-    """The first warnings that are logged in the block."""
+    """Collect the first warnings logged in the block."""
     texts: list[str] = []
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: texts.append(record.getMessage())  # type: ignore[method-assign]
@@ -261,4 +262,4 @@ def _warnings() -> Iterator[list[str]]:
         yield texts
     finally:
         logger.removeHandler(handler)
-        del texts[_MOST_WARNINGS:]
+        del texts[_MAX_WARNINGS:]

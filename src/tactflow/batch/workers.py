@@ -1,4 +1,4 @@
-"""What a batch runs on: processes of this machine, or the workers of a Dask cluster."""
+"""Workers of a batch: local processes, or those of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from tactflow.system.extras import missing
 from tactflow.system.signals import ENDING
 
 CONNECT_SECONDS = 10.0
-"""How long a scheduler may take to answer, s. Chosen by hand."""
-AHEAD = 2
-"""Tasks for each thread of a Dask worker: the one under way, and the next, so that it never waits."""
-SCHEDULER_GONE = "the Dask scheduler is gone; call again when it is back: what is done stays done"
+"""Timeout for the scheduler's answer, s. Chosen by hand."""
+TASKS_PER_THREAD = 2
+"""Tasks per thread of a Dask worker: the current one and the next, so that it never idles."""
+SCHEDULER_GONE = "lost the Dask scheduler; run again when it is back: finished recordings are kept"
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
-"""Environment of a worker: there are as many workers as processors, so each library gets one thread."""
+"""Environment of a worker: with a worker per processor, each library gets one thread."""
 
 
 class Workers(Protocol):
-    """Run tasks. description : for people. slots : tasks that keep all workers busy."""
+    """Run tasks. description : for log messages. slots : number of tasks that keeps all workers busy."""
 
     description: str
 
@@ -41,20 +41,20 @@ class Workers(Protocol):
     def slots(self) -> int: ...
 
     def submit(self, task: Task) -> Future[Outcome]:
-        """Begin a task as soon as a worker is free.
+        """Start a task as soon as a worker is free.
 
-        The future raises BrokenProcessPool if its worker died, perhaps through another task, and
-        CancelledError if the scheduler is gone. Raises StageError if it is gone now.
+        The future raises BrokenProcessPool if its worker died, possibly because of another task, and
+        CancelledError if the scheduler is lost. Raises StageError if it is lost already.
         """
         ...
 
     def close(self, *, kill: bool) -> None:
-        """End the workers. kill : at once, whatever they are doing."""
+        """Stop the workers. kill : immediately, aborting running tasks."""
         ...
 
 
 class LocalProcesses:
-    """Processes on this machine. count : how many."""
+    """Processes on this machine. count : number of processes."""
 
     def __init__(self, count: int) -> None:
         self.description = f"{count} {'process' if count == 1 else 'processes'}"
@@ -69,7 +69,7 @@ class LocalProcesses:
 
     def submit(self, task: Task) -> Future[Outcome]:
         """See `Workers.submit`."""
-        # Not SIGTERM, by which the pool itself ends its processes.
+        # Not SIGTERM, with which the pool terminates its processes.
         with starting_children([number for number in ENDING if number != signal.SIGTERM]):
             try:
                 return self._pool.submit(work, task)
@@ -86,7 +86,7 @@ class LocalProcesses:
 
 
 def _begin() -> None:
-    """In a new worker: leave Ctrl-C to the parent, and end with it, as the work would be done again."""
+    """Initialise a worker: ignore Ctrl-C, which the parent handles, and exit when the parent exits."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
 
@@ -99,9 +99,9 @@ def _begin() -> None:
 
 
 class DaskCluster:
-    """Workers of a Dask cluster, which see the recordings, the pipeline and `--out` under the same paths.
+    """Workers of a Dask cluster, which must see recordings, pipeline and `--out` under the same paths.
 
-    The scheduler gives the tasks of a worker that dies to others. address : of it, "tcp://host:8786".
+    The scheduler reassigns the tasks of a worker that dies. address : of the scheduler, "tcp://host:8786".
 
     Raises
     ------
@@ -117,9 +117,9 @@ class DaskCluster:
 
     @property
     def slots(self) -> int:
-        """More as the cluster grows; without a worker, wait for the first one."""
+        """Grows with the cluster; at least one, to wait for the first worker."""
         threads: int = sum(self._client.nthreads().values())
-        return max(1, AHEAD * threads)
+        return max(1, TASKS_PER_THREAD * threads)
 
     def submit(self, task: Task) -> Future[Outcome]:
         """See `Workers.submit`."""
@@ -132,16 +132,16 @@ class DaskCluster:
         """See `Workers.close`."""
         if kill and self._client.status == "running":
             self._executor.shutdown(wait=False)
-        # A slow goodbye takes nothing from what is done.
+        # All results are saved, so a timeout is harmless.
         with suppress(TimeoutError):
             self._client.close(timeout=CONNECT_SECONDS)
 
 
 def _connect(address: str) -> Any:
-    """A client of a scheduler and workers of our version of Dask."""
-    # Imported here: it takes a second.
+    """Connect to a scheduler and check that all machines have our version of Dask."""
+    # Imported here because it takes a second.
     distributed = import_module("distributed")
-    # Errors that it would log with tracebacks are reported here in words.
+    # Errors are reported below, without tracebacks.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
@@ -152,16 +152,16 @@ def _connect(address: str) -> Any:
             f"--scheduler {address}: no Dask scheduler answers ({error}); is it the address that "
             "`dask scheduler` shows, tcp://HOST:8786, of the same version of Dask?"
         ) from None
-    found = client.get_versions()
-    here, *others = (
+    versions = client.get_versions()
+    here, *remote = (
         str(host["packages"]["distributed"])
-        for host in (found["client"], found["scheduler"], *found["workers"].values())
+        for host in (versions["client"], versions["scheduler"], *versions["workers"].values())
     )
-    if set(others) - {here}:
+    if set(remote) - {here}:
         client.close()
-        there = ", ".join(sorted(set(others) - {here}))
+        there = ", ".join(sorted(set(remote) - {here}))
         raise ConfigError(
-            f"--scheduler {address}: has distributed {there}, here is {here}; install the same version on "
-            "all machines"
+            f"--scheduler {address}: runs distributed {there}, this machine {here}; install the same version "
+            "on all machines"
         )
     return client

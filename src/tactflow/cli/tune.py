@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         folder = Path(name)
         file = find_pipeline(args.pipeline)
         recording = take(args.source, Candidate(DEFAULT).load(file, args.sensor), folder)
-        if args.pipeline is None and recording.seen.dots is None:
+        if args.pipeline is None and recording.observation.dots is None:
             file = find_pipeline("markerless")
             say(f"no dots are found: starting from {file.name}")
         search = Search(

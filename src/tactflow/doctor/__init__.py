@@ -1,4 +1,4 @@
-"""What is wrong with a sensor's pictures, from the pictures alone: `tactflow doctor`."""
+"""Diagnose a sensor from its pictures alone: `tactflow doctor`."""
 
 from tactflow.doctor.checks import CHECKS, Finding, examine, worst
 from tactflow.doctor.observation import Observation, observe

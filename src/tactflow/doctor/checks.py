@@ -1,10 +1,8 @@
 """The checks of `tactflow doctor`, one function each.
 
 To add a check, write a function below `@check(name, unit, warning=..., fault=...)`. It takes an `Observation`
-and returns a `Measured`: a number to compare with the limits, what it does to the errors, and what to change;
-or in words why this source does not show it. Limits without a comment are measured: there, an error of the
-default pipeline is twice and five times what it is without the fault, on the simulated scene `press`
-(docs/doctor.md).
+and returns a `Measured`, or the reason why this source cannot be checked. Limits without a comment are
+measured: they double, or increase fivefold, an error of the default pipeline on the simulated scene `press`.
 """
 
 from __future__ import annotations
@@ -24,8 +22,9 @@ Verdict = Literal["good", "warning", "fault", "unknown"]
 
 
 class Measured(NamedTuple):
-    """number : in the unit of the check. says : the same in words. effect : what a fault does to the errors.
-    advice : what to change. limits : warning and fault, where they depend on the source."""
+    """number : in the unit of the check. says : its description. effect : consequence of a fault for the
+    errors.
+    advice : remedy. limits : for warning and fault, if they depend on the source."""
 
     number: float
     says: str
@@ -36,11 +35,11 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a check found.
+    """Result of a check.
 
-    verdict : `unknown` where the source does not show it. number : None where nothing was measured. says :
-    the value in words, or why it is unknown. effect : what it does to the errors; advice : what to change;
-    both empty where all is good.
+    verdict : `unknown` if the source cannot be checked. number : measured value, or None. says : description
+    of the value, or why it is unknown. effect : consequence for the errors, advice : remedy; both empty if
+    good.
     """
 
     name: str
@@ -58,11 +57,11 @@ CHECKS: list[Callable[[Observation], Finding]] = []
 
 
 def check(name: str, unit: str, *, warning: float, fault: float) -> Callable[[Measure], Measure]:
-    """Make a function a check. warning, fault : limits; where `fault` is smaller, low values are bad."""
+    """Register a check. warning, fault : limits; if `fault` is smaller, low values are bad."""
 
     def register(measure: Measure) -> Measure:
-        def run(seen: Observation) -> Finding:
-            measured = measure(seen)
+        def run(observed: Observation) -> Finding:
+            measured = measure(observed)
             if isinstance(measured, str):
                 return Finding(name, "unknown", measured)
             number, says, effect, advice, limits = measured
@@ -79,44 +78,44 @@ def check(name: str, unit: str, *, warning: float, fault: float) -> Callable[[Me
     return register
 
 
-def examine(seen: Observation) -> list[Finding]:
+def examine(observed: Observation) -> list[Finding]:
     """Run all checks.
 
     >>> from tactflow.doctor import observe
     >>> sorted({finding.verdict for finding in examine(observe("sim:idle?frames=8", 1.0))})
     ['good', 'unknown']
     """
-    return [run(seen) for run in CHECKS]
+    return [run(observed) for run in CHECKS]
 
 
 def worst(findings: list[Finding]) -> Verdict:
-    """The worst verdict of all: fault, warning, or good."""
+    """The worst verdict: fault, warning, or good."""
     verdicts = {finding.verdict for finding in findings}
     return "fault" if "fault" in verdicts else "warning" if "warning" in verdicts else "good"
 
 
 Curve = tuple[tuple[float, float], ...]
-"""(value, factor by which an error grows), measured."""
+"""(value, measured factor on an error)."""
 
 BLUR: Final[Curve] = ((0.09, 1), (0.13, 1.1), (0.2, 1.6), (0.28, 2.1), (0.35, 2.7), (0.41, 4.6), (0.47, 8.8))
-"""Blur, in sizes of a dot, and the error of a dot's displacement."""
+"""Blur in dot radii -> factor on the error of a dot's displacement."""
 NOISE: Final[Curve] = ((2, 1), (4, 1.3), (8, 2.3), (12, 3.5), (16, 4.9))
-"""Noise, grey levels, and the error of a dot's displacement."""
+"""Noise, grey levels -> factor on the error of a dot's displacement."""
 JPEG: Final[Curve] = ((2, 1.05), (10, 1.5), (20, 2.2), (37, 3.4), (69, 6.3))
-"""Step of JPEG, grey levels, and the error of a dot's displacement."""
+"""JPEG quantisation step, grey levels -> factor on the error of a dot's displacement."""
 BANDS: Final[Curve] = ((0.5, 1), (1.0, 1.05), (1.9, 1.3), (2.8, 8.5), (3.7, 21), (4.7, 86))
-"""Amplitude of bands, %, and the error of the contact's centre."""
+"""Amplitude of bands, % -> factor on the error of the contact's centre."""
 CLIPPED: Final[Curve] = ((0, 1), (1.2, 1.7), (13, 5.4), (90, 4.1), (95, 32))
-"""Clipped part of the gel, %, and the error of the contact's centre."""
-DOT_PITCHES: Final = 0.15
-"""Radius of a dot over the pitch, at most: a blurred dot looks larger. 0.11 to 0.15 in simulated scenes."""
+"""Clipped share of the gel, % -> factor on the error of the contact's centre."""
+MAX_DOT_RADIUS: Final = 0.15
+"""Largest plausible dot radius in pitches: blur makes dots look larger. 0.11 to 0.15 in simulated scenes."""
 CODEC_REPEATS: Final = 10.0
-"""Frames of a good recording that repeat the one before, %: codecs do so where nothing changes (measured)."""
+"""Repeated frames in a good recording, %: codecs produce them in still scenes (measured)."""
 STEADY: Final = 0.35
-"""95th percentile of the dots' displacement, px, up to which nothing touches the gel: the bound by which the
-recordings of franka_mini were labelled."""
-LEAST: Final = 3
-"""Frames from which bands, and untouched frames from which a drift can be measured."""
+"""Threshold of the 95th percentile of the dots' displacement, px, below which the gel is untouched: the bound
+used to label the recordings of franka_mini."""
+MIN_FRAMES: Final = 3
+"""Minimum number of frames for bands, and of untouched frames for drift."""
 
 
 def _growth(curve: Curve, value: float, error: str) -> str:
@@ -125,95 +124,98 @@ def _growth(curve: Curve, value: float, error: str) -> str:
     return f"{error} off {least}{factor:.2g} times as much (simulated sensor)"
 
 
-# The slowest cameras of such sensors are sold with 25 frames/s. One that lengthens its exposure in the dark
-# falls to half of what it promises.
+# The slowest cameras of such sensors have 25 frames/s; automatic exposure in the dark halves the rate.
 @check("rate", "1/s", warning=20.0, fault=12.0)
-def _rate(seen: Observation) -> Measured | str:
-    if isinstance(gaps := seen.gaps, str):
+def _rate(observed: Observation) -> Measured | str:
+    if isinstance(gaps := observed.gaps, str):
         return gaps
     rate = 1.0 / float(gaps.mean())
     jitter = 100.0 * measures.spread(gaps - np.median(gaps)) * rate
-    promised, limits = "", None
-    if seen.live and seen.promised:
-        promised = f" of {seen.promised:.3g} promised"
-        limits = max(20.0, 0.9 * seen.promised), max(12.0, 0.7 * seen.promised)
-    # Dots that move by a whole pitch between two frames are mistaken for others (scene `jumps`).
-    reach = f"; dots may move by {0.9 * seen.dots.pitch * rate:.0f} px/s" if seen.dots else ""
+    nominal, limits = "", None
+    if observed.live and observed.nominal:
+        nominal = f" of nominally {observed.nominal:.3g}"
+        limits = max(20.0, 0.9 * observed.nominal), max(12.0, 0.7 * observed.nominal)
+    # Dots that move by a whole pitch between two frames are confused with their neighbours (scene `jumps`).
+    reach = (
+        f"; dots faster than {0.9 * observed.dots.pitch * rate:.0f} px/s are confused"
+        if observed.dots
+        else ""
+    )
     return Measured(
         rate,
-        f"{rate:.3g} frames/s{promised}, jitter {jitter:.0f} %",
-        f"a contact shorter than {1000 / rate:.0f} ms may pass unseen{reach} before they are mistaken",
+        f"{rate:.3g} frames/s{nominal}, jitter {jitter:.0f} %",
+        f"contacts shorter than {1000 / rate:.0f} ms may be missed{reach}",
         "a fixed short exposure with more light (automatic exposure halves the rate in the dark); format "
-        "MJPG or fewer pixels; a USB port of its own",
+        "MJPG or fewer pixels; a separate USB port",
         limits,
     )
 
 
 # Chosen by hand.
 @check("drop-outs", "%", warning=1.0, fault=10.0)
-def _drop_outs(seen: Observation) -> Measured:
+def _drop_outs(observed: Observation) -> Measured:
     late = 0
-    if not isinstance(gaps := seen.gaps, str):
+    if not isinstance(gaps := observed.gaps, str):
         usual = max(float(np.median(gaps)), 1e-9)
         late = int(np.maximum(np.rint(gaps / usual) - 1, 0).sum())
-    missing = max(late, seen.missing)
-    total = seen.frames + missing
-    repeated = 100.0 * seen.repeated / total - (0.0 if seen.live else CODEC_REPEATS)
-    stopped = f"; then: {seen.stopped}" if seen.stopped else ""
+    missing = max(late, observed.missing)
+    total = observed.frames + missing
+    repeated = 100.0 * observed.repeated / total - (0.0 if observed.live else CODEC_REPEATS)
+    stopped = f"; then: {observed.stopped}" if observed.stopped else ""
     return Measured(
         100.0 if stopped else 100.0 * missing / total + max(0.0, repeated),
-        f"{missing} of {total} frames missing, {seen.repeated} repeated{stopped}",
-        "contacts begin late, and dots move further between two frames",
-        "another cable and port (no hub), fewer pixels or MJPG, nothing else that needs the processor",
+        f"{missing} of {total} frames missing, {observed.repeated} repeated{stopped}",
+        "contacts are detected late, and dots move further between frames",
+        "another cable and port (no hub), fewer pixels or MJPG, less load on the processor",
     )
 
 
 # Three and nine frames at 30 a second; chosen by hand.
 @check("latency", "ms", warning=100.0, fault=300.0)
-def _latency(seen: Observation) -> Measured | str:
-    if not seen.delays:
-        return "frames come without the time they were taken" if seen.live else "a recording has none"
-    delay = 1000.0 * float(np.median(seen.delays))
+def _latency(observed: Observation) -> Measured | str:
+    if not observed.delays:
+        return "frames have no capture time" if observed.live else "a recording has no latency"
+    delay = 1000.0 * float(np.median(observed.delays))
     return Measured(
         delay,
         f"frames are {delay:.0f} ms old when they are read",
-        "whatever acts on the results acts that much later",
-        "fewer pixels or an uncompressed format; a driver that keeps fewer frames",
+        "a controller reacts that much later",
+        "fewer pixels or an uncompressed format; a driver that buffers fewer frames",
     )
 
 
-# At 46 grey levels dots are off by 1.3 times as much, at 23 they are not found.
+# At 46 grey levels, dots have 1.3 times the error; at 23 they are not detected.
 @check("exposure", "grey levels", warning=50.0, fault=30.0)
-def _exposure(seen: Observation) -> Measured:
-    level = float(np.median([exposure.level for exposure in seen.exposures]))
+def _exposure(observed: Observation) -> Measured:
+    level = float(np.median([exposure.level for exposure in observed.exposures]))
     return Measured(
         level,
         f"the brighter gel has {level:.0f} of 255 grey levels",
-        "dots and shades sink into the noise; below 24 grey levels the gel is taken for surroundings",
+        "dots and shading disappear in the noise; below 24 grey levels the gel is classified as background",
         "more light, or a longer exposure as far as the rate allows it",
     )
 
 
 @check("clipping", "%", warning=1.5, fault=10.0)
-def _clipping(seen: Observation) -> Measured:
-    share = 100.0 * float(np.mean([exposure.clipped for exposure in seen.exposures]))
+def _clipping(observed: Observation) -> Measured:
+    share = 100.0 * float(np.mean([exposure.clipped for exposure in observed.exposures]))
     return Measured(
         share,
         f"{round(share, 2):.2g} % of the gel is clipped",
-        "a contact there shows no shades: " + _growth(CLIPPED, share, "its centre is"),
-        "less exposure or gain, fixed and not automatic; lamps that do not shine into the camera",
+        "a contact there has no shading: " + _growth(CLIPPED, share, "its centre is"),
+        "less exposure or gain, fixed instead of automatic; lamps that do not shine into the camera",
     )
 
 
-# Without dots: 0.5 % of the picture's width, where the contact's centre is off by twice as much, and 1 %.
+# Without dots: 0.5 % of the width, which doubles the error of the contact's centre, and 1 %.
 @check("focus", "px", warning=math.nan, fault=math.nan)
-def _focus(seen: Observation) -> Measured | str:
-    blur, dots, width = measures.blur(seen.typical), seen.dots, seen.typical.shape[1]
+def _focus(observed: Observation) -> Measured | str:
+    blur, dots, width = measures.blur(observed.typical), observed.dots, observed.typical.shape[1]
     if blur is None:
-        return "there is no sharp edge in the picture to measure it by"
+        return "the picture has no sharp edges"
     says, effect, limits = f"blur of {blur:.1f} px", "outlines of contacts are blurred", (0.005, 0.01)
     if dots is not None:
-        width = min(dots.dot_radius, DOT_PITCHES * dots.pitch)
+        width = min(dots.dot_radius, MAX_DOT_RADIUS * dots.pitch)
         says += f", dots of radius {dots.dot_radius:.1f} px"
         effect, limits = _growth(BLUR, blur / width, "displacements of dots are"), (0.28, 0.42)
     advice = "focus the lens on the gel's surface, clean it; a shorter exposure if the gel moves fast"
@@ -221,8 +223,8 @@ def _focus(seen: Observation) -> Measured | str:
 
 
 @check("noise", "grey levels", warning=7.0, fault=16.0)
-def _noise(seen: Observation) -> Measured:
-    noise = measures.noise_of(seen.pairs)
+def _noise(observed: Observation) -> Measured:
+    noise = measures.noise_of(observed.pairs)
     return Measured(
         noise,
         f"{noise:.1f} grey levels",
@@ -231,92 +233,93 @@ def _noise(seen: Observation) -> Measured:
     )
 
 
-# From 2 to 3 % the error grows from 1.3 to 8.5 times. Large contacts make up to 0.9 % on real gels (sts_640).
+# From 2 to 3 %, the factor on the error grows from 1.3 to 8.5. Large contacts cause up to 0.9 % on real gels
+# (sts_640).
 @check("banding", "%", warning=1.5, fault=2.5)
-def _banding(seen: Observation) -> Measured | str:
-    if len(seen.pairs) < LEAST:
-        return f"{len(seen.pairs)} frames are too few"
-    amplitude, axis = measures.bands(seen.grays)
+def _banding(observed: Observation) -> Measured | str:
+    if len(observed.pairs) < MIN_FRAMES:
+        return f"{len(observed.pairs)} frames are too few"
+    amplitude, axis = measures.bands(observed.grays)
     return Measured(
         100.0 * amplitude,
         f"bands of {100 * amplitude:.1f} % of the light across the {axis}",
-        "bands are taken for contacts: " + _growth(BANDS, 100.0 * amplitude, "centres are"),
-        "lamps on direct current; else exposures of whole periods of the mains (10 or 8.33 ms), and no "
-        "daylight tubes that shine through the gel",
+        "bands are detected as contacts: " + _growth(BANDS, 100.0 * amplitude, "centres are"),
+        "lamps on direct current; otherwise exposure times of whole mains periods (10 or 8.33 ms), and no "
+        "fluorescent light through the gel",
     )
 
 
 @check("light", "%", warning=50.0, fault=math.inf)
-def _light(seen: Observation) -> Measured:
-    typical = np.maximum(seen.typical, measures.DIM)
-    levels = np.array([float(np.median(gray / typical)) for gray in seen.grays])
+def _light(observed: Observation) -> Measured:
+    typical = np.maximum(observed.typical, measures.DIM)
+    levels = np.array([float(np.median(gray / typical)) for gray in observed.grays])
     change = 100.0 * float(levels.max() / max(levels.min(), 1e-9) - 1.0)
     return Measured(
         change,
         f"changes by {change:.1f} %",
-        "up to 50 % nothing suffers; more was not measured",
-        "exposure and white balance fixed, and not automatic; let lamps warm up",
+        "harmless up to 50 %; more was not measured",
+        "fixed exposure and white balance; warm up the lamps",
     )
 
 
 # JPEG qualities of about 30 and 10.
 @check("compression", "grey levels", warning=18.0, fault=55.0)
-def _compression(seen: Observation) -> Measured:
-    step, says = seen.jpeg_step or 0.0, "no trace of JPEG"
+def _compression(observed: Observation) -> Measured:
+    step, says = observed.jpeg_step or 0.0, "no trace of JPEG"
     if step:
-        says = f"JPEG of quality {measures.jpeg_quality(step):.0f} or so, steps of {step:.0f} grey levels"
+        says = f"JPEG of quality ~{measures.jpeg_quality(step):.0f}, steps of {step:.0f} grey levels"
     return Measured(
         step,
         says,
-        _growth(JPEG, step, "displacements of dots are") + "; outlines are cut to blocks of 8 px",
-        "a higher quality, or an uncompressed format (YUYV); record with tactflow record, without loss",
+        _growth(JPEG, step, "displacements of dots are") + "; outlines are quantised to blocks of 8 px",
+        "a higher quality, or an uncompressed format (YUYV); record losslessly with tactflow record",
     )
 
 
-# Real grids have up to 13 % empty places, also in perspective; chosen by hand.
+# Real grids have up to 13 % empty positions, including perspective views; chosen by hand.
 @check("dots", "% missing", warning=15.0, fault=40.0)
-def _dots(seen: Observation) -> Measured | str:
-    dots = seen.dots
+def _dots(observed: Observation) -> Measured | str:
+    dots = observed.dots
     if dots is None:
-        return "none found; fine for a gel without: pipelines/markerless.yaml"
-    found = measures.lattice(dots, seen.typical)
+        return "none detected; for a gel without dots use pipelines/markerless.yaml"
+    grid = measures.lattice(dots, observed.typical)
     return Measured(
-        100.0 * found.missing,
-        f"{found.found} {dots.polarity} dots {dots.pitch:.0f} px apart, {100 * found.closed:.0f} % regular, "
-        f"{100 * found.missing:.0f} % missing, contrast {found.contrast:.0f} grey levels",
-        "where a dot is missing, motion is guessed from its neighbours",
-        "look at tactflow detect SRC --picture FILE; give polarity and dot, print worn dots anew",
+        100.0 * grid.missing,
+        f"{grid.found} {dots.polarity} dots {dots.pitch:.0f} px apart, {100 * grid.closed:.0f} % regular, "
+        f"{100 * grid.missing:.0f} % missing, contrast {grid.contrast:.0f} grey levels",
+        "motion at missing dots is interpolated from their neighbours",
+        "check with tactflow detect SRC --picture FILE; set polarity and dot, reprint worn dots",
     )
 
 
-# All of it is error of the dots' displacement, which is 0.01 px on a resting simulated gel; this check itself
-# may be off by 0.05 px. Chosen by hand.
+# Drift adds to the error of displacements, 0.01 px on a resting simulated gel; the measurement itself has an
+# error of up to 0.05 px. Chosen by hand.
 @check("drift", "px", warning=0.15, fault=1.0)
-def _drift(seen: Observation) -> Measured | str:
-    late = [shift for number, shift in _at_rest(seen) if 2 * number >= seen.frames]
-    if len(late) < LEAST:
+def _drift(observed: Observation) -> Measured | str:
+    late = [shift for number, shift in _at_rest(observed) if 2 * number >= observed.frames]
+    if len(late) < MIN_FRAMES:
         return "too few untouched frames in the second half"
-    x, y = np.median(late[-max(LEAST, len(late) // 3) :], axis=0)
+    x, y = np.median(late[-max(MIN_FRAMES, len(late) // 3) :], axis=0)
     drift = math.hypot(x, y)
     return Measured(
         drift,
         f"the resting gel has moved by {drift:.2f} px ({x:+.2f}, {y:+.2f})",
-        f"every displacement is off by {drift:.2f} px, and flow with it",
-        "fix gel and camera; let the gel settle; take a new reference while nothing touches",
+        f"every displacement, and the flow, is off by {drift:.2f} px",
+        "fasten gel and camera; let the gel settle; take a new reference of the untouched gel",
     )
 
 
-def _at_rest(seen: Observation) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Frames in which the gel rests: number, and (x, y) px by which it has moved as a whole."""
-    first = seen.pairs[0].image
-    points = measures.points(first) if seen.dots is None else seen.dots.centers.astype(np.float32)
+def _at_rest(observed: Observation) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """Frames with an untouched gel: number, and displacement (x, y) of the whole gel, px."""
+    first = observed.pairs[0].image
+    points = measures.points(first) if observed.dots is None else observed.dots.centers.astype(np.float32)
     reference = measures.smooth(first)
-    for pair in seen.pairs[1:]:
+    for pair in observed.pairs[1:]:
         moved = measures.motion(reference, measures.smooth(pair.image), points)
-        found = moved[np.isfinite(moved[:, 0])]
-        # Ten points, and half of them, make a sound median.
-        if len(found) < max(10, len(points) / 2):
+        tracked = moved[np.isfinite(moved[:, 0])]
+        # A reliable median needs ten points, and half of all.
+        if len(tracked) < max(10, len(points) / 2):
             continue
-        middle = np.median(found, axis=0)
-        if np.percentile(np.hypot(*(found - middle).T), 95) < STEADY:
+        middle = np.median(tracked, axis=0)
+        if np.percentile(np.hypot(*(tracked - middle).T), 95) < STEADY:
             yield pair.number, middle.astype(np.float64)

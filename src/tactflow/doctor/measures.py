@@ -1,4 +1,4 @@
-"""Measures of a sensor's pictures that need no truth: pure functions on arrays."""
+"""Quality measures of a sensor's pictures without ground truth: pure functions on arrays."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ Image = NDArray[np.uint8]
 Gray = NDArray[np.float32]
 
 TILE: Final = 16
-"""Side of the tiles that noise is measured in, px: each has 256 samples."""
+"""Side of the tiles for noise estimates, px: 256 samples each."""
 BLOCK: Final = 8
-"""Side of the blocks of JPEG, px."""
+"""Side of a JPEG block, px."""
 BLACK: Final = 4
-"""Grey level up to which a pixel shows no gel, but a black surround."""
+"""Highest grey level of the black surround of the gel."""
 DIM: Final = 25
-"""Grey level below which no change of the light is measured: noise of 2 grey levels would be 8 %."""
+"""Minimum grey level for relative changes of light: noise of 2 grey levels would be 8 %."""
 STRIPS: Final = 4
-"""Strips of a picture, all of which a band of light crosses and no contact does."""
-MOST_WAVES: Final = 24
-"""Bands across a picture, at most: mains light at 120 Hz on a shutter of 100 ms makes 12."""
+"""Strips of a picture: bands of light cross all of them, a contact does not."""
+MAX_BANDS: Final = 24
+"""Maximum number of bands across a picture: 120 Hz light with a readout of 100 ms causes 12."""
 REGULAR: Final = 0.7
-"""Share of closing parallelograms from which on a grid is regular; 0.8 and more in grids. Chosen by hand."""
+"""Minimum share of closing parallelograms in a regular grid, where it is 0.8 and more. Chosen by hand."""
 
 
 class Pair(NamedTuple):
-    """Two frames in a row.
+    """Two consecutive frames.
 
-    number : of the first. image : (H, W, 3) uint8. after : the next frame, None at the end.
+    number : index of the first. image : (H, W, 3) uint8. after : the next frame, None at the end.
     """
 
     number: int
@@ -44,17 +44,17 @@ class Pair(NamedTuple):
 
 
 class Exposure(NamedTuple):
-    """level : 95th percentile of the gel in its brightest channel, grey levels: a dark gel with bright pins
-    is well exposed. clipped : share of the gel with a channel at its upper end."""
+    """level : 95th percentile of the gel's brightest channel, grey levels, because a dark gel with bright
+    pins is well exposed. clipped : share of the gel with a saturated channel."""
 
     level: float
     clipped: float
 
 
 class Lattice(NamedTuple):
-    """found : dots. closed : share of the parallelograms of neighbours that close. missing : share of the
-    places of a regular grid, between the dots found, that are empty. contrast : median difference of a dot to
-    its surroundings, grey levels."""
+    """found : number of dots. closed : share of the parallelograms of neighbours that close. missing : share
+    of empty positions in a regular grid. contrast : median difference between a dot and its surroundings,
+    grey levels."""
 
     found: int
     closed: float
@@ -63,7 +63,7 @@ class Lattice(NamedTuple):
 
 
 def spread(values: NDArray[Any]) -> float:
-    """Standard deviation of values around 0 without outliers, from the median absolute value."""
+    """Robust standard deviation of values around 0, from the median absolute value."""
     return 1.4826 * float(np.median(np.abs(values)))
 
 
@@ -73,41 +73,41 @@ def grey(image: Image) -> Gray:
 
 
 def temporal_noise(first: Image, second: Image) -> float:
-    """Standard deviation of one frame's noise, grey levels, from two frames in a row.
+    """Standard deviation of the noise of a frame, grey levels, from two consecutive frames.
 
-    first, second : (H, W, 3) uint8. Motion in less than three quarters of the picture does not count.
+    first, second : (H, W, 3) uint8. Robust to motion in up to three quarters of the picture.
 
     >>> rng = np.random.default_rng(0)
-    >>> one, other = (np.uint8(rng.normal(100, 3, (160, 160, 3)).round()) for _ in range(2))
-    >>> round(temporal_noise(one, other))
+    >>> first, second = (np.uint8(rng.normal(100, 3, (160, 160, 3)).round()) for _ in range(2))
+    >>> round(temporal_noise(first, second))
     3
     """
     return _calm_deviation(first.astype(np.float32) - second) / 2**0.5
 
 
 def spatial_noise(image: Image) -> float:
-    """Standard deviation of a frame's noise, grey levels, from that frame alone; texture adds to it.
+    """Standard deviation of the noise of a single frame, grey levels; texture adds to it.
 
-    image : (H, W, 3) uint8. By the difference of two Laplacians, which is blind to slopes and edges along the
-    axes (J. Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding 64, 1996).
+    image : (H, W, 3) uint8. The difference of two Laplacians cancels slopes and edges along the axes (J.
+    Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding 64, 1996).
     """
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     return _calm_deviation(np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel), np.float32)) / 6.0
 
 
 def noise_of(pairs: Sequence[Pair]) -> float:
-    """Standard deviation of a frame's noise, grey levels: the smaller of that within frames, where texture
-    counts too, and that between them, where motion does."""
+    """Standard deviation of the noise, grey levels: the smaller of the spatial estimate, which includes
+    texture, and the temporal one, which includes motion."""
     # Eight pairs have thousands of tiles.
-    some = pairs[:: max(1, len(pairs) // 8)]
-    within = [spatial_noise(pair.image) for pair in some]
-    between = [temporal_noise(pair.image, pair.after) for pair in some if pair.after is not None]
+    sample = pairs[:: max(1, len(pairs) // 8)]
+    within = [spatial_noise(pair.image) for pair in sample]
+    between = [temporal_noise(pair.image, pair.after) for pair in sample if pair.after is not None]
     return min(float(np.median(values)) for values in (within, between) if values)
 
 
 def _calm_deviation(values: NDArray[np.float32]) -> float:
-    """Deviation of (H, W, 3) values within the calmer quarter of the tiles, RMS over the channels: motion and
-    texture fill the others."""
+    """Standard deviation of (H, W, 3) values at the lower quartile of the tiles, without motion and
+    texture."""
     height, width = (side - side % TILE for side in values.shape[:2])
     if not height or not width:
         return float(values.std())
@@ -117,7 +117,7 @@ def _calm_deviation(values: NDArray[np.float32]) -> float:
 
 
 def exposure(image: Image) -> Exposure:
-    """How a frame (H, W, 3) uint8 is exposed; black surroundings do not count.
+    """Exposure of a frame (H, W, 3) uint8, without the black surround.
 
     >>> exposure(np.full((4, 4, 3), 255, np.uint8))
     Exposure(level=255.0, clipped=1.0)
@@ -130,35 +130,35 @@ def exposure(image: Image) -> Exposure:
 
 
 def blur(gray: Gray) -> float | None:
-    """Standard deviation of the point spread at the sharper edges of a picture, px; None without edges.
+    """Standard deviation of the point spread function at the sharper edges, px; None without edges.
 
-    gray : (H, W) float32, best a median over frames. The slope of a step that is blurred by s and by a known
-    blur a falls as 1 / sqrt(s^2 + a^2); two known blurs give s (S. Zhuo and T. Sim, "Defocus map estimation
-    from a single image", Pattern Recognition 44, 2011).
+    gray : (H, W) float32, preferably a median over frames. The slope of a step that is blurred by s and by a
+    known blur a falls as 1 / sqrt(s^2 + a^2); two known blurs give s (S. Zhuo and T. Sim, "Defocus map
+    estimation from a single image", Pattern Recognition 44, 2011).
 
     >>> step = np.repeat([[50.0] * 40 + [150.0] * 40], 80, axis=0).astype(np.float32)
     >>> round(blur(np.asarray(cv2.GaussianBlur(step, (0, 0), 3.0), np.float32)))
     3
     """
-    # Where the blur is wider than a dot, the coarser pair of blurs shows more of it.
+    # For blur wider than a dot, the coarser pair of scales is more sensitive.
     found = [_blur_between(gray, *scales) for scales in ((1.0, 2.0), (2.0, 4.0))]
     return max((value for value in found if value is not None), default=None)
 
 
 def _blur_between(gray: Gray, first: float, second: float) -> float | None:
-    """The same, from the slopes under two blurs, px."""
+    """Blur from the slopes at two scales, px."""
     fine, coarse = (
         _slope(np.asarray(cv2.GaussianBlur(gray, (0, 0), sigma), np.float32)) for sigma in (first, second)
     )
-    # The crest of an edge, where no neighbour is steeper: well above noise, which leaves a slope of 0.6 grey
-    # levels a px of a noise of 2, and among the steepest 2 % of the picture.
+    # Edge pixels are local maxima of the slope, among the steepest 2 % of the picture and well above noise,
+    # which has a slope of 0.6 grey levels per px at a standard deviation of 2.
     crest = (fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))) & (fine >= 2.0 / first)
     crest &= fine >= np.percentile(fine, 98.0)
     if np.count_nonzero(crest) < 30:
         return None
     ratio = np.square(fine[crest] / np.maximum(coarse[crest], 1e-6))
     squared = (second**2 - ratio * first**2) / np.maximum(ratio - 1.0, 1e-3)
-    # The sharper edges show the lens; soft shades are edges, too.
+    # Only the sharper edges show the blur of the lens; soft shading also has edges.
     return float(np.sqrt(np.percentile(np.maximum(squared, 0.0), 25.0)))
 
 
@@ -169,11 +169,11 @@ def _slope(gray: Gray) -> Gray:
 
 
 def jpeg_step(gray: Gray) -> float | None:
-    """Step to which JPEG has rounded the coarsest wave of its blocks, grey levels; None without JPEG.
+    """JPEG quantisation step of the lowest frequency, grey levels; None without JPEG.
 
-    gray : (H, W) float32, whole grey levels of one frame. The blocks may begin at any pixel: a picture may
-    have been cut. Their coefficients are multiples of the step (Z. Fan and R. L. de Queiroz, "Identification
-    of bitmap compression history", IEEE Trans. Image Processing 12, 2003).
+    gray : (H, W) float32, whole grey levels of one frame, possibly cropped: blocks may start at any pixel.
+    Their coefficients are multiples of the step (Z. Fan and R. L. de Queiroz, "Identification of bitmap
+    compression history", IEEE Trans. Image Processing 12, 2003).
     """
     waves = _coefficients(gray[_phase(gray.T) :, _phase(gray) :])
     found = None
@@ -181,16 +181,16 @@ def jpeg_step(gray: Gray) -> float | None:
         larger = waves[np.abs(waves) > step / 2]
         if len(larger) < 100:
             break
-        # 1 for exact multiples, 0 at random; measured: 0.2 at most without JPEG, 0.8 and more with it.
+        # 1 for exact multiples, 0 for random values; measured: up to 0.2 without JPEG, 0.8 and more with it.
         if np.cos(2 * np.pi * larger / step).mean() > 0.5:
             found = float(step)
     return found
 
 
 def jpeg_quality(step: float) -> float:
-    """Quality, 1 to 100, at which the usual tables have this step in grey levels.
+    """JPEG quality, 1 to 100, whose standard tables have this step in grey levels.
 
-    It is 11.5 at quality 50, the mean of 11 and 12 (ITU-T T.81, table K.1).
+    The step is 11.5 at quality 50, the mean of 11 and 12 (ITU-T T.81, table K.1).
 
     >>> jpeg_quality(11.5), jpeg_quality(23.0), jpeg_quality(2.3)
     (50.0, 25.0, 90.0)
@@ -200,7 +200,7 @@ def jpeg_quality(step: float) -> float:
 
 
 def _phase(gray: Gray) -> int:
-    """Column, 0 to 7, at which blocks begin: there the differences of neighbours are largest."""
+    """Column, 0 to 7, at which blocks start: differences between neighbours are largest there."""
     step = np.abs(np.diff(gray, axis=1))
     excess = (step[:, 1:-1] - (step[:, :-2] + step[:, 2:]) / 2).mean(axis=0)
     excess = excess[: len(excess) - len(excess) % BLOCK].reshape(-1, BLOCK)
@@ -208,7 +208,7 @@ def _phase(gray: Gray) -> int:
 
 
 def _coefficients(gray: Gray) -> NDArray[np.float32]:
-    """The coefficients of the half wave across and of that down of each block, (N,)."""
+    """Coefficients (N,) of the lowest horizontal and vertical frequency of all blocks."""
     height, width = (side - side % BLOCK for side in gray.shape)
     blocks = gray[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
     waves = scipy.fft.dctn(blocks, axes=(1, 3), norm="ortho")
@@ -216,10 +216,11 @@ def _coefficients(gray: Gray) -> NDArray[np.float32]:
 
 
 def bands(frames: Sequence[Gray]) -> tuple[float, str]:
-    """Amplitude of bands of light that roll over the frames, relative, and the axis they are stacked along.
+    """Relative amplitude of bands of light that roll over the frames, and the axis along which they
+    alternate.
 
-    frames : (H, W) float32 each, at least three. Each frame is divided by the median frame; the median over a
-    row, in several strips, is the profile of the light.
+    frames : (H, W) float32 each, at least three. Each frame is divided by the median frame; the medians over
+    the rows of a strip are a profile of the light.
     """
     middle = np.median(np.stack(frames), axis=0)
     ratios = [np.where(middle > DIM, frame / np.maximum(middle, DIM), 1.0) for frame in frames]
@@ -236,46 +237,48 @@ def _profiles(ratio: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def _common_wave(profiles: Sequence[Sequence[NDArray[Any]]]) -> float:
-    """Amplitude of the strongest wave that all strips of the profiles (frames, strips, N) have in common."""
+    """Amplitude of the strongest wave common to all strips of the profiles (frames, strips, N)."""
     stack = np.array(profiles)
     length = stack.shape[-1]
-    place = np.linspace(-1.0, 1.0, length)
-    basis = np.stack([np.ones(length), place, place**2], axis=1)
-    rest = stack - (stack @ np.linalg.pinv(basis).T) @ basis.T
-    spectrum = np.fft.rfft(rest * np.hanning(length))[..., 1 : MOST_WAVES + 1] * 4.0 / length
+    position = np.linspace(-1.0, 1.0, length)
+    basis = np.stack([np.ones(length), position, position**2], axis=1)
+    residual = stack - (stack @ np.linalg.pinv(basis).T) @ basis.T
+    spectrum = np.fft.rfft(residual * np.hanning(length))[..., 1 : MAX_BANDS + 1] * 4.0 / length
     mean = spectrum.mean(axis=1, keepdims=True)
     along = np.real(spectrum * np.conj(mean)) / np.maximum(np.abs(mean), 1e-12)
     return float(np.median(along.min(axis=1), axis=0).max(initial=0.0))
 
 
-def lattice(found: Detection, gray: Gray) -> Lattice:
-    """How regular the dots of a detection are, and how clear in the picture (H, W) they were found in."""
+def lattice(detection: Detection, gray: Gray) -> Lattice:
+    """Regularity of the dots of a detection, and their contrast in the picture (H, W)."""
     height, width = gray.shape
-    x, y = np.clip(np.rint(found.centers).astype(int), 0, (width - 1, height - 1)).T
-    around = cv2.blur(gray, (round(found.pitch) | 1,) * 2)
+    x, y = np.clip(np.rint(detection.centers).astype(int), 0, (width - 1, height - 1)).T
+    around = cv2.blur(gray, (round(detection.pitch) | 1,) * 2)
     contrast = float(np.median(np.abs(around[y, x] - gray[y, x])))
-    closed = 0.0 if found.chosen is None else found.chosen.lattice
-    # Where the grid is irregular, nobody knows where a dot would be.
-    empty = len(_empty_places(found)) if closed >= REGULAR else 0
-    return Lattice(len(found.centers), closed, empty / (len(found.centers) + empty), contrast)
+    closed = 0.0 if detection.chosen is None else detection.chosen.lattice
+    # An irregular grid has no predictable positions.
+    empty = len(_empty_positions(detection)) if closed >= REGULAR else 0
+    return Lattice(len(detection.centers), closed, empty / (len(detection.centers) + empty), contrast)
 
 
-def _empty_places(found: Detection) -> list[NDArray[np.float64]]:
-    """Places of a regular grid, between the dots found, that have no dot; (x, y) px."""
-    hull = cv2.convexHull(found.centers.astype(np.float32))
+def _empty_positions(detection: Detection) -> list[NDArray[np.float64]]:
+    """Positions (x, y), px, of a regular grid within the hull of the dots that have no dot."""
+    hull = cv2.convexHull(detection.centers.astype(np.float32))
     empty: list[NDArray[np.float64]] = []
-    for place in corners(found.centers, found.edges).points:
-        others = np.array([*found.centers, *empty])
-        inside = cv2.pointPolygonTest(hull, (float(place[0]), float(place[1])), False) > 0
-        if inside and np.hypot(*(others - place).T).min() > found.pitch / 2:
-            empty.append(place)
+    for position in corners(detection.centers, detection.edges).points:
+        occupied = np.array([*detection.centers, *empty])
+        inside = cv2.pointPolygonTest(hull, (float(position[0]), float(position[1])), False) > 0
+        if inside and np.hypot(*(occupied - position).T).min() > detection.pitch / 2:
+            empty.append(position)
     return empty
 
 
 def points(image: Image) -> NDArray[np.float32]:
-    """(N, 2) float32, px: up to 200 points of a picture that can be followed, 8 px apart or more."""
-    found = cv2.goodFeaturesToTrack(smooth(image), 200, 0.05, 8.0)
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2), np.float32)
+    """(N, 2) float32, px: up to 200 trackable points of a picture, at least 8 px apart."""
+    features = cv2.goodFeaturesToTrack(smooth(image), 200, 0.05, 8.0)
+    return (
+        np.zeros((0, 2), np.float32) if features is None else np.asarray(features.reshape(-1, 2), np.float32)
+    )
 
 
 def smooth(image: Image) -> Image:
@@ -284,22 +287,22 @@ def smooth(image: Image) -> Image:
 
 
 def motion(reference: Image, now: Image, points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Displacements (N, 2) px of points (N, 2) of a gray picture; NaN where they are not found again.
+    """Displacements (N, 2), px, of points (N, 2) of a gray picture; NaN where tracking fails.
 
-    reference, now : (H, W) uint8. Each point is followed to `now` and back: it must come back within 0.3 px.
+    reference, now : (H, W) uint8. Each point is tracked to `now` and back, and must return to within 0.3 px.
     """
     if not len(points):
         return np.zeros((0, 2), np.float32)
-    ends, found = _followed(reference, now, points)
-    back, found_back = _followed(now, reference, ends)
+    ends, found = _tracked(reference, now, points)
+    back, found_back = _tracked(now, reference, ends)
     moved = ends - points
     moved[~(found & found_back & (np.hypot(*(back - points).T) < 0.3))] = np.nan
     return np.asarray(moved, np.float32)
 
 
-def _followed(
+def _tracked(
     reference: Image, now: Image, points: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where points (N, 2) went, (N, 2), and whether they were found, (N,)."""
+    """Positions (N, 2) of points (N, 2) tracked to `now`, and whether tracking succeeded, (N,)."""
     ends, found, _ = cv2.calcOpticalFlowPyrLK(reference, now, points, points.copy(), winSize=(31, 31))
     return np.asarray(ends, np.float32).reshape(-1, 2), np.asarray(found).ravel() == 1

@@ -1,4 +1,4 @@
-"""Read a source for a while, and keep what the checks need: all times, and some pairs of frames."""
+"""Read a source for a while, keeping what the checks need: all times, and some pairs of frames."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Detection, NoMarkersError, detect_markers
 
 KEPT: Final = 24
-"""Pairs of frames that are kept, up to twice as many while reading: 70 MB at 800 x 600."""
-LEAST_DOTS: Final = 20
-"""Spots below which an irregular grid is no grid: on wedge_grasp, a gel without dots, compression makes 6 and
-16 of them."""
+"""Pairs of frames to keep, up to twice as many while reading: 70 MB at 800 x 600."""
+MIN_DOTS: Final = 20
+"""Minimum number of dots of an irregular grid: compression produces 6 and 16 spots on wedge_grasp, a gel
+without dots."""
 
 
 @dataclass
 class Observation:
-    """What was seen of a source.
+    """Observation of a source over some seconds.
 
-    source, description : how it was named, and what it is. live : a camera or a stream. promised : frames per
-    second that it says it has, or None. times : (N,) s, or None where a source of single pictures has none.
-    frames : how many came. repeated : of these the same as the one before, bit for bit. missing : frames that
-    a recording knows it has lost. stopped : why it ended too early, else "". delays : s, from the driver's
-    stamp to here, for each frame with a stamp. pairs : kept frames.
+    source : as given by the user. description : of its kind. live : a camera or stream. nominal : frame rate
+    that it reports, 1/s, or None. times : (N,) s, or None for single pictures. frames : number of frames.
+    repeated : frames bit-identical to their predecessor. missing : lost frames, by the numbers in a
+    recording. stopped : why it ended early, or "". delays : s from the driver's time stamp to reading, for
+    frames with a stamp. pairs : kept frames.
     """
 
     source: str
     description: str
     live: bool
-    promised: float | None = None
+    nominal: float | None = None
     times: NDArray[np.float64] | None = None
     frames: int = 0
     repeated: int = 0
@@ -51,7 +51,7 @@ class Observation:
 
     @property
     def gaps(self) -> NDArray[np.float64] | str:
-        """Times between frames, s; or why they are unknown."""
+        """Intervals between frames, s, or why they are unknown."""
         if self.times is None:
             return "single pictures have no times"
         gaps = np.diff(self.times)
@@ -64,26 +64,26 @@ class Observation:
 
     @cached_property
     def exposures(self) -> list[Exposure]:
-        """How the kept frames are exposed."""
+        """Exposure of the kept frames."""
         return [exposure(pair.image) for pair in self.pairs]
 
     @cached_property
     def jpeg_step(self) -> float | None:
-        """Step of JPEG's coarsest quantisation, grey levels, where half of the frames or more show one."""
+        """JPEG quantisation step, grey levels, if at least half of the frames show one."""
         frames = self.grays[::4]
         steps = [step for gray in frames if (step := jpeg_step(gray)) is not None]
         return float(np.median(steps)) if steps and 2 * len(steps) >= len(frames) else None
 
     @cached_property
     def typical(self) -> Gray:
-        """The median of the kept frames, (H, W) float32: without noise, and without short contacts."""
+        """Median of the kept frames, (H, W) float32, without noise and short contacts."""
         return np.asarray(np.median(np.stack(self.grays), axis=0), np.float32)
 
     @cached_property
     def dots(self) -> Detection | None:
-        """The dots of the first frame, or of the second that is kept.
+        """Dots of the first kept frame, or else of the second.
 
-        An irregular grid must show again in the next frame: what compression makes differs in each.
+        An irregular grid must recur in the next frame, because compression artefacts do not.
         """
         for pair in self.pairs[:2]:
             found = _dots_of(pair.image)
@@ -92,7 +92,7 @@ class Observation:
             if found.chosen is not None and found.chosen.lattice >= REGULAR:
                 return found
             again = None if pair.after is None else _dots_of(pair.after)
-            if len(found.centers) >= LEAST_DOTS and (pair.after is None or _show_again(found, again)):
+            if len(found.centers) >= MIN_DOTS and (pair.after is None or _recur(found, again)):
                 return found
         return None
 
@@ -104,51 +104,55 @@ def _dots_of(image: Image) -> Detection | None:
         return None
 
 
-def _show_again(dots: Detection, again: Detection | None) -> bool:
-    """Whether at least half of the dots are in the same places, to half a pitch."""
+def _recur(dots: Detection, again: Detection | None) -> bool:
+    """Whether at least half of the dots recur within half a pitch."""
     if again is None:
         return False
-    away = np.hypot(*(dots.centers[:, None] - again.centers).transpose(2, 0, 1)).min(axis=1)
-    return bool(np.mean(away < dots.pitch / 2) >= 0.5)
+    distances = np.hypot(*(dots.centers[:, None] - again.centers).transpose(2, 0, 1)).min(axis=1)
+    return bool(np.mean(distances < dots.pitch / 2) >= 0.5)
 
 
 def observe(source: str, seconds: float, report: Callable[[int], None] = lambda _: None) -> Observation:
-    """Look at a source for so many seconds of its own time, or to its end. Ctrl-C ends the look early.
+    """Observe a source for some seconds of its own time, or to its end. Ctrl-C ends the observation.
 
     source : as `open_source` takes it. report : called with the number of frames so far.
 
     Raises
     ------
     SourceError
-        If it cannot be opened, or delivers no frame.
+        The source cannot be opened or delivers no frames.
 
-    >>> seen = observe("sim:idle?frames=5", 10.0)
-    >>> seen.frames, seen.promised, len(seen.pairs)
+    >>> observation = observe("sim:idle?frames=5", 10.0)
+    >>> observation.frames, observation.nominal, len(observation.pairs)
     (5, 60.0, 5)
     """
     reader = open_source(source)
-    seen = Observation(source, reader.description, reader.live, reader.fps)
+    observation = Observation(source, reader.description, reader.live, reader.fps)
     times: list[float] = []
     try:
-        _read(reader, seconds, seen, times, report)
+        _read(reader, seconds, observation, times, report)
     except SourceError as error:
-        seen.stopped = str(error)
+        observation.stopped = str(error)
     except KeyboardInterrupt:
-        seen.stopped = ""
+        observation.stopped = ""
     finally:
         reader.close()
-    if not seen.frames:
-        raise SourceError(f"{source}: {seen.stopped or 'there is no frame in it'}")
+    if not observation.frames:
+        raise SourceError(f"{source}: {observation.stopped or 'it contains no frames'}")
     if isinstance(reader, ImageFiles | ArrayFile):
-        # Its rate is made up.
-        seen.promised = None
+        # The reader invents the rate of these.
+        observation.nominal = None
     else:
-        seen.times = np.array(times)
-    return seen
+        observation.times = np.array(times)
+    return observation
 
 
 def _read(
-    reader: FrameReader, seconds: float, seen: Observation, times: list[float], report: Callable[[int], None]
+    reader: FrameReader,
+    seconds: float,
+    observation: Observation,
+    times: list[float],
+    report: Callable[[int], None],
 ) -> None:
     last: Image | None = None
     last_seq: int | None = None
@@ -158,28 +162,28 @@ def _read(
         if times and t - times[0] > seconds:
             return
         if seq is not None and last_seq is not None:
-            seen.missing += max(seq - last_seq - 1, 0)
+            observation.missing += max(seq - last_seq - 1, 0)
         if last is not None:
-            seen.repeated += bool(np.array_equal(last, image))
-            if seen.pairs and seen.pairs[-1].number == seen.frames - 1:
-                seen.pairs[-1] = seen.pairs[-1]._replace(after=image)
-        if seen.frames % stride == 0:
-            seen.pairs.append(Pair(seen.frames, image, None))
-            if len(seen.pairs) > 2 * KEPT:
+            observation.repeated += bool(np.array_equal(last, image))
+            if observation.pairs and observation.pairs[-1].number == observation.frames - 1:
+                observation.pairs[-1] = observation.pairs[-1]._replace(after=image)
+        if observation.frames % stride == 0:
+            observation.pairs.append(Pair(observation.frames, image, None))
+            if len(observation.pairs) > 2 * KEPT:
                 stride *= 2
-                seen.pairs[:] = [pair for pair in seen.pairs if pair.number % stride == 0]
+                observation.pairs[:] = [pair for pair in observation.pairs if pair.number % stride == 0]
         if isinstance(reader, Camera) and (delay := reader.delay()) is not None:
-            seen.delays.append(delay)
+            observation.delays.append(delay)
         times.append(t)
         last, last_seq = image, seq
-        seen.frames += 1
-        report(seen.frames)
+        observation.frames += 1
+        report(observation.frames)
     if reader.live and times:
-        seen.stopped = f"it ended after {times[-1] - times[0]:.1f} s"
+        observation.stopped = f"it ended after {times[-1] - times[0]:.1f} s"
 
 
 def _next(reader: FrameReader) -> tuple[Image, float, int | None] | None:
-    """The next frame, its time, and its number where the recording remembers one."""
+    """The next frame, its time, and its number if the recording has one."""
     if not isinstance(reader, StampedReader):
         frame = reader.read()
         return None if frame is None else (*frame, None)

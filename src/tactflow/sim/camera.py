@@ -1,7 +1,7 @@
-"""The simulated camera: where a point of the gel lands on the sensor, and what the electronics add.
+"""The simulated camera: projection of the gel to the raw frame, noise and compression.
 
-The gel plane and the raw frame share one unit (raw pixels); without perspective and distortion they are
-the same plane. Everything is closed-form or solved to machine precision, so that truth can be mapped too.
+The gel plane and the raw frame share one unit (raw pixels); without perspective and distortion they coincide.
+Everything is closed-form or solved to machine precision, so that truth can be mapped too.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ SIZE = (800, 600)
 NOISE_UNIT = 4096.0
 """Integer steps of the noise bank per standard deviation."""
 _APERTURE_EDGE = 3.0
-"""Width of the unsharp rim of the aperture, px. Chosen by hand."""
+"""Width of the blurred edge of the aperture, px. Chosen by hand."""
 _NEWTON_STEPS = 12
-"""Steps by which the distortion is inverted; they converge quadratically, to machine precision."""
+"""Newton steps to invert the distortion, enough for machine precision."""
 _BANK_SPAN = 1 << 22
 _BANK_STEP = 2592173
-"""Offsets into the noise bank, elements, and the step from one frame's to the next. An odd step near span /
-golden ratio visits all 2**22 offsets before it repeats one, and keeps any two of the first n at least
-span / (2.7 n) apart."""
+"""Number of offsets into the noise bank, and the step between consecutive frames, elements. An odd step near
+span / golden ratio visits all 2**22 offsets before repeating, and keeps any two of the first n at least span
+/ (2.7 n) apart."""
 
 
 @dataclass(frozen=True)
@@ -107,18 +107,18 @@ class Camera:
         return np.asarray(offset * self._half_diagonal + self._center, dtype=np.float64)
 
     def aperture(self, raw: Points) -> NDArray[np.float64]:
-        """Share of the light, (N,) in [0, 1], that reaches raw pixel positions (N, 2): 0 in a black frame."""
+        """Fraction of light (N,), 0 to 1, at raw pixel positions (N, 2): 0 in the black frame."""
         radius = self.aperture_radius * self.size[1] / 2.0 if self.aperture_radius else np.inf
         inside = radius - np.hypot(raw[..., 0] - self._center[0], raw[..., 1] - self._center[1])
         return np.asarray(0.5 + 0.5 * np.tanh(inside / _APERTURE_EDGE), dtype=np.float64)
 
     def sees(self, raw: Points) -> NDArray[np.bool_]:
-        """(N,): which raw positions (N, 2) lie in the frame and get light."""
+        """(N,) bool: whether raw positions (N, 2) lie in the frame and are lit."""
         inside = np.all((raw >= -0.5) & (raw <= np.array(self.size) - 0.5), axis=1)
         return np.asarray(inside & (self.aperture(raw) >= 0.5))
 
     def local_inverse(self, gel: Points) -> NDArray[np.float64]:
-        """(N, 2, 2) derivative d gel / d raw at gel points (N, 2): how a small dot is deformed."""
+        """(N, 2, 2) derivative d gel / d raw at gel points (N, 2), the deformation of a small dot."""
         step = 0.01
         raw = self.to_raw(gel)
         columns = []
@@ -142,9 +142,9 @@ def _noise_bank(seed: int, count: int) -> NDArray[np.int16]:
 def sensor_noise(seed: int, index: int, shape: tuple[int, int, int]) -> NDArray[np.int16]:
     """Standard normal noise of one frame as a read-only view, in units of 1 / `NOISE_UNIT`.
 
-    Drawing 1.4 million normals costs 12 ms; a window of a fixed bank costs nothing. Window `index` starts at
-    an offset that no other of 2**22 frames uses, so that at each pixel every frame sees a draw of its own;
-    two frames share draws only at positions apart from each other.
+    Drawing 1.4 million normals takes 12 ms; a window of a fixed bank takes no time. Each of 2**22 frames has
+    a unique offset, so the noise of a pixel is different in every frame; two frames share values only at
+    different positions.
     """
     count = shape[0] * shape[1] * shape[2]
     start = (index * _BANK_STEP + seed * 7919) % _BANK_SPAN
@@ -152,6 +152,6 @@ def sensor_noise(seed: int, index: int, shape: tuple[int, int, int]) -> NDArray[
 
 
 def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    """The image (H, W, 3) uint8 after a JPEG round trip at `quality` in 1..100."""
+    """An image (H, W, 3) uint8 after a JPEG round trip; quality 1 to 100."""
     _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), dtype=np.uint8)

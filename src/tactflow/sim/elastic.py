@@ -1,9 +1,8 @@
-"""The force of an indenter on the simulated gel by a linear-elastic law, to test fits of the force.
+"""The force of an indenter on the simulated gel, to test force calibration.
 
-The gel is a bed of springs on which shear acts apart from pressure (Winkler): where it is in contact, each
-bit of it pushes back in proportion to how far it has sunk, and drags back in proportion to how far it moved.
-What a calibration sees is not of this form: its heights come from colours, its outline from a threshold, and
-its shear from a few dots.
+The gel is a linear-elastic bed of springs with independent pressure and shear (Winkler): in contact, normal
+pressure is proportional to depth, and traction to displacement. The inputs of a calibration differ from this
+model: its heights come from colours, its outline from a threshold, and its shear from a few dots.
 
 References
 ----------
@@ -20,18 +19,18 @@ import numpy as np
 from tactflow.sim.gel import Press, displacement, reached, surface
 
 MM: Final = 0.025
-"""Millimetres per raw pixel that the simulated gel is given: its balls have a radius of 2.375 mm."""
+"""Millimetres per raw pixel of the simulated gel: its balls have a radius of 2.375 mm."""
 STIFFNESS: Final = 1.0
-"""Pressure per depth, N/mm^3: a layer of 3 mm of a gel whose constrained modulus is 3 N/mm^2. By hand."""
+"""Pressure per depth, N/mm^3: a 3 mm layer with a constrained modulus of 3 N/mm^2. Chosen by hand."""
 SHEAR_STIFFNESS: Final = 0.1
 """Traction per displacement along the gel, N/mm^3. Chosen by hand."""
 _STEP: Final = 3.0
-"""Distance of the points at which pressure and traction are computed, px. Chosen by hand: half of it changes
-the force by less than 0.2 %."""
+"""Grid spacing for pressure and traction, px. Chosen by hand: halving it changes the force by less than 0.2
+%."""
 
 
 def force(presses: Sequence[Press]) -> tuple[float, float, float]:
-    """(x, y, z), N, by which all indenters act on the gel: x right and y down in the gel, z presses.
+    """Total force (x, y, z), N, of the indenters on the gel: x right, y down, z into the gel.
 
     >>> force(())
     (0.0, 0.0, 0.0)
@@ -46,7 +45,7 @@ def force(presses: Sequence[Press]) -> tuple[float, float, float]:
         depth = reached(press, x, y)
         touched = depth > press.sink * press.depth
         points = np.stack([x[touched], y[touched]], axis=1).astype(np.float64)
-        # Gel that is here now was where its displacement here, to first order, says.
+        # First-order inverse of the displacement.
         moved = displacement(presses, points - displacement(presses, points))
         total[:2] += SHEAR_STIFFNESS * MM * area * moved.sum(axis=0)
         total[2] += STIFFNESS * MM * area * float(surface(press, depth)[touched].sum())

@@ -1,7 +1,6 @@
-"""Writing a scene to disk: the frames without loss, and the truth beside them.
+"""Write a scene to disk: lossless frames, and the truth.
 
-Frames are rendered and written one at a time. A file appears under its name only when it is complete; until
-then its name begins with a dot.
+Frames are rendered and written one at a time. Until a file is complete, its name begins with a dot.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ from tactflow.system.files import completed
 VIDEO_SUFFIXES = (".avi", ".mkv")
 TRUTH_SUFFIXES = (".jsonl", ".npz", ".csv")
 Report = Callable[[int], None]
-# Lossless through OpenCV, and every frame written so far can be read after a crash.
+# Lossless in OpenCV, and readable up to the last frame after a crash.
 _FOURCC = "HFYU"
 _ARRAYS = ("contact_mask", "touching", "area", "depth", "position", "visible")
-"""What a `.npz` holds of every frame as it is."""
+"""Attributes of `Truth` that a `.npz` file contains unchanged."""
 
 
 class NotLosslessError(RuntimeError):
-    """The video that was written does not give the same frames back."""
+    """The video that was written does not decode to the same frames."""
 
 
 def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
     """Write all frames of a scene.
 
     path : `.npy` (uint8 N x H x W x 3 BGR), `.avi` or `.mkv` (HFYU, read back and compared frame by frame),
-        or, without a suffix, a folder of numbered PNG files. What is there is replaced.
+        or, without a suffix, a folder of numbered PNG files. Overwrites existing files.
     report : called with the number of frames written so far.
 
     Raises
     ------
-    ValueError : a suffix that is not one of these. OSError : the place cannot be written.
+    ValueError : an unsupported suffix. OSError : the path is not writable.
     NotLosslessError : the video codec of this machine is not lossless.
     """
     kind = frames_kind(path)
@@ -57,15 +56,14 @@ def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) 
 def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
     """Write the truth about all frames, in raw pixel coordinates.
 
-    path : `.jsonl` is one JSON object a frame: frame, t (s), touching, center, angle, hull, area, depth,
-        origin, position, visible, mean_flow, with null for unknown values. `.npz` holds the same as
-        arrays, with contact_mask (N, H, W) bool besides: center, angle and mean_flow are 0 where `touching`,
-        `directed` and `has_flow` are false; the hull of frame i is hull[hull_start[i]:hull_start[i + 1]].
-        All of it is held in memory until it is written.
-        `.csv` is what a gauge would write: t (s), fx, fy, fz (N).
+    path : `.jsonl` has a JSON object per frame: frame, t (s), touching, center, angle, hull, area, depth,
+        origin, position, visible, mean_flow, null if missing. `.npz` has the same as arrays, and contact_mask
+        (N, H, W) bool: center, angle and mean_flow are 0 where `touching`, `directed` and `has_flow` are
+        false; the hull of frame i is hull[hull_start[i]:hull_start[i + 1]]. It is assembled in memory. `.csv`
+        is the log of a force gauge: t (s), fx, fy, fz (N).
     report : called with the number of frames written so far.
 
-    Raises ValueError for another suffix and OSError where the place cannot be written.
+    Raises ValueError for an unsupported suffix and OSError if the path is not writable.
     """
     suffix = path.suffix.lower()
     if suffix not in TRUTH_SUFFIXES:
@@ -75,7 +73,7 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
 
 
 def frames_kind(path: Path) -> str:
-    """`npy`, `video` or `folder`; ValueError for any other suffix."""
+    """`npy`, `video` or `folder`; raises ValueError for an unsupported suffix."""
     suffix = path.suffix.lower()
     if suffix == ".npy":
         return "npy"
@@ -87,7 +85,7 @@ def frames_kind(path: Path) -> str:
 
 
 def _write_npy(scene: Scene, path: Path, report: Report) -> None:
-    # Written, not mapped: a full disk then is an error of write(), not a SIGBUS.
+    # Not memory-mapped, so that a full disk raises OSError instead of SIGBUS.
     width, height = scene.size
     header = {"descr": "|u1", "fortran_order": False, "shape": (len(scene), height, width, 3)}
     with path.open("wb") as file:
@@ -114,13 +112,13 @@ def _write_video(scene: Scene, path: Path, report: Report) -> None:
     reader = cv2.VideoCapture(str(path))
     try:
         for index, expected in enumerate(sums):
-            there, image_back = reader.read()
-            if not there:
+            ok, decoded = reader.read()
+            if not ok:
                 raise OSError(
                     f"{path}: only {index} of {len(sums)} frames can be read back; is the disk full?"
                 )
-            if zlib.crc32(image_back.tobytes()) != expected:
-                raise NotLosslessError(f"{path}: frame {index} reads back different; write .npy instead")
+            if zlib.crc32(decoded.tobytes()) != expected:
+                raise NotLosslessError(f"{path}: frame {index} decodes differently; write .npy instead")
     finally:
         reader.release()
 

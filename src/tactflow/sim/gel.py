@@ -1,13 +1,13 @@
-"""The gel: where an indenter touches it, what its surface looks like, and how its markers move.
+"""The gel: contact region, surface and displacement under an indenter.
 
-Contact. A soft surface gives way before it is touched. Around a ball of radius R pressed by d into a deep gel
-it has sunk by d / 2 at the edge of the contact, whose radius is sqrt(R d) (Hertz); a thin layer on a plate
-sinks only where it is touched, and the radius is the sqrt(2 R d) of the geometric overlap (Johnson, Contact
-Mechanics, 1985, ch. 4 and 5.8). The gel of a sensor is a layer of moderate depth: here it has sunk by
-`SINK_IN` d at the edge, and for every shape the contact is where the indenter reaches deeper than that. There
-the gel's surface is the indenter's surface. Around it the surface decays smoothly to rest, as the pyramid of
-Gaussians of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors",
-RA-L 2022) makes it, but in closed form: with s = SINK_IN d it is s exp(RIM (reached / s - 1)).
+A soft surface sinks around a contact. When a ball of radius R is pressed by d into a deep gel, the surface
+has sunk by d / 2 at the edge of the contact, whose radius is sqrt(R d) (Hertz); a thin layer on a plate sinks
+only in the contact, whose radius is the sqrt(2 R d) of the geometric overlap (Johnson, Contact Mechanics,
+1985, ch. 4 and 5.8). A sensor's gel lies in between: here it sinks by s = SINK_IN d at the edge, and for
+every shape the contact is where the indenter reaches deeper than s. In the contact, the surface is that of
+the indenter. Around it, the surface decays as s exp(RIM (reached / s - 1)), a closed form of the Gaussian
+pyramid of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L
+2022).
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from numpy.typing import NDArray
 from tactflow.sim.shapes import Array, Shape
 
 SINK_IN = 0.3
-"""Share of the depth by which the gel has sunk at the edge of a contact. Chosen by hand, between a thin layer
+"""Depth of the surface at the edge of a contact, relative to full depth. Chosen by hand, between a thin layer
 (0) and a deep gel (0.5)."""
 RIM = 0.6
-"""Slope of the surface just outside a contact, relative to just inside: the crease at the edge.
-Chosen by hand."""
+"""Slope of the surface just outside a contact relative to just inside; less than 1 is a crease. Chosen by
+hand."""
 TOUCH_DEPTH = 0.25
 """Depth below which an indenter does not count as touching, px. Chosen by hand."""
-_MOST_STICK = 0.999
-"""Part of a contact's radius that sticks at most: where all sticks, the edge has a traction without bound."""
+_MAX_STICK = 0.999
+"""Maximum relative radius of the stick region: full stick would have infinite traction at the edge."""
 _BISECTIONS = 20
-"""Steps in which the radius of a contact is found: to a millionth of an indenter's reach."""
+"""Bisection steps for the radius of a contact: to a millionth of an indenter's reach."""
 SHEAR_SPREAD = 110.0
-"""How far around a contact the gel follows its shear and twist, px (standard deviation of a Gaussian).
-Chosen by hand: four to five pitches of the markers."""
+"""Standard deviation of the Gaussian decay of shear and twist around a contact, px. Chosen by hand: four to
+five marker pitches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +42,11 @@ class Press:
     """One indenter at one moment.
 
     x, y : its origin in gel coordinates, px. angle : rotation, radians, clockwise on the screen (y down).
-    depth : px, 0 when it is off the gel.
-    shear : (sx, sy) by which the gel under it has been dragged, px. twist : the same for rotation, radians.
-    dilation : largest displacement by which the press pushes the gel apart, px.
-    sink, rim : the gel's `SINK_IN` and `RIM`.
-    stick : for a ball, radius of the part of the contact that still follows the shear over that of the whole
-        contact, 0 to 1: around it the gel slips (Mindlin). None: all of the contact follows.
-    sliding : whether the indenter moves on while the gel under it stays behind.
+    depth : px, 0 off the gel. shear : (sx, sy), displacement of the gel under it, px. twist : rotation of the
+    gel under it, radians. dilation : maximum outward displacement of the gel, px. sink, rim : `SINK_IN` and
+    `RIM`.
+    stick : for a ball, radius of the stick region relative to the contact's, 0 to 1, with slip around it
+    (Mindlin). None: no slip. sliding : whether the indenter moves relative to the gel under it.
     """
 
     shape: Shape
@@ -66,7 +64,7 @@ class Press:
 
     @property
     def radius(self) -> float:
-        """Distance from the origin along x up to which the gel is in contact, px: the radius of a ball's."""
+        """Extent of the contact along x from the origin, px: for a ball, its contact radius."""
         near, far = 0.0, self.shape.reach
         for _ in range(_BISECTIONS):
             middle = np.array([(near + far) / 2], np.float32)
@@ -76,7 +74,7 @@ class Press:
 
     @property
     def stick_ratio(self) -> float:
-        """Share of the contact's area on which the gel sticks to the indenter."""
+        """Share of the contact's area that sticks to the indenter."""
         if self.sliding:
             return 0.0
         return 1.0 if self.stick is None else self.stick**2
@@ -88,7 +86,7 @@ class Press:
 
 
 def reached(press: Press, x: Array, y: Array) -> Array:
-    """Depth the indenter reaches below the untouched surface at (x, y), px; negative where it stays above."""
+    """Depth of the indenter below the untouched surface at (x, y), px; negative above it."""
     cos, sin = np.float32(np.cos(press.angle)), np.float32(np.sin(press.angle))
     dx, dy = x - np.float32(press.x), y - np.float32(press.y)
     gap = press.shape.gap(dx * cos + dy * sin, dy * cos - dx * sin)
@@ -96,7 +94,7 @@ def reached(press: Press, x: Array, y: Array) -> Array:
 
 
 def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_]:
-    """Where the gel is in contact: bool, of the shape of x and y (float32 gel coordinates, px)."""
+    """Whether the gel is in contact: bool of the shape of x and y (float32 gel coordinates, px)."""
     mask = np.zeros(x.shape, dtype=np.bool_)
     for press in presses:
         if press.touching:
@@ -105,19 +103,18 @@ def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_
 
 
 def surface(press: Press, depth: Array) -> Array:
-    """How far the gel's surface has sunk, px >= 0, from the depth that `reached` gives."""
+    """Depth of the gel's surface, px >= 0, from the result of `reached`."""
     sink = np.float32(press.sink * press.depth)
     outside = sink * np.exp(np.float32(press.rim) * (np.minimum(depth, sink) / sink - np.float32(1.0)))
     return np.maximum(depth, outside)
 
 
 def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 2) float64 displacement, px, of gel points whose rest positions (N, 2) are given.
+    """Displacement (N, 2) float64, px, of gel points with rest positions (N, 2).
 
-    Press pushes the gel apart, shear drags it along, twist turns it about the contact, each with a Gaussian
-    decay around the contact, after FOTS (Zhao et al., RA-L 2024). Shear and twist act in full within the
-    push's spread around the shape and fade beyond; all fade with the depth when the contact is released.
-    The spread grows with the shear so that its slope stays below 1: the gel never folds over.
+    The sum of dilation, shear and twist, each with a Gaussian decay around the contact, after FOTS (Zhao et
+    al., RA-L 2024). Shear and twist are constant within the shape's spread; all terms vanish with the depth
+    on release. The spread grows with the shear to keep its slope below 1, so that the gel never folds.
     """
     moved = np.zeros_like(rest)
     for press in presses:
@@ -144,7 +141,7 @@ def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray
             if press.stick is not None:
                 weight = partial_slip(distance / max(press.radius, 1e-6), press.stick)
             turn = weight * press.twist * grip
-            # A turn by an angle that varies with the distance keeps areas; a faded displacement would not.
+            # Scaling the angle, not the displacement, preserves areas.
             moved[:, 0] += offset[:, 0] * (np.cos(turn) - 1.0) - offset[:, 1] * np.sin(turn)
             moved[:, 1] += offset[:, 0] * np.sin(turn) + offset[:, 1] * (np.cos(turn) - 1.0)
             moved += weight[:, None] * shear
@@ -152,26 +149,27 @@ def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray
 
 
 def partial_slip(distance: NDArray[np.float64], stick: float) -> NDArray[np.float64]:
-    """How far the gel follows a ball that is dragged along, 0 to 1, where only the middle still sticks.
+    """Relative displacement of the gel under a dragged ball with partial slip: 1 in the stick region, less
+    outside.
 
-    distance : (N,), from the middle, in radii of the contact. stick : radius of the part that sticks, in
-    radii of the contact, 0 to 1. There the result is 1; around it the gel follows less and less.
+    distance : (N,), from the centre, in contact radii. stick : radius of the stick region in contact radii, 0
+    to 1.
 
     References
     ----------
     R. D. Mindlin, "Compliance of elastic bodies in contact", J. Appl. Mech. 16 (1949); K. L. Johnson, Contact
-    Mechanics (1985), ch. 7.2: the traction of full slip on the contact less one of the same form on the part
-    that sticks, each with the displacement that a Hertz pressure has (eq. 3.41, 3.42).
+    Mechanics (1985), ch. 7.2: the traction of full slip on the contact minus one of the same form on the
+    stick region, with the displacements of Hertz pressures (eq. 3.41, 3.42).
 
     >>> partial_slip(np.array([0.0, 0.5, 1.0]), 0.0).tolist()
     [1.0, 0.875, 0.5]
     """
-    stick = min(stick, _MOST_STICK)
+    stick = min(stick, _MAX_STICK)
     return np.asarray((_hertz(distance, 1.0) - _hertz(distance, stick)) / (2 * (1 - stick * stick)))
 
 
 def _hertz(distance: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
-    """Form of the displacement, 1, at distances from the middle of a Hertz traction on a disc."""
+    """Unnormalised displacement at distances from the centre of a Hertz traction on a disc."""
     if radius <= 0:
         return np.zeros_like(distance)
     away = np.maximum(distance, radius)

@@ -1,11 +1,11 @@
-"""How the gel is lit: the untouched gel, and how its light changes where the surface tilts.
+"""Illumination: the untouched gel, and shading of its deformed surface.
 
-Three coloured lights graze the gel from three sides, so that each colour channel answers to the slope of
-the surface in one direction: photometric stereo as in GelSight (Yuan, Dong and Adelson, "GelSight:
+Three coloured lights at grazing angles make each colour channel respond to the slope of the surface in one
+direction: photometric stereo as in GelSight (Yuan, Dong and Adelson, "GelSight:
 High-Resolution Robot Tactile Sensors for Estimating Geometry and Force", Sensors 2017). With the elevation e
-of a light and the horizontal direction t towards it, a Lambertian surface of height z and slope g = grad z
-answers (1 - cot(e) g . t) / sqrt(1 + |g|^2), which is 1 at rest. Seen from inside, where the camera sits,
-a pressed place is a hill.
+of a light and the horizontal direction t towards it, the shading of a Lambertian surface with slope g = grad
+z is (1 - cot(e) g . t) / sqrt(1 + |g|^2), which is 1 at rest. Seen from the camera inside, an indentation is
+a hill.
 """
 
 from __future__ import annotations
@@ -23,17 +23,16 @@ from tactflow.sim.shapes import Array
 
 @dataclass(frozen=True)
 class Light:
-    """A named sensor.
+    """The illumination of a type of sensor.
 
-    azimuth : of the blue, green and red light, degrees, counter-clockwise as seen on the screen.
+    azimuth : of the blue, green and red light, degrees, counter-clockwise on the screen.
     level : grey level of the untouched gel at the centre, blue, green, red.
-    falloff : how much brighter the gel is near a light than far from it, 0 for even light.
-    slope_gain : cotangent of the lights' elevation, one for all or one each; more makes a tilted surface more
-        colourful.
-    ambient : share of the light that comes from everywhere, in [0, 1].
-    brightening : grey levels by which all channels rise in a contact of full depth; negative: fall.
-    onset : depth beyond the contact's edge over which they do, as a share of the full depth.
-    halo : grey levels by which the gel is brighter just outside a contact of full depth.
+    falloff : decrease of brightness with the distance from a light, 0 for uniform light.
+    slope_gain : cotangent of the lights' elevation, common or per light; higher values give stronger colours.
+    ambient : fraction of diffuse light, 0 to 1.
+    brightening : change of all channels in a contact of full depth, grey levels.
+    onset : depth range of this change beyond the contact's edge, relative to full depth.
+    halo : brightening just outside a contact of full depth, grey levels.
     """
 
     azimuth: tuple[float, float, float]
@@ -46,18 +45,18 @@ class Light:
     halo: float = 0.0
 
     def tilt(self) -> NDArray[np.float32]:
-        """(3, 2) float32: change of a channel's relative light per unit slope in x and y."""
+        """(3, 2) float32: relative change of each channel per unit slope in x and y."""
         angle = np.radians(np.asarray(self.azimuth))
         toward = np.stack([np.cos(angle), -np.sin(angle)], axis=1)
         return np.asarray(-toward * np.reshape(self.slope_gain, (-1, 1)), dtype=np.float32)
 
 
 LIGHTS = {
-    # Three coloured lights; a contact answers with colour.
+    # Three coloured lights; a contact changes the colour.
     "photometric": Light((325.0, 80.0, 205.0), (122.0, 136.0, 118.0), 0.4, 1.9, 0.25, 0.0),
-    # White light; a contact brightens in all channels.
+    # White light; a contact brightens all channels.
     "bright": Light((325.0, 80.0, 205.0), (98.0, 104.0, 100.0), 0.12, 0.10, 0.5, 58.0),
-    # Coloured lights, and a contact brightens too.
+    # Coloured lights; a contact changes colour and brightness.
     "mixed": Light((325.0, 80.0, 205.0), (106.0, 114.0, 104.0), 0.35, 0.7, 0.35, 46.0),
     # Three coloured lights; the red one grazes the gel, which is nearly dark in it until it is touched.
     "dark_channel": Light((325.0, 80.0, 205.0), (115.0, 132.0, 12.0), 0.4, (0.5, 1.9, 9.0), 0.25, 0.0),
@@ -74,7 +73,7 @@ def untouched_gel(
     half_diagonal: float,
     dim: float = 1.0,
 ) -> NDArray[np.float32]:
-    """(H, W, 3) float32 grey levels, BGR, of the gel at rest, at gel coordinates x, y (H, W), px."""
+    """Grey levels (H, W, 3) float32, BGR, of the gel at rest, at gel coordinates x, y (H, W), px."""
     angle = np.radians(np.asarray(light.azimuth))
     image = np.empty((*x.shape, 3), np.float32)
     for channel in range(3):
@@ -85,7 +84,7 @@ def untouched_gel(
 
 
 def texture(shape: tuple[int, int], strength: float, seed: int) -> NDArray[np.float32]:
-    """(H, W, 1) float32: the grain of the gel's coating, relative, standard deviation `strength` / 100."""
+    """(H, W, 1) float32: factor for the grain of the coating, with standard deviation `strength` / 100."""
     return _grain(shape, seed) * np.float32(strength / 100.0) + np.float32(1.0)
 
 
@@ -100,9 +99,9 @@ def _grain(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
 
 
 def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
-    """(h, w, 3) float32: light of a deformed surface relative to the surface at rest, >= 0.
+    """(h, w, 3) float32: shading of a deformed surface relative to rest, >= 0.
 
-    depth : (h, w) float32, how far the surface has sunk, px, sampled every `step` px.
+    depth : (h, w) float32, depth of the surface, px, sampled every `step` px.
     """
     slope_x = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
     slope_y = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
@@ -118,7 +117,7 @@ def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
 
 
 def brightness(light: Light, press: Press, depth: Array) -> Array:
-    """Grey levels (h, w) that a contact adds to all channels; `depth` (h, w) px, as `reached` gives it."""
+    """Grey levels (h, w) that a contact adds to all channels. depth : (h, w), px, from `reached`."""
     share = press.depth / press.shape.depth
     grown, set_in = 0.45 + 0.55 * share, min(1.0, share / 0.1)
     beyond = (depth - np.float32(press.sink * press.depth)) * np.float32(
@@ -133,19 +132,19 @@ def brightness(light: Light, press: Press, depth: Array) -> Array:
 
 
 def settling(moment: int, frames: int) -> NDArray[np.float64]:
-    """(3,) gains, BGR, of a camera that begins too bright and too blue and is right after so many frames.
+    """Gains (3,), BGR, of a camera that starts too bright and too blue and settles within `frames`.
 
-    The way is that of a control loop: fast at first, without a step at its end. In the first frame the
-    brighter parts of the gel are clipped.
+    Like a control loop, they change fast at first and end smoothly. The first frame clips bright parts of the
+    gel.
     """
     left = max(1.0 - moment / frames, 0.0) ** 2 if frames else 0.0
     return np.asarray(1.0 + left * np.array([0.9, 0.7, 0.5]))
 
 
 def lamp(size: tuple[int, int], strength: float) -> NDArray[np.float32]:
-    """(H, W, 3) float32: the gel's light after a lamp was switched on at its right, relative to before.
+    """(H, W, 3) float32: factor on the light after a lamp on the right is switched on.
 
-    size : (width, height) px. strength : of the lamp in the middle, relative.
+    size : (width, height), px. strength : relative light of the lamp at the centre.
     """
     side = np.linspace(0.65, 1.35, size[0], dtype=np.float32) * np.float32(strength)
     row = 1.0 + side[:, None] * np.array([0.8, 1.0, 1.2], np.float32)
@@ -153,7 +152,8 @@ def lamp(size: tuple[int, int], strength: float) -> NDArray[np.float32]:
 
 
 def add_mirror_spots(image: NDArray[np.float32], x: Array, y: Array, strength: float, seed: int) -> None:
-    """Add mirror images of lamps to the untouched gel (H, W, 3), grey levels; x, y : (H, W) coordinates."""
+    """Add specular reflections of lamps to the untouched gel (H, W, 3), grey levels; x, y : (H, W)
+    coordinates."""
     rng = np.random.default_rng([seed, 0x7370])
     height, width = x.shape
     for _ in range(4):
@@ -164,7 +164,7 @@ def add_mirror_spots(image: NDArray[np.float32], x: Array, y: Array, strength: f
 
 @lru_cache(maxsize=2)
 def blotches(size: tuple[int, int], contrast: float, seed: int) -> Array:
-    """(H, W) float32: the light that a random pattern of blotches some 15 px wide lets through."""
+    """(H, W) float32: light transmitted by a random pattern of blotches about 15 px wide."""
     draw = np.random.default_rng([seed, 0x626C]).standard_normal((size[1], size[0]), dtype=np.float32)
     smooth = np.asarray(cv2.GaussianBlur(draw, (0, 0), 5.0), dtype=np.float32)
     pattern = 0.5 + 0.5 * np.tanh(2.0 * smooth / float(smooth.std()))
@@ -174,7 +174,7 @@ def blotches(size: tuple[int, int], contrast: float, seed: int) -> Array:
 
 
 def highlight(depth: Array, step: float, strength: float) -> Array:
-    """(h, w) float32 grey levels: the mirror image of a lamp on the slope that faces it."""
+    """(h, w) float32 grey levels: specular reflection of a lamp on the slope that faces it."""
     slope_x = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
     slope_y = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
     off = (slope_x - np.float32(0.13)) ** 2 + (slope_y - np.float32(0.16)) ** 2

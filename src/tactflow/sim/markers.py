@@ -1,8 +1,8 @@
-"""Markers on the gel: where they are printed, and how they are drawn with exact sub-pixel centres.
+"""Markers on the gel: their layout, and drawing with exact sub-pixel centres.
 
-A marker is drawn by evaluating its shape, blurred by the lens, at each pixel's centre. The edge is a logistic
-ramp of `EDGE` px standard deviation, close to that of a Gaussian point spread: smooth enough that sampling it
-at whole pixels moves its centre of gravity by less than 1e-3 px, wherever it lies.
+A marker is drawn by evaluating its blurred shape at each pixel's centre. Its edge is a logistic ramp of
+`EDGE` px standard deviation, similar to a Gaussian point spread function and smooth enough that sampling
+shifts the centroid by less than 1e-3 px.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from tactflow.sim.settings import Settings
 EDGE = 0.8
 """Standard deviation of the lens blur at a marker's edge, px. Chosen by hand."""
 DARK_MARKER = 0.88
-"""Share of the light that a fresh dark marker takes away. Chosen by hand."""
+"""Fraction of light that a fresh dark marker absorbs. Chosen by hand."""
 FIXED_POINT = 64.0
-"""Integer steps of the canvas per grey level. Chosen by hand: far finer than the noise, and 255 of them fit
-into 16 bits."""
+"""Fixed-point steps per grey level. Chosen by hand: much finer than the noise, and 255 levels fit into 16
+bits."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What is printed on the gel.
+    """The markers printed on the gel.
 
-    rest : (N, 2) float64 positions on the untouched gel, px. contrast : (N,) in [0, 1], 1 for a fresh marker.
+    rest : (N, 2) float64, positions on the untouched gel, px. contrast : (N,) in [0, 1], 1 for a fresh
+    marker.
     group : (N,) int; markers of the same group never overlap. pitch, radius : px.
     """
 
@@ -46,7 +47,7 @@ def layout(settings: Settings, size: tuple[int, int]) -> Layout:
     across = (np.arange(columns) - (columns - 1) / 2.0) * pitch + (width - 1) / 2.0
     down = (np.arange(rows) - (rows - 1) / 2.0) * pitch + (height - 1) / 2.0
     rest = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-    # No printer and no mould is perfect: a hundredth of a pitch keeps centres off special sub-pixel phases.
+    # A random offset of a hundredth of a pitch, as in a real print, avoids special sub-pixel phases.
     rest = rest + rng.normal(0.0, 0.01, rest.shape) * pitch
     rest += np.clip(rng.normal(0.0, 1.0, rest.shape), -1.5, 1.5) * (settings.jitter * pitch)
     parity = np.stack(np.meshgrid(np.arange(columns) % 2, np.arange(rows) % 2), axis=-1).reshape(-1, 2)
@@ -69,7 +70,7 @@ def coverage(
     radius: float,
     shape: str,
 ) -> NDArray[np.float32]:
-    """How much of a pixel at offset (x, y) from a marker's centre the marker covers, in [0, 1]."""
+    """Fraction of a pixel at offset (x, y), px, from a marker's centre that the marker covers."""
     r = np.float32(radius)
     if shape == "square":
         return _ramp(r - np.abs(x)) * _ramp(r - np.abs(y))
@@ -82,7 +83,7 @@ def coverage(
 
 
 def half_patch(radius: float, shape: str, scale: float = 1.0) -> int:
-    """Pixels around a marker's centre, to each side, outside which it leaves no trace."""
+    """Half the side of the square, px, outside which a marker is invisible."""
     extent = {"round": 1.0, "square": 1.4143, "doubled": 1.45}[shape]
     return int(np.ceil(radius * extent * scale + 5.0 * EDGE)) + 1
 
@@ -102,15 +103,15 @@ def draw(
     """Paint markers onto a padded canvas, in place.
 
     canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT`.
-    centers : (N, 2) positions without the padding, px. strength : (N,) in [0, 1], how opaque each is.
+    centers : (N, 2) positions without the padding, px. strength : (N,) opacity, 0 to 1.
     radius : px. half : see `half_patch`.
-    bright : grey level of a bright marker, or None for a dark one, which lets 12 % of the light through.
-    deform : (N, 2, 2), from offsets in the image to offsets on the gel; None where they are equal.
+    bright : grey level of a bright marker, None for dark ones. deform : (N, 2, 2), Jacobian from the image to
+    the gel; None for the identity.
     """
     padded_height, padded_width = canvas.shape[:2]
     anchor = np.rint(centers).astype(np.int64)
-    # A marker whose centre is outside still shows if its edge reaches in. Where its patch leaves the padding,
-    # the indices are clamped to the outermost padding, which is cut off.
+    # A marker outside the frame may still reach in. Indices beyond the padding are clamped to its invisible
+    # edge.
     reachable = np.all(anchor > -half, axis=1)
     reachable &= (anchor[:, 0] < padded_width - half) & (anchor[:, 1] < padded_height - half)
     span = np.arange(-half, half + 1)

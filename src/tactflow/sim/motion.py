@@ -1,7 +1,6 @@
-"""What the indenters do: programmes of press, hold and release, random but reproducible.
+"""Motion of the indenters: programmes of press, hold and release, random but reproducible.
 
-Frame 0 and the first tenth of a recording, at most two seconds, show the untouched gel, and so do its last
-frames.
+The gel is untouched in the first tenth of a recording (one frame to two seconds) and in its last frames.
 """
 
 from __future__ import annotations
@@ -18,39 +17,40 @@ from tactflow.sim.settings import Settings
 from tactflow.sim.shapes import Shape
 
 _REST = 0.1
-"""Part of a recording at its start in which nothing touches the gel; chosen by hand."""
+"""Initial fraction of a recording without contact; chosen by hand."""
 
 _LONGEST_REST = 120
-"""The same at most, frames: 2 s at 60 frames a second."""
+"""Its maximum, frames: 2 s at 60 frames/s."""
 
 _LAST_REST = 30
-"""One frame of so many is left untouched at the end of a recording; chosen by hand."""
+"""Length of a recording per untouched frame at its end; chosen by hand."""
 
 _FULL_LOAD = 0.75
-"""Part of a hold after which a ball that slips at the edge first slips altogether. Chosen by hand."""
+"""Fraction of a hold after which partial slip becomes full slip. Chosen by hand."""
 
 _LARGEST_CREEP = 60.0
-"""Farthest that a creeping gel is dragged before it turns back, px; chosen by hand."""
+"""Amplitude of creep before it reverses, px; chosen by hand."""
 
 _LARGEST_STROKE = 110.0
-"""Contacts move the gel in proportion to the markers' pitch, up to this pitch, px. Chosen by hand."""
+"""Maximum marker pitch, px, to which displacements of the gel are proportional. Chosen by hand."""
 
 _LARGEST_JUMP = 0.45
-"""Farthest that a jumping gel is from its middle, pitches: jumps of up to 0.9 pitches from place to place."""
+"""Maximum displacement of a jumping gel from its rest position, pitches: jumps of up to 0.9 pitches."""
 
 
 @dataclass(frozen=True)
 class Programme:
     """A series of contacts; lengths of time are in frames.
 
-    build : makes the indenter(s). offsets : where each of them sits, px.
-    period : from one contact to the next. rise : from touch to full depth, and back. hold : time at depth.
-    depths : relative depth of successive contacts. place : their mean position as a fraction of the frame;
-    wander : how far from it they may be, px. angles : range of the indenter's angle, degrees.
-    travel : px by which the indenter slides during a hold. jumps : if true, the gel is dragged to a new place
-    every third frame. creep : px per frame by which the gel is dragged. dilation : pitches by which a press
-    pushes the gel apart. contacts : so many that share the length of the recording; 0: as many as fit.
-    partial : whether the gel begins to slip at the edge of the contact before all of it does; for balls.
+    build : creates the indenter(s) for a bend in degrees. offsets : their positions, px. period : time
+    between contacts. rise : time from touch to full depth, and back. hold : time at full depth. depths :
+    relative depths of successive contacts. place : mean position as a fraction of the frame; wander : maximum
+    deviation from it, px.
+    angles : range of the indenter's angle, degrees. travel : distance the indenter slides during a hold, px.
+    jumps : whether the gel is dragged to a new position every third frame. creep : drag of the gel, px per
+    frame.
+    dilation : outward displacement by a press, pitches. contacts : number spread over the recording; 0: as
+    many as fit. partial : whether slip starts at the edge of the contact; for balls.
     """
 
     build: Callable[[float], tuple[Shape, ...]]
@@ -97,7 +97,7 @@ def _plan(programme: Programme, seed: int, cycle: int, size: tuple[int, int]) ->
     )
     direction = float(rng.uniform(0, 2 * np.pi))
     if programme.travel:
-        # Slide across the middle of the gel, not out of it.
+        # Slide towards the centre, not off the gel.
         direction = float(np.arctan2(size[1] * programme.place[1] - y, size[0] * programme.place[0] - x))
     depth = programme.depths[cycle % len(programme.depths)]
     return _Plan(float(x), float(y), angle, direction, -1.0 if cycle % 2 else 1.0, depth)
@@ -110,10 +110,10 @@ def _smooth(value: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Timing:
-    """Where in its contacts a programme is.
+    """Timing within a programme.
 
-    cycle : number of the contact. phase : frames since it began. rise : frames from touch to full depth.
-    envelope : depth now over full depth, 0 to 1. progress : part of the hold that is over, 0 to 1.
+    cycle : index of the contact. phase : frames since it began. rise : frames from touch to full depth.
+    envelope : current relative depth, 0 to 1. progress : elapsed fraction of the hold, 0 to 1.
     """
 
     cycle: int
@@ -124,7 +124,7 @@ class _Timing:
 
 
 def _timing(programme: Programme, moment: int, frames: int) -> _Timing | None:
-    """The contact at a frame of a recording of so many frames; None where nothing touches the gel."""
+    """The contact at a frame; None between contacts. frames : length of the recording."""
     start = min(max(1, round(_REST * frames)), _LONGEST_REST)
     usable = frames - start - max(1, frames // _LAST_REST)
     if moment < start or usable < 1:
@@ -150,22 +150,22 @@ def _timing(programme: Programme, moment: int, frames: int) -> _Timing | None:
 
 
 def _jump(timing: _Timing, seed: int, pitch: float) -> NDArray[np.float64]:
-    """Displacement (2,), px, drawn anew every third frame: up to 0.45 pitches from the middle."""
+    """Random displacement (2,), px, changed every third frame: up to 0.45 pitches."""
     draw = np.random.default_rng([seed, timing.cycle, int(timing.phase // 3), 0x6A75])
     angle, radius = draw.uniform(0, 2 * np.pi), _LARGEST_JUMP * pitch * np.sqrt(draw.uniform(0.3, 1))
     return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
 
 
 def _creep(programme: Programme, timing: _Timing) -> float:
-    """How far the gel has been dragged, px: to and fro, so that the contact stays on it for ever."""
-    way = programme.creep * max(timing.phase - timing.rise, 0.0) % (2 * _LARGEST_CREEP)
-    return _LARGEST_CREEP - abs(way - _LARGEST_CREEP)
+    """Current displacement of creep, px, back and forth."""
+    distance = programme.creep * max(timing.phase - timing.rise, 0.0) % (2 * _LARGEST_CREEP)
+    return _LARGEST_CREEP - abs(distance - _LARGEST_CREEP)
 
 
 def _dragged(
     programme: Programme, timing: _Timing, plan: _Plan, seed: int, pitch: float, shear: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float | None, bool]:
-    """How far the gel is dragged and the indenter has travelled, (2,) px; `stick`, `sliding` of `Press`."""
+    """Displacements (2,), px, of the gel and of the indenter; `stick` and `sliding` of `Press`."""
     ahead = plan.ahead
     farthest = shear * pitch
     if programme.jumps:
@@ -181,9 +181,10 @@ def _dragged(
         beyond = programme.travel * max(timing.progress - _FULL_LOAD, 0.0)
         return drag, drag + beyond * ahead, stick, load > 1 and timing.progress < 1
     if programme.travel:
-        # Stick until the gel has been dragged as far as friction holds it, then slip.
-        way = programme.travel * timing.progress
-        return min(way, farthest) * ahead, way * ahead, None, 0 < farthest < way and timing.progress < 1
+        # Stick up to the largest drag that friction allows, then slip.
+        distance = programme.travel * timing.progress
+        sliding = 0 < farthest < distance and timing.progress < 1
+        return min(distance, farthest) * ahead, distance * ahead, None, sliding
     swing = float(np.sin(np.pi * _smooth(timing.progress)))
     drag = farthest * swing * ahead if shear else np.zeros(2)
     return drag, drag, None, False
@@ -198,7 +199,7 @@ def presses(
     size: tuple[int, int],
     pitch: float,
 ) -> tuple[tuple[Press, ...], int]:
-    """The indenters at one moment, and the number of the contact they belong to (-1 between contacts).
+    """The indenters at a moment, and the index of their contact (-1 between contacts).
 
     moment : frame of the scene. size : (width, height) of the gel, px. pitch : of its markers, px.
     """
@@ -210,7 +211,7 @@ def presses(
     swing = float(np.sin(np.pi * _smooth(timing.progress)))
     drag, travelled, stick, sliding = _dragged(programme, timing, plan, settings.seed, pitch, settings.shear)
     turn = np.radians(settings.twist) * plan.sign * swing
-    made = [
+    indenters = [
         Press(
             shape,
             plan.x + offset_x + float(travelled[0]),
@@ -227,4 +228,4 @@ def presses(
         )
         for shape, (offset_x, offset_y) in zip(shapes, programme.offsets, strict=True)
     ]
-    return tuple(made), timing.cycle
+    return tuple(indenters), timing.cycle

@@ -1,4 +1,4 @@
-"""Renders the frames of a simulated scene."""
+"""Render the frames of a simulated scene."""
 
 from __future__ import annotations
 
@@ -19,26 +19,25 @@ Canvas = NDArray[np.int16]
 """(H, W, 3) grey levels times `FIXED_POINT`."""
 
 _STEP = 2
-"""The gel's surface is computed at every second pixel of the raw frame; the light on it is smooth. Chosen
-by hand."""
+"""Grid spacing of the gel's surface, raw px; its shading is smooth. Chosen by hand."""
 _SPECKLE_STEP = 20
-"""How far blotches are carried along is computed at every so many pixels; the gel stretches smoothly. Chosen
-by hand."""
+"""Grid spacing of the displacement of the speckle pattern, raw px; the gel stretches smoothly. Chosen by
+hand."""
 _INVERSIONS = 4
-"""Steps of the fixed-point iteration that finds where a point of the gel came from. Chosen by hand: the
-pattern need not be exact, only carried along."""
+"""Fixed-point iterations to invert the displacement of the gel. Chosen by hand: the pattern need not be
+exact."""
 _LAMP_AT = 0.475
-"""Part of a recording after which the lamp is on: between two contacts that share its length."""
+"""Fraction of a recording after which the lamp is on: between the two contacts."""
 _BRIGHT_MARKER = 225.0
 """Grey level of a bright marker; chosen by hand, below saturation."""
 _FPS = 60.0
-"""Frames a second, by which lights drift and flicker."""
+"""Frames per second, for drift and flicker of the light."""
 
 
 class Painter:
-    """Draws what the camera sees of the gel at a moment.
+    """Draws the camera's view of the gel.
 
-    settings : of the scene. camera : see `Camera`. layout : the markers as printed.
+    layout : the markers as printed.
     """
 
     def __init__(self, settings: Settings, camera: Camera, layout: markers.Layout) -> None:
@@ -52,9 +51,10 @@ class Painter:
     def frame(
         self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
-        """The raw frame, (600, 800, 3) uint8 BGR, fresh.
+        """Render the raw frame, a new (600, 800, 3) uint8 BGR array.
 
-        index : of the frame. moment : of the scene that it shows. shown : (N,), false for invisible markers.
+        index : of the frame. moment : of the scene it shows, in frames. shown : (N,), false for invisible
+        markers.
         """
         settings = self._settings
         canvas = self._canvas(index, moment, pressed, shown)
@@ -76,7 +76,7 @@ class Painter:
         return np.asarray(image, dtype=np.uint8)
 
     def clean(self, index: int, moment: int, pressed: Sequence[gel.Press]) -> NDArray[np.uint8]:
-        """The raw frame without markers, dirt and noise, (600, 800, 3) uint8 BGR, fresh."""
+        """Render the raw frame without markers, dirt and noise, a new (600, 800, 3) uint8 BGR array."""
         canvas = self._canvas(index, moment, pressed, None)
         scale = self._gain(moment) / FIXED_POINT
         return np.asarray(cv2.addWeighted(canvas, scale, canvas, 0.0, 0.0, dtype=cv2.CV_8U), dtype=np.uint8)
@@ -90,7 +90,7 @@ class Painter:
     def _canvas(
         self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_] | None
     ) -> Canvas:
-        """A frame before gain and noise; a view or fresh. shown : None to leave markers and dirt out."""
+        """A frame before gain and noise, possibly a view. shown : None to omit markers and dirt."""
         settings = self._settings
         if not pressed:
             padded = self._resting if shown is None else self._resting_marked
@@ -131,7 +131,8 @@ class Painter:
         return x, y, rng.integers(200, 256, (count, 3)).astype(np.uint8)
 
     def _gel_blocks(self, step: int) -> NDArray[np.float64]:
-        """Gel coordinates (600 // step, 800 // step, 2) of the centres of blocks of so many raw pixels."""
+        """Gel coordinates (600 // step, 800 // step, 2) of the centres of blocks of `step` x `step` raw
+        pixels."""
         width, height = SIZE
         across = np.arange(width // step) * step + (step - 1) / 2.0
         down = np.arange(height // step) * step + (step - 1) / 2.0
@@ -164,21 +165,21 @@ class Painter:
         if settings.perspective:
             image *= self._gel_window()
         if settings.aperture:
-            image *= self._framed[..., None]
+            image *= self._aperture[..., None]
         np.clip(image, 0, 500, out=image)
         fixed = np.rint(image * np.float32(FIXED_POINT)).astype(np.int16)
         half = self._half
         return np.asarray(cv2.copyMakeBorder(fixed, half, half, half, half, cv2.BORDER_REPLICATE), np.int16)
 
     @cached_property
-    def _framed(self) -> NDArray[np.float32]:
-        """(H, W): the share of the light that the aperture lets through."""
+    def _aperture(self) -> NDArray[np.float32]:
+        """(H, W): fraction of light transmitted by the aperture."""
         width, height = SIZE
         raw = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
         return self._camera.aperture(raw).astype(np.float32)
 
     def _gel_window(self) -> NDArray[np.float32]:
-        """(H, W, 1): 1 on the gel, nearly dark around it, where a tilted camera sees past its border."""
+        """(H, W, 1): 1 on the gel, nearly 0 outside, where a tilted camera sees past its edge."""
         x, y = np.moveaxis(self._gel_blocks(1), -1, 0)
         width, height = SIZE
         inside = np.minimum.reduce([x + 0.5, width - 0.5 - x, y + 0.5, height - 0.5 - y])
@@ -196,10 +197,10 @@ class Painter:
         layout, camera, settings = self._layout, self._camera, self._settings
         if settings.dirty and len(layout.rest):
             rest, strength, deform = self._dirt
-            places = camera.to_raw(rest + gel.displacement(pressed, rest))
-            # One at a time: nothing keeps two specks apart.
-            alone = np.arange(len(rest))
-            markers.draw(canvas, places, strength, alone, layout.radius, half=self._half, deform=deform)
+            centers = camera.to_raw(rest + gel.displacement(pressed, rest))
+            # Specks may overlap, so each is drawn separately.
+            groups = np.arange(len(rest))
+            markers.draw(canvas, centers, strength, groups, layout.radius, half=self._half, deform=deform)
         now = layout.rest + gel.displacement(pressed, layout.rest)
         raw = camera.to_raw(now)
         markers.draw(
@@ -231,21 +232,21 @@ class Painter:
         return self._speckle(())
 
     def _speckle(self, pressed: Sequence[gel.Press]) -> NDArray[np.float32]:
-        """(H, W): the share of the light that the blotches let through."""
+        """(H, W): fraction of light transmitted by the speckle pattern."""
         blocks = self._gel_blocks(_SPECKLE_STEP).reshape(-1, 2)
         origin = blocks
         for _ in range(_INVERSIONS if pressed else 0):
             origin = blocks - gel.displacement(pressed, origin)
         width, height = SIZE
         moved = (blocks - origin).reshape(height // _SPECKLE_STEP, width // _SPECKLE_STEP, 2)
-        place = self._gel_blocks(1) - cv2.resize(moved, SIZE, interpolation=cv2.INTER_LINEAR)
+        source = self._gel_blocks(1) - cv2.resize(moved, SIZE, interpolation=cv2.INTER_LINEAR)
         pattern = light.blotches(SIZE, self._settings.speckle, self._settings.seed)
-        x, y = place[..., 0].astype(np.float32), place[..., 1].astype(np.float32)
+        x, y = source[..., 0].astype(np.float32), source[..., 1].astype(np.float32)
         shade = cv2.remap(pattern, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         return np.asarray(shade, dtype=np.float32)
 
     def _shade(self, padded: Canvas, press: gel.Press) -> None:
-        """Change the light of a padded canvas where a contact deforms the gel, in place."""
+        """Shade the part of a padded canvas that a contact deforms, in place."""
         if press.depth <= 0:
             return
         window = self._window(press)
@@ -270,7 +271,7 @@ class Painter:
         if extra is not None:
             wide = cv2.resize(extra, full, interpolation=cv2.INTER_LINEAR) * np.float32(FIXED_POINT)
             if self._settings.aperture:
-                wide *= self._framed[
+                wide *= self._aperture[
                     _STEP * rows.start : _STEP * rows.stop, _STEP * columns.start : _STEP * columns.stop
                 ]
             lit = cv2.add(lit, cv2.merge([wide, wide, wide]))

@@ -1,4 +1,4 @@
-"""The named scenes: what presses the gel, and what ails the sensor."""
+"""The named scenes: their contacts, and the defects of their sensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from tactflow.sim.motion import Programme
 
 @dataclass(frozen=True)
 class Recipe:
-    """A scene: what it shows, what the indenters do (None: nothing), and its own settings."""
+    """A scene: description, programme of contacts (None: no contact), and settings that differ from the
+    defaults."""
 
     description: str
     programme: Programme | None
@@ -35,11 +36,11 @@ _PRESS = Programme(_sphere)
 _CABLE = Programme(
     lambda bend: (shapes.cable(bend=bend),), wander=(60.0, 60.0), angles=(-75.0, 75.0), dilation=0.25
 )
-"""Programmes that several scenes share; lengths in px of the raw frame, angles in degrees."""
+"""Programmes shared by several scenes; lengths in raw px, angles in degrees."""
 SCENES: dict[str, Recipe] = {
     "press": Recipe("a ball is pressed in several places, at several depths", _PRESS),
     "ball": Recipe(
-        "a ball of radius 2.375 mm is pressed all over the gel, for a calibration: 0.025 mm a raw pixel",
+        "a ball of radius 2.375 mm is pressed all over the gel, for calibration: 0.025 mm per raw pixel",
         Programme(
             lambda _: (shapes.ball(),), wander=(300.0, 210.0), period=20, rise=4, hold=10,
             depths=(1.0, 0.8, 0.9, 0.6),
@@ -95,7 +96,7 @@ SCENES: dict[str, Recipe] = {
         Programme(_pair, offsets=((-150.0, -40.0), (150.0, 50.0)), wander=(90.0, 90.0), dilation=0.2),
     ),
     "border": Recipe(
-        "a contact that the border of the frame cuts",
+        "a contact cut off by the border of the frame",
         Programme(_sphere, place=(0.965, 0.5), wander=(25.0, 180.0)),
     ),
     "tap": Recipe(
@@ -103,7 +104,7 @@ SCENES: dict[str, Recipe] = {
         Programme(_sphere, period=30, rise=0, hold=1, depths=(1.0, 0.6)),
     ),
     "creep": Recipe(
-        "one long contact that drags the gel by 0.02 px a frame",
+        "one long contact that drags the gel by 0.02 px per frame",
         Programme(_sphere, contacts=1, period=300, rise=15, hold=225, depths=(0.9,), creep=0.02),
     ),
     "drift": Recipe("presses while the lights warm up", _PRESS, {"drift": 0.18}),
@@ -122,11 +123,11 @@ SCENES: dict[str, Recipe] = {
     "bright_dots": Recipe("bright markers on a darker gel", _PRESS, {"polarity": "bright"}),
     "square_dots": Recipe("square markers", _PRESS, {"shape": "square"}),
     "doubled_dots": Recipe("each marker is a pair of dots", _PRESS, {"shape": "doubled"}),
-    "irregular": Recipe("markers in no regular grid", _PRESS, {"jitter": 0.14}),
+    "irregular": Recipe("markers without a regular grid", _PRESS, {"jitter": 0.14}),
     "unmarked": Recipe("a gel without markers", _PRESS, {"markers": (0, 0)}),
     "bright": Recipe("a gel whose pressed area brightens in all channels", _PRESS, {"light": "bright"}),
     "bright_cable": Recipe("a cable on a gel that brightens", _CABLE, {"light": "bright"}),
-    "mixed": Recipe("a gel that answers with colour and brightness", _PRESS, {"light": "mixed"}),
+    "mixed": Recipe("a gel that responds with colour and brightness", _PRESS, {"light": "mixed"}),
     "glossy": Recipe("a gel with mirror-like highlights", _PRESS, {"specular": 0.8}),
     "tilted": Recipe("a tilted camera with a wide lens", _PRESS, {"perspective": 0.22, "distortion": 0.12}),
     "noisy": Recipe(
@@ -140,10 +141,10 @@ SCENES: dict[str, Recipe] = {
         {"shear": 1.3},
     ),
     "warm_up": Recipe(
-        "presses that begin soon after the camera has set exposure and white balance", _PRESS, {"settle": 12}
+        "presses that begin soon after exposure and white balance have settled", _PRESS, {"settle": 12}
     ),
     "stale": Recipe(
-        "six first frames that the camera had kept from an earlier contact", _PRESS, {"stale": 6, "settle": 3}
+        "six buffered frames of an earlier contact at the start", _PRESS, {"stale": 6, "settle": 3}
     ),
     "lamp": Recipe(
         "a lamp is switched on between two presses",

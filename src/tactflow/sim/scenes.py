@@ -1,4 +1,4 @@
-"""The named scenes of the simulated sensor: images on one side, the truth about them on the other."""
+"""The named scenes of the simulated sensor: images, and the truth about them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tactflow.sim.truth import Truth, measure
 from tactflow.system.spelling import did_you_mean
 
 FPS = 60.0
-"""Frames a second of every scene."""
-_STALE_FROM = 300
-"""Frames among which stale ones are looked for; enough for a few contacts."""
+"""Frames per second of every scene."""
+_STALE_FRAMES = 300
+"""Number of frames searched for the deepest contact, which stale frames show; enough for a few contacts."""
 
 
 def scene_descriptions() -> dict[str, str]:
-    """Scene -> what it shows, in one line."""
+    """Scene -> one-line description."""
     return {name: recipe.description for name, recipe in SCENES.items()}
 
 
@@ -35,7 +35,7 @@ def open_scene(spec: str) -> Scene:
 
     Raises
     ------
-    ValueError : an unknown name or key, or a value out of its range, with what was expected.
+    ValueError : an unknown name or key, or an invalid value; the message states the valid ones.
 
     Examples
     --------
@@ -52,13 +52,12 @@ def open_scene(spec: str) -> Scene:
 
 
 class Scene:
-    """A simulated recording, frame by frame, in any order; the same spec gives the same bits.
+    """A simulated recording with random access to frames; the same spec gives bit-identical frames.
 
     Attributes
     ----------
-    name : of the scene. settings : all of its settings. size : (width, height), px. fps : frames a second.
-    camera : where a point of the gel lands in the raw frame.
-    layout : the markers as printed.
+    name : of the scene. settings : its settings. size : (width, height), px. fps : frames per second. camera
+    : maps the gel to the raw frame. layout : the markers as printed.
     """
 
     fps = FPS
@@ -74,7 +73,7 @@ class Scene:
         self._painter = Painter(settings, self.camera, self.layout)
         self._stale = 0
         if settings.stale:
-            self._stale = max(range(min(len(self), _STALE_FROM)), key=self._depth)
+            self._stale = max(range(min(len(self), _STALE_FRAMES)), key=self._depth)
         self._vanishing = np.random.default_rng([settings.seed, 0x7661]).random(len(self.layout.rest))
 
     def __len__(self) -> int:
@@ -88,22 +87,22 @@ class Scene:
         return self._contact(self._moment(index))[0]
 
     def frame(self, index: int) -> NDArray[np.uint8]:
-        """The raw frame `index`: (600, 800, 3) uint8 BGR, fresh."""
+        """Render raw frame `index`, a new (600, 800, 3) uint8 BGR array."""
         moment = self._moment(index)
         pressed, cycle = self._contact(moment)
         return self._painter.frame(index, moment, pressed, ~self._hidden(cycle))
 
     def clean(self, index: int) -> NDArray[np.uint8]:
-        """The raw frame without markers, dirt, and noise: (600, 800, 3) uint8 BGR, fresh."""
+        """Render raw frame `index` without markers, dirt and noise, a new (600, 800, 3) uint8 BGR array."""
         moment = self._moment(index)
         return self._painter.clean(index, moment, self._contact(moment)[0])
 
     def truth(self, index: int, mapping: Any = None) -> Truth:
-        """What frame `index` really shows.
+        """Ground truth of frame `index`.
 
-        mapping : a `PixelMapping` or a `Preprocessor` of `tactflow.vision.geometry`; the truth is then given
-            in the coordinates of the processed frame, with the contact evaluated at its pixels' centres, and
-            a `Preprocessor` also makes `unmarked` exactly as it makes the frame. None: raw.
+        mapping : a `PixelMapping` or `Preprocessor` of `tactflow.vision.geometry` gives the truth in
+            coordinates of the processed frame, with the contact evaluated at its pixel centres; a
+            `Preprocessor` also computes `unmarked` exactly as it does the frame. None: raw coordinates.
         """
         pressed, cycle = self._contact(self._moment(index))
         origin, position = self.markers(index)
@@ -111,17 +110,17 @@ class Scene:
         return measure(pressed, self.camera, origin, position, ~self._hidden(cycle), mapping, clean)
 
     def markers(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Origin and position (N, 2) of the markers in frame `index`, raw pixels: a cheap part of `truth`."""
+        """Origin and position (N, 2) of the markers in frame `index`, raw px; faster than `truth`."""
         rest = self.layout.rest
         now = rest + gel.displacement(self.presses(index), rest)
         return self.camera.to_raw(rest), self.camera.to_raw(now)
 
     def _hidden(self, cycle: int) -> NDArray[np.bool_]:
-        """(N,): markers that cannot be seen during contact number `cycle` (-1: no contact)."""
+        """(N,) bool: markers invisible during contact number `cycle` (-1: no contact)."""
         return (self._vanishing < self.settings.vanish) & (cycle >= 0)
 
     def _moment(self, index: int) -> int:
-        """Which moment of the scene frame `index` shows: stale frames show an earlier contact."""
+        """Moment that frame `index` shows: stale frames show an earlier contact."""
         if not 0 <= index < len(self):
             raise IndexError(f"required a frame in [0, {len(self) - 1}], got {index}")
         return self._stale if index < self.settings.stale else index
@@ -130,7 +129,7 @@ class Scene:
         return max((press.depth for press in self._contact(moment)[0]), default=0.0)
 
     def _contact(self, moment: int) -> tuple[tuple[gel.Press, ...], int]:
-        """The indenters at a moment, and the number of the contact they belong to."""
+        """The indenters at a moment, and the index of their contact."""
         if self._programme is None:
             return (), -1
         return motion.presses(

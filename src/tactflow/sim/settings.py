@@ -1,4 +1,4 @@
-"""The settings of a simulated scene, as the query of its name gives them: `press?noise=4&light=bright`."""
+"""Settings of a simulated scene, parsed from its query: `press?noise=4&light=bright`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactflow.system.spelling import closest, did_you_mean
 
 
 def _grid(text: Any) -> Any:
-    """(columns, rows) from `10x8` or `none`."""
+    """Parse `10x8` to (columns, rows); `none` is (0, 0)."""
     if not isinstance(text, str):
         return text
     columns, times, rows = text.partition("x")
@@ -27,13 +27,13 @@ Side = Annotated[int, Field(ge=0, le=60)]
 
 
 class Settings(BaseModel):
-    """Everything a query can set."""
+    """All settings of a query."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     frames: int = _number(300, 1, 10_000_000, "length of the recording, frames")
-    seed: int = _number(7, 0, 2**31 - 1, "of everything random")
-    noise: float = _number(2, 0, 60, "standard deviation of the sensor's noise, grey levels")
+    seed: int = _number(7, 0, 2**31 - 1, "seed of all random numbers")
+    noise: float = _number(2, 0, 60, "standard deviation of the sensor noise, grey levels")
     shot: float = _number(
         0, 0, 30, "standard deviation of shot noise, which grows with the light, at level 128, grey levels"
     )
@@ -54,7 +54,7 @@ class Settings(BaseModel):
     speckle: float = _number(0, 0, 1, "contrast of random blotches that move with the gel")
     light: Literal["photometric", "bright", "mixed", "dark_channel", "darkening"] = Field(
         "photometric",
-        description="the kind of sensor (photometric|bright|mixed|dark_channel|darkening)",
+        description="type of sensor (photometric|bright|mixed|dark_channel|darkening)",
     )
     drift: float = _number(
         0, -0.5, 0.5, "rise of the brightness while the lights warm up (time constant 5 s), relative"
@@ -62,13 +62,13 @@ class Settings(BaseModel):
     flicker: float = _number(
         0, 0, 0.5, "amplitude of the flicker of mains light (100 Hz seen at 60 Hz), relative"
     )
-    settle: int = _number(0, 0, 10_000, "frames until the camera has set exposure and white balance")
+    settle: int = _number(0, 0, 10_000, "frames until exposure and white balance have settled")
     stale: int = _number(0, 0, 10_000, "frames at the start that show an earlier contact")
     lamp: float = _number(0, -0.5, 0.5, "light of a lamp that comes on before the second half, relative")
     vignette: float = _number(0.2, 0, 1, "loss of light in the corners, relative")
     specular: float = _number(0, 0, 1, "strength of mirror-like highlights")
     texture: float = _number(1, 0, 10, "grain of the gel's coating, % of the light")
-    blur: float = _number(0, 0, 20, "standard deviation of a Gaussian blur on top of the lens's own, px")
+    blur: float = _number(0, 0, 20, "standard deviation of a Gaussian blur in addition to the lens's own, px")
     jpeg: int = _number(0, 0, 100, "quality of a JPEG round trip; 0 for none")
     gain: float = _number(0, 0, 0.5, "amplitude of bands of gain that roll over the frame, relative")
     hot: int = _number(0, 0, 10_000, "number of hot pixels")
@@ -79,29 +79,29 @@ class Settings(BaseModel):
     aperture: float = _number(
         0, 0, 2, "radius of the round picture in a black frame, in half heights of the frame; 0 for none"
     )
-    depth: float = _number(1, 0, 1.5, "factor on the depth of every contact")
+    depth: float = _number(1, 0, 1.5, "factor on the depth of all contacts")
     shear: float = _number(0.12, 0, 1.5, "largest drag of the gel by a contact, pitches")
     twist: float = _number(0, -60, 60, "largest turn of the gel by a contact, degrees")
     bend: float = _number(0, -150, 150, "turn of a cable's direction from end to end, degrees")
     sink: float = _number(
-        SINK_IN, 0.1, 0.6, "depth to which the gel has sunk at a contact's edge, relative; 0.5: deep gel"
+        SINK_IN, 0.1, 0.6, "depth of the gel at a contact's edge, relative to full depth; 0.5: deep gel"
     )
     rim: float = _number(RIM, 0.4, 1, "slope just outside a contact relative to just inside; 1: no crease")
 
 
 def setting_descriptions() -> dict[str, str]:
-    """Setting -> what it means and which values it takes, in one line."""
+    """Setting -> one-line description with its range."""
     return {name: str(field.description) for name, field in Settings.model_fields.items()}
 
 
 def parse_query(query: str, defaults: Mapping[str, Any]) -> Settings:
-    """Settings from `key=value&key=value`.
+    """Parse settings from `key=value&key=value`.
 
-    defaults : the scene's own values, which the query overrides.
+    defaults : of the scene, overridden by the query.
 
     Raises
     ------
-    ValueError : an unknown or repeated key, or a value out of its range, with what was expected.
+    ValueError : an unknown or repeated key, or an invalid value; the message states the valid ones.
     """
     values: dict[str, str] = {}
     for part in query.split("&") if query else []:
@@ -110,7 +110,7 @@ def parse_query(query: str, defaults: Mapping[str, Any]) -> Settings:
             hint = did_you_mean(key, sorted(Settings.model_fields))
             raise ValueError(f"simulated sensor: unknown key {key!r}{hint}")
         if key in values:
-            raise ValueError(f"simulated sensor: {key} is given twice")
+            raise ValueError(f"simulated sensor: duplicate key {key!r}")
         if not value:
             raise ValueError(f"simulated sensor: required {key}=VALUE, got {part!r}")
         values[key] = value

@@ -1,7 +1,7 @@
 """Indenters: the gap between an indenter's surface and the plane through its lowest point.
 
-A shape knows nothing of where it is: coordinates are its own, in raw pixels, with the lowest point(s) at
-gap 0. Pressed by a depth d, it reaches `d - gap` below the untouched surface of the gel.
+Coordinates are local to the shape, in raw pixels; the gap is 0 at the lowest point(s). Pressed by d, the
+indenter reaches `d - gap` below the untouched surface of the gel.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ class Shape:
     """An indenter.
 
     gap : (x, y) float32 arrays, px -> height of the surface above the lowest point, px, >= 0.
-    reach : distance from the origin beyond which nothing of it touches or moves the gel visibly, px.
-    depth : full depth, px: what a relative depth of 1 means for this shape.
-    sources : (K, 2) float64, px; the gel is pushed away from these points (press dilates the gel).
-    spread : px; how far the push reaches.
+    reach : distance from the origin beyond which it does not visibly affect the gel, px. depth : full depth,
+    px.
+    sources : (K, 2) float64, px, points from which a press dilates the gel. spread : standard deviation of
+    the dilation, px.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Shape:
     dilation: float = field(default=1.0)
 
     def __post_init__(self) -> None:
-        # A push of strength 1 shall move the most displaced point of the gel by 1.
+        # Normalise the largest displacement to 1.
         line = np.linspace(-self.reach, self.reach, 41)
         grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         largest = float(np.sqrt(np.max(np.sum(self._push(grid) ** 2, axis=1))))
@@ -62,7 +62,7 @@ def _segment(half_length: float, count: int) -> NDArray[np.float64]:
 
 
 def sphere(radius: float = 95.0, depth: float = 26.0) -> Shape:
-    """A ball of `radius` px, as the paraboloid that Hertz's theory puts in its place."""
+    """A ball of `radius` px, approximated by a paraboloid as in Hertz's theory."""
 
     def gap(x: Array, y: Array) -> Array:
         return np.asarray((x * x + y * y) * np.float32(0.5 / radius), dtype=np.float32)
@@ -72,7 +72,7 @@ def sphere(radius: float = 95.0, depth: float = 26.0) -> Shape:
 
 
 def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
-    """A ball of `radius` px, as it is: what a calibration is made with."""
+    """A ball of `radius` px with its exact shape, for calibration."""
 
     def gap(x: Array, y: Array) -> Array:
         squared = np.minimum(x * x + y * y, np.float32((0.99 * radius) ** 2))
@@ -86,14 +86,14 @@ def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
 def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0, bend: float = 0.0) -> Shape:
     """A cylinder of `radius` px along x with rounded ends.
 
-    bend : degrees by which the direction turns from end to end of a cable of 800 px; 0 is straight.
+    bend : change of direction along 800 px of cable, degrees; 0 is straight.
     """
     curvature = np.radians(bend) / 800.0
 
     def gap(x: Array, y: Array) -> Array:
         if abs(curvature) > 1e-9:
             turn = np.float32(1.0 / curvature)
-            # The centre line is an arc through the origin about (0, turn): unroll it to a straight line.
+            # The centre line is an arc through the origin about (0, turn); unroll it.
             from_center = np.hypot(x, y - turn)
             along = np.arctan2(x, np.sign(turn) * (turn - y)) * abs(turn)
             across = from_center - abs(turn)
@@ -113,9 +113,9 @@ def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0,
 def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, lean: float = 0.0) -> Shape:
     """A rounded knife edge along x whose flanks rise with `slope`.
 
-    lean : in [0, 1); one flank rises by this share more, the other by this share less: the edge of a box.
+    lean : in [0, 1); relative difference of the slopes of both flanks from `slope`, for the edge of a box.
     """
-    # Where a leaning edge is lowest: there its gap is 0.
+    # Lowest point of a leaning edge, where the gap is 0.
     lowest, rise = -3.0 * lean / np.sqrt(1.0 - lean**2), 3.0 * np.sqrt(1.0 - lean**2)
 
     def gap(x: Array, y: Array) -> Array:
@@ -131,7 +131,7 @@ def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, l
 
 
 def _flank(outside: Array) -> Array:
-    # A chamfer with a rounded foot: no crease in the shading where the flat ends.
+    # A chamfer with a rounded foot avoids a crease in the shading.
     return np.asarray(np.sqrt(outside * outside + np.float32(4.0)) - np.float32(2.0), dtype=np.float32)
 
 
@@ -151,7 +151,7 @@ def box(
 
 
 def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape:
-    """A torus: `radius` of its centre line, `tube` radius."""
+    """A torus with centre line `radius` and tube radius `tube`, px."""
 
     def gap(x: Array, y: Array) -> Array:
         across = np.hypot(x, y) - np.float32(radius)
@@ -161,33 +161,33 @@ def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape
 
 
 def _lookup(picture: Array, outside: float) -> Callable[[Array, Array], Array]:
-    """The value of a picture (H, W) whose centre is the origin, at (x, y) px; `outside` beyond its border."""
+    """Interpolate a picture (H, W) centred on the origin at (x, y), px; `outside` beyond its border."""
     center_x, center_y = np.float32((picture.shape[1] - 1) / 2), np.float32((picture.shape[0] - 1) / 2)
 
     def value(x: Array, y: Array) -> Array:
         map_x = np.ascontiguousarray(x + center_x).reshape(len(x), -1)
         map_y = np.ascontiguousarray(y + center_y).reshape(len(y), -1)
-        found = cv2.remap(
+        values = cv2.remap(
             picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(outside,)
         )
-        return np.asarray(found, dtype=np.float32).reshape(x.shape)
+        return np.asarray(values, dtype=np.float32).reshape(x.shape)
 
     return value
 
 
-def _letters(words: str, scale: float, thickness: int, margin: int) -> tuple[NDArray[np.uint8], int, int]:
-    """Words in OpenCV's plain font, 0 on 255, with their width and height without the margin, px."""
-    (width, height), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
+def _letters(text: str, scale: float, thickness: int, margin: int) -> tuple[NDArray[np.uint8], int, int]:
+    """Text in OpenCV's plain font, 0 on 255, and its width and height without the margin, px."""
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
     canvas = np.full((height + 2 * margin, width + 2 * margin), 255, np.uint8)
-    place = (margin, margin + height)
-    cv2.putText(canvas, words, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0.0,), thickness, cv2.LINE_8)
+    origin = (margin, margin + height)
+    cv2.putText(canvas, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, (0.0,), thickness, cv2.LINE_8)
     return canvas, width, height
 
 
 def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Shape:
-    """A disc with a raised rim and raised words, `relief` px high, on a plane that touches as well."""
-    words = 255 - _letters("10c", 3.4, 14, 60)[0]
-    smooth = np.asarray(cv2.GaussianBlur(words, (0, 0), 2.5), dtype=np.float32)
+    """A disc with a raised rim and text, `relief` px high, on a face that also makes contact."""
+    letters = 255 - _letters("10c", 3.4, 14, 60)[0]
+    smooth = np.asarray(cv2.GaussianBlur(letters, (0, 0), 2.5), dtype=np.float32)
     raised = _lookup(smooth / np.float32(255.0), 0.0)
 
     def gap(x: Array, y: Array) -> Array:
@@ -207,7 +207,7 @@ def screw(
     depth: float = 16.0,
     ridges: float = 2.4,
 ) -> Shape:
-    """A threaded rod along x: ridges every `thread` px, `ridges` px to either side of the mean, inclined."""
+    """A threaded rod along x, with inclined ridges of amplitude `ridges` px every `thread` px."""
     smooth = cable(radius, half_length, depth)
 
     def gap(x: Array, y: Array) -> Array:

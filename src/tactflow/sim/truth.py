@@ -1,4 +1,4 @@
-"""What a simulated frame really shows, in raw or in processed coordinates."""
+"""Ground truth of a simulated frame, in raw or processed coordinates."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from tactflow.sim.elastic import force
 from tactflow.sim.gel import Press, displacement, in_contact, reached, surface
 
 FLOW_POINTS = 1500
-"""Points of the gel around a contact at which its displacement is computed; in between it is interpolated.
-With FLOW_FINE, the mean over a contact is right to 0.01 px (five scenes, against four times the points)."""
+"""Points around a contact at which the displacement is computed, with interpolation in between. With
+FLOW_FINE, the mean over a contact is accurate to 0.01 px (five scenes, against four times the points)."""
 FLOW_FINE = 0.5
-"""Distance of the points at which it is asked whether they are in contact, processed px."""
+"""Spacing of the points tested for contact, processed px."""
 
 NO_DIRECTION = 0.02
 """Anisotropy (difference over sum of the principal second moments) below which a region has no direction.
@@ -28,9 +28,9 @@ Chosen by hand: an axis ratio of 1.02."""
 
 @dataclass(frozen=True)
 class View:
-    """The pixels in which a truth is given.
+    """Pixel coordinates of a truth.
 
-    camera : makes the raw frame. mapping : `PixelMapping` to the processed frame; None: raw pixels.
+    mapping : `PixelMapping` to the processed frame; None for raw pixels.
     """
 
     camera: Camera
@@ -60,7 +60,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The truth about one frame. Coordinates as in `tactflow.vision.types`.
+    """Ground truth of one frame. Coordinates as in `tactflow.vision.types`.
 
     touching : whether the contact covers at least one pixel of the frame.
     contact_mask : (H, W) bool, true where the gel is in contact at the pixel's centre.
@@ -69,16 +69,15 @@ class Truth:
     hull : (N, 2) float64, vertices of the convex hull of the region's pixel centres, in order; (0, 2)
         without a contact.
     area : of that hull, px^2.
-    depth : of the deepest indenter, raw px, 0 without a contact: how faint the contact is.
-    stick_ratio : share of the contact's area on which the gel sticks to the indenter, the least of several;
-        None without a contact. slipping : whether one slides over the gel.
-    origin : (N, 2) float64, markers on the untouched gel. position : (N, 2) float64, now. Markers that were
-        never printed are not listed.
-    visible : (N,) bool, whether a marker can be seen in this frame: its centre inside, lit, not vanished.
+    depth : of the deepest indenter, raw px, 0 without a contact.
+    stick_ratio : share of the contact's area that sticks to the indenter, minimum over indenters; None
+        without a contact. slipping : whether an indenter slides over the gel.
+    origin, position : (N, 2) float64, printed markers on the untouched gel and now.
+    visible : (N,) bool, whether a marker is visible: centre inside the frame, lit, not vanished.
     inside : (N,) bool, whether a marker is visible and its centre lies in the contact.
-    mean_flow : (dx, dy), mean displacement of the markers inside, px; None where there are none.
+    mean_flow : (dx, dy), mean displacement of the markers inside, px; None if there are none.
 
-    What takes long is computed when it is first asked for.
+    Expensive values are computed on first access.
     """
 
     touching: bool
@@ -101,22 +100,22 @@ class Truth:
     _clean: Callable[[], NDArray[np.uint8]] = field(repr=False)
 
     def displacement(self, points: Points) -> Points:
-        """(N, 2) float64: how far the gel has moved that rests at points (N, 2), px."""
+        """Displacement (N, 2) float64, px, of the gel that rests at points (N, 2)."""
         camera = self._view.camera
         rest = camera.to_gel(self._view.to_raw(points))
         return self._view.from_raw(camera.to_raw(rest + displacement(self._pressed, rest))) - points
 
     @cached_property
     def contact_flow(self) -> tuple[float, float] | None:
-        """(dx, dy), px: mean displacement of the gel in contact, by its area at rest; None without contact.
+        """Area-weighted mean displacement (dx, dy), px, of the gel in contact; None without contact.
 
-        Unlike `mean_flow` it does not depend on which markers happen to lie inside.
+        Unlike `mean_flow`, it does not depend on the positions of markers.
         """
         if not self.touching:
             return None
         rows, columns = np.nonzero(self.contact_mask)
         markers = self.position - self.origin
-        # Gel in contact was at rest where the contact is, less how far gel has moved.
+        # Bounding box of the rest positions of the gel in contact.
         low = np.array([columns.min(), rows.min()]) - markers.max(axis=0, initial=0)
         high = np.array([columns.max(), rows.max()]) - markers.min(axis=0, initial=0)
         step = max(2.0, float(np.sqrt(np.prod(high - low) / FLOW_POINTS)))
@@ -133,11 +132,11 @@ class Truth:
         return float(dx), float(dy)
 
     def _touched(self, points: Points) -> NDArray[np.bool_]:
-        """(rows, columns): which points (rows, columns, 2) show gel in contact, inside of the picture."""
+        """(rows, columns) bool: whether points (rows, columns, 2) are in contact and inside the frame."""
         raw = self._view.to_raw(points.reshape(-1, 2))
         gel = self._view.camera.to_gel(raw).astype(np.float32).reshape(points.shape)
-        seen = self._view.camera.sees(raw).reshape(points.shape[:2])
-        return seen & in_contact(self._pressed, gel[..., 0], gel[..., 1])
+        visible_pixels = self._view.camera.sees(raw).reshape(points.shape[:2])
+        return visible_pixels & in_contact(self._pressed, gel[..., 0], gel[..., 1])
 
     @cached_property
     def unmarked(self) -> NDArray[np.uint8]:
@@ -151,13 +150,13 @@ class Truth:
 
     @cached_property
     def sunk(self) -> NDArray[np.float32]:
-        """(H, W) float32, raw px: how far the gel's surface has sunk, by the deepest of all presses."""
-        gel_x, gel_y, seen = _pixel_centres(self._view)
+        """(H, W) float32: depth of the gel's surface, raw px, maximum over presses."""
+        gel_x, gel_y, visible_pixels = _pixel_centres(self._view)
         lowest = np.zeros(gel_x.shape, np.float32)
         for press in self._pressed:
             if press.touching:
                 np.maximum(lowest, surface(press, reached(press, gel_x, gel_y)), out=lowest)
-        return np.where(seen, lowest, np.float32(0))
+        return np.where(visible_pixels, lowest, np.float32(0))
 
     @cached_property
     def force(self) -> tuple[float, float, float]:
@@ -184,7 +183,7 @@ def measure(
     process: Any,
     clean: Callable[[], NDArray[np.uint8]],
 ) -> Truth:
-    """Put the truth together.
+    """Compute the truth of a frame.
 
     origin, position : (N, 2) float64 raw pixels. shown : (N,) bool, false where a marker has vanished.
     process : the `mapping` of `Scene.truth`. clean : renders the raw frame without markers and noise.
@@ -227,7 +226,7 @@ def measure(
 
 
 def principal_angle(columns: NDArray[np.int64], rows: NDArray[np.int64]) -> float | None:
-    """Direction of the larger second moment of a region, degrees in (-90, 90]; None where it has none.
+    """Principal direction of a region by its second moments, degrees in (-90, 90]; None if isotropic.
 
     columns, rows : (n,) int, x and y of the region's pixels.
     """
@@ -235,14 +234,14 @@ def principal_angle(columns: NDArray[np.int64], rows: NDArray[np.int64]) -> floa
     xx, yy, xy = float(np.mean(x * x)), float(np.mean(y * y)), float(np.mean(x * y))
     if np.hypot(xx - yy, 2 * xy) <= NO_DIRECTION * (xx + yy):
         return None
-    # The sign turns the angle of image coordinates (y down) into one that is counter-clockwise on the screen.
+    # Negative because y points down and angles are counter-clockwise on the screen.
     angle = -0.5 * float(np.degrees(np.arctan2(2 * xy, xx - yy)))
     return 90.0 if angle <= -90.0 else angle
 
 
 @lru_cache(maxsize=8)
 def _pixel_centres(view: View) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Gel coordinates x and y (H, W) of each pixel's centre, and whether the raw frame covers it."""
+    """Gel coordinates x and y (H, W) of pixel centres, and whether the raw frame covers them."""
     width, height = view.size
     raw = view.to_raw(view.grid)
     mapped = view.camera.to_gel(raw).astype(np.float32).reshape(height, width, 2)
@@ -254,7 +253,7 @@ def _contact(
     pressed: Sequence[Press], view: View
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
     """The contact mask (H, W), and x and y (n,) of its pixels, line by line."""
-    gel_x, gel_y, seen = _pixel_centres(view)
+    gel_x, gel_y, visible_pixels = _pixel_centres(view)
     near = np.zeros(gel_x.shape, dtype=np.bool_)
     for press in pressed:
         if press.touching:
@@ -265,27 +264,27 @@ def _contact(
     left, top, width, height = cv2.boundingRect(near.astype(np.uint8))
     part = slice(top, top + height), slice(left, left + width)
     mask = np.zeros(gel_x.shape, dtype=np.bool_)
-    mask[part] = in_contact(pressed, gel_x[part], gel_y[part]) & seen[part]
+    mask[part] = in_contact(pressed, gel_x[part], gel_y[part]) & visible_pixels[part]
     rows, columns = np.nonzero(mask)
     return mask, columns, rows
 
 
 def _resampled(image: NDArray[np.uint8], mapping: Any) -> NDArray[np.uint8]:
-    """The image in processed pixels: the mean of 2 x 2 bilinear samples of each processed pixel."""
+    """Resample an image to processed pixels: the mean of 2 x 2 bilinear samples each."""
     width, height = mapping.size
     total = np.zeros((height, width, 3), np.float32)
-    for x, y in _sample_places(mapping):
+    for x, y in _sample_points(mapping):
         total += cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.rint(total / 4.0).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)
-def _sample_places(mapping: Any) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+def _sample_points(mapping: Any) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Raw coordinates (H, W) of the four samples of each processed pixel."""
     width, height = mapping.size
     grid = View(Camera(), mapping).grid
-    places = []
+    samples = []
     for shift in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         raw = np.asarray(mapping.to_raw(grid + shift), dtype=np.float32).reshape(height, width, 2)
-        places.append((np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])))
-    return places
+        samples.append((np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])))
+    return samples

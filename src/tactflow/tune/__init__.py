@@ -1,5 +1,5 @@
-"""The cheapest pipeline within an error budget for a sensor, from a recording without labels.
+"""Find the cheapest pipeline within an error budget for a sensor, from an unlabelled recording.
 
-`recording` takes the part with a contact, `sensor` makes the simulator look like it, `space` lists pipelines,
-`measure` judges them, `search` narrows them down, `report` writes what was found.
+`recording` extracts the part with a contact, `sensor` fits the simulator to it, `space` lists candidates,
+`measure` evaluates them, `search` narrows them down, `report` writes the result.
 """

@@ -1,4 +1,4 @@
-"""The recording that is tuned for: the part of it with a contact, as an array on disk."""
+"""Extract the part of a recording with a contact, as an array on disk."""
 
 from __future__ import annotations
 
@@ -20,94 +20,96 @@ from tactflow.sources import open_source
 
 Image = NDArray[np.uint8]
 
-MOST_READ: Final = 1800
-"""Frames of a recording that are looked at, at most: 30 s at 60 a second."""
-MOST_USED: Final = 160
-"""Frames that pipelines run on, at most: 230 MB at 800 x 600 in a temporary file."""
-LEAST: Final = 20
-"""Frames without which nothing is measured. Chosen by hand."""
+MAX_READ: Final = 1800
+"""Maximum number of frames searched for a contact: 30 s at 60 frames/s."""
+MAX_USED: Final = 160
+"""Maximum number of frames extracted: 230 MB at 800 x 600 in a temporary file."""
+MIN_FRAMES: Final = 20
+"""Minimum length of a recording, frames. Chosen by hand."""
 HEAD: Final = 8
-"""First frames that are always used: references are taken from them."""
+"""First frames, always extracted because references are taken from them."""
 CHANGE: Final = 0.04
-"""Relative change of the light somewhere in the small picture from which on there is a contact. By hand: 1.6
-times what `difference` takes for the gel's own (repeatability)."""
+"""Threshold for a contact: maximum relative change of light in the small picture. Chosen by hand, 1.6 times
+the repeatability of the gel that `difference` assumes."""
 
 
 @dataclass
 class Recording:
-    """Part of a recording.
+    """The extracted part of a recording.
 
-    source : how it was named. path : its frames, a `.npy` file. frames : how many. size : (width, height),
-    px, before the pipeline shrinks them. seen : some of these frames, for the doctor's measures. changes :
-    how far the light of each frame is from the first, relative.
+    source : as given by the user. path : `.npy` file of the frames. frames : number of frames. size : (width,
+    height), px, before downsampling. observation : some of the frames, for the doctor's measures. changes :
+    maximum relative change of light of each frame from the first.
     """
 
     source: str
     path: Path
     frames: int
     size: tuple[int, int]
-    seen: Observation
+    observation: Observation
     changes: list[float]
 
 
 def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
-    """Copy the part of a recording that is used.
+    """Extract the first frames and those around the strongest contact.
 
-    source : as `open_source` takes it; not live. pipeline : its geometry is applied to what is looked at, but
-    for `downsample`. folder : where the frames go.
+    source : as for `open_source`; not live. pipeline : its geometry, except for `downsample`, is applied to
+    the observation. folder : where to write the frames.
 
     Raises
     ------
     SourceError
-        If it cannot be read, is live, too short, or shows no contact.
+        The source cannot be read, is live or too short, or shows no contact.
     """
     changes = _changes(source)
-    if len(changes) < LEAST:
-        raise SourceError(f"{source}: {len(changes)} frames are too few to tune on; required {LEAST} or more")
+    if len(changes) < MIN_FRAMES:
+        raise SourceError(
+            f"{source}: {len(changes)} frames are too few to tune on; required {MIN_FRAMES} or more"
+        )
     touched = int(np.argmax(changes))
     if changes[touched] < CHANGE:
         raise SourceError(
-            f"{source}: nothing touches the gel in its {len(changes)} first frames (the light changes by "
-            f"{100 * changes[touched]:.1f} % at most); record some presses, with the gel untouched at first"
+            f"{source}: no contact in the first {len(changes)} frames (the light changes by at most "
+            f"{100 * changes[touched]:.1f} %); record some presses, with the gel untouched at first"
         )
-    start = max(HEAD, min(touched - MOST_USED // 2, len(changes) - MOST_USED + HEAD))
-    wanted = [*range(HEAD), *range(start, min(len(changes), start + MOST_USED - HEAD))]
-    frames = _copy(source, wanted, folder / "recording.npy")
-    straight = _geometry(pipeline)
+    start = max(HEAD, min(touched - MAX_USED // 2, len(changes) - MAX_USED + HEAD))
+    indices = [*range(HEAD), *range(start, min(len(changes), start + MAX_USED - HEAD))]
+    frames = _copy(source, indices, folder / "recording.npy")
+    transform = _geometry(pipeline)
     pairs = [
-        Pair(n, straight(frames[n]), straight(frames[n + 1]))
+        Pair(n, transform(frames[n]), transform(frames[n + 1]))
         for n in range(0, len(frames) - 1, max(1, len(frames) // KEPT))
     ]
-    seen = Observation(source, source, False, frames=len(frames), pairs=pairs)
+    observation = Observation(source, source, False, frames=len(frames), pairs=pairs)
     height, width = pairs[0].image.shape[:2]
-    used = [changes[index] for index in wanted]
-    return Recording(source, folder / "recording.npy", len(frames), (width, height), seen, used)
+    used = [changes[index] for index in indices]
+    return Recording(source, folder / "recording.npy", len(frames), (width, height), observation, used)
 
 
 def _changes(source: str) -> list[float]:
-    """How far each frame is from the first, relative, where it is farthest."""
+    """Maximum relative change of light of each frame from the first."""
     reader = open_source(source)
     try:
         if reader.live:
             raise SourceError(f"{source}: tune needs a recording; make one: tactflow record --out FILE.mcap")
         first: NDArray[np.float32] | None = None
-        found: list[float] = []
-        while len(found) < MOST_READ and (frame := reader.read()) is not None:
+        changes: list[float] = []
+        while len(changes) < MAX_READ and (frame := reader.read()) is not None:
             small = _small(frame[0])
             first = small if first is None else first
-            found.append(_change(first, small))
-        return found
+            changes.append(_change(first, small))
+        return changes
     finally:
         reader.close()
 
 
 def change_between(first: Image, now: Image) -> float:
-    """How far the light of two pictures (H, W, 3) uint8 is apart, relative, where it is farthest."""
+    """Maximum relative change of light between two pictures (H, W, 3) uint8."""
     return _change(_small(first), _small(now))
 
 
 def _small(image: Image) -> NDArray[np.float32]:
-    # A contact fills several pixels of a picture that is 96 px wide.
+    # 96 px are enough for a contact to cover several pixels.
     size = (96, max(1, round(96 * image.shape[0] / image.shape[1])))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
@@ -119,21 +121,21 @@ def _change(first: NDArray[np.float32], now: NDArray[np.float32]) -> float:
     return float(smooth.max())
 
 
-def _copy(source: str, wanted: list[int], path: Path) -> NDArray[np.uint8]:
-    """The wanted frames of a source, (N, H, W, 3), in a file."""
+def _copy(source: str, indices: list[int], path: Path) -> NDArray[np.uint8]:
+    """Write the frames (N, H, W, 3) with these indices to a file."""
     reader = open_source(source)
     frames: NDArray[np.uint8] | None = None
-    places = {index: place for place, index in enumerate(wanted)}
+    positions = {index: position for position, index in enumerate(indices)}
     try:
-        for index in range(wanted[-1] + 1):
+        for index in range(indices[-1] + 1):
             frame = reader.read()
             if frame is None:
-                raise SourceError(f"{source}: ended sooner when it was read again")
+                raise SourceError(f"{source}: ended earlier when read a second time")
             if frames is None:
-                shape = (len(wanted), *frame[0].shape)
+                shape = (len(indices), *frame[0].shape)
                 frames = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
-            if index in places:
-                frames[places[index]] = frame[0]
+            if index in positions:
+                frames[positions[index]] = frame[0]
     finally:
         reader.close()
     assert frames is not None
@@ -141,7 +143,7 @@ def _copy(source: str, wanted: list[int], path: Path) -> NDArray[np.uint8]:
 
 
 def _geometry(pipeline: Pipeline) -> Callable[[Image], Image]:
-    """What the pipeline's `preprocess` does to a picture, (H, W, 3) uint8, without shrinking it."""
+    """The geometry of the pipeline's `preprocess` without downsampling, a function on (H, W, 3) uint8."""
     node = pipeline.nodes.get("preprocess")
     if node is None:
         return np.array
@@ -151,7 +153,7 @@ def _geometry(pipeline: Pipeline) -> Callable[[Image], Image]:
     except ValueError as error:
         raise ConfigError(f"stages.preprocess: {error}") from None
 
-    def straight(image: Image) -> Image:
+    def transform(image: Image) -> Image:
         return np.array(stage.process(Frame("tune", 0, 0.0, np.array(image))).image)
 
-    return straight
+    return transform

@@ -1,4 +1,4 @@
-"""The simulated sensor, made to look like the one that is tuned for."""
+"""Fit the simulated sensor to a recording."""
 
 from __future__ import annotations
 
@@ -24,28 +24,29 @@ from tactflow.vision.markers import NoMarkersError, detect_markers
 Image = NDArray[np.uint8]
 
 OWN_BLUR: Final = 0.9
-"""Blur of the simulator's own dots as the doctor measures it, px of its frame."""
+"""Intrinsic blur of the simulator's dots as the doctor measures it, px of its frame."""
 DOT_LIMITS: Final = (1.5, 60.0)
-"""Radii of a dot that the simulator is asked for, px of its frame. Chosen by hand."""
-COLUMNS: Final = 60
-"""Columns and rows of dots that the simulator draws at most."""
+"""Range of dot radii passed to the simulator, px of its frame. Chosen by hand."""
+MAX_COLUMNS: Final = 60
+"""Maximum number of columns and rows of dots in the simulator."""
 LIGHTS: Final = {"photometric": 0.0, "mixed": 0.5, "bright": 1.0}
-"""Light of the simulator -> how much its contacts brighten all channels alike, 0 to 1."""
+"""Light of the simulator -> share of the change at a contact common to all channels, 0 to 1."""
 DEPTHS: Final = (0.3, 0.5, 0.75, 1.0)
-"""Depths of the simulated press, relative, among which the one with the change of the recording is taken."""
+"""Relative depths of the simulated press among which the best match is selected."""
 NOISES: Final = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
-"""Noises that are tried under JPEG, grey levels."""
+"""Noise levels tried before JPEG compression, grey levels."""
 FAINT: Final = 0.06
-"""Change of the light, relative, from which on a place tells how the light of a contact changes. By hand."""
+"""Minimum relative change of light at pixels that decide the type of light. Chosen by hand."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How the simulator is set to look like a sensor.
+    """Simulator settings that reproduce the look of a sensor.
 
-    size : (width, height) of its frames, px. query : settings of the scene, as `open_scene` takes them.
-    noise : grey levels. blur : px of its frames, on top of the simulator's own. jpeg : quality, 0 for none.
-    levels : (3,) factors of the simulator's light, BGR. contrast : of the dots, relative to the simulator's.
+    size : (width, height) of the frames, px. query : scene settings, as for `open_scene`. noise : grey
+    levels.
+    blur : px, in addition to the simulator's own. jpeg : quality, 0 for none. levels : (3,) factors on the
+    simulator's light, BGR. contrast : of the dots, relative to the simulator's.
     """
 
     size: tuple[int, int]
@@ -68,61 +69,63 @@ class Look:
 
 
 def fit(recording: Recording) -> Look:
-    """Settings with which the simulator looks like a recording.
+    """Fit the simulator to a recording.
 
-    The simulator's frames keep their shape of 4 : 3 and get as many pixels as the sensor's; so dots and
-    noise have the size, in pixels, that they have there.
+    Its frames keep the aspect ratio 4 : 3 and get as many pixels as the sensor's, so that dots and noise have
+    the same size in pixels.
     """
-    seen = recording.seen
+    observation = recording.observation
     scale = math.sqrt(recording.size[0] * recording.size[1] / (SIZE[0] * SIZE[1]))
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
-    plain = Look(size, f"{_dots(seen, scale)}&light={_light_of(recording)}")
-    own = compressed(light(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0), 0)
-    levels = tuple(float(v) for v in _levels(seen.pairs[0].image) / np.maximum(_levels(own), 1.0))
-    jpeg = 0 if seen.jpeg_step is None else round(measures.jpeg_quality(seen.jpeg_step))
-    noise = _noise_before(recording, jpeg) if jpeg else measures.noise_of(seen.pairs)
-    blur = measures.blur(seen.typical) or 0.0
+    plain = Look(size, f"{_dots(observation, scale)}&light={_light_of(recording)}")
+    simulated = compressed(light(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0), 0)
+    levels = tuple(
+        float(v) for v in _levels(observation.pairs[0].image) / np.maximum(_levels(simulated), 1.0)
+    )
+    jpeg = 0 if observation.jpeg_step is None else round(measures.jpeg_quality(observation.jpeg_step))
+    noise = _noise_before(recording, jpeg) if jpeg else measures.noise_of(observation.pairs)
+    blur = measures.blur(observation.typical) or 0.0
     return Look(
         size,
-        f"{plain.query}&depth={_depth(recording, plain, own)}",
+        f"{plain.query}&depth={_depth(recording, plain, simulated)}",
         round(noise, 2),
         round(math.sqrt(max(blur**2 - (OWN_BLUR * scale) ** 2, 0.0)), 2),
         jpeg,
         levels,
-        round(_contrast_ratio(seen, own, levels), 2),
+        round(_contrast_ratio(observation, simulated, levels), 2),
     )
 
 
-def _dots(seen: Observation, scale: float) -> str:
-    """The settings of the simulator's dots. scale : px of the sensor for one of the simulator."""
-    dots = seen.dots
+def _dots(observation: Observation, scale: float) -> str:
+    """Query for the simulator's dots. scale : sensor pixels per simulator pixel."""
+    dots = observation.dots
     if dots is None:
         return "markers=none"
-    missing = measures.lattice(dots, seen.typical).missing
+    missing = measures.lattice(dots, observation.typical).missing
     pitch = min(dots.pitch / scale, 400.0)
     radius = float(np.clip(min(dots.dot_radius / scale, 0.4 * pitch), *DOT_LIMITS))
-    columns, rows = (int(np.clip(side // pitch, 1, COLUMNS)) for side in SIZE)
+    columns, rows = (int(np.clip(side // pitch, 1, MAX_COLUMNS)) for side in SIZE)
     grid = f"markers={columns}x{rows}&pitch={pitch:.2f}&dot={radius:.2f}&polarity={dots.polarity}"
     return f"{grid}&missing={min(missing, 0.5):.3f}"
 
 
 def _noise_before(recording: Recording, jpeg: int) -> float:
-    """Noise, grey levels, of which JPEG leaves as much from frame to frame as the recording shows."""
-    pairs = [pair for pair in recording.seen.pairs if pair.after is not None]
-    wanted = float(
+    """Noise, grey levels, that after JPEG matches the frame-to-frame noise of the recording."""
+    pairs = [pair for pair in recording.observation.pairs if pair.after is not None]
+    target = float(
         np.median([measures.temporal_noise(p.image, p.after) for p in pairs if p.after is not None])
     )
-    plain = np.asarray(cv2.GaussianBlur(recording.seen.pairs[0].image, (0, 0), 2.0), np.float32)
+    plain = np.asarray(cv2.GaussianBlur(recording.observation.pairs[0].image, (0, 0), 2.0), np.float32)
     rng = np.random.default_rng(0)
-    left = []
+    measured = []
     for noise in NOISES:
         frames = [compressed(plain + noise * rng.standard_normal(plain.shape), jpeg) for _ in range(2)]
-        left.append(measures.temporal_noise(*frames))
-    return float(np.interp(wanted, np.maximum.accumulate(left), NOISES))
+        measured.append(measures.temporal_noise(*frames))
+    return float(np.interp(target, np.maximum.accumulate(measured), NOISES))
 
 
 def compressed(light: NDArray[Any], jpeg: int) -> Image:
-    """(H, W, 3) grey levels as uint8, after JPEG of a quality; 0 is none."""
+    """(H, W, 3) uint8 from grey levels, after JPEG compression; quality 0 is none."""
     image = np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
     if not jpeg:
         return image
@@ -131,26 +134,27 @@ def compressed(light: NDArray[Any], jpeg: int) -> Image:
 
 
 def _levels(image: Image) -> NDArray[np.float64]:
-    """(3,) median of the gel's channels, BGR."""
+    """Median grey levels (3,) of the gel, BGR."""
     gel = image[image.max(axis=2) > measures.BLACK]
     return np.asarray(np.median(gel, axis=0) if len(gel) else np.ones(3), np.float64)
 
 
-def _contrast_ratio(seen: Observation, own: Image, levels: tuple[float, ...]) -> float:
-    """Contrast of the dots, relative to that of the simulator's dots (`own`) under as much light."""
-    if seen.dots is None:
+def _contrast_ratio(observation: Observation, simulated: Image, levels: tuple[float, ...]) -> float:
+    """Contrast of the dots, relative to the dots of the simulated frame at the same light levels."""
+    if observation.dots is None:
         return 1.0
-    own = np.clip(own * np.array(levels), 0, 255).astype(np.uint8)
+    simulated = np.clip(simulated * np.array(levels), 0, 255).astype(np.uint8)
     try:
-        dots = detect_markers(own)
+        dots = detect_markers(simulated)
     except NoMarkersError:
         return 1.0
-    theirs = measures.lattice(seen.dots, seen.grays[0]).contrast
-    return float(np.clip(theirs / max(measures.lattice(dots, measures.grey(own)).contrast, 1.0), 0.1, 1.1))
+    contrast = measures.lattice(dots, measures.grey(simulated)).contrast
+    target = measures.lattice(observation.dots, observation.grays[0]).contrast
+    return float(np.clip(target / max(contrast, 1.0), 0.1, 1.1))
 
 
 def _light_of(recording: Recording) -> str:
-    """Which of the simulator's lights answers to a contact as the recording does."""
+    """The simulator's light that responds to contacts like the recording."""
     untouched, touched = _extremes(recording)
     ratio = (touched / np.maximum(untouched, 25.0)).reshape(-1, 3)
     ratio = ratio / np.maximum(np.median(ratio, axis=0), 0.1) - 1.0
@@ -165,8 +169,8 @@ def _light_of(recording: Recording) -> str:
 
 
 def _extremes(recording: Recording) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The untouched picture and the one in which most has changed, of those kept; (h, w, 3), smoothed."""
-    pairs = recording.seen.pairs
+    """The untouched picture and the one with the largest change, (h, w, 3), smoothed and subsampled."""
+    pairs = recording.observation.pairs
     first = pairs[0].image
     most = max(pairs, key=lambda pair: recording.changes[pair.number])
     side = max(8, min(first.shape[:2]) // 60)
@@ -174,25 +178,24 @@ def _extremes(recording: Recording) -> tuple[NDArray[np.float32], NDArray[np.flo
     return small[0], small[1]
 
 
-def _depth(recording: Recording, plain: Look, own: Image) -> float:
-    """Depth of the simulated press whose light changes as much as that of the recording.
+def _depth(recording: Recording, plain: Look, untouched: Image) -> float:
+    """Depth of the simulated press that changes the light as much as the recording.
 
-    own : the simulated gel before it is touched.
+    untouched : simulated frame of the untouched gel.
     """
-    wanted = max(recording.changes)
-    found = {}
+    target = max(recording.changes)
+    changes = {}
     for depth in DEPTHS:
         scene = open_scene(f"press?{plain.query}&frames=60&noise=0&depth={depth}")
         deepest = max(range(60), key=lambda index: max((p.depth for p in scene.presses(index)), default=0.0))
-        found[depth] = change_between(own, compressed(light(plain, scene, deepest), 0))
-    return min(found, key=lambda depth: abs(math.log(max(found[depth], 1e-3) / wanted)))
+        changes[depth] = change_between(untouched, compressed(light(plain, scene, deepest), 0))
+    return min(changes, key=lambda depth: abs(math.log(max(changes[depth], 1e-3) / target)))
 
 
 def light(look: Look, scene: Any, index: int) -> NDArray[np.float32]:
-    """A frame of the sensor's size, light and contrast of dots, in grey levels (H, W, 3).
+    """A frame with the sensor's size, light levels and dot contrast, (H, W, 3) grey levels.
 
-    They are not rounded: rounded before the noise is added, they have steps in which nothing changes, and the
-    contact's centre is off by half as much again.
+    Not rounded: quantisation before adding noise increases the error of the contact's centre by half.
     """
     image = scene.frame(index).astype(np.float32)
     if look.contrast != 1.0:
@@ -205,10 +208,10 @@ def light(look: Look, scene: Any, index: int) -> NDArray[np.float32]:
 
 
 class Fitted(Rendered):
-    """A simulated recording that looks like the sensor, with its truth.
+    """A simulated recording with the look of the sensor, and its truth.
 
-    look : of the sensor. case : scene and length; its query is added to the look's. folder : for its frames.
-    seed : of the noise.
+    case : scene and length; its query extends that of the look. folder : for the frames. seed : for the
+    noise.
     """
 
     def __init__(self, look: Look, case: Case, folder: Path, seed: int) -> None:
@@ -231,7 +234,7 @@ class Fitted(Rendered):
         self._scale = width / SIZE[0], height / SIZE[1]
 
     def truths(self, mapping: PixelMapping) -> list[Truth]:
-        """As `Rendered.truths`, in the coordinates of a mapping from the sensor's frames."""
+        """Like `Rendered.truths`, for a mapping from frames of the sensor's size."""
         sx, sy = self._scale
         shrink = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
         return super().truths(PixelMapping(SIZE, mapping.size, mapping.matrix @ shrink))
