@@ -1,4 +1,4 @@
-"""A source that shows a few pictures again and again. Copied beside the pipeline file that names it."""
+"""A source that repeats a few pictures; copied to the folder of the pipeline file."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from tactflow import Frame, Source, StageParams
 
 
 class Endless(Source):
-    """Pictures at a rate, like a camera, or as fast as possible, like a recording.
+    """Pictures at a fixed rate, like a camera, or as fast as possible, like a recording.
 
-    The time of a live frame is when it was due on the monotonic clock, which all processes share, so that a
-    subscriber can tell how old a result is.
+    The time of a live frame is its due time on the monotonic clock, which all processes share, so that
+    subscribers can measure the age of a result.
     """
 
     class Params(StageParams):
-        """What to show, and how fast."""
+        """Pictures and rate."""
 
         pictures: str = Field(description=".npy file")
         rate: float = Field(0.0, description="frames per second; 0: as fast as possible")
-        frames: int = Field(1_000_000_000, description="how many")
+        frames: int = Field(1_000_000_000, description="number of frames")
 
     def __init__(self, params: Params, sensor: str) -> None:
         super().__init__(params)
@@ -35,7 +35,7 @@ class Endless(Source):
         self._stopped = threading.Event()
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame when it is due."""
+        """Yield each frame when it is due."""
         pictures = np.load(self.params.pictures)
         pictures.flags.writeable = False
         began = time.perf_counter()
@@ -47,5 +47,5 @@ class Endless(Source):
             yield Frame(self._sensor, seq, t, pictures[seq % len(pictures)], captured, reference=seq == 0)
 
     def stop(self) -> None:
-        """Show no more."""
+        """End the frames."""
         self._stopped.set()

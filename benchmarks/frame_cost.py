@@ -1,12 +1,12 @@
-"""What a frame costs: CPU time of the default pipeline, whole and per stage; and the time to start.
+"""Measure the CPU time of a frame in the default pipeline, in total and per stage, and the startup time.
 
     python benchmarks/frame_cost.py                        # this checkout
     python benchmarks/frame_cost.py --against DIR          # DIR (old) and this checkout (new) in turns
 
-Each checkout needs a `.venv` of its own. The pipeline runs in one thread with a JSON Lines sink; reading the
+Each checkout needs its own `.venv`. The pipeline runs in one thread with a JSON Lines sink; reading the
 recording is not counted. Two checkouts take turns every 20 frames, and each frame is compared with the same
-frame of the other: the median ratio new / old and its 95 % interval (bootstrap over runs) hardly suffer from
-other programs on the machine. The times themselves do.
+frame of the other. So the median ratio new / old and its 95 % interval (bootstrap over runs) are robust to
+other load on the machine, unlike the times themselves.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ("press", "cable", "dense")
 FRAMES = 240
-"""Frames of each scene: several presses, about as many frames with contact as without."""
+"""Frames of each scene: several presses, about half of the frames with contact."""
 BLOCK = 20
-"""Frames in a turn. They are read while the clock stands: in memory then, but not in the CPU's cache."""
+"""Frames per turn, read before the clock starts: they are in memory, but not in the CPU's cache."""
 START = {
     "import tactflow": "-c 'import tactflow'",
     "tactflow run, 2 frames": "-m tactflow run --max-frames 2 --quiet --set sinks.jsonl.path=/dev/null",
@@ -41,7 +41,7 @@ START = {
 """Commands whose wall time is measured, as arguments of Python."""
 
 Times = dict[str, float]
-"""What was measured -> ms."""
+"""Name of a measurement -> ms."""
 Samples = dict[str, list[Times]]
 """Checkout (`old`, `new`) -> its measurements, in the same order for both."""
 
@@ -49,7 +49,7 @@ Samples = dict[str, list[Times]]
 class Stopwatch:
     """Collects the CPU time of each frame and of the stages within it by patching their classes.
 
-    frames : seq -> times; `frame` is the whole, including the engine's own work.
+    frames : seq -> times; `frame` is the total, including the engine.
     """
 
     def __init__(self) -> None:
@@ -57,12 +57,12 @@ class Stopwatch:
         self._stages: Times = {}
 
     def time_source(self, _: str, cls: type, method: str) -> None:
-        """Measure what the pipeline does with a frame until it asks this source for the next one."""
+        """Measure the time until the pipeline requests the next frame of this source."""
         original = getattr(cls, method)
 
         def frames(source: Any) -> Iterator[Any]:
             pending = original(source)
-            # Copied, so that no page of a mapped file is read while the clock runs.
+            # Copy, to avoid page faults of a mapped file while the clock runs.
             while block := [replace(frame, image=frame.image.copy()) for frame in islice(pending, BLOCK)]:
                 print("ready", flush=True)
                 sys.stdin.readline()
@@ -114,12 +114,12 @@ def measure_frames(recording: Path, results: Path) -> list[Times]:
 
 
 def python(tree: Path, *arguments: str | Path) -> list[str]:
-    """The command that runs the Python of a checkout."""
+    """Command line for the Python of a checkout."""
     return [str(tree / ".venv" / "bin" / "python"), *map(str, arguments)]
 
 
 def measure_scene(trees: dict[str, Path], recording: Path) -> Samples:
-    """Run all checkouts on a recording, in turns of `BLOCK` frames."""
+    """Run all checkouts on a recording, taking turns of `BLOCK` frames."""
     children: dict[str, Any] = {}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with tempfile.TemporaryDirectory() as folder:
@@ -127,29 +127,29 @@ def measure_scene(trees: dict[str, Path], recording: Path) -> Samples:
             command = python(tree, Path(__file__).resolve(), "--child", recording, f"{folder}/{name}.jsonl")
             children[name] = subprocess.Popen(command, cwd=tree, **pipes)
             children[name].stdout.readline()
-        found: Samples = {}
-        while len(found) < len(children):
-            for name in children.keys() - found.keys():
+        samples: Samples = {}
+        while len(samples) < len(children):
+            for name in children.keys() - samples.keys():
                 print(file=children[name].stdin, flush=True)
                 answer = children[name].stdout.readline()
                 if answer != "ready\n":
-                    found[name] = json.loads(answer)
-    return found
+                    samples[name] = json.loads(answer)
+    return samples
 
 
 def measure_start(trees: dict[str, Path]) -> Samples:
     """Wall time of the commands of `START`, ms."""
-    found: Samples = {name: [{}] for name in trees}
+    samples: Samples = {name: [{}] for name in trees}
     for name, tree in trees.items():
         for title, arguments in START.items():
             began = time.perf_counter()
             subprocess.run(python(tree, *shlex.split(arguments)), cwd=tree, capture_output=True, check=True)
-            found[name][0][title] = 1e3 * (time.perf_counter() - began)
-    return found
+            samples[name][0][title] = 1e3 * (time.perf_counter() - began)
+    return samples
 
 
 def print_rows(title: str, turns: Sequence[Samples]) -> None:
-    """Print the median time of everything measured and, of two checkouts, the median ratio."""
+    """Print the median of each measurement and, for two checkouts, the median ratio."""
     for key in dict.fromkeys(key for turn in turns for times in turn["new"] for key in times):
         row, ratios = f"{title + key:<32}", []
         for name in turns[0]:
@@ -172,8 +172,8 @@ def ratio_text(ratios: Sequence[float]) -> str:
 
 
 def main() -> None:
-    """Measure what the command line asks for."""
-    parser = argparse.ArgumentParser(description="What a frame costs, and the time to start.")
+    """Parse the command line, measure and print."""
+    parser = argparse.ArgumentParser(description="CPU time of a frame, and startup time.")
     parser.add_argument("--against", type=Path, metavar="DIR", help="the old checkout")
     parser.add_argument("--scene", action="append", metavar="NAME", help=f"default: {', '.join(SCENES)}")
     parser.add_argument("--turns", type=int, default=5, help="runs of each checkout (default: 5)")

@@ -1,11 +1,11 @@
-"""A running tactflow under load: how old results are, how many are dropped, what it holds over time.
+"""Measure a running tactflow under load: age and loss of results, memory over time.
 
     python benchmarks/load.py                       # 1 to 16 sensors, 1 to 128 subscribers; five minutes
     python benchmarks/load.py --sensors 1 --rate 60
     python benchmarks/load.py --soak 1000000        # frames through all sinks as fast as possible; an hour
 
-Each sensor shows 800 x 600 px pictures of a contact that comes and goes to the default pipeline. Subscribers
-run on the same machine. Tables are printed in Markdown.
+Each sensor feeds 800 x 600 px pictures with intermittent contact to the default pipeline. Subscribers run on
+the same machine. Tables are printed in Markdown.
 """
 
 from __future__ import annotations
@@ -34,19 +34,20 @@ import tactflow
 
 ROOT = Path(__file__).resolve().parents[1]
 CYCLE = 60
-"""Pictures that are shown again and again: one press and release."""
+"""Number of pictures in the repeated cycle: one press and release."""
 SETTLE, MEASURED = 4.0, 15.0
-"""Seconds that a run is given after its first results, and that it is measured for. Chosen by hand."""
-LOOK_EVERY = 5.0
-"""Seconds between two looks at what a process holds. Chosen by hand."""
+"""Seconds between the first results and the measurement, and duration of the measurement. Chosen by hand."""
+SAMPLE_SECONDS = 5.0
+"""Interval between samples of a process's memory, s. Chosen by hand."""
 PORT = 5750
-"""Of the publisher; the page has the next one."""
+"""Port of the publisher; the page has the next one."""
 SOAK_SIZE = (200, 150)
-"""Small pictures, so that a million take an hour: what is lost with each frame shows all the same."""
+"""Width and height, px: small, so that a million frames take an hour; leaks per frame do not depend on the
+size."""
 
 
 def write_pipeline(folder: Path, size: tuple[int, int], source: Mapping[str, Any], **changes: Any) -> None:
-    """The default pipeline with the endless source, its pictures beside it, and changes of its keys."""
+    """Write the default pipeline with the endless source, its pictures, and changed keys."""
     scene = tactflow.open_scene(f"press?frames={CYCLE}")
     pictures = [cv2.resize(scene.frame(i), size, interpolation=cv2.INTER_AREA) for i in range(CYCLE)]
     np.save(folder / "pictures.npy", np.stack(pictures))
@@ -75,13 +76,13 @@ def running(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def fail_if_ended(process: subprocess.Popen[bytes], folder: Path) -> None:
-    """Stop with what the process has reported if it has ended."""
+    """Exit with the messages of the process if it has ended."""
     if process.poll() is not None:
         raise SystemExit((folder / "messages.txt").read_text(encoding="utf-8"))
 
 
-def held_by(pid: int) -> dict[str, float]:
-    """Memory of a process and its children, MB, and its open files and threads; empty once it has ended."""
+def resources(pid: int) -> dict[str, float]:
+    """Memory of a process and its children, MB, its open files and threads; empty if it has ended."""
     folder = Path(f"/proc/{pid}")
     with suppress(OSError, IndexError):
         children = (folder / f"task/{pid}/children").read_text().split()
@@ -93,7 +94,7 @@ def held_by(pid: int) -> dict[str, float]:
 
 
 class Subscribers:
-    """Reads results over several connections. ages : s. seqs : sensor -> those of the first connection."""
+    """Receives results over several connections. ages : s. seqs : by sensor, of the first connection."""
 
     def __init__(self, count: int) -> None:
         self.ages: list[float] = []
@@ -102,7 +103,7 @@ class Subscribers:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Read in a thread of its own while the block lasts."""
+        """Receive in a thread for the duration of the block."""
         end = threading.Event()
         thread = threading.Thread(target=self._read, args=(end,))
         thread.start()
@@ -132,7 +133,7 @@ class Subscribers:
 
 
 def measure(sensors: int, subscribers: int, rate: float) -> list[str]:
-    """Run one load; returns the cells of its row."""
+    """Measure one load; return the cells of its row."""
     names = {"sensors": {f"s{n}": {} for n in range(sensors)}} if sensors > 1 else {"sensor": "s0"}
     readers = Subscribers(subscribers)
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
@@ -147,9 +148,9 @@ def measure(sensors: int, subscribers: int, rate: float) -> list[str]:
         time.sleep(SETTLE)
         readers.ages.clear()
         readers.seqs.clear()
-        before = held_by(process.pid)["memory, MB"]
+        before = resources(process.pid)["memory, MB"]
         time.sleep(MEASURED)
-        memory = held_by(process.pid)["memory, MB"]
+        memory = resources(process.pid)["memory, MB"]
         ages = 1e3 * np.array(readers.ages)
         arrived = [len(seqs) / (seqs[-1] - seqs[0] + 1) for seqs in readers.seqs.values()]
     p50, p99 = np.percentile(ages, (50, 99))
@@ -163,7 +164,7 @@ def measure(sensors: int, subscribers: int, rate: float) -> list[str]:
 
 
 def soak(frames: int, folder: Path) -> list[dict[str, float]]:
-    """Run frames through all sinks; returns what the process held, look by look."""
+    """Run frames through all sinks; return samples of the process's resources."""
     sinks = {
         "zmq": {"endpoint": f"tcp://127.0.0.1:{PORT}"},
         "jsonl": {"path": "results.jsonl"},
@@ -173,21 +174,21 @@ def soak(frames: int, folder: Path) -> list[dict[str, float]]:
         "view": {"port": PORT + 1},
     }
     write_pipeline(folder, SOAK_SIZE, {"frames": frames}, sinks=sinks, sensor="s0")
-    looks = []
+    samples = []
     with running(folder, "--set", "stages.preprocess.downsample=1") as process, Subscribers(1).reading():
         while process.poll() is None:
-            looks.append(held_by(process.pid))
+            samples.append(resources(process.pid))
             for old in sorted(folder.glob("recording*.mcap"), key=os.path.getmtime)[:-2]:
                 old.unlink()
-            time.sleep(LOOK_EVERY)
+            time.sleep(SAMPLE_SECONDS)
     if process.returncode:
         fail_if_ended(process, folder)
     with (folder / "results.jsonl").open("rb") as lines:
         count = sum(1 for _ in lines)
     if count != frames:
         raise SystemExit(f"required {frames} lines, got {count}")
-    # The last looks find a process that closes what it has open.
-    return [look for look in looks if look][:-1]
+    # The last sample shows a process that is shutting down.
+    return [sample for sample in samples if sample][:-1]
 
 
 def print_row(cells: Sequence[str]) -> None:
@@ -196,20 +197,24 @@ def print_row(cells: Sequence[str]) -> None:
 
 
 def main() -> None:
-    """Measure what the command line asks for."""
-    parser = argparse.ArgumentParser(description="A running tactflow under load.")
+    """Parse the command line, measure and print."""
+    parser = argparse.ArgumentParser(description="Measure a running tactflow under load.")
     parser.add_argument("--sensors", type=int, nargs="+", default=[1, 2, 4, 8, 16])
-    parser.add_argument("--subscribers", type=int, nargs="+", default=[16, 128], help="of one sensor")
-    parser.add_argument("--rate", type=float, default=30.0, help="of each sensor, frames per second (30)")
-    parser.add_argument("--soak", type=int, metavar="FRAMES", help="instead: memory over so many frames")
+    parser.add_argument(
+        "--subscribers", type=int, nargs="+", default=[16, 128], help="number, with one sensor"
+    )
+    parser.add_argument("--rate", type=float, default=30.0, help="frames per second of each sensor (30)")
+    parser.add_argument(
+        "--soak", type=int, metavar="FRAMES", help="measure memory over this number of frames instead"
+    )
     args = parser.parse_args()
     if args.soak:
         with tempfile.TemporaryDirectory() as folder:
-            looks = soak(args.soak, Path(folder))
+            samples = soak(args.soak, Path(folder))
         print_row(["", "after a tenth", "least since", "most since", "at the end"])
         print_row(["---"] * 5)
-        for what in looks[0]:
-            values = [look[what] for look in looks[len(looks) // 10 :]]
+        for what in samples[0]:
+            values = [sample[what] for sample in samples[len(samples) // 10 :]]
             print_row([what, *(f"{v:.0f}" for v in (values[0], min(values), max(values), values[-1]))])
         return
     heads = ["sensors", "subscribers", "results", "age, ms: p50", "p99", "oldest at the end", "memory, MB"]

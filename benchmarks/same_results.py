@@ -1,6 +1,6 @@
 """Compare the results of two checkouts over simulated scenes and real recordings.
 
-    python benchmarks/same_results.py run OUT [--data ../shared/data]     # with the tactflow of this Python
+    python benchmarks/same_results.py run OUT [--data ../shared/data]     # with this Python's tactflow
     python benchmarks/same_results.py compare BEFORE AFTER
 
 Exit code 1 if anything differs by more than the tolerances below.
@@ -25,18 +25,18 @@ SCENES = (
 )
 PIPELINES = ("default", "wedge", "markerless", "classic")
 UPRIGHT = {"wedge": [f"stages.preprocess.{key}" for key in ("homography=null", "rotate=90", "downsample=2")]}
-"""Settings with which a pipeline made for another camera takes the simulator's pictures."""
+"""Pipeline for another camera -> settings for the simulator's pictures."""
 
 MARKER_TOLERANCE = 1e-3
-"""Markers may move by so much, px."""
+"""Maximum difference of marker positions, px."""
 OUTLINE_TOLERANCE = 1.0
-"""Outlines may move by so much, px: every vertex lies within this distance of the other hull."""
+"""Maximum distance of a hull's vertex from the other hull, px."""
 OTHER_TOLERANCE = 1e-2
-"""Centre (px), angle (degrees) and mean flow (px) may differ by so much."""
+"""Maximum difference of centre (px), angle (degrees) and mean flow (px)."""
 
 
 def jobs(data: Path) -> Iterator[tuple[str, str, str, list[str]]]:
-    """Name, pipeline, source and settings of every run."""
+    """Yield name, pipeline, source and settings of every run."""
     for pipeline in PIPELINES:
         for scene in SCENES:
             yield f"{pipeline}-{scene}", pipeline, f"sim:{scene}?frames=60", UPRIGHT.get(pipeline, [])
@@ -69,9 +69,9 @@ def run(out: Path, data: Path, frames: int) -> None:
         print(f"{name}: {len(done.stdout.splitlines())} messages, exit {done.returncode}", flush=True)
 
 
-def hull_distance(one: list[Any], other: list[Any]) -> float:
-    """Largest distance of a vertex of one hull from the border of the other, px."""
-    first, second = (np.asarray(hull, np.float32).reshape(-1, 1, 2) for hull in (one, other))
+def hull_distance(before: list[Any], after: list[Any]) -> float:
+    """Largest distance of a vertex of a hull from the border of the other, px."""
+    first, second = (np.asarray(hull, np.float32).reshape(-1, 1, 2) for hull in (before, after))
     return max(
         max(abs(cv2.pointPolygonTest(border, (float(x), float(y)), True)) for x, y in points[:, 0])
         for points, border in ((first, second), (second, first))
@@ -79,7 +79,7 @@ def hull_distance(one: list[Any], other: list[Any]) -> float:
 
 
 def differences(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
-    """What differs between two messages of the same frame."""
+    """Describe the differences between two messages of the same frame."""
     if before["seq"] != after["seq"]:
         yield f"seq {before['seq']} and {after['seq']}"
         return
@@ -118,27 +118,28 @@ def differences(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
 
 
 def compare(before: Path, after: Path) -> int:
-    """Print what differs; returns how many runs do."""
+    """Print the differences; return the number of runs that differ."""
     bad = total = 0
     for file in sorted(before.glob("*.jsonl")):
         if not (after / file.name).exists():
-            print(f"{file.stem}: was not run")
+            print(f"{file.stem}: not run")
             bad += 1
             continue
         lines = [
             [json.loads(line) for line in (f / file.name).read_text().splitlines()] for f in (before, after)
         ]
-        found: dict[str, list[int]] = {}
-        for one, other in zip(*lines, strict=False):
+        changes: dict[str, list[int]] = {}
+        for message, new_message in zip(*lines, strict=False):
             total += 1
-            for text in differences(one, other):
-                found.setdefault(text, []).append(one["seq"])
+            for text in differences(message, new_message):
+                changes.setdefault(text, []).append(message["seq"])
         if len(lines[0]) != len(lines[1]):
-            found[f"{len(lines[0])} and {len(lines[1])} messages"] = []
-        if found:
+            changes[f"{len(lines[0])} and {len(lines[1])} messages"] = []
+        if changes:
             bad += 1
             print(
-                f"{file.stem}: " + "; ".join(f"{text} ({seqs[:3]})" for text, seqs in list(found.items())[:6])
+                f"{file.stem}: "
+                + "; ".join(f"{text} ({seqs[:3]})" for text, seqs in list(changes.items())[:6])
             )
     print(f"{total} messages compared; {bad} runs differ")
     return bad
@@ -149,15 +150,17 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    one = commands.add_parser("run")
-    one.add_argument("out", type=Path)
-    one.add_argument("--data", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "data")
-    one.add_argument("--frames", type=int, default=60)
-    two = commands.add_parser("compare")
-    two.add_argument("before", type=Path)
-    two.add_argument("after", type=Path)
-    given = parser.parse_args()
-    if given.command == "run":
-        run(given.out.resolve(), given.data.resolve(), given.frames)
+    run_parser = commands.add_parser("run")
+    run_parser.add_argument("out", type=Path)
+    run_parser.add_argument(
+        "--data", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "data"
+    )
+    run_parser.add_argument("--frames", type=int, default=60)
+    compare_parser = commands.add_parser("compare")
+    compare_parser.add_argument("before", type=Path)
+    compare_parser.add_argument("after", type=Path)
+    args = parser.parse_args()
+    if args.command == "run":
+        run(args.out.resolve(), args.data.resolve(), args.frames)
     else:
-        sys.exit(bool(compare(given.before, given.after)))
+        sys.exit(bool(compare(args.before, args.after)))

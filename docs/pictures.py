@@ -1,11 +1,11 @@
-"""The pictures of README.md, view.md and accuracy.md.
+"""Create the pictures of README.md, view.md and accuracy.md.
 
     python docs/pictures.py            results.jpg, view-dark.jpg, view-phone.jpg
     python docs/pictures.py troubles   accuracy/troubles.jpg
 
-The first calibrates the simulated sensor, draws what it feels with the stage `visualize`, and takes pictures
-of the live page in Chromium. Needs what the browser tests need, and a quiet machine: the page shows latency.
-The second draws the worst frames that `tactflow bench` finds. Each takes two minutes.
+The first calibrates the simulated sensor, draws its results with the stage `visualize`, and takes screenshots
+of the live page in Chromium. It needs the packages of the browser tests, and an idle machine because the page
+shows latency. The second draws the worst frames of `tactflow bench`. Each takes two minutes.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from tactflow.bench.scenes import TROUBLES
 DOCS = Path(__file__).resolve().parent
 PITCH: Final = 1.724
 BALL_RADIUS: Final = 2.375
-"""Of the simulated sensor and its ball, mm, if a raw pixel is taken for 0.025 mm."""
+"""Pitch of the simulated dots and radius of the ball, mm, at 0.025 mm per raw pixel."""
 GAUGED: Final = "twist?frames=800&seed=3"
-"""Scene with a gauge, from which the force is learned."""
+"""Scene for the force calibration."""
 WATCHED: Final = "sim:twist?frames=100000"
 """Source of the page."""
 SHOWN: Final = {"press": (30, 50), "cable": (30, 50), "slide": (40, 60)}
-"""Scene -> frames among which the deepest is drawn."""
+"""Scene -> range of frames, of which the deepest is drawn."""
 DEEPEST: Final = 0.8
 """Height of the lightest colour, mm."""
 QUALITY: Final = 82
-"""Of all pictures, as JPEG."""
+"""JPEG quality of all pictures."""
 FULL_SECONDS: Final = 11
-"""After so many seconds the plots of the page are full."""
+"""Seconds until the plots of the page are full."""
 ACROSS: Final = 5
-"""Scenes of troubles beside each other."""
+"""Columns of the picture of troubles."""
 SMALL: Final = (270, 380)
-"""Size of each, px."""
+"""Width and height of each, px."""
 DEEP: Final = "() => parseFloat(document.getElementById('value-depth').textContent) > 0.2"
 
 
 def main() -> None:
-    """Make them all."""
+    """Create results.jpg and the screenshots."""
     with tempfile.TemporaryDirectory() as folder:
         calibration = Path(folder) / "main.yaml"
         scale = ("--pitch", str(PITCH), "--ball-radius", str(BALL_RADIUS), "--out", str(calibration))
@@ -66,7 +66,7 @@ def main() -> None:
 
 
 def troubles() -> None:
-    """The worst frame of each scene with a real gel's trouble."""
+    """Create the picture of the worst frame of each scene with troubles of real gels."""
     names = [case.label for case in TROUBLES]
     with tempfile.TemporaryDirectory() as folder:
         scenes = [word for name in names for word in ("--scene", name)]
@@ -80,7 +80,7 @@ def troubles() -> None:
 
 
 def _drawn(scene: str, calibration: Path, first: int, last: int) -> NDArray[np.uint8]:
-    """The results of a scene drawn on the frame, and its height map below."""
+    """The deepest frame of a range with its results, and its height map below."""
     settings = {"calibration": str(calibration)}
     results = tactflow.stream(source=f"sim:{scene}", settings=settings, max_frames=last, images=True)
     r = max(
@@ -115,7 +115,7 @@ def _pages(calibration: Path) -> None:
 
 
 def _page(browser: Browser, url: str, name: str, *, surface: bool, **options: Any) -> None:
-    """A picture of the page of a run, held in contact, with full plots."""
+    """Take a screenshot of the page during contact, with full plots."""
     page = browser.new_context(color_scheme="dark", **options).new_page()
     page.goto(url)
     if surface:

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What a running tactflow publishes, as topics of ROS 1: for robots that still have it.
+"""Publish the results of a running tactflow as ROS 1 topics.
 
     python3 tactflow_ros1.py _endpoint:=tcp://127.0.0.1:5556 _sensor:=main _frame_id:=tactile_optical_frame
 
-Needs rospy, std_msgs, geometry_msgs and pyzmq. Topics, units and stamps are those of the ROS 2 bridge
-(docs/robots.md), as far as they are here: touching, contact, contact_pose, flow, and the same with _pixels.
+Needs rospy, std_msgs, geometry_msgs and pyzmq. Topics, units and stamps are a subset of the ROS 2 bridge's
+(docs/robots.md): touching, contact, contact_pose, flow, and the last three with the suffix _pixels.
 """
 
 import json
@@ -20,7 +20,7 @@ KINDS = {"contact": PolygonStamped, "contact_pose": PoseStamped, "flow": Vector3
 
 
 def publish(topics, message, head):
-    """Send one message of tactflow; lengths in pixels, and in metres where there is a scale."""
+    """Publish a message of tactflow, with lengths in pixels and, if it has a scale, in metres."""
     contact, scale = message["contact"], message.get("scale")
     mean = message["flow"] and message["flow"]["mean"]
     topics["touching"].publish(contact is not None)
@@ -36,7 +36,7 @@ def publish(topics, message, head):
             pose = PoseStamped(header=head)
             x, y = contact["center"]
             pose.pose.position.x, pose.pose.position.y = (x - origin[0]) * size[0], (y - origin[1]) * size[1]
-            # Counter-clockwise as seen is against z, which points into the picture.
+            # tactflow's angles are counter-clockwise on the screen; z points into the picture.
             half = -math.radians(contact["angle"] or 0.0) / 2
             pose.pose.orientation.z, pose.pose.orientation.w = math.sin(half), math.cos(half)
             topics["contact_pose" + suffix].publish(pose)
@@ -47,7 +47,7 @@ def publish(topics, message, head):
 
 
 def main():
-    """Receive and publish until told to end."""
+    """Receive and publish until shutdown."""
     rospy.init_node("tactflow")
     sensor = rospy.get_param("~sensor", "main")
     frame_id = rospy.get_param("~frame_id", "tactile_optical_frame")
@@ -56,7 +56,7 @@ def main():
     socket = zmq.Context().socket(zmq.SUB)
     socket.subscribe(f"tactflow.{sensor} ".encode())
     endpoint = rospy.get_param("~endpoint", "tcp://127.0.0.1:5556")
-    # ZeroMQ takes addresses of IPv6 only where it is told to.
+    # ZeroMQ accepts IPv6 addresses only with this option.
     socket.setsockopt(zmq.IPV6, endpoint.startswith("tcp://["))
     socket.connect(endpoint)
     while not rospy.is_shutdown():

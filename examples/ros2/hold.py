@@ -1,9 +1,9 @@
-"""Close a gripper until something touches it, and tighten while the object slips: a node beside the bridge.
+"""A node that closes a gripper until contact and tightens while the object slips.
 
     python3 examples/ros2/hold.py --ros-args -p sensor:=main
 
-Publishes the width that the gripper shall have, m, on ~/width (std_msgs/Float64). Whether something slips is
-told where tactflow's pipeline has the stage `slip`.
+Publishes the target width of the gripper, m, on ~/width (std_msgs/Float64). Slip detection needs the stage
+`slip` in tactflow's pipeline.
 """
 
 import rclpy
@@ -13,13 +13,13 @@ from rclpy.qos import qos_profile_sensor_data
 from std_msgs.msg import Bool, Float64
 
 STEP = 0.0005
-"""By how much the gripper closes in a frame, m. Chosen by hand: 30 mm/s at 60 Hz."""
+"""Closing distance per frame, m. Chosen by hand: 30 mm/s at 60 Hz."""
 TIGHTEN = 0.0001
-"""By how much it closes in a frame while the object slips, m. Chosen by hand."""
+"""Closing distance per frame while the object slips, m. Chosen by hand."""
 
 
 class Hold(Node):
-    """Closes while nothing touches, tightens while something slips."""
+    """Closes without contact, tightens during slip."""
 
     def __init__(self) -> None:
         super().__init__("hold")
@@ -27,16 +27,16 @@ class Hold(Node):
         self.width = self.declare_parameter("width", 0.08).value
         self.slipping = False
         self.command = self.create_publisher(Float64, "~/width", 10)
-        # The bridge sends as sensors do; who asks for more receives nothing.
+        # The bridge publishes with the QoS of sensor data; a reliable subscription would receive nothing.
         for topic, callback in (("touching", self.on_touching), ("slipping", self.on_slipping)):
             self.create_subscription(Bool, f"/{sensor}/tactflow/{topic}", callback, qos_profile_sensor_data)
 
     def on_slipping(self, message: Bool) -> None:
-        """Comes after `touching` of the same frame."""
+        """Arrives after `touching` of the same frame."""
         self.slipping = message.data
 
     def on_touching(self, message: Bool) -> None:
-        """Every frame: the next width."""
+        """Publish the next width, every frame."""
         if not message.data:
             self.width -= STEP
         elif self.slipping:
@@ -46,7 +46,7 @@ class Hold(Node):
 
 
 def main() -> None:
-    """Run until told to end."""
+    """Run until shutdown."""
     rclpy.init()
     try:
         rclpy.spin(Hold())

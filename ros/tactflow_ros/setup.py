@@ -1,4 +1,4 @@
-"""Installs the package where ROS 2 looks for it."""
+"""Install the package for ROS 2."""
 
 from setuptools import setup
 

@@ -360,7 +360,7 @@ def test_the_stop_button_ends_the_process(run: Callable[..., Run], open_page: Ca
     assert started.exit_code() == 0
     status(page, "ended")
     assert page.inner_text("#empty-title") == "The run has ended"
-    assert "It was stopped." in page.inner_text("#empty-text")
+    assert "The run was stopped." in page.inner_text("#empty-text")
     assert page.is_disabled("#stop")
 
 
@@ -772,7 +772,7 @@ def test_a_session_of_presses_is_guided_and_the_last_one_can_be_undone(
     until(page, "() => document.getElementById('guide-now').textContent === 'Lift the ball.'")
     assert page.is_disabled("#undo")
     stage.send(state("main", end="signal"))
-    until(page, "() => document.getElementById('empty-title').textContent === 'The presses are collected'")
+    until(page, "() => document.getElementById('empty-title').textContent === 'All presses are recorded'")
 
 
 # -- one run that several tests watch: the last ones, so that it does not run beside the others -------------

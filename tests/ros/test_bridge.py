@@ -291,7 +291,7 @@ def test_a_subscriber_that_asks_for_more_is_told_why_it_receives_nothing(pair: P
         ({"parent_frame": "finger", "rotation": [0.0] * 4}, "configured", "required a quaternion x, y, z, w"),
         ({"parent_frame": "finger", "translation": [1.0]}, "configured", "required 3 finite numbers"),
         ({"endpoint": "nowhere"}, "activated", "required an address such as tcp://127.0.0.1:5556"),
-        ({"keys": "/nowhere"}, "activated", "tactflow keys new makes such a folder"),
+        ({"keys": "/nowhere"}, "activated", "tactflow keys new creates such a folder"),
     ],
 )
 def test_parameters_that_cannot_be_are_refused_with_what_to_do(
@@ -321,7 +321,7 @@ def test_silence_and_keys_that_are_refused_are_told(pair: Pair, tmp_path: Path) 
     sink.open()
     for keys in ("", str(stranger)):
         told = condition(pair, {"endpoint": sink.endpoint, "keys": keys, "timeout": 60.0})
-        assert "asks for keys, or for others: set the parameter keys" in told["condition"]
+        assert "requires other keys, or any: set the parameter keys" in told["condition"]
     sink.close()
     silent = condition(pair, {"endpoint": f"ipc://{tmp_path}/nobody", "timeout": 0.1})
     assert "no message since the start; is tactflow running" in silent["condition"]

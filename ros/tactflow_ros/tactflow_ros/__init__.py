@@ -1,1 +1,1 @@
-"""Topics from a running tactflow. Needs rclpy, numpy and pyzmq, and nothing of tactflow itself."""
+"""Bridge from a running tactflow to ROS 2 topics. Needs rclpy, numpy and pyzmq, but not tactflow."""

@@ -6,7 +6,7 @@ import sys
 
 
 def main() -> int:
-    """Run the node, or say what is missing."""
+    """Run the node, or report a missing package."""
     try:
         from tactflow_ros.bridge import main as run
     except ModuleNotFoundError as error:

@@ -1,7 +1,7 @@
-"""The node: what a running tactflow publishes over ZeroMQ, as topics.
+"""The node that publishes the results of a running tactflow as topics.
 
-A lifecycle node for one sensor. `configure` checks the parameters and makes the topics, `activate` connects.
-Messages are published by the thread that receives them; the executor only has the service and a timer.
+A lifecycle node for one sensor. `configure` validates the parameters and creates the topics, `activate`
+connects. The receiving thread publishes the messages; the executor handles only the service and a timer.
 """
 
 from __future__ import annotations
@@ -30,33 +30,33 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from tactflow_ros import messages
-from tactflow_ros.link import Link, LinkError, ask
+from tactflow_ros.link import Link, LinkError, send_command
 
 DEPTH = 10
-"""Messages of a topic that may wait for a subscriber."""
+"""Queue length of a topic."""
 ANSWER_SECONDS = 2.0
-"""How long the service waits for tactflow, s. Chosen by hand."""
+"""Timeout of the service, s. Chosen by hand."""
 LIVE = 1e9
-"""Times above are those of a live source (Unix time); a recording counts from its beginning, s."""
+"""Times above this are Unix times of a live source; those of a recording start at 0, s."""
 MOST_LOST = 0.5
 """Share of lost markers above which /diagnostics warns. Chosen by hand."""
 
 PARAMETERS: dict[str, tuple[Any, str]] = {
-    "endpoint": ("tcp://127.0.0.1:5556", "where tactflow publishes: sinks.zmq.endpoint"),
+    "endpoint": ("tcp://127.0.0.1:5556", "address of results: sinks.zmq.endpoint"),
     "sensor": ("main", "name of the sensor in tactflow"),
-    "control": ("", "sinks.zmq.control, for the service ~/take_reference; empty: none"),
-    "keys": ("", "the subscriber's folder of tactflow keys new; empty: none are needed"),
-    "frame_id": ("tactile_optical_frame", "of the picture: x right, y down, z out of the gel"),
-    "parent_frame": ("", "what it is fixed to; empty: no transform is published"),
+    "control": ("", "sinks.zmq.control, for the service ~/take_reference; empty disables it"),
+    "keys": ("", "folder of the subscriber, from tactflow keys new; empty for no keys"),
+    "frame_id": ("tactile_optical_frame", "frame of the picture: x right, y down, z out of the gel"),
+    "parent_frame": ("", "parent of frame_id; empty for no transform"),
     "translation": ([0.0, 0.0, 0.0], "of frame_id in parent_frame: x, y, z, m"),
     "rotation": ([0.0, 0.0, 0.0, 1.0], "quaternion x, y, z, w"),
     "reliability": ("best_effort", "of the topics: best_effort or reliable"),
-    "timeout": (2.0, "time without a message after which /diagnostics says so, s"),
+    "timeout": (2.0, "time without a message before /diagnostics reports it, s"),
     "tactile": (False, "also publish /tactile: mean flow x, y in pixels, and slope"),
     "publish_clock": (False, "also publish /clock, from the capture times of a recording"),
-    "autostart": (True, "configure and activate by itself"),
+    "autostart": (True, "configure and activate automatically"),
 }
-"""Parameter -> its default, and what it means."""
+"""Parameter -> default, description."""
 
 Maker = Callable[[messages.Message, Any, messages.Unit], Any]
 
@@ -66,23 +66,23 @@ GEOMETRY: dict[str, tuple[type, Maker]] = {
     "flow": (Vector3Stamped, messages.flow),
     "markers": (PointCloud2, messages.markers),
 }
-"""Topic -> its type and what makes it; each in metres, and, as `NAME_pixels`, in pixels."""
-OTHERS = {
+"""Topic -> type and converter; published in metres and, as `NAME_pixels`, in pixels."""
+UNITLESS = {
     "touching": Bool,
     "slipping": Bool,
     "wrench": WrenchStamped,
     "depth": Image,
     "image/compressed": CompressedImage,
 }
-"""Topic -> its type, of those without lengths in two units."""
+"""Topic -> type, for topics in a single unit."""
 ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
-"""What tactflow sends only to those who ask -> the topic that it is for."""
+"""Message sent by tactflow only on subscription -> topic."""
 
 
 class Counts:
-    """What /diagnostics tells, counted from one report to the next.
+    """Statistics for /diagnostics between two reports.
 
-    `note` and `report` may be called from two threads.
+    `note` and `report` are thread-safe.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class Counts:
             self.lost_markers = status.count("lost") / len(status) if status else math.nan
 
     def report(self) -> dict[str, float]:
-        """The numbers since the last report."""
+        """Statistics since the last report."""
         with self._lock:
             now = time.monotonic()
             latency = sorted(self._latency_s) or [math.nan]
@@ -137,19 +137,19 @@ class Bridge(LifecycleNode):
         self._counts = Counts()
         self._run: dict[str, Any] = {}
         self._static: Any = None
-        self._told_replay = False
+        self._warned_replay = False
         self.create_service(Trigger, "~/take_reference", self._take_reference)
-        # Also where simulated time stands still.
+        # Steady, because simulated time may stand still.
         self.create_timer(1.0, self._look, clock=Steady(clock_type=ClockType.STEADY_TIME))
 
     def value(self, name: str) -> Any:
-        """Of a parameter."""
+        """Value of a parameter."""
         return self.get_parameter(name).value
 
     # -- life cycle ---------------------------------------------------------------------------------------
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
-        """Check the parameters, make the topics."""
+        """Validate the parameters and create the topics."""
         del state
         try:
             self._make_topics()
@@ -162,10 +162,10 @@ class Bridge(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Connect to tactflow, which may be started before or after."""
+        """Connect to tactflow, which may start before or after."""
         endpoint, sensor = self.value("endpoint"), self.value("sensor")
         self._counts, self._run = Counts(), {}
-        # Publishers first: the first message may come at once.
+        # Publishers first: a message may arrive immediately.
         result = super().on_activate(state)
         try:
             self._link = Link(endpoint, sensor, self.value("keys"), self._received)
@@ -182,18 +182,18 @@ class Bridge(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Take the topics back."""
+        """Remove the topics."""
         del state
         self._forget()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """As `on_cleanup`, from any state."""
+        """Like `on_cleanup`, from any state."""
         self.disconnect()
         return self.on_cleanup(state)
 
     def disconnect(self) -> None:
-        """Receive no more. May be called twice."""
+        """Stop receiving; idempotent."""
         link, self._link = self._link, None
         if link is not None:
             link.close()
@@ -209,7 +209,7 @@ class Bridge(LifecycleNode):
             raise ValueError(f"reliability: required best_effort or reliable, got {word!r}")
         reliability = QoSReliabilityPolicy[word.upper()]
         qos = QoSProfile(depth=DEPTH, reliability=reliability, durability=QoSDurabilityPolicy.VOLATILE)
-        kinds = dict(OTHERS)
+        kinds = dict(UNITLESS)
         for name, (kind, _) in GEOMETRY.items():
             kinds |= {name: kind, f"{name}_pixels": kind}
         for name, kind in kinds.items():
@@ -222,13 +222,13 @@ class Bridge(LifecycleNode):
         self._others.append(self._diagnostics)
 
     def _publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
-        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._tell_mismatch(topic))
+        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._warn_mismatch(topic))
         return self.create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
 
-    def _tell_mismatch(self, topic: str) -> None:
+    def _warn_mismatch(self, topic: str) -> None:
         self.get_logger().warning(
-            f"{topic}: a subscriber asks for another quality of service and receives nothing; have it ask "
-            "for best_effort and volatile (qos_profile_sensor_data), or set the parameter reliability to "
+            f"{topic}: a subscriber requests an incompatible quality of service and receives nothing; let it "
+            "request best_effort and volatile (qos_profile_sensor_data), or set the parameter reliability to "
             "reliable"
         )
 
@@ -252,7 +252,7 @@ class Bridge(LifecycleNode):
     # -- messages -----------------------------------------------------------------------------------------
 
     def _received(self, name: str, message: messages.Message, data: bytes) -> None:
-        """What tactflow has sent; in the link's thread."""
+        """Handle a message of tactflow, in the link's thread."""
         frame_id = self.value("frame_id")
         if name == "stats":
             self._run = message
@@ -265,7 +265,7 @@ class Bridge(LifecycleNode):
             self._publish(message, messages.header(message, frame_id))
 
     def _publish(self, message: messages.Message, head: Any) -> None:
-        self._tell_replay(message["t"])
+        self._warn_replay(message["t"])
         self._offer("/clock", lambda: Clock(clock=head.stamp))
         self._offer("touching", lambda: Bool(data=message["contact"] is not None))
         slip = message.get("slip")
@@ -277,20 +277,21 @@ class Bridge(LifecycleNode):
         self._offer("/tactile", lambda: messages.tactile(message))
 
     def _offer(self, topic: str, make: Callable[[], Any]) -> None:
-        """Publish what is made, if there is something, where somebody listens."""
+        """Create and publish a message, unless the topic has no subscribers or there is nothing to
+        publish."""
         publisher = self._topics.get(topic)
         if publisher is not None and publisher.get_subscription_count():
-            made = make()
-            if made is not None:
-                publisher.publish(made)
+            message = make()
+            if message is not None:
+                publisher.publish(message)
 
-    def _tell_replay(self, t: float) -> None:
-        if t > LIVE or self._told_replay or self.value("use_sim_time"):
+    def _warn_replay(self, t: float) -> None:
+        if t > LIVE or self._warned_replay or self.value("use_sim_time"):
             return
-        self._told_replay = True
+        self._warned_replay = True
         self.get_logger().warning(
             "this is a recording: its stamps count from its beginning, not from 1970; for nodes that compare "
-            "them with now, set use_sim_time everywhere and publish_clock here"
+            "them with the current time, set use_sim_time everywhere and publish_clock here"
         )
 
     # -- service and diagnostics --------------------------------------------------------------------------
@@ -299,7 +300,7 @@ class Bridge(LifecycleNode):
         del request
         control = self.value("control")
         if control:
-            response.success, response.message = ask(
+            response.success, response.message = send_command(
                 control, "take_reference", self.value("keys"), ANSWER_SECONDS
             )
         else:
@@ -310,7 +311,7 @@ class Bridge(LifecycleNode):
         return response
 
     def _look(self) -> None:
-        """Once a second: what is wanted, and how it is."""
+        """Once a second: update the subscriptions and publish diagnostics."""
         link = self._link
         if link is None:
             return
@@ -349,12 +350,12 @@ class Bridge(LifecycleNode):
 
 
 def main() -> int:
-    """Run the node until it is told to end."""
+    """Run the node until shutdown."""
     rclpy.init()
     try:
         node = Bridge()
     except ParameterException as error:
-        get_logger("tactflow").error(f"{error}; a number with a point, as in 2.0, is a DOUBLE")
+        get_logger("tactflow").error(f"{error}; a DOUBLE needs a decimal point, as in 2.0")
         rclpy.try_shutdown()
         return 1
     try:

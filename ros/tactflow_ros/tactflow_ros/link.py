@@ -1,4 +1,4 @@
-"""The way to tactflow over ZeroMQ: its messages, and commands to it."""
+"""Connection to tactflow over ZeroMQ: receive messages, send commands."""
 
 from __future__ import annotations
 
@@ -12,47 +12,47 @@ import zmq
 import zmq.auth
 
 POLL_MS = 100
-"""How often the thread looks whether it shall end, and what is wanted, ms. Chosen by hand."""
+"""Interval at which the thread checks for closing and for changed subscriptions, ms. Chosen by hand."""
 BACKLOG = 120
-"""Messages that may wait while this process stands still: two seconds at 60 Hz. Chosen by hand."""
-LONGEST_MESSAGE = 16 << 20
-"""Bytes of a message at most. Chosen by hand."""
+"""Messages queued while this process is blocked: two seconds at 60 Hz. Chosen by hand."""
+MAX_MESSAGE_BYTES = 16 << 20
+"""Maximum size of a message. Chosen by hand."""
 REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-"""After these, ZeroMQ does not try again."""
+"""Handshake failures after which ZeroMQ does not reconnect."""
 REQUIRED = frozenset(["sensor", "seq", "t", "contact", "flow", "markers"])
 """Keys that a result message must have."""
 
 
 class LinkError(Exception):
-    """tactflow cannot be reached so; says what to do."""
+    """Invalid address or keys; the message states the remedy."""
 
 
-def show_keys(socket: zmq.Socket, folder: str) -> None:
-    """Let a socket prove who it is. folder : the subscriber's, that `tactflow keys new` makes; "": none."""
+def set_keys(socket: zmq.Socket, folder: str) -> None:
+    """Set the keys of a socket. folder : of the subscriber, from `tactflow keys new`; "" for no keys."""
     if not folder:
         return
-    place = Path(folder).expanduser()
+    path = Path(folder).expanduser()
     try:
-        public, secret = zmq.auth.load_certificate(place / "subscriber.key_secret")
-        server, _ = zmq.auth.load_certificate(place / "publisher.key")
+        public, secret = zmq.auth.load_certificate(path / "subscriber.key_secret")
+        server, _ = zmq.auth.load_certificate(path / "publisher.key")
     except (OSError, ValueError) as error:
-        raise LinkError(f"keys: {error}; tactflow keys new makes such a folder") from None
+        raise LinkError(f"keys: {error}; tactflow keys new creates such a folder") from None
     socket.curve_publickey, socket.curve_secretkey = public, secret
     socket.curve_serverkey = server
 
 
 def connect(socket: zmq.Socket, endpoint: str, keys: str, what: str) -> None:
-    """Connect, which does not wait for the other side.
+    """Connect without waiting for the publisher.
 
     Raises
     ------
-    LinkError : no address, or no keys.
+    LinkError : invalid address, or unreadable keys.
     """
     socket.linger = 0
-    socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_MESSAGE)
-    # ZeroMQ takes addresses of IPv6 only where it is told to.
+    socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+    # ZeroMQ accepts IPv6 addresses only with this option.
     socket.setsockopt(zmq.IPV6, endpoint.startswith("tcp://["))
-    show_keys(socket, keys)
+    set_keys(socket, keys)
     try:
         socket.connect(endpoint)
     except zmq.ZMQError as error:
@@ -61,8 +61,8 @@ def connect(socket: zmq.Socket, endpoint: str, keys: str, what: str) -> None:
         ) from None
 
 
-def ask(endpoint: str, command: str, keys: str, seconds: float) -> tuple[bool, str]:
-    """Send a command to tactflow; whether it was carried out, and what happened in words."""
+def send_command(endpoint: str, command: str, keys: str, seconds: float) -> tuple[bool, str]:
+    """Send a command to tactflow; return whether it succeeded, and a message."""
     with zmq.Context() as context, context.socket(zmq.REQ) as socket:
         try:
             connect(socket, endpoint, keys, "control")
@@ -78,24 +78,22 @@ def ask(endpoint: str, command: str, keys: str, seconds: float) -> tuple[bool, s
             answer = json.loads(socket.recv())
             return bool(answer["ok"]), str(answer["message"])
         except (ValueError, TypeError, KeyError):
-            return False, f"{endpoint} does not answer as tactflow does"
+            return False, f"{endpoint}: not an answer of tactflow"
 
 
 class Link:
-    """A thread that receives, until it is closed.
+    """A thread that receives messages until it is closed.
 
-    endpoint, sensor : of tactflow. keys : folder, or "". on_message : is called in the thread with a topic's
-    first word (`tactflow`, `tactflow_picture`, `tactflow_depth`, or `stats`), the JSON of a message, and what
-    follows it.
+    endpoint, sensor : of tactflow. keys : folder, or "". on_message : called in the thread with the kind of
+    message (`tactflow`, `tactflow_picture`, `tactflow_depth` or `stats`), its JSON, and the bytes after it.
 
     Raises
     ------
-    LinkError : the endpoint is no address, or there are no keys.
+    LinkError : invalid endpoint, or unreadable keys.
 
     Attributes
     ----------
-    refused : why tactflow does not admit us; None while it has not said so. damaged : messages that could
-    not be read.
+    refused : why tactflow rejected the connection, or None. damaged : number of unreadable messages.
     """
 
     def __init__(
@@ -122,7 +120,7 @@ class Link:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.rcvhwm = BACKLOG
-        # A publisher that has lost its power says no goodbye; without a sign of life it is sought again.
+        # Heartbeats detect a publisher that disappeared without closing its connection, and reconnect.
         self._socket.setsockopt(zmq.HEARTBEAT_IVL, 2000)
         self._monitor = self._socket.get_monitor_socket(REFUSALS)
         try:
@@ -134,11 +132,11 @@ class Link:
         self._thread.start()
 
     def want(self, extra: Iterable[str]) -> None:
-        """Also receive these, such as `tactflow_picture`; a moment later."""
+        """Set the additional topics to receive, such as `tactflow_picture`; takes effect within `POLL_MS`."""
         self._wanted = frozenset(["tactflow", "stats", *extra])
 
     def close(self) -> None:
-        """Receive no more."""
+        """Stop receiving."""
         self._closing.set()
         self._thread.join()
         self._end()
@@ -159,7 +157,7 @@ class Link:
             ready = dict(poller.poll(POLL_MS))
             if self._monitor in ready:
                 self._monitor.recv_multipart()
-                self.refused = f"{self._endpoint} asks for keys, or for others: set the parameter keys"
+                self.refused = f"{self._endpoint} requires other keys, or any: set the parameter keys"
             if self._socket in ready:
                 self._pass_on(self._socket.recv())
 
@@ -180,9 +178,9 @@ class Link:
             message = json.loads(text)
             ours = message["sensor"] == self._sensor
             if name == "tactflow" and not message.keys() >= REQUIRED:
-                raise ValueError("no result message")
+                raise ValueError("not a result message")
             if ours:
                 self._on_message(name, message, rest)
         except Exception:
-            # Whatever a message says, the next one shall be received. (rclpy asserts ranges of numbers.)
+            # An invalid message must not end the thread. (rclpy asserts ranges of numbers.)
             self.damaged += 1

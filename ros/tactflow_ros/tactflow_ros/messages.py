@@ -1,7 +1,8 @@
-"""ROS messages from tactflow's: numbers in, messages out; nothing is sent here.
+"""Convert tactflow's messages to ROS messages.
 
-tactflow tells pixels of the processed picture (x right, y down) and, with a calibration, `scale`, which makes
-millimetres of them. Here, lengths are metres (REP 103) or, in topics whose name ends in `_pixels`, pixels.
+Lengths in tactflow are pixels of the processed picture (x right, y down); with a calibration, `scale`
+converts them to millimetres. Here, lengths are metres (REP 103) or, in topics with the suffix `_pixels`,
+pixels.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from std_msgs.msg import Header
 Message = dict[str, Any]
 
 MM = 1e-3
-"""Metres in a millimetre."""
+"""Metres per millimetre."""
 NANOSECONDS = 1_000_000_000
-"""In a second."""
+"""Nanoseconds per second."""
 
 STATUS = {"tracked": 0, "inferred": 1, "lost": 2}
-"""Number of each status of a marker in the cloud."""
+"""Status of a marker -> its number in the cloud."""
 MARKER = np.dtype(
     {
         "names": ["x", "y", "z", "dx", "dy", "stderr", "status"],
@@ -54,9 +55,9 @@ FIELDS = [
 
 
 class Unit(NamedTuple):
-    """How lengths are told.
+    """A unit of length.
 
-    per_pixel : along (x, y). origin : (x, y), px, where coordinates are 0. suffix : of topics' names.
+    per_pixel : units per pixel in (x, y). origin : (x, y), px. suffix : of topic names.
     """
 
     per_pixel: tuple[float, float]
@@ -64,11 +65,11 @@ class Unit(NamedTuple):
     suffix: str
 
     def places(self, points: Any) -> np.ndarray:
-        """(N, 2) places, from pixels."""
+        """Convert positions (N, 2) from pixels."""
         return (np.asarray(points, float).reshape(-1, 2) - self.origin) * self.per_pixel
 
     def vectors(self, vectors: Any) -> np.ndarray:
-        """(N, 2) displacements, from pixels."""
+        """Convert displacements (N, 2) from pixels."""
         return np.asarray(vectors, float).reshape(-1, 2) * self.per_pixel
 
 
@@ -76,7 +77,7 @@ PIXELS = Unit((1.0, 1.0), (0.0, 0.0), "_pixels")
 
 
 def units(message: Message) -> list[Unit]:
-    """Pixels, and metres where the sensor is calibrated."""
+    """Pixels, and metres if the sensor is calibrated."""
     scale = message.get("scale")
     if scale is None:
         return [PIXELS]
@@ -85,8 +86,8 @@ def units(message: Message) -> list[Unit]:
 
 
 def stamp(t: float) -> Time:
-    """Time of the capture, to the nanosecond that the number tells."""
-    # Unix times have no room for nanoseconds in one double.
+    """Convert a capture time, s."""
+    # A double cannot hold a Unix time in nanoseconds, so split it first.
     nanoseconds = math.floor(t) * NANOSECONDS + round(t % 1 * NANOSECONDS)
     return Time(sec=nanoseconds // NANOSECONDS, nanosec=nanoseconds % NANOSECONDS)
 
@@ -97,7 +98,7 @@ def header(message: Message, frame_id: str) -> Header:
 
 
 def polygon(message: Message, head: Header, unit: Unit) -> PolygonStamped:
-    """The convex hull of the contact; without a contact, no points."""
+    """Convex hull of the contact; empty without contact."""
     contact = message["contact"]
     result = PolygonStamped(header=head)
     if contact is not None:
@@ -106,14 +107,14 @@ def polygon(message: Message, head: Header, unit: Unit) -> PolygonStamped:
 
 
 def pose(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
-    """Centre of the contact; its x axis is the contact's direction (the frame's x where it has none)."""
+    """Centre of the contact, with the x axis along its direction (or along the frame's x if it has none)."""
     contact = message["contact"]
     if contact is None:
         return None
     result = PoseStamped(header=head)
     place = result.pose.position
     ((place.x, place.y),) = unit.places(contact["center"]).tolist()
-    # tactflow counts angles counter-clockwise as seen, the frame about z, which points into the picture.
+    # tactflow's angles are counter-clockwise on the screen; the frame's z points into the picture.
     angle = -math.radians(contact["angle"] or 0.0)
     result.pose.orientation.z = math.sin(angle / 2)
     result.pose.orientation.w = math.cos(angle / 2)
@@ -132,17 +133,17 @@ def flow(message: Message, head: Header, unit: Unit) -> Vector3Stamped | None:
 
 def markers(message: Message, head: Header, unit: Unit) -> PointCloud2 | None:
     """A point for each marker: x, y, z (0), dx, dy, stderr (NaN: unknown), status."""
-    told = message["markers"]
-    if told is None:
+    dots = message["markers"]
+    if dots is None:
         return None
-    count = len(told["status"])
+    count = len(dots["status"])
     cloud = np.zeros(count, MARKER)
-    place, origin = unit.places(told["position"]), unit.places(told["origin"])
+    place, origin = unit.places(dots["position"]), unit.places(dots["origin"])
     cloud["x"], cloud["y"] = place.T
     cloud["dx"], cloud["dy"] = (place - origin).T
-    errors = np.array(told.get("stderr") or [None] * count, float)
+    errors = np.array(dots.get("stderr") or [None] * count, float)
     cloud["stderr"] = errors * math.sqrt(unit.per_pixel[0] * unit.per_pixel[1])
-    cloud["status"] = [STATUS.get(word, STATUS["lost"]) for word in told["status"]]
+    cloud["status"] = [STATUS.get(word, STATUS["lost"]) for word in dots["status"]]
     return PointCloud2(
         header=head,
         height=1,
@@ -157,19 +158,19 @@ def markers(message: Message, head: Header, unit: Unit) -> PointCloud2 | None:
 
 
 def wrench(message: Message, head: Header) -> WrenchStamped | None:
-    """The force that acts on the gel; a component that the calibration does not know is NaN."""
+    """Force on the gel; components unknown to the calibration are NaN."""
     force = message.get("force")
     if force is None:
         return None
     result = WrenchStamped(header=head)
     x, y, pressed = (math.nan if part is None else float(part) for part in force["value"])
-    # Pressed in is against z, which points out of the gel.
+    # Pressing is negative because z points out of the gel.
     result.wrench.force.x, result.wrench.force.y, result.wrench.force.z = x, y, -pressed
     return result
 
 
 def tactile(message: Message) -> Point | None:
-    """The original script's message: mean flow x, y, px; slope. Only where there is a slope."""
+    """The original script's message: mean flow x, y, px, and slope; None without a slope."""
     contact, mean = message["contact"], message["flow"] and message["flow"]["mean"]
     if contact is None or contact["slope"] is None:
         return None
@@ -177,17 +178,17 @@ def tactile(message: Message) -> Point | None:
     return Point(x=float(x), y=float(y), z=float(contact["slope"]))
 
 
-def picture(told: Message, data: bytes, frame_id: str) -> CompressedImage:
+def picture(message: Message, data: bytes, frame_id: str) -> CompressedImage:
     """The processed picture."""
-    return CompressedImage(header=header(told, frame_id), format="jpeg", data=array("B", data))
+    return CompressedImage(header=header(message, frame_id), format="jpeg", data=array("B", data))
 
 
-def depth(told: Message, data: bytes, frame_id: str) -> Image:
-    """How far the gel is pushed in, m. data : (height, width) float32, little-endian, mm."""
-    width, height = told["size"]
+def depth(message: Message, data: bytes, frame_id: str) -> Image:
+    """Depth of the indentation, m. data : (height, width) float32, little-endian, mm."""
+    width, height = message["size"]
     metres = np.frombuffer(data, "<f4", width * height) * np.float32(MM)
     return Image(
-        header=header(told, frame_id),
+        header=header(message, frame_id),
         height=height,
         width=width,
         encoding="32FC1",
@@ -200,7 +201,7 @@ def depth(told: Message, data: bytes, frame_id: str) -> Image:
 def transform(
     frame_id: str, parent: str, translation: Sequence[float], rotation: Sequence[float], now: Time
 ) -> TransformStamped:
-    """Where the sensor's frame is. translation : x, y, z, m. rotation : quaternion x, y, z, w.
+    """Pose of the sensor's frame. translation : x, y, z, m. rotation : quaternion x, y, z, w.
 
     Raises
     ------

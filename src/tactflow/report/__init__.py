@@ -1,4 +1,4 @@
-"""Reports: one HTML file that needs nothing else, with headings, text, tables, pictures and plots."""
+"""Reports: a self-contained HTML file with headings, text, tables, pictures and plots."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f8a94")
-"""Colours of data, by Okabe and Ito: distinct with any kind of colour vision, on a light and a dark page."""
+"""Data colours by Okabe and Ito: distinct for all types of colour vision, on light and dark pages."""
 
 
 class Html(str):
-    """Text that is HTML already; any other text is escaped."""
+    """Text that is already HTML; other text is escaped."""
 
 
 @dataclass(frozen=True)
 class Table:
     """A table, sorted by a click on a heading.
 
-    columns : headings with units, such as "time, ms". rows : cells are text, numbers, None or `Html`, such as
-    `link`, `mark` and `picture` return.
+    columns : headings with units, such as "time, ms". rows : cells are text, numbers, None or `Html` from
+    `link`, `mark` or `picture`.
     """
 
     columns: Sequence[str]
@@ -45,10 +45,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with, in this order, text, pictures and tables.
+    """A heading followed by text, pictures and tables.
 
-    text : paragraphs, separated by empty lines. pictures : of `picture`. folded : show only the heading until
-    the reader clicks on it.
+    text : paragraphs, separated by empty lines. pictures : from `picture`. folded : collapse to the heading
+    until clicked.
     """
 
     title: str
@@ -59,7 +59,7 @@ class Section:
 
 
 def write_report(path: Path, title: str, sections: Iterable[Section], text: str = "") -> Path:
-    """Write a report, replacing an earlier one; returns its path. text : paragraphs below the title.
+    """Write a report, overwriting an earlier one; return its path. text : paragraphs below the title.
 
     Raises
     ------
@@ -82,10 +82,10 @@ def write_report(path: Path, title: str, sections: Iterable[Section], text: str 
 
 
 def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (4.8, 3.0), **options: Any) -> Any:
-    """A matplotlib figure and its axes, as `pyplot.subplots` returns them, without a window.
+    """A matplotlib figure and its axes, like `pyplot.subplots` but without a window.
 
-    size : width and height, inches. options : of `Figure.subplots`, such as `sharex=True`. Black and white
-    follow the page's light or dark theme; take other colours from `COLORS`.
+    size : width and height, inches. options : for `Figure.subplots`, such as `sharex=True`. Black and white
+    adapt to the page's light or dark theme; take other colours from `COLORS`.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (4.8, 3.
 
 
 def picture(content: NDArray[Any] | bytes | Figure, caption: str = "") -> Html:
-    """A picture or a plot, for a section or for a cell of a table.
+    """A picture or plot, for a section or a table cell.
 
     content : (H, W) or (H, W, 3) uint8, gray or BGR; an encoded JPEG or PNG; or a matplotlib figure.
     """
@@ -118,12 +118,12 @@ def picture(content: NDArray[Any] | bytes | Figure, caption: str = "") -> Html:
 
 
 def link(text: str, address: str) -> Html:
-    """A link, for a cell of a table. address : quoted for a URL."""
+    """A link, for a table cell. address : URL-quoted."""
     return Html(f'<a href="{escape(address)}">{escape(text)}</a>')
 
 
 def mark(text: str, good: bool) -> Html:
-    """Text in the colour of success or of failure, for a cell of a table."""
+    """Text in the colour of success or failure, for a table cell."""
     return Html(f'<b class="{"good" if good else "bad"}">{escape(text)}</b>')
 
 
@@ -133,7 +133,7 @@ def _image(encoded: bytes) -> str:
 
 
 def _svg(drawing: Figure) -> str:
-    """A figure as SVG whose black and white follow the page's theme."""
+    """A figure as SVG whose black and white adapt to the page's theme."""
     import matplotlib
 
     buffer = io.StringIO()

@@ -1,6 +1,6 @@
-"""The live view: a page in the browser that shows a run while it lasts.
+"""The live view: a browser page that shows a running pipeline.
 
-`hub` decides who is sent what and when, `compact` makes it small, `server` speaks HTTP and WebSocket on its
-own thread, `page/` holds what the browser runs. The sink `tactflow.sinks.view` feeds them. `guided` is for a
-page that guides people through a session.
+`hub` schedules messages to pages, `compact` encodes them, `server` is an HTTP and WebSocket server in a
+thread, `page/` contains the browser code. The sink `tactflow.sinks.view` feeds the hub. `guided` shows guided
+sessions.
 """

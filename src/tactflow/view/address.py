@@ -1,4 +1,4 @@
-"""Addresses of the live view. Imports none of the server's packages."""
+"""Addresses of the live view, without imports of the server's packages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WILDCARDS = frozenset({"0.0.0.0", "::"})
 
 
 def bracketed(host: str) -> str:
-    """A host as written in a URL: IPv6 in brackets."""
+    """Format a host for a URL: IPv6 in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
@@ -27,7 +27,8 @@ def address(host: str, port: int) -> str:
 def bind(host: str, port: int, *, tries: int = 20) -> socket.socket:
     """Open a listening socket on `port`, or on the next free one.
 
-    host : address or name of this machine. port : 0 picks any. tries : ports tried before any is taken.
+    host : address or name of this machine. port : 0 for any. tries : number of ports tried before any free
+    one.
 
     Raises
     ------
@@ -38,7 +39,7 @@ def bind(host: str, port: int, *, tries: int = 20) -> socket.socket:
     for candidate in (*candidates, 0):
         listener = socket.socket(family, socket.SOCK_STREAM)
         try:
-            # The port of a run that has just ended is otherwise refused for a while.
+            # Allows reusing the port of a run that has just ended.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind((resolved[0], candidate, *resolved[2:]))
             listener.listen(64)
@@ -52,9 +53,9 @@ def bind(host: str, port: int, *, tries: int = 20) -> socket.socket:
 
 
 class Neighbours:
-    """Lets the views of several sensors (one process each) find each other through files in a folder.
+    """Discovery between the views of several sensors (one process each), through files in a folder.
 
-    folder : shared by these views only. sensor : the one of this view.
+    folder : shared by these views only. sensor : name of this view's sensor.
     """
 
     def __init__(self, folder: Path, sensor: str) -> None:
@@ -73,12 +74,12 @@ class Neighbours:
 
     def __call__(self) -> Mapping[str, int]:
         """Sensor -> port of every other view."""
-        found: dict[str, int] = {}
+        ports: dict[str, int] = {}
         for file in sorted(self._folder.glob("*.view")):
             if file != self._own:
                 try:
-                    found[file.stem] = int(file.read_text())
+                    ports[file.stem] = int(file.read_text())
                 except (OSError, ValueError):
-                    # That view has just ended.
+                    # The view has just ended.
                     continue
-        return found
+        return ports

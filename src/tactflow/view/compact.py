@@ -1,7 +1,6 @@
-"""What a page is sent about one frame, with compact encodings of markers and height maps.
+"""Encoding of a frame for the page, with compact markers and height maps.
 
-Coordinates that are only drawn are sent in tenths of a pixel, and a height map with as many cells as a screen
-can show.
+Marker coordinates are rounded to tenths of a pixel, and height maps reduced to the resolution of the screen.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from tactflow.vision.types import Depth, Markers
 
 STATUS_LETTERS: Final = np.array([ord(name[0]) for name in STATUS_NAMES], np.uint8)
 """The first letter of the word for each value of `MarkerStatus`."""
-MOST_CELLS: Final = 96
-"""Most cells of a surface along its longer side: a panel of the page is some 600 px wide."""
-LEAST_CELL: Final = 2.0
-"""Smallest side of a cell, px: heights are computed at half the resolution of the picture."""
+MAX_CELLS: Final = 96
+"""Maximum number of cells along the longer side of a surface: its panel is about 600 px wide."""
+MIN_CELL: Final = 2.0
+"""Minimum side of a cell, px: heights are computed at half the resolution of the picture."""
 LEVELS: Final = 65535
-"""Quantization steps from 0 to the greatest height; with 255 a shaded surface shows terraces."""
+"""Quantisation steps from 0 to the greatest height; 255 would show as terraces on the shaded surface."""
 FIELD_ARROWS = 14.0
-"""Distance of the arrows of a displacement field in a picture of 400 px, px. Chosen by hand."""
+"""Spacing of the arrows of a displacement field in a picture of 400 px, px. Chosen by hand."""
 
 
 def encode_packet(
@@ -47,10 +46,10 @@ def encode_packet(
 ) -> tuple[bytes, bytes]:
     """The header, JSON without its closing brace, and the heights of a surface followed by the JPEG picture.
 
-    The picture is plain, and darker where there is no gel; the page draws the results over it. A field or
-    height map that no page shows is `true`: pages offer to show it.
+    The picture is dimmed outside the gel; the page draws the results over it. A field or height map that is
+    available but not shown by any page is `true`.
 
-    shown : those of "field" and "surface" that a page shows. latency_ms : from capture; -1 where not known.
+    shown : layers of "field" and "surface" shown by a page. latency_ms : since capture; -1 if unknown.
     guide : state of a guided session. max_size : of the longer side of the picture, px.
     """
     contact, markers, scale = result.contact, result.markers, result.scale
@@ -120,18 +119,18 @@ def compact_surface(depth: Depth) -> tuple[bytes, bytes]:
 
     >>> heights = np.zeros((40, 60), np.float32)
     >>> heights[10:20, 30:50] = 0.65535
-    >>> described, data = compact_surface(Depth(heights, 0.65535, None, 1.0, None))
-    >>> described
+    >>> header, data = compact_surface(Depth(heights, 0.65535, None, 1.0, None))
+    >>> header
     b'{"box":[30,10,20,10],"size":[10,5],"step":1e-05,"bytes":100}'
     """
     x, y, width, height = cv2.boundingRect((depth.heights > 0).view(np.uint8))
     if not width:
         return b"null", b""
-    side = max(LEAST_CELL, max(width, height) / MOST_CELLS)
+    side = max(MIN_CELL, max(width, height) / MAX_CELLS)
     columns, rows = math.ceil(width / side), math.ceil(height / side)
     part = depth.heights[y : y + height, x : x + width]
     cells = cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA)
     step = float(cells.max()) / LEVELS
     data = np.rint(cells * np.float32(1 / step)).astype("<u2").tobytes()
-    described = b'{"box":[%d,%d,%d,%d],"size":[%d,%d],"step":%.8g,"bytes":%d}'
-    return described % (x, y, width, height, columns, rows, step, len(data)), data
+    header = b'{"box":[%d,%d,%d,%d],"size":[%d,%d],"step":%.8g,"bytes":%d}'
+    return header % (x, y, width, height, columns, rows, step, len(data)), data

@@ -9,10 +9,10 @@ from tactflow.engine.contract import Sink
 
 
 class Session(Protocol):
-    """A guided session; may be used from any thread."""
+    """A guided session; thread-safe."""
 
     state: Mapping[str, Any]
-    """What to do next and what has been done, for the page; replaced as a whole."""
+    """Next step and progress, for the page; replaced as a whole."""
 
     def undo(self) -> None:
         """Undo the last step."""
@@ -26,5 +26,5 @@ class Guiding(Sink):
 
     @classmethod
     def through(cls, session: Session) -> type[Self]:
-        """A subclass of this sink that shows a session."""
+        """Create a subclass of this sink that shows a session."""
         return type(cls.__name__, (cls,), {"session": session})

@@ -1,8 +1,8 @@
 """The open pages of the live view, and flow control for each of them.
 
-Every page has credit for one frame: the next frame is sent only after the page has acknowledged drawing the
-last. So a slow page gets fewer frames, never older ones, and slows down nobody else. While no page has
-credit, the view wants no frame.
+Each page has credit for one frame: the next one is sent only after the page has acknowledged drawing the
+last. So a slow page gets fewer frames instead of old ones and does not slow down others. While no page has
+credit, the view requests no frames.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ STATS_SECONDS = 0.5
 """Interval at which pages receive the statistics of the run, s."""
 
 STALE_SECONDS = 1.0
-"""Older pictures are not shown to a page that has just opened, unless the run is paused, s."""
+"""Maximum age of a picture shown to a newly opened page, unless the run is paused, s."""
 
 REST_MS = 250
 """Longest pause that a page on a busy machine may request before its next frame, ms."""
 
-SHOWN_IF_ASKED = frozenset({"field", "surface"})
-"""Layers that are only sent to pages that show them."""
+ON_DEMAND = frozenset({"field", "surface"})
+"""Layers sent only to pages that show them."""
 
 MAX_PAGES = 16
-"""Open pages at a time; further ones are turned away."""
+"""Maximum number of open pages; further ones are rejected."""
 
 
 class Wire(Protocol):
-    """The connection to one page, as far as the hub uses it."""
+    """The connection to a page."""
 
     async def send_text(self, data: str) -> None:
-        """Send a text message; waits while the connection is full."""
+        """Send a text message; waits while the buffer is full."""
 
     async def send_bytes(self, data: bytes) -> None:
-        """Send a binary message; waits while the connection is full."""
+        """Send a binary message; waits while the buffer is full."""
 
     async def receive_text(self) -> str:
-        """The next text message of the page; raises when the connection has ended."""
+        """Receive a text message; raises when the connection is closed."""
 
     async def close(self, code: int, reason: str) -> None:
-        """End the connection."""
+        """Close the connection."""
 
 
 class Packet(NamedTuple):
@@ -73,10 +73,10 @@ class Packet(NamedTuple):
 class Page:
     """State of one open page.
 
-    credit : whether it may be sent the next frame. shows : layers of `SHOWN_IF_ASKED` that it shows. sent,
-    answered : numbers of the last frame sent and of the last acknowledged. captured, sent_at :
-    `time.perf_counter` of the frame sent, s. screen_s : latest times from capture to screen, s. wake : set
-    when there is something to send. ended : the run is over.
+    credit : whether the next frame may be sent. shows : layers of `ON_DEMAND` that it shows. sent, answered :
+    numbers of the last frame sent and acknowledged. captured, sent_at : `time.perf_counter` of the frame
+    sent, s. screen_s : recent times from capture to screen, s. wake : set when there is something to send.
+    ended : the run is over.
     """
 
     def __init__(self, wire: Wire) -> None:
@@ -88,7 +88,7 @@ class Page:
         self.captured = 0.0
         self.sent_at = 0.0
         self.screen_s: deque[float] = deque(maxlen=64)
-        # Only the newest message of each kind is kept, so nothing piles up for a page that does not read.
+        # Only the newest message of each kind is kept, which bounds the queue of a page that does not read.
         self.texts: dict[str, str] = {}
         self.wake = asyncio.Event()
         self.ended = False
@@ -100,22 +100,22 @@ class Page:
 
     @property
     def stuck(self) -> bool:
-        """Whether the acknowledgement is overdue: the page is hidden, or its connection is slow."""
+        """Whether the acknowledgement is overdue, because the page is hidden or the connection slow."""
         return not self.credit and time.perf_counter() - self.sent_at > 2 * STATS_SECONDS
 
 
 class Hub:
-    """The pages that are open now.
+    """The open pages.
 
     `publish`, `wanted`, `owed`, `shown` and `counters` may be used from any thread, the rest in the server's
     event loop.
 
     Parameters
     ----------
-    control : handle on the run; None shows frames without any control over it.
+    control : handle on the run; None disables commands.
     sensor : name of the sensor.
-    neighbours : returns the ports of other sensors' pages by sensor name.
-    again : publishes the last frame once more; called in a worker thread.
+    neighbours : returns sensor name -> port of the other sensors' pages.
+    again : publishes the last frame again; called in a worker thread.
     session : the guided session that the run is part of, if any.
     """
 
@@ -136,12 +136,12 @@ class Hub:
         self.wanted = False
         """Whether a page has credit."""
         self.owed = False
-        """Whether a single step was requested, whose frame is shown regardless of the rate limit."""
+        """Whether the frame of a requested single step is pending; it is exempt from the rate limit."""
         self._owed_since = 0.0
         self.shown: frozenset[str] = frozenset()
-        """Layers of `SHOWN_IF_ASKED` that at least one page shows."""
+        """Layers of `ON_DEMAND` shown by at least one page."""
         self.pages: set[Page] = set()
-        self._someone = asyncio.Event()
+        self._any_page = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._latest: Packet | None = None
         self._number = 0
@@ -185,8 +185,8 @@ class Hub:
             self._loop.call_soon_threadsafe(self._take, packet)
 
     def counters(self) -> dict[str, int]:
-        """Statistics: open `pages`, frames `sent` over all pages, and quantiles of the time from capture to
-        the page's acknowledgement, ms (an upper bound of the time to the screen)."""
+        """Statistics: open `pages`, frames `sent` to all pages, and quantiles of the time from capture to
+        acknowledgement, ms (an upper bound of the time to the screen)."""
         result = {"pages": len(self.pages), "sent": self._sent}
         for name, q in (("p50", 0.5), ("p99", 0.99)):
             value = self._screen.quantile(q)
@@ -204,7 +204,7 @@ class Hub:
         if self._latest is not None and not self._fresh(self._latest):
             self._latest = None
         self.pages.add(page)
-        self._someone.set()
+        self._any_page.set()
         self._recount()
         page.wake.set()
         sender = asyncio.create_task(self._send(page))
@@ -215,7 +215,7 @@ class Hub:
             self.pages.discard(page)
             self._recount()
             if not self.pages:
-                self._someone.clear()
+                self._any_page.clear()
             for task in (sender, reader):
                 task.cancel()
             await asyncio.gather(sender, reader, return_exceptions=True)
@@ -223,12 +223,12 @@ class Hub:
     async def report(self) -> None:
         """Send the statistics of the run periodically while pages are open."""
         while True:
-            await self._someone.wait()
-            self.tell_stats()
+            await self._any_page.wait()
+            self.post_stats()
             await asyncio.sleep(STATS_SECONDS)
 
     def end(self) -> None:
-        """Tell every page how the run ended, and disconnect it."""
+        """Send every page the reason for the end of the run, and disconnect it."""
         snapshot = self._commands.snapshot()
         self._end = str(snapshot.get("end", "eos"))
         for page in self.pages:
@@ -236,14 +236,14 @@ class Hub:
             page.post("state", self.state())
             page.ended = True
 
-    def tell_state(self) -> None:
+    def post_state(self) -> None:
         """Send the current state to every page."""
         text = self.state()
         for page in self.pages:
             page.post("state", text)
 
-    def tell_stats(self) -> None:
-        """Send statistics and state to the pages that keep up."""
+    def post_stats(self) -> None:
+        """Send statistics and state to the pages that are not stuck."""
         listeners = [page for page in self.pages if not page.stuck]
         if not listeners:
             return
@@ -257,7 +257,7 @@ class Hub:
             page.post("state", state)
 
     def state(self) -> str:
-        """State message: what the run is doing, and for each button null or why it is disabled."""
+        """State message: status of the run, and for each button null or why it is disabled."""
         control = self.control
         source = None if control is None else control.source
         now = self._commands.state()
@@ -330,11 +330,11 @@ class Hub:
             else:
                 await self._command(page, message)
 
-    async def _show(self, page: Page, asked: Any) -> None:
-        page.shows = SHOWN_IF_ASKED.intersection(map(str, asked if isinstance(asked, list) else ()))
+    async def _show(self, page: Page, layers: Any) -> None:
+        page.shows = ON_DEMAND.intersection(map(str, layers if isinstance(layers, list) else ()))
         before = self.shown
         self._recount()
-        # While paused no further frame would bring the new layer.
+        # While paused, no new frame would provide the layer.
         if self.shown - before and self.control is not None and self.control.paused:
             await asyncio.to_thread(self._again)
 
@@ -342,13 +342,13 @@ class Hub:
         if message["ack"] != page.sent or page.sent == page.answered:
             return
         page.answered = page.sent
-        # A hidden page draws only when it becomes visible again, which does not count as latency.
+        # A hidden page draws when it becomes visible again, which does not count as latency.
         if message.get("late") is not True and page.captured > 0:
             delay = time.perf_counter() - page.captured
             page.screen_s.append(delay)
             self._screen.add(delay)
         rest = message.get("rest")
-        # The browser may share a busy machine with the pipeline: leave the pipeline half of the time.
+        # On a busy machine shared with the browser, leave half of the time to the pipeline.
         if isinstance(rest, int) and rest > 0:
             asyncio.get_running_loop().call_later(min(rest, REST_MS) / 1000, self._ready, page)
         else:
@@ -373,10 +373,10 @@ class Hub:
             if not isinstance(error, RefusedError):
                 log.warning("view: %s failed: %s: %s", name, type(error).__name__, error)
             page.post("note", _text(type="note", text=str(error) or type(error).__name__))
-        self.tell_state()
+        self.post_state()
 
     def _refusal(self, name: str) -> str | None:
-        """Why a command is not possible now; None if it is possible."""
+        """Why a command is unavailable, or None."""
         return "the run has ended" if self._end is not None else self._commands.refusal(name)
 
     def _step(self) -> None:

@@ -1,7 +1,7 @@
-"""HTTP and WebSocket server of the live view, in a thread of its own.
+"""HTTP and WebSocket server of the live view, in its own thread.
 
-Serves a handful of fixed files and one WebSocket. It refuses requests under a foreign host name (DNS
-rebinding), WebSockets opened by other pages, and, where a token is set, WebSockets without it.
+Serves a few fixed files and a WebSocket. Rejects requests for foreign host names (DNS rebinding), WebSockets
+from other origins, and, if a token is set, WebSockets without it.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ HOST_HEADER = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?"
 
 START_SECONDS = 10.0
 CLOSE_SECONDS = 3.0
-"""Time limits for the server to start and to end, s."""
+"""Timeouts for starting and stopping the server, s."""
 
 MAX_CONNECTIONS = 128
-"""Connections at a time; more are answered with 503. Each page opens up to seven."""
+"""Maximum number of connections; further ones are answered with 503. Each page opens up to seven."""
 
 WRONG_TOKEN = 4401
 TOO_MANY = 4429
-"""WebSocket close codes: a refused handshake would not tell the page why. Codes from 4000 on are for private
-use (RFC 6455, 7.4.2); the rest follows HTTP 401 and 429."""
+"""WebSocket close codes, because a page cannot read the reason for a rejected handshake. Codes from 4000 are
+for private use (RFC 6455, 7.4.2); the last digits follow HTTP 401 and 429."""
 
 TYPES = {
     "html": "text/html; charset=utf-8",
@@ -55,7 +55,7 @@ TYPES = {
 
 
 class _Connection(H11Protocol):
-    """An HTTP connection that survives a malformed HEAD request, whose error page h11 refuses to send."""
+    """An HTTP connection that handles malformed HEAD requests, for which h11 rejects an error page."""
 
     def send_400_response(self, msg: str) -> None:
         """Answer 400 Bad Request and close the connection."""
@@ -65,10 +65,10 @@ class _Connection(H11Protocol):
 
 
 class Server:
-    """Serves the page and the hub's messages on a listening socket, which it takes over.
+    """Serves the page and the hub's messages on a listening socket, which it owns.
 
-    host : configured name or address; requests must be addressed to it or to loopback.
-    token : secret that a page must present; None admits every page of this server.
+    host : configured name or address; requests must address it or loopback. token : required of pages; None
+    admits all pages of this origin.
     """
 
     def __init__(self, hub: Hub, listener: socket.socket, host: str, token: str | None) -> None:
@@ -86,7 +86,7 @@ class Server:
             loop="asyncio",
             http=_Connection,
             ws="websockets-sansio",
-            # Commands are short; pictures are compressed already.
+            # Commands are short; pictures are already compressed.
             ws_max_size=4096,
             ws_per_message_deflate=False,
             limit_concurrency=MAX_CONNECTIONS,
@@ -107,23 +107,23 @@ class Server:
         self._ready.wait(START_SECONDS)
 
     def close(self) -> None:
-        """Tell the pages that the run has ended, and stop serving; takes at most `CLOSE_SECONDS`."""
+        """Notify the pages of the end of the run and stop serving, within `CLOSE_SECONDS`."""
         loop = self._loop
         if loop is not None and self._thread.is_alive():
             try:
                 asyncio.run_coroutine_threadsafe(self._end(), loop)
             except RuntimeError:
-                # It ended by itself in this moment.
+                # The loop has just closed.
                 return
             self._thread.join(CLOSE_SECONDS)
             if self._thread.is_alive():
-                log.warning("view: the server did not end within %g s; it is left behind", CLOSE_SECONDS)
+                log.warning("view: the server did not stop within %g s; abandoning it", CLOSE_SECONDS)
 
     def _run(self) -> None:
         try:
             asyncio.run(self._serve())
         except Exception as error:
-            log.warning("view: the server has failed: %s: %s", type(error).__name__, error)
+            log.warning("view: the server failed: %s: %s", type(error).__name__, error)
         finally:
             self._listener.close()
             self._ready.set()
@@ -137,7 +137,7 @@ class Server:
             await self._server.serve(sockets=[self._listener])
         finally:
             reporter.cancel()
-            # A page that reads nothing would keep its connection open for ever.
+            # A page that does not read would keep its connection open forever.
             for connection in list(self._server.server_state.connections):
                 transport = getattr(connection, "transport", None)
                 if transport is not None:
@@ -148,11 +148,11 @@ class Server:
         try:
             await self.hub.report()
         except Exception as error:
-            log.warning("view: no more statistics: %s: %s", type(error).__name__, error)
+            log.warning("view: the statistics failed: %s: %s", type(error).__name__, error)
 
     async def _end(self) -> None:
         self.hub.end()
-        # A page that reads needs a moment for the last message; one that does not read is not waited for.
+        # Give pages half a second to read the last message.
         for _ in range(25):
             if not self.hub.pages:
                 break
@@ -163,7 +163,7 @@ class Server:
         name = request.path_params["path"] or "index.html"
         content = self._files.get(name)
         if content is None:
-            return PlainTextResponse("there is no such page\n", 404)
+            return PlainTextResponse("no such page\n", 404)
         return Response(content, media_type=TYPES[name.rpartition(".")[2]])
 
     async def _live(self, websocket: WebSocket) -> None:
@@ -172,7 +172,7 @@ class Server:
             return
         await websocket.accept()
         if not self._admits(websocket):
-            # Slow down guessing.
+            # Slow down brute-force attacks.
             await asyncio.sleep(0.5)
             await websocket.close(WRONG_TOKEN, "token required")
         elif len(self.hub.pages) >= MAX_PAGES:
@@ -183,12 +183,12 @@ class Server:
     def _admits(self, websocket: WebSocket) -> bool:
         if self.token is None:
             return True
-        shown = parse_qs(websocket.url.query).get("token", [""])[0]
-        return hmac.compare_digest(shown.encode(), self.token.encode())
+        token = parse_qs(websocket.url.query).get("token", [""])[0]
+        return hmac.compare_digest(token.encode(), self.token.encode())
 
 
 class _Wire:
-    """A WebSocket whose closing never raises, whichever side closes it first."""
+    """A WebSocket that can be closed repeatedly and by both sides without errors."""
 
     def __init__(self, websocket: WebSocket) -> None:
         self._websocket = websocket
@@ -203,16 +203,16 @@ class _Wire:
 
 
 class _Guard:
-    """Refuse requests under foreign host names, and add security headers to every response."""
+    """Reject requests for foreign host names, and add security headers to every response."""
 
     def __init__(self, app: ASGIApp, host: str) -> None:
         self._app = app
         wildcard = host in WILDCARDS
-        # On all interfaces the valid names are unknown; there a token is required instead.
+        # On a wildcard address the valid names are unknown; a token is required instead.
         self._names = None if wildcard else LOOPBACK_NAMES | {bracketed(host).lower()}
 
     def _is_ours(self, host: str) -> bool:
-        # The header is copied into the policy below, so only a name and a port are accepted.
+        # The header is copied into the policy below, so it must be a plain name and port.
         parts = HOST_HEADER.fullmatch(host)
         return parts is not None and (self._names is None or parts[1].lower() in self._names)
 
@@ -225,7 +225,7 @@ class _Guard:
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})
             else:
-                text = "this address is not known here; open the one that tactflow printed\n"
+                text = "unknown host name; open the address that tactflow printed\n"
                 await PlainTextResponse(text, 421)(scope, receive, send)
             return
         policy = (
@@ -252,7 +252,7 @@ class _Guard:
 
 
 def _load_files() -> dict[str, bytes]:
-    """All files of the page, read once: no request reaches the file system."""
+    """Read all files of the page, so that requests do not access the file system."""
     folder = resources.files("tactflow.view") / "page"
     return {
         item.name: item.read_bytes()
@@ -262,7 +262,7 @@ def _load_files() -> dict[str, bytes]:
 
 
 def _same_origin(headers: Headers) -> bool:
-    """Whether a WebSocket was opened by our own page, according to its Origin header."""
+    """Whether a WebSocket was opened by our page, according to its Origin header."""
     origin, host = headers.get("origin", ""), headers.get("host", "")
     try:
         parts = urlsplit(origin)

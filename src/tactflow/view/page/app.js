@@ -1,5 +1,5 @@
-// The page: one tab per sensor, its numbers and statistics, and the buttons that steer the run. The picture and
-// the plots are drawn by a worker, which also talks to the run.
+// The page: a tab per sensor, values and statistics, and buttons that control the run. A worker draws the picture and
+// the plots and holds the connection to the run.
 
 import { RAMP } from "./surface.js";
 import * as words from "./words.js";
@@ -7,7 +7,7 @@ import * as words from "./words.js";
 const { fixed, grouped } = words;
 const $ = (id) => document.getElementById(id);
 const STALL_SECONDS = 2;
-// How many times as long or high as they are, arrows and the surface can be drawn.
+// Magnifications of arrows and of the surface.
 const FACTORS = [1, 3, 5, 10];
 const PLOTS = ["area", "angle", "flow", "latency", "depth", "force", "slip"].map((name) => `plot-${name}`);
 const CANVASES = ["picture", "surface", ...PLOTS];
@@ -22,7 +22,7 @@ const LAYERS = [
   { id: "field", label: "Field", key: "7", colour: "var(--field)", off: true, offer: "field" },
   { id: "surface", label: "Surface", key: "8", colour: `linear-gradient(90deg, ${RAMP})`, off: true, offer: "surface" },
 ];
-// What is shown only where the run has it: the tile or button, and what of a frame it needs.
+// Optional tiles and buttons, and the part of a frame that they need.
 const OFFERED = { "tile-guide": "guide", unit: "scale", "layer-field": "field", "layer-surface": "surface", "tile-depth": "surface", "tile-force": "force", "tile-slip": "slip" };
 
 const sensors = new Map();
@@ -45,7 +45,7 @@ function sensor(name) {
   return sensors.get(name);
 }
 
-// -- what comes from the run ------------------------------------------------------------------------------
+// -- messages from the run ------------------------------------------------------------------------------
 
 const painter = new Worker("painter.js", { type: "module" });
 const order = (name, content = {}, transfer = []) => painter.postMessage({ order: name, ...content }, transfer);
@@ -58,7 +58,7 @@ const news = {
     refresh();
   },
   hello({ message }) {
-    // Another run behind the same address: what is on the screen is not its own.
+    // A new run at the same address: discard the state of the previous one.
     if (run !== null && run !== message.run) {
       sensors.clear();
       current = null;
@@ -100,7 +100,7 @@ const news = {
   note: ({ text, message }) => note(text ?? message.text),
   turns({ turns }) {
     document.body.dataset.turns = turns;
-    if (!turns) set("turn-hint", "seen from above: this browser has no WebGL");
+    if (!turns) set("turn-hint", "view from above: this browser has no WebGL");
   },
   lost({ seconds }) {
     link = "lost";
@@ -159,7 +159,7 @@ function drawGuide(guide) {
   put($("undo"), "disabled", guide.presses.length === 0 || link !== "open");
 }
 
-// The unit of lengths: millimetres only where the run knows them.
+// Unit of lengths: millimetres only with a scale.
 function unit() {
   return sensors.get(current)?.last?.offers.includes("scale") ? wanted : "px";
 }
@@ -184,7 +184,7 @@ function drawStats(s) {
     return;
   }
   const entries = [
-    // The source's time is mostly waiting for the next frame.
+    // The time of the source is mostly spent waiting for frames.
     ...Object.entries(stats.stages).map(([id, node], index) => ({ id, node, kind: index ? "stage" : "source" })),
     ...Object.entries(stats.sinks).map(([id, node]) => ({ id, node, kind: "sink" })),
   ];
@@ -222,7 +222,7 @@ function skips(node) {
   return parts.join(", ") || "–";
 }
 
-// Sensors of this run, and those that other processes of a run of several serve on pages of their own.
+// Sensors of this process, and those of the run's other processes, which have their own pages.
 function tabs() {
   const all = new Map([...sensors.keys()].map((name) => [name, null]));
   for (const { state } of sensors.values()) {
@@ -279,8 +279,8 @@ function status() {
 
 const ENDS = {
   eos: "The source has ended.",
-  signal: "It was stopped.",
-  max_frames: "It has processed as many frames as it was asked to.",
+  signal: "The run was stopped.",
+  max_frames: "The requested number of frames has been processed.",
 };
 
 function refresh() {
@@ -292,12 +292,12 @@ function refresh() {
   put(document.body.dataset, "status", now);
   const silent = Math.round((performance.now() - lastFrame) / 1000);
   const texts = {
-    connecting: ["Connecting", "Looking for the run."],
+    connecting: ["Connecting", "Connecting to the run."],
     token: ["Token required", "Open the address that tactflow printed, or enter the token here."],
     disconnected: ["Disconnected", `The run does not answer. ${wait ? `Next attempt in ${wait} s.` : "Trying again …"}`],
-    ended: s?.last?.guide ? ["The presses are collected", "What is learned from them is told in the terminal."] : ["The run has ended", `${ENDS[state?.end] ?? state?.end ?? ""} This page comes back when a new run starts here.`],
-    waiting: ["Waiting for frames", "The run is up; its source has not delivered a frame yet."],
-    paused: ["Paused", "No frame was shown yet."],
+    ended: s?.last?.guide ? ["All presses are recorded", "The terminal shows the result of the calibration."] : ["The run has ended", `${ENDS[state?.end] ?? state?.end ?? ""} This page reconnects when a new run starts at this address.`],
+    waiting: ["Waiting for frames", "The run has started, but its source has not delivered a frame yet."],
+    paused: ["Paused", "No frame has been shown yet."],
     stalled: ["", ""],
     live: ["", ""],
   };
@@ -325,7 +325,7 @@ function refresh() {
   const guided = Boolean(s?.last?.guide);
   put($("stop").querySelector(".label"), "textContent", guided ? "Finish" : "Stop");
   press("record", Boolean(state?.recording), "Stop recording", "Record");
-  // An animation would have the browser draw the page anew at every refresh of the screen.
+  // A CSS animation would repaint the page at every refresh of the screen.
   put($("record").dataset, "beat", String(Number(Boolean(state?.recording)) && Math.floor(performance.now() / 500) % 2));
 }
 
@@ -381,7 +381,7 @@ for (const layer of LAYERS) {
   $("layers").append(button);
   keys[layer.key] = button.id;
 }
-// A button that goes through some factors.
+// A button that cycles through factors.
 function addFactor(id, key, title, factors, text, choose) {
   const button = document.createElement("button");
   Object.assign(button, { type: "button", id, title });
@@ -400,11 +400,11 @@ function addFactor(id, key, title, factors, text, choose) {
   return button;
 }
 $("layers").append(
-  addFactor("magnify", "x", "How much longer arrows are than the displacement they show", FACTORS, "Arrows", (factor) => { magnification = factor; }),
+  addFactor("magnify", "x", "Magnification of the arrows", FACTORS, "Arrows", (factor) => { magnification = factor; }),
   $("unit"),
 );
 $("surface-tools").prepend(
-  addFactor("rise", "z", "How much higher the surface is shown than it is", FACTORS, "Heights", (factor) => { rise = factor; }),
+  addFactor("rise", "z", "Magnification of the heights", FACTORS, "Heights", (factor) => { rise = factor; }),
 );
 document.querySelector("#ramp i").style.background = `linear-gradient(90deg, ${RAMP})`;
 keys.u = "unit";
@@ -414,7 +414,7 @@ $("unit").addEventListener("click", () => {
   drawValues(sensors.get(current));
 });
 
-// Dragging turns the surface, arrow keys do when it has the focus.
+// Drag the surface, or use the arrow keys when it has the focus.
 const TURNS = { ArrowLeft: [-20, 0], ArrowRight: [20, 0], ArrowUp: [0, 20], ArrowDown: [0, -20], Home: [] };
 $("surface").addEventListener("keydown", (event) => {
   const turn = TURNS[event.key];
@@ -436,7 +436,7 @@ document.addEventListener("keydown", (event) => {
     choose(names[(names.indexOf(current) + step + names.length) % names.length]);
     return;
   }
-  // The space bar presses the button that has the focus.
+  // Space activates the focused button.
   if (event.key === " " && event.target.matches("button")) return;
   const id = keys[event.key.toLowerCase()];
   if (!id || event.repeat) return;
@@ -457,9 +457,9 @@ $("token-form").addEventListener("submit", (event) => {
   refresh();
 });
 
-// -- the worker's side of it ------------------------------------------------------------------------------
+// -- the worker ------------------------------------------------------------------------------
 
-// A token in the address is kept for this tab only, and leaves the address bar.
+// Move a token from the address bar to the storage of this tab.
 function takeToken() {
   const url = new URL(location.href);
   const shown = url.searchParams.get("token");
@@ -497,9 +497,9 @@ setInterval(refresh, 500);
 drawValues(null);
 refresh();
 
-// -- words ------------------------------------------------------------------------------------------------
+// -- text ------------------------------------------------------------------------------------------------
 
-// Writing what is there already would have the browser lay the page out again.
+// Writing an unchanged value would still trigger a layout.
 function put(thing, property, value) {
   if (thing[property] !== value) thing[property] = value;
 }

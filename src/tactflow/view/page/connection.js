@@ -1,6 +1,6 @@
-// The WebSocket to the run: decodes what comes, and finds the run again when it is lost.
+// The WebSocket to the run: decodes messages, and reconnects after a loss.
 
-const DELAYS = [0.3, 0.7, 1.5, 3, 5];  // s between attempts; the last one repeats
+const DELAYS = [0.3, 0.7, 1.5, 3, 5];  // back-off between attempts, s; the last value repeats
 const WRONG_TOKEN = 4401;
 
 export class Connection {
@@ -44,7 +44,7 @@ export class Connection {
     this.socket = socket;
   }
 
-  // Skip the rest of the wait, if one is under way.
+  // Reconnect now, if waiting.
   retryNow() {
     if (this.socket === null) this.connect();
   }
@@ -59,7 +59,7 @@ export class Connection {
   }
 }
 
-// A little-endian length, a JSON header of that length, the heights of a surface if it has some, a JPEG picture.
+// Format: little-endian length of the header, JSON header, heights of a surface (optional), JPEG picture.
 function decode(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));

@@ -1,25 +1,25 @@
-// The worker behind the page: talks to the run, and draws its frames and plots.
+// The worker of the page: receives frames from the run, and draws them and the plots.
 //
-// A canvas that belongs to a worker reaches the screen without the page: no style, layout or paint for a new
-// frame. The page itself hears a summary of the frames, a few times a second.
+// A canvas owned by a worker is displayed without style, layout or paint by the page. The page only receives a summary
+// of the frames, a few times per second.
 
 import { Connection } from "./connection.js";
 import { Picture } from "./picture.js";
 import { Plot, SECONDS } from "./plot.js";
 import { Surface } from "./surface.js";
 
-const BUSY_MS = 20;  // a frame that took longer is followed by a rest: the machine is full
-const NEWS_MS = 200;  // between two changes of anything but the picture
+const BUSY_MS = 20;  // a frame that took longer is followed by a pause: the machine is busy
+const NEWS_MS = 200;  // interval between updates of all but the picture
 
 let connection = null;
 let picture = null;
 let surface = null;
 let plots = {};
-let shows = [];  // what is sent only because it is shown here
+let shows = [];  // on-demand layers requested by this page
 let run = null;
 let current = null;
 let visible = Promise.resolve();
-let reveal = null;  // ends the wait of a hidden page
+let reveal = null;  // resolves `visible`
 let hiddenSince = 0;
 const sensors = new Map();
 
@@ -27,7 +27,7 @@ const tell = (type, content = {}) => postMessage({ type, ...content });
 
 function sensor(name) {
   if (!sensors.has(name)) {
-    sensors.set(name, { name, points: [], header: null, bitmap: null, heights: null, offers: new Set(), shown: [], told: -Infinity, timer: 0 });
+    sensors.set(name, { name, points: [], header: null, bitmap: null, heights: null, offers: new Set(), shown: [], summarised: -Infinity, timer: 0 });
     current ??= name;
   }
   return sensors.get(name);
@@ -68,7 +68,7 @@ const orders = {
     shows = ["field", "surface"].filter((name) => layers[name]);
     if (String(shows) !== before) {
       connection.send({ show: shows });
-      // Another page may have had the heights sent: while the run is paused, no frame comes that would show them.
+      // The heights may already be here because another page requested them; a paused run sends no new frame.
       if (current !== null) showSurface(sensor(current));
     }
   },
@@ -105,7 +105,7 @@ function open() {
 
 function text(message) {
   if (message.type === "hello") {
-    // Another run behind the same address: what is on the screen is not its own.
+    // A new run at the same address: discard the state of the previous one.
     if (run !== null && run !== message.run) {
       picture.show(null, null);
       surface.show(null, null, 1);
@@ -132,14 +132,14 @@ async function frame(header, blob, heights) {
   } catch {
     tell("note", { text: "a picture could not be decoded" });
   }
-  // A hidden page draws nothing, and is sent nothing, until it is looked at again.
+  // A hidden page neither draws nor requests frames.
   await visible;
   if (bitmap) {
     s.bitmap?.close();
     s.bitmap = bitmap;
   }
   addFrame(s, header, heights);
-  // The run sends the next frame only now: a slow page gets fewer of them, never old ones.
+  // The run sends the next frame after this: a slow page gets fewer frames instead of old ones.
   const busy = performance.now() - received;
   const late = hiddenSince > received;
   connection.send({ ack: header.number, late, rest: late || busy < BUSY_MS ? 0 : Math.round(busy) });
@@ -163,15 +163,15 @@ function addFrame(s, header, heights) {
   const first = s.points.findIndex((point) => point.t >= message.t - SECONDS);
   if (first > 0) s.points.splice(0, first);
   if (s.header && header.epoch !== s.header.epoch) tell("note", { text: `new reference taken at frame ${message.seq}` });
-  const there = { scale: header.scale, field: header.field, surface: header.surface, guide: header.guide, force, slip };
-  for (const [name, value] of Object.entries(there)) if (value) s.offers.add(name);
+  const available = { scale: header.scale, field: header.field, surface: header.surface, guide: header.guide, force, slip };
+  for (const [name, value] of Object.entries(available)) if (value) s.offers.add(name);
   Object.assign(s, { header, heights });
   const now = performance.now();
   s.shown.push(now);
   while (now - s.shown[0] > 1000) s.shown.shift();
   if (s.name === current) showFrame(s);
-  if (now - s.told >= NEWS_MS) summarise(s);
-  else if (!s.timer) s.timer = setTimeout(summarise, s.told + NEWS_MS - now, s);
+  if (now - s.summarised >= NEWS_MS) summarise(s);
+  else if (!s.timer) s.timer = setTimeout(summarise, s.summarised + NEWS_MS - now, s);
 }
 
 function showFrame(s) {
@@ -180,16 +180,16 @@ function showFrame(s) {
 }
 
 function showSurface(s) {
-  // The colours' scale is that of the plot, which rarely changes.
+  // The colour scale is that of the plot, which rarely changes.
   if (shows.includes("surface")) surface.show(s.header, s.heights, plots["plot-depth"].limits(s.points)[1]);
 }
 
-// The plots, and what the page writes in words.
+// Update the plots and the text of the page.
 function summarise(s) {
   if (s.name === current) replot();
   clearTimeout(s.timer);
   s.timer = 0;
-  s.told = performance.now();
+  s.summarised = performance.now();
   const { message: { seq, t, size, contact, flow, force, slip }, markers, latency_ms, guide } = s.header;
   const count = (letter) => markers.status.split(letter).length - 1;
   tell("frames", {

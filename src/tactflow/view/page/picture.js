@@ -1,5 +1,5 @@
-// The processed frame, and the results drawn over it. Coordinates of the results are pixels of the frame, with
-// the centre of the top-left pixel at (0, 0).
+// The processed frame with the results drawn over it. Coordinates are pixels of the frame, with the centre of the
+// top-left pixel at (0, 0).
 
 const DARK = "rgb(0 0 0 / .65)";
 
@@ -27,8 +27,7 @@ export class Picture {
     this.draw();
   }
 
-  // layers: whether each is shown, by its name. magnify: how much longer arrows are than what they show.
-  // units: "px" or "mm", of the lengths that are written.
+  // layers: name -> whether it is shown. magnify: magnification of arrows. units: "px" or "mm".
   choose(layers, magnify, units) {
     this.layers = layers;
     this.magnify = magnify;
@@ -36,7 +35,7 @@ export class Picture {
     this.draw();
   }
 
-  // header: what came with the picture.
+  // header: of the frame.
   show(bitmap, header) {
     this.bitmap = bitmap;
     this.header = header;
@@ -72,7 +71,7 @@ export class Picture {
     if (this.units === "mm" && scale) this.drawRuler(sx / scale[0]);
   }
 
-  // Every line has a dark rim, so that it shows on any picture.
+  // Lines have a dark outline, to be visible on any picture.
   stroke(path, colour, width, dash = []) {
     const c = this.context;
     c.setLineDash([]);
@@ -87,11 +86,11 @@ export class Picture {
     c.setLineDash([]);
   }
 
-  // Seen markers are many and in every frame. Filling a polygon costs far less than stroking lines, so their
-  // arrows are filled twice: a little larger for the rim, then in their colour.
+  // Filling polygons is much faster than stroking lines, so the arrows of the many tracked markers are filled twice:
+  // slightly larger for the outline, then in their colour.
   drawMarkers({ origin, position, status }) {
-    const seen = { rim: new Path2D(), body: new Path2D() };
-    const placed = { line: new Path2D(), head: new Path2D() };
+    const tracked = { rim: new Path2D(), body: new Path2D() };
+    const inferred = { line: new Path2D(), head: new Path2D() };
     const lost = new Path2D();
     const c = this.context;
     const u = this.unit;
@@ -106,41 +105,41 @@ export class Picture {
         lost.lineTo(xp + r, yp - r);
         continue;
       }
-      const tracked = status[i] === "t";
+      const isTracked = status[i] === "t";
       const [x0, y0] = point(origin, i);
       const dx = (xp - x0) * this.magnify;
       const dy = (yp - y0) * this.magnify;
       const length = Math.hypot(dx, dy);
       const size = Math.min(6 * u, Math.max(3.5 * u, length * 0.35));
       if (length < 3 * u) {
-        if (tracked) {
-          octagon(seen.rim, x0, y0, 3.2 * u);
-          octagon(seen.body, x0, y0, 2.2 * u);
+        if (isTracked) {
+          octagon(tracked.rim, x0, y0, 3.2 * u);
+          octagon(tracked.body, x0, y0, 2.2 * u);
         } else {
-          placed.head.moveTo(x0 + 1.8 * u, y0);
-          placed.head.arc(x0, y0, 1.8 * u, 0, 2 * Math.PI);
+          inferred.head.moveTo(x0 + 1.8 * u, y0);
+          inferred.head.arc(x0, y0, 1.8 * u, 0, 2 * Math.PI);
         }
-      } else if (tracked) {
-        solidArrow(seen.rim, x0, y0, dx / length, dy / length, length, size, 1.8 * u, 1.4 * u);
-        solidArrow(seen.body, x0, y0, dx / length, dy / length, length, size, 0.8 * u, 0.4 * u);
+      } else if (isTracked) {
+        solidArrow(tracked.rim, x0, y0, dx / length, dy / length, length, size, 1.8 * u, 1.4 * u);
+        solidArrow(tracked.body, x0, y0, dx / length, dy / length, length, size, 0.8 * u, 0.4 * u);
       } else {
-        arrow(placed.line, placed.head, x0, y0, dx, dy, length, size);
+        arrow(inferred.line, inferred.head, x0, y0, dx, dy, length, size);
       }
     }
-    if (status.includes("i")) this.stroke(placed.line, this.colours.inferred, 1.6, [4, 3]);
+    if (status.includes("i")) this.stroke(inferred.line, this.colours.inferred, 1.6, [4, 3]);
     if (status.includes("l")) {
       c.globalAlpha = 0.55;
       this.stroke(lost, this.colours.lost, 1.4);
       c.globalAlpha = 1;
     }
     c.fillStyle = DARK;
-    c.fill(seen.rim);
+    c.fill(tracked.rim);
     c.fillStyle = this.colours.tracked;
-    c.fill(seen.body);
-    if (status.includes("i")) this.stroke(placed.head, this.colours.inferred, 1.2);
+    c.fill(tracked.body);
+    if (status.includes("i")) this.stroke(inferred.head, this.colours.inferred, 1.2);
   }
 
-  // How the gel between the markers has moved, in the same tenths of a pixel.
+  // Displacement of the gel between the markers, in tenths of a pixel.
   drawField({ origin, position }) {
     const rim = new Path2D();
     const body = new Path2D();
@@ -161,7 +160,7 @@ export class Picture {
     this.context.fill(body);
   }
 
-  // Where presses were, and the part of the gel that wants the next one.
+  // Positions of presses, and the cell of the gel for the next one.
   drawGuide({ presses, next: [row, column], lasts }) {
     const { width, height } = this.canvas;
     const c = this.context;
@@ -188,7 +187,7 @@ export class Picture {
     }
   }
 
-  // A bar of 1, 2 or 5 times a power of ten of mm, about a fifth of the picture. pixels: of the canvas for 1 mm.
+  // A scale bar of 1, 2 or 5 times a power of ten mm, about a fifth of the picture. pixels: of the canvas per mm.
   drawRuler(pixels) {
     const { width, height } = this.canvas;
     const u = this.unit;
@@ -229,7 +228,7 @@ export class Picture {
     if (angle !== null) {
       const ux = Math.cos(radians(angle));
       const uy = -Math.sin(radians(angle));
-      // As long as the contact is in that direction, and a little more.
+      // Slightly longer than the contact in that direction.
       const along = hull.map(([hx, hy]) => (hx - center[0]) * ux + (hy - center[1]) * uy);
       const low = Math.min(0, ...along) - 10;
       const high = Math.max(0, ...along) + 10;
@@ -289,7 +288,7 @@ function arrow(line, head, x, y, dx, dy, length, size) {
   head.closePath();
 }
 
-// One outline of shaft and head. half: half the width of the shaft. more: by how much the head is larger.
+// Outline of shaft and head. half: half the width of the shaft. more: enlargement of the head.
 function solidArrow(path, x, y, ux, uy, length, size, half, more) {
   const wide = size * 0.5 + 1.2 * more;
   const neck = length - size - more;

@@ -1,7 +1,7 @@
-// A line plot of the last ten seconds. A missing value leaves a gap: nothing is invented between two contacts.
+// A line plot of the last ten seconds, with gaps at missing values.
 
 export const SECONDS = 10;
-const GAP = 0.6;  // s; points further apart are not joined
+const GAP = 0.6;  // s; maximum distance of joined points
 const LEFT = 34;
 const TOP = 6;
 const SERIES = [
@@ -11,8 +11,8 @@ const SERIES = [
 ];
 
 export class Plot {
-  // series: one function (point, unit) -> number or null each. range: [low, high], or "positive", "symmetric",
-  // or "signed": positive until a value is not. minimum: least value at the top, or one for each unit.
+  // series: functions (point, unit) -> number or null. range: [low, high], "positive", "symmetric", or "signed"
+  // (symmetric only with negative values). minimum: of the upper limit, or unit -> minimum.
   constructor(canvas, { series, range, jump = Infinity, minimum = 1, format = short }) {
     Object.assign(this, { canvas, series, range, jump, minimum, format });
     this.context = canvas.getContext("2d", { alpha: false });
@@ -85,7 +85,7 @@ export class Plot {
     });
   }
 
-  // Lines and numbers change rarely; they are drawn once and copied.
+  // Grid lines and labels rarely change; they are drawn once and copied.
   drawGround(w, h, values, y) {
     const { colours, ratio } = this;
     const c = this.ground.getContext("2d", { alpha: false });
@@ -122,7 +122,7 @@ export class Plot {
   }
 }
 
-// The next of 1, 2, 4, 6, 8, 10 times a power of ten: steps that halve well, and rarely change.
+// Round up to 1, 2, 4, 6, 8 or 10 times a power of ten: limits that can be halved and rarely change.
 function nice(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   return [1, 2, 4, 6, 8, 10].find((step) => step * power >= value * 0.999) * power;

@@ -1,15 +1,15 @@
-// The height map as a shaded surface: seen from the camera's side, so that what is pushed in rises towards the
-// viewer, and turned as the user likes. Where there is no WebGL, a shaded picture seen from straight above.
+// The height map as a shaded surface that the user can rotate: seen from the camera, indentations rise towards the
+// viewer. Without WebGL, a shaded picture from above.
 
-const START = { azimuth: 0.35, tilt: 0.95 };  // radians; the tilt is that from straight above
+const START = { azimuth: 0.35, tilt: 0.95 };  // radians; tilt 0 is the view from above
 const STEEPEST = 1.45;  // radians
-const PER_PIXEL = 0.008;  // radians for each pixel that the pointer moves
-const MARGIN = 1.08;  // how much wider than the gel the view is
+const PER_PIXEL = 0.008;  // radians per pixel of pointer motion
+const MARGIN = 1.08;  // width of the view relative to the gel
 const LIGHT = unit([-0.45, -0.55, 0.7]);  // towards the lamp: x right, y down, z towards the viewer
 const AMBIENT = 0.35;
-const BELOW = 0.02;  // mm that the gel around lies deeper, so that it hides nothing
+const BELOW = 0.02;  // mm by which the surrounding gel is lowered, to avoid covering the mesh
 
-// Viridis at five places, from 0 to the top of the scale.
+// Five colours of viridis, from 0 to the top of the scale.
 export const RAMP = ["#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"];
 const COLOURS = RAMP.map(channels);
 
@@ -37,7 +37,7 @@ void main() {
 
 export class Surface {
   constructor(canvas) {
-    // Smoothed edges would double what a frame takes without a graphics card: 20 ms instead of 10.
+    // Without a graphics card, antialiasing would double the time of a frame to 20 ms.
     const gl = canvas.getContext("webgl", { alpha: false, antialias: false });
     this.canvas = canvas;
     this.painter = gl ? new Turning(gl) : new Flat(canvas.getContext("2d", { alpha: false }));
@@ -65,13 +65,13 @@ export class Surface {
     this.draw();
   }
 
-  // rise: how much higher than it is the surface is shown.
+  // rise: magnification of the heights.
   choose(rise) {
     this.rise = rise;
     this.draw();
   }
 
-  // By so many pixels of the pointer; without numbers, back to where it was at first.
+  // Rotate by pixels of pointer motion; without arguments, reset the view.
   turn(dx, dy) {
     const { azimuth, tilt } = this.turned;
     this.turned = dx === undefined
@@ -80,8 +80,8 @@ export class Surface {
     this.draw();
   }
 
-  // header: what came with the frame. heights: of its cells, in its steps; null where nothing is pushed in.
-  // top: height of the lightest colour, mm.
+  // header: of the frame. heights: of the cells, in steps; null without contact. top: height of the lightest
+  // colour, mm.
   show(header, heights, top) {
     this.gel = header?.scale ? header.message.size.map((side, axis) => side * header.scale[axis]) : null;
     this.mesh = heights ? mesh(header, heights) : null;
@@ -94,8 +94,8 @@ export class Surface {
   }
 }
 
-// Points of the surface: their place in mm from the middle of the gel, x right and y down, and their relief:
-// height and its slopes. The outermost ones lie around the part that is pushed in, and are at rest.
+// Vertices: place (x right, y down) in mm from the centre of the gel, and relief (height and its slopes). The outermost
+// ones surround the indentation and are at rest.
 function mesh({ scale, surface: { box, size, step }, message }, heights) {
   const [columns, rows] = [size[0] + 2, size[1] + 2];
   const cell = [0, 1].map((axis) => (box[axis + 2] / size[axis]) * scale[axis]);
@@ -149,7 +149,7 @@ class Turning {
     gl.clearColor(...channels(colours.well), 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     if (!gel) return;
-    // The gel's diagonal fits however it is turned; the more it is tilted, the less high it is.
+    // The diagonal of the gel fits at any rotation; tilting reduces its height.
     const pixels = Math.min(canvas.width, canvas.height / Math.max(0.55, Math.cos(turned.tilt))) / MARGIN;
     const size = 2 / Math.hypot(...gel);
     gl.uniformMatrix3fv(at.view, false, rotation(turned).map((value) => value * size));
@@ -176,7 +176,7 @@ class Turning {
   }
 }
 
-// Without WebGL: from straight above.
+// Without WebGL: from above.
 class Flat {
   constructor(context) {
     this.context = context;
@@ -205,7 +205,7 @@ class Flat {
   }
 }
 
-// What the shaders do, seen from straight above: red, green, blue, alpha, 0 to 255.
+// Equivalent of the shaders for the view from above: red, green, blue, alpha, 0 to 255.
 function shaded([height, across, down], rise, top) {
   const level = Math.min(Math.max(height / top, 0), 1) * 4;
   const below = Math.min(Math.floor(level), 3);
@@ -216,7 +216,7 @@ function shaded([height, across, down], rise, top) {
   return [...colour.map((part) => Math.min(part, 255)), 255];
 }
 
-// Columns of the matrix that turns about z, then tilts back.
+// Column-major matrix that rotates about z, then tilts back.
 function rotation({ azimuth, tilt }) {
   const [sa, ca, st, ct] = [Math.sin(azimuth), Math.cos(azimuth), Math.sin(tilt), Math.cos(tilt)];
   return [ca, sa * ct, sa * st, -sa, ca * ct, ca * st, 0, -st, ct];

@@ -1,4 +1,4 @@
-// What the tiles say: numbers of the result message in words, each [number, what stands behind it].
+// Text of the tiles, from the result message: [value, unit and remarks] each.
 
 const MINUS = "−";
 export const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", MINUS);
@@ -33,12 +33,12 @@ export function depth({ contact }) {
   return [fixed(depth_mm, 3), `mm${error(depth_mm_stderr, 3)}, ${fixed(volume_mm3, 2)} mm³`];
 }
 
-// The component across the gel is always there; those along it where the calibration has them.
+// The normal component is always present; tangential ones depend on the calibration.
 export function force({ force }) {
   if (!force) return NONE;
   const { value, stderr, in_range } = force;
   const along = ["x", "y"].flatMap((axis, i) => (value[i] === null ? [] : [`${axis} ${fixed(value[i], 2)}`]));
-  // Of a contact unlike those of the calibration, the standard error does not hold.
+  // Outside the range of the calibration, the standard error is invalid.
   const unit = in_range === false ? "N, outside the fit" : `N${error(stderr[2], 2)}`;
   return [fixed(value[2], 2), [unit, ...along].join(", ")];
 }
@@ -48,7 +48,7 @@ export function slip({ slip }) {
   return [slip.slipping ? "slips" : "holds", `${Math.round(100 * slip.stick_ratio)}\u202f% of the contact sticks`];
 }
 
-// How a session of presses goes: [count, share, the last press, whether it is good].
+// Progress of a session: [count, fraction, result of the last press, whether it is good].
 export function guide({ done, good, wanted, presses, lasts }) {
   const count = `${done} of ${wanted} presses${good < done ? `, ${good} good` : ""}`;
   const share = Math.min(1, done / wanted);
