@@ -243,7 +243,7 @@ def test_the_unmarked_image_is_the_frame_where_no_marker_is() -> None:
         ("press?noise=-1", r"0 to 60\), got '-1'"),
         ("press?noise=nan", "got 'nan'"),
         ("press?noise=", "noise=VALUE"),
-        ("press?noise=2&noise=3", "twice"),
+        ("press?noise=2&noise=3", "duplicate"),
         ("press?frames=2.5", "frames"),
         ("press?light=brigt", "did you mean bright"),
         ("press?markers=10", "10x8"),
