@@ -8,12 +8,11 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tactflow.engine.control import Control
 from tactflow.engine.frame import Frame, Tick
 from tactflow.network.keys import make_keys
 from tactflow.sinks.zmq import Zmq
@@ -22,7 +21,7 @@ from tests.clock import until
 from tests.conftest import REPOSITORY
 from tests.messages import Results, result_of
 from tests.ros.programs import Program, needs_rclpy
-from tests.sinks.test_view import FakeRun
+from tests.sinks.test_view import fake_run
 
 IMAGE = np.full((40, 60, 3), 90, np.uint8)
 CONTACT = Contact(200.0, (30.0, 20.0), 30.0, -0.577, np.array([[25.0, 15], [35, 15], [30, 28]]), None)
@@ -52,7 +51,7 @@ class Pair:
     """tactflow's sink in this process, the bridge and a listener in two others."""
 
     def __init__(self) -> None:
-        self.run = FakeRun()
+        self.run = fake_run()
         self.sink = self._sink("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
         self.control = self.sink.control_endpoint or ""
         given = {
@@ -76,7 +75,7 @@ class Pair:
 
     def _sink(self, endpoint: str, control: str) -> Zmq:
         params = Zmq.Params(endpoint=endpoint, control=control, detail=True, pictures=100, stats_every=0.1)
-        sink = Zmq(params, "left", cast(Control, self.run))
+        sink = Zmq(params, "left", self.run)
         sink.open()
         return sink
 
@@ -246,11 +245,11 @@ def numbers(report: dict[str, Any]) -> dict[str, float]:
 @needs_rclpy
 def test_damaged_messages_are_passed_over_and_counted(pair: Pair) -> None:
     for text in (b"{broken", b"[]", b"7", b'{"sensor": "left"}', b'{"sensor": "left", "seq": 1}\nx', b"\xff"):
-        pair.sink._send(b"tactflow.left " + text)
+        pair.sink._publisher.send(b"tactflow.left " + text)
     for text in (b'{"sensor": "left", "t": 1.0}\n', b'{"sensor": "left", "t": 1.0, "size": [9, 9]}\n123'):
-        pair.sink._send(b"tactflow_depth.left " + text)
+        pair.sink._publisher.send(b"tactflow_depth.left " + text)
     far = {"sensor": "left", "seq": 1, "t": 1e300, "contact": None, "flow": None, "markers": None}
-    pair.sink._send(b"tactflow.left " + json.dumps(far).encode())
+    pair.sink._publisher.send(b"tactflow.left " + json.dumps(far).encode())
 
     def nine_counted(told: dict[str, Any]) -> bool:
         return told.get("topic") == "/diagnostics" and numbers(told["message"])["damaged messages"] == 9
@@ -273,7 +272,7 @@ def test_the_service_takes_a_new_reference_in_the_run(pair: Pair) -> None:
     pair.listener.order(do="call")
     answer = pair.listener.told(lambda told: "success" in told)
     assert answer == {"success": True, "said": "the next frame is taken as the reference"}
-    assert pair.run.calls == ["reference"]
+    pair.run.retake_reference.assert_called_once_with()
 
 
 @needs_rclpy
