@@ -5,7 +5,6 @@
 # make fuzz         damaged input to every parser, SECONDS for each
 # make audit        known weaknesses of the packages that are used, where the list can be reached
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
-# make kernels      measures what compiling gains, and writes docs/kernels.md
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
 # make system-deps  what the tests need from the system: a browser, ffmpeg, ROS 1 (Debian; needs root)
 
@@ -21,7 +20,7 @@ SYSTEM_DEPS := chromium ffmpeg
 # For the script for ROS 1; Debian 12 has them, later ones do not, and its test says so.
 ROS1_DEPS := python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs python3-zmq
 
-.PHONY: run test soak load fuzz audit lock lint types kernels ros-env system-deps clean
+.PHONY: run test soak load fuzz audit lock lint types ros-env system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -50,8 +49,6 @@ types: $(VENV)/.installed-test
 	$(PY) -m mypy --platform darwin
 	$(PY) -m mypy --platform win32
 
-kernels: $(VENV)/.installed-test
-	$(PY) -m tests.oracles
 
 $(VENV)/bin/python:
 	python3 -m venv $(VENV)

@@ -8,10 +8,7 @@ from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import ContactMask, Unmarked, Untouched
-from tactflow.vision import compiled
-from tactflow.vision.depth import poisson, slopes
 from tactflow.vision.depth.surface import Rest, Surface
-from tactflow.vision.geometry import moments
 from tactflow.vision.types import Depth as HeightMap
 from tactflow.vision.types import Scale
 
@@ -28,8 +25,6 @@ class Depth(Stage):
         """Prepare. calibration : the file."""
         super().__init__(params)
         self._known = None if calibration is None else Calibration.load(calibration)
-        if self._known is not None:
-            compiled.load(moments, poisson, slopes)
         self._surface: tuple[Scale, Surface] | None = None
         self._rest: tuple[Untouched, Rest] | None = None
 

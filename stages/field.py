@@ -7,8 +7,6 @@ from typing import NamedTuple
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Image
-from tactflow.vision import compiled
-from tactflow.vision.flow import loops
 from tactflow.vision.flow.displacement_field import FEWEST, DisplacementField, FieldModel
 from tactflow.vision.types import Markers
 
@@ -26,7 +24,6 @@ class Field(Stage):
 
     def __init__(self, params: StageParams) -> None:
         super().__init__(params)
-        compiled.load(loops)
         self._model: FieldModel | None = None
         self._reference = b"", (0, 0)
 

@@ -8,9 +8,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask
-from tactflow.vision import compiled
-from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field, loops
-from tactflow.vision.geometry.moments import RegionProperties
+from tactflow.vision.flow import DisplacementField, flow_in_mask, flow_of_field
 from tactflow.vision.types import Evidence, Flow, Markers
 
 
@@ -38,7 +36,6 @@ class FlowInMask(Stage):
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(loops)
 
     def process(
         self,
@@ -46,12 +43,9 @@ class FlowInMask(Stage):
         contact_mask: ContactMask,
         field: DisplacementField | None = None,
         evidence: Evidence | None = None,
-        region: RegionProperties | None = None,
     ) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside, or none near."""
         dilate = self._params.dilate
         if field is None or self._params.method == "mean":
             return flow_in_mask(markers, contact_mask, dilate=dilate)
-        return flow_of_field(
-            field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots", region=region
-        )
+        return flow_of_field(field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots")

@@ -8,25 +8,17 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Touching
-from tactflow.vision import compiled
 from tactflow.vision.contact.fusion import fuse_contact
-from tactflow.vision.flow import loops
 from tactflow.vision.flow.motion import MotionTest
-from tactflow.vision.geometry import moments
-from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Evidence, Markers
 
 
 class FusedPorts(NamedTuple):
-    """contact_mask : 255 in contact. touching : whether anything is. evidence : what showed it.
-
-    region : properties of the contact_mask, where they were needed to tell.
-    """
+    """contact_mask : 255 in contact. touching : whether anything is. evidence : what showed it."""
 
     contact_mask: ContactMask
     touching: Touching
     evidence: Evidence | None
-    region: RegionProperties | None = None
 
 
 class Fusion(Stage):
@@ -69,7 +61,6 @@ class Fusion(Stage):
 
     def __init__(self, params: Params) -> None:
         super().__init__(params)
-        compiled.load(loops, moments)
         self.reset()
 
     def reset(self) -> None:
@@ -95,4 +86,4 @@ class Fusion(Stage):
         self._changed = self._changed + 1 if fused.light_changed else 0
         if self._changed == self.params.patience > 0:
             self.wants_reference = "light_changed"
-        return FusedPorts(fused.mask, fused.touching, fused.evidence, fused.region)
+        return FusedPorts(fused.mask, fused.touching, fused.evidence)

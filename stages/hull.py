@@ -10,10 +10,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import ContactMask
-from tactflow.vision import compiled
-from tactflow.vision.geometry import moments
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
-from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Contact, Evidence
 
 
@@ -56,19 +53,16 @@ class Hull(Stage):
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(moments)
 
     def process(
         self,
         contact_mask: ContactMask,
         evidence: Evidence | None = None,
-        region: RegionProperties | None = None,
     ) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
         params = self._params
-        region = RegionProperties.of(contact_mask, region)
         parts = contact_parts(
-            region,
+            contact_mask,
             min_area=params.min_area,
             max_gap=params.max_gap or 0.0,
             min_confidence=params.min_confidence,
@@ -80,6 +74,8 @@ class Hull(Stage):
         if len(parts) == 1:
             return contact
         if params.merge == "all" and params.max_gap is None:
-            whole = contact_geometry(region, min_area=params.min_area, min_confidence=params.min_confidence)
+            whole = contact_geometry(
+                contact_mask, min_area=params.min_area, min_confidence=params.min_confidence
+            )
             contact = whole or contact
         return replace(contact, evidence=parts[0].evidence, separate=tuple(parts))

@@ -8,9 +8,6 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
-from tactflow.vision import compiled
-from tactflow.vision.geometry import downsample
-from tactflow.vision.markers import inpaint
 from tactflow.vision.markers.inpaint import RADIUS, remove_markers
 
 
@@ -28,8 +25,6 @@ class Inpaint(Stage):
         radius: float = Field(RADIUS, gt=0, le=100, description="neighbourhood, processed px")
 
     def __init__(self, params: Params) -> None:
-        if params.method == "normalized":
-            compiled.load(downsample, inpaint)
         self._params = params
 
     def process(self, image: Image, marker_mask: MarkerMask) -> Unmarked:

@@ -10,9 +10,6 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask, Valid
-from tactflow.vision import compiled
-from tactflow.vision.geometry import downsample
-from tactflow.vision.markers import mask
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 
 
@@ -34,7 +31,6 @@ class MarkerMaskStage(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        compiled.load(downsample, mask)
         self._params = params
         self._dot: Dot | None = None
         self._known = False

@@ -10,8 +10,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Image
-from tactflow.vision import compiled
-from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, downsample, find_homography
+from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 Row = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -81,8 +80,6 @@ class Preprocess(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        if params.method == "area" and params.downsample > 1:
-            compiled.load(downsample)
         self._params = params
         self._preprocessor: Preprocessor | None = None
 

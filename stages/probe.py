@@ -9,8 +9,7 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Changed
-from tactflow.vision import compiled
-from tactflow.vision.change import ChangeHold, ChangeProbe, tiles
+from tactflow.vision.change import ChangeHold, ChangeProbe
 from tactflow.vision.geometry.valid_area import bounding_box, valid_area
 
 
@@ -50,8 +49,6 @@ class Probe(Stage):
 
     def __init__(self, params: Params, skipping: bool = True) -> None:
         """Prepare; the first frame says where to look. Where nothing is skipped, nothing is looked at."""
-        if skipping:
-            compiled.load(tiles)
         self.params = params
         self._skipping = skipping
         self._probe: ChangeProbe | None = None

@@ -12,8 +12,6 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Image, Valid
-from tactflow.vision import compiled
-from tactflow.vision.markers import graph, matching, template, tracking
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers
@@ -44,7 +42,6 @@ class Tracker(Stage):
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        compiled.load(template, tracking, graph, matching)
         self.reset()
 
     def reset(self) -> None:

@@ -34,7 +34,6 @@ LONG_FILES = (
     "test_install.py",
     "cli/test_calibrate.py",
     "cli/test_record.py",
-    "vision/test_compiled.py",
 )
 """The files of tests that take longest, from a minute down to ten seconds. They begin first, so that no
 process is left alone with one at the end."""

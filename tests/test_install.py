@@ -23,8 +23,8 @@ code = main(["run", "--quiet", "--max-frames", "30", "--source", "sim:press", "-
 import tactflow.stages.hull
 print(tactflow.stages.hull.__file__)
 main(["stages"])
-kernels = compiled.known()
-print(code, sum(one.ready for one in kernels) > 5, [one.name for one in kernels if one.compiled_here])
+total, count = compiled.load()
+print(code, total > 5, count)
 """
 
 
@@ -66,9 +66,10 @@ def test_the_wheel_runs_in_a_fresh_environment_and_compiles_nothing_after_warmup
     warm = command(program, "warmup", cwd=empty)
     said = re.search(r"(\d+) loops are ready; (\d+) of them were compiled", warm)
     assert said is not None
-    assert said[1] == said[2]
+    # The other ones were compiled by a second process.
+    assert 0 < int(said[2]) <= int(said[1])
     where, *lines = command(python, "-c", RUN, cwd=empty).splitlines()
     assert str(tmp_path / "venv") in where
     assert any(line.startswith("hull") for line in lines)
-    assert "0 True []" in lines
+    assert "0 True 0" in lines
     assert len((empty / "out.jsonl").read_text().splitlines()) == 30

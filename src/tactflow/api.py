@@ -176,10 +176,11 @@ def run(
 
 
 def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
-    """A run of a pipeline, after OpenCV was given the threads that the pipeline sets.
+    """A run of a pipeline; loops are compiled, and OpenCV has the threads that the pipeline sets.
 
     options : of `Runner`.
     """
+    compiled.load()
     if pipeline.opencv_threads is not None:
         cv2.setNumThreads(pipeline.opencv_threads)
     return Runner(with_recorded_calibration(pipeline), **options)
@@ -189,7 +190,7 @@ def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
 def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
     """One Ctrl-C, SIGTERM or SIGHUP drains the pipeline; a second one ends it at once; a third is not caught.
 
-    While kernels are compiled there is nothing to drain, and the first one ends it. Gives those that came.
+    Gives those that came.
     """
     caught: list[int] = []
 
@@ -198,10 +199,8 @@ def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
         if len(caught) == 1:
             # In any case: Python drops what is raised while it frees an object or imports a module.
             runner.stop("signal")
-            if not compiled.is_loading():
-                return
-        else:
-            on_ending(signal.SIG_DFL)
+            return
+        on_ending(signal.SIG_DFL)
         raise Interrupted
 
     with ending_handled(handle):

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 from tactflow.vision.contact.background_kernels import (
     BESIDE,
     MIDDLE,
-    change_strength,
-    scaled_change,
-    smooth_cells,
-    weigh_change,
 )
-from tests.oracles.downsample import plain_halved
-from tests.oracles.gains import Gain
 
 Float = NDArray[np.float32]
 
@@ -30,7 +24,10 @@ def _change(planes: Float, mean: Float, coefficients: Float, across: Float, down
 
 def plain_smooth_cells(half: NDArray[np.uint8], smooth: Float) -> None:
     """Half the resolution, and a box filter."""
-    cells = plain_halved(half.reshape(len(half), -1, 3))
+    picture = half.reshape(len(half), -1, 3)
+    cells = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA).reshape(
+        *smooth.shape[1:], 3
+    )
     means = cv2.boxFilter(cells, cv2.CV_32F, (3, 3))
     smooth[:] = means.reshape(*smooth.shape[1:], 3).transpose(2, 0, 1)
 
@@ -122,14 +119,3 @@ def plain_change_strength(
     square = gain * (change**2).sum(axis=2) - (change @ strongest) ** 2
     strength[:] = np.sqrt(np.maximum(square, 0))
     common[:] = change.mean(axis=2)
-
-
-GAINS = [
-    # Grey levels; OpenCV multiplies the last ones of a line in float64.
-    Gain(smooth_cells, plain_smooth_cells, tolerance=2e-5),
-    # Squared deviations up to some thousands, to the rounding of float32; sums of thousands of them.
-    Gain(weigh_change, plain_weigh_change, tolerance=2.0),
-    # Where nothing counts, `blurred` is what it was.
-    Gain(scaled_change, plain_scaled_change, tolerance=1e-5),
-    Gain(change_strength, plain_change_strength, tolerance=1e-3),
-]

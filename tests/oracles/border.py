@@ -24,10 +24,8 @@ from tactflow.vision.contact.border import (
     STEPS,
     TOP,
     VARIES,
-    border_level,
 )
 from tactflow.vision.contact.contact_outline import WindowChange
-from tests.oracles.gains import Gain
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
@@ -131,6 +129,3 @@ def _crossing(profile: list[float], at: list[float], wanted: float) -> float:
         return at[0]
     fraction = (wanted - profile[first - 1]) / (profile[first] - profile[first - 1])
     return at[first - 1] + fraction * (at[first] - at[first - 1])
-
-
-GAINS = [Gain(border_level, plain_border_level, tolerance=1e-4)]

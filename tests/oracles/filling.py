@@ -6,9 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.filling import trace_outlines
-from tests.oracles.gains import Gain
-
 Mask = NDArray[np.uint8]
 
 
@@ -35,6 +32,3 @@ def plain_trace_outlines(
             ends[count] = start + len(kept), len(outline)
             points[start : ends[count, 0]] = kept
     return count
-
-
-GAINS = [Gain(trace_outlines, plain_trace_outlines, scratch=("marks",))]

@@ -11,10 +11,7 @@ from tactflow.vision.contact.illumination import (
     NEVER,
     REJECT,
     SATURATED,
-    compare_blocks,
-    fit_robustly,
 )
-from tests.oracles.gains import Gain
 
 Float = NDArray[np.float32]
 
@@ -55,9 +52,3 @@ def plain_fit_robustly(
             if np.abs(change).max() < CONVERGED:
                 break
     coefficients[:, :3] /= center[:, None]
-
-
-GAINS = [
-    Gain(compare_blocks, plain_compare_blocks, tolerance=1e-3),
-    Gain(fit_robustly, plain_fit_robustly, tolerance=1e-3),
-]

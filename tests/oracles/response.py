@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.response import LARGEST_GAIN, LEAST, LONG, ROUND, weigh_colours
-from tests.oracles.gains import Gain
+from tactflow.vision.contact.response import LARGEST_GAIN, LEAST, LONG, ROUND
 
 Float = NDArray[np.float32]
 
@@ -33,6 +32,3 @@ def plain_weigh_colours(change: Float, inside: NDArray[np.uint8], response: Floa
     scale = powers.sum() / (gain * powers.sum() - (gain - 1) * first)
     strongest = directions[:, 2] * np.copysign(1, directions[2, 2])
     response[0], response[1:] = gain * scale, strongest * np.sqrt((gain - 1) * scale)
-
-
-GAINS = [Gain(weigh_colours, plain_weigh_colours, tolerance=1e-4)]

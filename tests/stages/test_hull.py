@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent
 from tactflow.stages.hull import Hull
-from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Contact
 
 
@@ -25,16 +24,8 @@ def bar(height: int = 10) -> NDArray[np.uint8]:
     return mask
 
 
-def test_properties_serve_for_the_mask_that_they_are_of_and_for_no_other() -> None:
-    mask, other = bar(), bar(30)
-    hull = Hull(Hull.Params())
-    alone, known, stale = (
-        hull.process(mask, None, of) for of in (None, RegionProperties.of(mask), RegionProperties.of(other))
-    )
-    for contact in (alone, known, stale):
-        assert isinstance(contact, Contact)
-        assert contact.region_area == 500
-        assert contact.hull.tolist() == alone.hull.tolist()
+def test_an_empty_mask_is_no_contact() -> None:
+    assert run(np.zeros((60, 90), np.uint8)) == Absent("no_contact")
 
 
 def test_a_bar_is_described() -> None:

@@ -21,8 +21,8 @@ from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.report import Section, write_report
+from tactflow.system.processors import processors
 from tactflow.system.signals import INTERRUPTED, ending_handled
-from tactflow.vision.compiled import processors
 
 _FAILED_SHOWN = 20
 """Recordings that failed, named at the end: they fit on a screen."""

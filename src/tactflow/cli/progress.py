@@ -9,7 +9,6 @@ from typing import Any
 from tactflow.cli.statistics import share
 from tactflow.cli.terminal import progress_bar, say
 from tactflow.engine.run import Progress, Runner, RunResult
-from tactflow.vision import compiled
 
 _MOST_STAGES = 4
 """Stages named in a line of statistics, the most expensive ones: they fit on a wide terminal."""
@@ -38,10 +37,7 @@ def run_progress(
                 say(statistics_line(stats, last))
                 last = stats
 
-        with compiled.reporting(
-            lambda ready, total: bar(description=f"{sensor}: compiling loops, {ready} of {total}")
-        ):
-            yield update
+        yield update
 
 
 def statistics_line(stats: Mapping[str, Any], before: Mapping[str, Any]) -> str:

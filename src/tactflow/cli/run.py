@@ -6,7 +6,6 @@ import argparse
 import json
 import logging
 import os
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
@@ -32,7 +31,6 @@ from tactflow.fleet.run import Request, run_fleet
 from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
-from tactflow.vision import compiled
 
 REPORTS = {"--stats": '{\n "frames":', "--trace": TRACE_BEGINS}
 """Option that names a file -> how the file begins. A file that begins otherwise is not replaced."""
@@ -250,9 +248,6 @@ def _stop_at_end_of_input(runner: Runner) -> None:
         while os.read(sys.stdin.fileno(), 4096):
             pass
     runner.stop("signal")
-    if compiled.is_loading():
-        # It does not look at the runner.
-        signal.raise_signal(signal.SIGTERM)
 
 
 def add_arguments_record(parser: argparse.ArgumentParser) -> None:

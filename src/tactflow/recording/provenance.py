@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import platform
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,6 @@ from tactflow import __version__
 from tactflow.calibration.stored import stored_arrays, stored_text
 from tactflow.engine.control import Control
 from tactflow.system.redaction import without_secrets
-from tactflow.vision import compiled
 
 log = logging.getLogger("tactflow")
 
@@ -28,7 +28,7 @@ def facts(sensor: str, control: Control | None) -> dict[str, str]:
     found = {
         "tactflow": __version__,
         "numpy": np.__version__,
-        "numba": compiled.numba_version(),
+        "numba": version("numba"),
         "opencv": cv2.__version__,
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",

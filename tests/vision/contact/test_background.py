@@ -7,21 +7,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import event, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import Kernel
 from tactflow.vision.contact import (
     ContactDetector,
     background,
     border,
-    components,
     illumination,
-    resolution,
     response,
 )
-from tactflow.vision.contact.background import CELL, BackgroundModel, Change
+from tactflow.vision.contact.background import BackgroundModel, Change
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tests.oracles.background import (
     plain_change_strength,
@@ -30,9 +27,7 @@ from tests.oracles.background import (
     plain_weigh_change,
 )
 from tests.oracles.border import plain_border_level
-from tests.oracles.components import plain_close_changes
 from tests.oracles.illumination import plain_compare_blocks, plain_fit_robustly
-from tests.oracles.resolution import plain_halve_window, plain_raise_mask
 from tests.oracles.response import plain_weigh_colours
 
 Image = NDArray[np.uint8]
@@ -48,10 +43,7 @@ ORACLES = (
     (response, "weigh_colours", plain_weigh_colours),
     (illumination, "compare_blocks", plain_compare_blocks),
     (illumination, "fit_robustly", plain_fit_robustly),
-    (components, "close_changes", plain_close_changes),
     (border, "border_level", plain_border_level),
-    (resolution, "raise_mask", plain_raise_mask),
-    (resolution, "halve_window", plain_halve_window),
 )
 
 
@@ -141,101 +133,6 @@ def test_the_loops_find_a_window_as_strong_as_the_plain_version(
         oracles.undo()
     _close(fast.strength, slow.strength)
     _close(fast.brightness, slow.brightness)
-
-
-@settings(max_examples=100, deadline=None)
-@given(SIZES, st.integers(0, 2**16), st.data())
-def test_the_loops_halve_a_window_of_a_mask_as_the_plain_version(
-    size: tuple[int, int], seed: int, data: st.DataObject
-) -> None:
-    rng = np.random.default_rng(seed)
-    mask = ((rng.random(size) < rng.uniform(0, 0.5)) * rng.choice([1, 7, 255])).astype(np.uint8)
-    high, wide = -(-size[0] // CELL), -(-size[1] // CELL)
-    top, left = data.draw(st.integers(0, high - 1)), data.draw(st.integers(0, wide - 1))
-    bottom, right = data.draw(st.integers(top + 1, high)), data.draw(st.integers(left + 1, wide))
-    inside = rng.random((bottom - top, right - left)) < 0.7
-    fast = resolution.window_mask(mask, CELL * top, CELL * left, inside)
-    slow = np.empty_like(fast)
-    plain_halve_window(mask, CELL * top, CELL * left, inside.view(np.uint8), slow)
-    assert np.array_equal(fast, slow)
-    whole = resolution.window_mask(mask, CELL * top, CELL * left, inside, side=1)
-    assert np.array_equal(whole.reshape(len(fast), 2, -1, 2).max(axis=(1, 3)), fast)
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.tuples(st.integers(1, 20), st.integers(1, 20)), SIZES, st.integers(0, 2**16), st.data())
-def test_the_loops_draw_a_level_set_as_the_plain_version(
-    size: tuple[int, int], frame: tuple[int, int], seed: int, data: st.DataObject
-) -> None:
-    rng = np.random.default_rng(seed)
-    # Sixteenths, with which interpolation by quarters is exact.
-    level = (rng.integers(-40, 40, size) / 16).astype(np.float32)
-    top, left = data.draw(st.integers(0, frame[0] - 1)), data.draw(st.integers(0, frame[1] - 1))
-    fast = rng.choice([0, 255], frame, p=[0.9, 0.1]).astype(np.uint8)
-    slow = fast.copy()
-    any_inside = plain_raise_mask(level, top, left, slow)
-    assert resolution.draw_level(level, top, left, fast) == any_inside
-    assert np.array_equal(fast, slow)
-    drawn, shown = np.zeros(frame, np.uint8), level[: frame[0] - top, : frame[1] - left] > 0
-    assert resolution.draw_level(level, top, left, drawn, side=1) == shown.any()
-    assert np.array_equal(drawn[top:, left:][: shown.shape[0], : shown.shape[1]] == 255, shown)
-    assert cv2.countNonZero(drawn) == np.count_nonzero(shown)
-
-
-@settings(max_examples=60, deadline=None)
-@given(SIZES, st.integers(0, 2**16))
-def test_the_loops_close_changes_as_the_plain_version(size: tuple[int, int], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    squared = (rng.random(size) < rng.uniform(0, 1)).astype(np.float32)
-    _same_cells_and_box(squared, 0.5)
-
-
-@settings(max_examples=60, deadline=None)
-@given(SIZES, st.integers(0, 2**16), st.floats(1, 8))
-def test_the_loop_bounds_what_is_one_piece_as_the_plain_version(
-    size: tuple[int, int], seed: int, blur: float
-) -> None:
-    _, smooth = _blobs(size, seed, blur)
-    # One blob, or a few of them, some of which have bays, holes or parts.
-    boxes = [_same_cells_and_box(smooth, float(np.quantile(smooth, part))) for part in (0.5, 0.9, 0.98)]
-    event(f"one piece: {sum(box[4] > 0 for box in boxes)} of 3")
-
-
-@settings(max_examples=60, deadline=None)
-@given(SIZES, st.integers(0, 2**16), st.floats(1, 8))
-def test_a_contact_in_one_piece_is_what_opencv_outlines(
-    size: tuple[int, int], seed: int, blur: float
-) -> None:
-    noise, smooth = _blobs(size, seed, blur)
-    weak, largest = float(np.quantile(smooth, 0.9)), float(smooth.max())
-    for before in (None, noise > 0.5):
-        limits = smooth, weak, largest, largest if before is None else 1e9, weak, before
-        fast = components.contact_components(*limits)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(components, "close_changes", _never_one_piece)
-            slow = components.contact_components(*limits)
-        assert [found[:2] for found in fast] == [found[:2] for found in slow]
-        assert all(np.array_equal(one.inside, other.inside) for one, other in zip(fast, slow, strict=True))
-
-
-def _blobs(size: tuple[int, int], seed: int, blur: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """White noise, and what is left of it after a blur, px."""
-    noise = np.random.default_rng(seed).random(size).astype(np.float32)
-    return noise, np.asarray(cv2.GaussianBlur(noise, (0, 0), blur), np.float32)
-
-
-def _never_one_piece(*arguments: Any) -> tuple[int, ...]:
-    plain_close_changes(*arguments)
-    return (0,) * 5
-
-
-def _same_cells_and_box(squared: NDArray[np.float32], weak: float) -> tuple[int, ...]:
-    """What both versions of `close_changes` find to be the box of one piece."""
-    fast, slow = np.empty(squared.shape, np.uint8), np.empty(squared.shape, np.uint8)
-    box = components.close_changes(squared, weak, fast)
-    assert box == plain_close_changes(squared, np.float32(weak), slow)
-    assert np.array_equal(fast, slow)
-    return box
 
 
 def _contacts(seed: int) -> list[Image]:
@@ -328,14 +225,6 @@ def test_saturated_blocks_tell_nothing_of_the_light() -> None:
     frame = np.minimum(2.2 * gel, 255).astype(np.float32)
     left = np.abs(under_illumination(gel, model.fit(frame)) - frame)
     assert left.max() < 0.025 * 255
-
-
-def test_the_kernels_of_the_comparison_do_not_wait_for_the_first_frame() -> None:
-    ContactDetector()
-    for module, name, _ in ORACLES:
-        loops = getattr(module, name)
-        assert isinstance(loops, Kernel)
-        assert loops._compiled is not None
 
 
 def test_a_pattern_that_moves_counts_little_beside_a_change_of_colour() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -152,24 +151,6 @@ def test_the_mean_is_the_integral_of_the_field_over_the_gel_in_contact() -> None
     now = np.rint(rest + moved).astype(int)
     inside = mask[now[:, 1], now[:, 0]] > 0
     assert motion.mean == pytest.approx(tuple(moved[inside].mean(axis=0)), abs=0.01)
-
-
-@pytest.mark.parametrize("radius", [45, 120])  # px, summed on the fine and on the coarse grid
-def test_what_is_told_of_a_contact_does_not_depend_on_where_its_box_begins(radius: float) -> None:
-    field = field_of(markers(waves(GRID)))
-    mask = disc((150, 200), radius)
-    left, top, width, height = cv2.boundingRect(mask)
-    told = field.motion(mask)
-    assert told is not None
-    # Sums over the cells, in whatever order: two for a mean.
-    most = np.abs(field.displacement).max()
-    bound = 2 * math.prod(field.grid.shape) * np.finfo(np.float64).eps * most
-    for wider in range(1, 2 * math.ceil(field.grid.spacing) + 1):
-        again = field.motion(mask, (left - wider, top - wider, width + wider, height + wider))
-        assert again is not None
-        assert again.mean == pytest.approx(told.mean, rel=0, abs=bound)
-        assert again.stderr == pytest.approx(told.stderr, rel=1e-9)
-        assert again.spread == pytest.approx(told.spread, rel=1e-9)
 
 
 def test_a_marker_that_enters_the_contact_makes_no_jump() -> None:

@@ -153,6 +153,40 @@ def test_simulated_markers_are_covered_in_contact_and_out_of_it(scene: str) -> N
         assert (mask[change > 20] > 0).mean() > 0.97
 
 
+def _defined(image: Image, radius: float, contrast: float, dark: bool) -> Image:
+    """The definition, for pictures of even sides, point by point."""
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA).astype(int)
+    height, width = half.shape[:2]
+    outer = (radius + max(radius, 4.0) + 1) / 2
+    reach, worst = int(np.ceil(outer)), 10_000 if dark else -10_000
+    wide = np.pad(half, ((reach, reach), (reach, reach), (0, 0)), constant_values=worst)
+    angles = np.arange(12) * (2 * np.pi / 12)
+    rows, columns = np.rint(outer * np.stack([np.sin(angles), np.cos(angles)])).astype(int) + reach
+    around = np.stack([wide[y : y + height, x : x + width] for y, x in zip(rows, columns, strict=True)])
+    least = around.min(axis=0) - half if dark else half - around.max(axis=0)
+    spots = np.median(np.clip(least, 0, 255), axis=2) > np.floor(contrast)
+    side = (2 * reach + 1) // 4
+    for part in (spots[:side], spots[max(height - side, 0) :]):
+        part[:, :side] = part[:, max(width - side, 0) :] = False
+    covered = cv2.dilate(spots.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
+    return np.asarray(covered, np.uint8).repeat(2, axis=0).repeat(2, axis=1)
+
+
+@pytest.mark.parametrize("dark", [True, False])
+@pytest.mark.parametrize("size", [(40, 130), (100, 76)])
+@pytest.mark.parametrize("radius", [0.4, 2.0, 5.3, 11.0])
+def test_a_spot_differs_from_every_point_of_a_circle_in_two_channels(
+    radius: float, size: tuple[int, int], dark: bool
+) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (*size, 3)).astype(np.uint8)
+    smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), 2.5), float)
+    blobs = (smooth - smooth.min()) * (255 / np.ptp(smooth))
+    for image in (noise, blobs.astype(np.uint8)):
+        for contrast in (0.5, 25.9, 80.0, 300.0):
+            mask = marker_mask(image, Dot(radius, "dark" if dark else "bright", contrast))
+            np.testing.assert_array_equal(mask, _defined(image, radius, contrast, dark))
+
+
 def test_wrong_dots_and_images_are_refused() -> None:
     with pytest.raises(ValueError, match="radius: required > 0"):
         Dot(0)

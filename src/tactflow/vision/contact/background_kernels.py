@@ -68,7 +68,6 @@ def smooth_cells(half: Byte, smooth: Float) -> None:
     "UniTuple(float64, 4)(float32[:, :, ::1], float32[:, ::1], float32[::1], float32[::1],"
     " float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1], float32[:, ::1], uint8[:, ::1],"
     " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
-    reorder=True,
 )
 def weigh_change(
     smooth: Float,
@@ -131,9 +130,9 @@ def weigh_change(
 
 
 @kernel(
-    "void(uint8[:, ::1], int64, int64, float32[:, ::1], float32[::1], float32[::1], float32[:, ::1],"
+    "void(Array(uint8, 2, 'C', readonly=True), int64, int64, float32[:, ::1], float32[::1], float32[::1],"
+    " float32[:, ::1],"
     " float32[:, ::1], float32[:, ::1], uint8[:, ::1], float32[:, ::1], int64[:, ::1], float32[::1])",
-    reorder=True,
 )
 def scaled_change(
     picture: Byte,
@@ -268,7 +267,6 @@ def _neighbours(spans: Index, row: int, wide: int) -> tuple[int, int]:
 @kernel(
     "void(float32[:, ::1], uint8[:, ::1], int64[:, ::1], float32, float32[::1], float32[:, ::1],"
     " float32[:, ::1])",
-    reorder=True,
 )
 def change_strength(
     blurred: Float,

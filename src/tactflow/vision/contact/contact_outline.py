@@ -144,7 +144,6 @@ def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Fl
 
 @kernel(
     "UniTuple(float64, 3)(float32[:, ::1], float32[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, ::1])",
-    reorder=True,
 )
 def cut_gloss(
     strength: Float, brightness: Float, hidden: Mask, beside: Mask, cut: Float

@@ -33,23 +33,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision import compiled
-from tactflow.vision.contact import (
-    background_kernels,
-    border,
-    components,
-    contact_outline,
-    filling,
-    illumination,
-    nearby,
-    resolution,
-    response,
-)
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.components import Component, contact_components, union, wide_change
 from tactflow.vision.contact.contact_outline import contact_level
 from tactflow.vision.contact.resolution import draw_level, window_mask
-from tactflow.vision.geometry import downsample
 
 ContactMethod = Literal["noise", "colour"]
 Float = NDArray[np.float32]
@@ -196,19 +183,6 @@ class ContactDetector:
         self._relaxation = relaxation
         self._creep = creep
         self._distance = distance
-        if method == "noise":
-            compiled.load(
-                background_kernels,
-                border,
-                components,
-                contact_outline,
-                downsample,
-                filling,
-                illumination,
-                nearby,
-                resolution,
-                response,
-            )
         self.reset()
 
     def reset(self) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
-from tactflow.vision.geometry.moments import Box, RegionProperties
+from tactflow.vision.geometry.region import Region, measure_region
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
 
 Mask = NDArray[np.uint8]
@@ -45,13 +45,11 @@ class FusedContact(NamedTuple):
 
     mask : (H, W) uint8, 255 in contact. evidence : what showed it; None where nothing touches.
     light_changed : whether there is a change of the light that is no contact.
-    region : properties of the mask; None where they were not needed.
     """
 
     mask: Mask
     evidence: Evidence | None
     light_changed: bool = False
-    region: RegionProperties | None = None
 
     @property
     def touching(self) -> bool:
@@ -82,19 +80,16 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
     >>> fused.evidence, fused.mask[20, 40]
     ('dots', np.uint8(255))
     """
-    motion, region = test(markers), RegionProperties(light)
-    if not region.moments.pixels:
+    motion, region = test(markers), measure_region(light)
+    if not region.pixels:
         if not motion.clearly:
             return FusedContact(light, None)
         return FusedContact(_hull_of(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        mask = _without_strays(region, markers, motion, test.pitch)
-        return FusedContact(mask, "both", region=region if mask is light else None)
+        return FusedContact(_without_strays(light, region, markers, motion, test.pitch), "both")
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
-    mask = _without_rims(light, region.box, markers)
-    if mask is light:
-        return FusedContact(light, "light", region=region)
+    mask = _without_rims(light, region, markers)
     return FusedContact(mask, "light" if cv2.countNonZero(mask) else None)
 
 
@@ -106,19 +101,23 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     return len(resting) >= UNMOVED and bool(resting.all())
 
 
-def _without_strays(region: RegionProperties, markers: Markers, motion: Motion, reach: float) -> Mask:
+def _without_strays(light: Mask, region: Region, markers: Markers, motion: Motion, reach: float) -> Mask:
     """Of several regions those that are neither reflections nor rims of markers; none is left out alone.
 
-    reach : how far around a region markers tell what it is, px.
+    region : all of them. reach : how far around a region markers tell what it is, px.
     """
-    light = region.mask
-    if region.connected or len(region.contours) < 2:
+    if region.in_one_piece:
         return light
-    moved = _without_reflections(light, region.contours, markers, motion, reach)
-    if all(pixels > _largest_rim(markers) for pixels in _fewest_pixels(region)):
+    left, top, width, height = region[:4]
+    window = light[top : top + height, left : left + width]
+    outlines, _ = cv2.findContours(window, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top))
+    if len(outlines) < 2:
+        return light
+    moved = _without_reflections(light, outlines, markers, motion, reach)
+    if all(pixels > _largest_rim(markers) for pixels in _fewest_pixels(light, outlines)):
         return moved
-    left = _without_rims(moved, region.box, markers)
-    return left if cv2.countNonZero(left) else moved
+    kept = _without_rims(moved, region, markers)
+    return kept if cv2.countNonZero(kept) else moved
 
 
 def _largest_rim(markers: Markers) -> float:
@@ -126,14 +125,14 @@ def _largest_rim(markers: Markers) -> float:
     return 0.0 if markers.radius is None else np.pi * (markers.radius + SPREAD) ** 2
 
 
-def _fewest_pixels(region: RegionProperties) -> Iterator[int]:
+def _fewest_pixels(light: Mask, outlines: Sequence[cv2.typing.MatLike]) -> Iterator[int]:
     """How many pixels each region has at least: those in its box, less where boxes of others overlap it.
 
     To tell the regions apart pixel by pixel takes fifty times as long.
     """
-    boxes = [cv2.boundingRect(outline) for outline in region.contours]
+    boxes = [cv2.boundingRect(outline) for outline in outlines]
     for number, (left, top, width, height) in enumerate(boxes):
-        pixels = cv2.countNonZero(region.mask[top : top + height, left : left + width])
+        pixels = cv2.countNonZero(light[top : top + height, left : left + width])
         for x, y, wide, high in boxes[:number] + boxes[number + 1 :]:
             across = min(left + width, x + wide) - max(left, x)
             down = min(top + height, y + high) - max(top, y)
@@ -161,17 +160,17 @@ def _without_reflections(
     return kept
 
 
-def _without_rims(light: Mask, box: Box, markers: Markers) -> Mask:
+def _without_rims(light: Mask, region: Region, markers: Markers) -> Mask:
     """The regions that are more than what removing a marker leaves at its rim; the same array if all are.
 
-    box : around all regions.
+    region : all of them.
     A marker that has moved by a part of a pixel is not quite where it is painted over.
     """
     radius = markers.radius
     if radius is None or not len(markers.position):
         return light
     # OpenCV takes twenty times as long for the whole frame as for the box around a first touch.
-    left, top, width, height = box
+    left, top, width, height = region[:4]
     window = light[top : top + height, left : left + width]
     count, labels, boxes, centers = cv2.connectedComponentsWithStats(window)
     small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= _largest_rim(markers))

@@ -159,7 +159,6 @@ def _block_weights(blocks: int, count: int) -> Float:
 @kernel(
     "void(float32[:, :, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1],"
     " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
-    reorder=True,
 )
 def compare_blocks(
     cells: Float,
@@ -221,7 +220,6 @@ def compare_blocks(
 @kernel(
     "void(float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1],"
     " float32[::1], float32[:, ::1])",
-    reorder=True,
 )
 def fit_robustly(
     excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, center: Float, coefficients: Float

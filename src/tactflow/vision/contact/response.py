@@ -72,7 +72,7 @@ def light_response(change: Float, inside: NDArray[np.bool_]) -> Response:
     return Response(response[0], response[1:])
 
 
-@kernel("void(float32[:, ::1], uint8[:, ::1], float32[::1])", reorder=True)
+@kernel("void(float32[:, ::1], uint8[:, ::1], float32[::1])")
 def weigh_colours(change: Float, inside: NDArray[np.uint8], response: Float) -> None:
     """What `light_response` does; response : (4,), filled with the gain and the strongest colour."""
     each, zero = len(change) // (2 * len(inside)), np.float32(0)

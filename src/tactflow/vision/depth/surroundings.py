@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.depth.slopes import BAND, Bytes
-from tactflow.vision.geometry.moments import Moments, RegionProperties
+from tactflow.vision.geometry.region import Region, measure_region
 
 MARGIN: Final = 1.25
 """How far the gel may have sunk beyond the contact, relative to half of the contact's shorter axis. Chosen on
@@ -61,9 +61,9 @@ def surroundings(mask: Bytes, whole: Window, relative: float = MARGIN) -> Surrou
 
     relative : how far, in halves of the contact's shorter axis; `LEAST_MARGIN` at least.
     """
-    contact = RegionProperties(mask)
-    x, y, width, height = contact.box
-    margin = max(LEAST_MARGIN, round(relative * _shorter_axis(contact.moments) / 4))
+    contact = measure_region(mask)
+    x, y, width, height = contact[:4]
+    margin = max(LEAST_MARGIN, round(relative * _shorter_axis(contact) / 4))
     left, right = max(0, x // 2 - margin), min((x + width + 1) // 2 + margin, whole.right)
     # Rows of such a length are transformed in up to a third of the time.
     columns = min(cv2.getOptimalDFTSize(right - left), whole.right)
@@ -83,7 +83,9 @@ def _near(mask: Bytes, window: Window, margin: int) -> Bytes:
     return np.asarray(cv2.dilate(contact.reshape(bands, BAND, -1).max(axis=1), reach), np.uint8)
 
 
-def _shorter_axis(moments: Moments) -> float:
-    """Shorter axis of the ellipse that has these second moments, px: of a disc its diameter."""
-    xx, xy, yy = (value / moments.pixels**2 for value in moments.central())
+def _shorter_axis(region: Region) -> float:
+    """Shorter axis of the ellipse that has a region's second moments, px: of a disc its diameter."""
+    count, x, y = region.pixels, region.x, region.y
+    sums = count * region.xx - x * x, count * region.xy - x * y, count * region.yy - y * y
+    xx, xy, yy = (value / (count * count) for value in sums)
     return 4 * math.sqrt(max((xx + yy) / 2 - math.hypot((xx - yy) / 2, xy), 0.0))

@@ -2,8 +2,7 @@
 
 `motion` tests whether markers move as something that touches the gel moves them. `displacement_field` tells
 how the gel moves between them; `in_mask` sums that up for the contact, or else the motions of the markers
-that are `inside` of it, by a `similarity`; `slip` tells whether the contact slides. `loops` holds what they
-compile.
+that are `inside` of it; `slip` tells whether the contact slides.
 """
 
 from tactflow.vision.flow.displacement_field import DisplacementField, FieldModel

@@ -15,24 +15,11 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from tactflow.vision.flow.inside import check_mask
-from tactflow.vision.flow.loops import (
-    COEFFICIENTS,
-    PRECISION,
-    SHARE,
-    VARIANCE,
-    sample_region,
-    sum_markers,
-    sum_region,
-    weigh_markers,
-)
+from tactflow.vision.arrays import Flags, Floats, Mask, Points, check_mask
+from tactflow.vision.flow.loops import COEFFICIENTS, PRECISION, VARIANCE, sum_region, weigh_markers
 from tactflow.vision.markers.lattice import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 LENGTH: Final = 1.5
 """Correlation length of the field, pitches. Kernel and length are those that predict the markers of nine real
@@ -52,9 +39,6 @@ pitches wide or more, and the field varies over one and a half. Chosen by hand."
 OUTLINE: Final = 4.0
 """How uncertain a contact's outline is: the square of its error times the length over which it errs alike,
 px^3; 0.5 px over 16 px. Measured on 22 simulated recordings, by what it does to the mean."""
-BLOCK: Final = 32
-"""Points whose kernel with all markers is computed at once, so that what is computed in between stays in the
-caches. Chosen by time, of 16 to 128."""
 FEWEST: Final = 3
 """Markers that must be seen for a field. Chosen by hand."""
 OVERSHOOT: Final = 0.5
@@ -72,7 +56,7 @@ class Grid(NamedTuple):
     spacing: float
 
     @property
-    def points(self) -> FloatArray:
+    def points(self) -> Floats:
         """(rows, columns, 2) float64: x and y of every cell's centre, px."""
         rows, columns = self.shape
         x = self.first[0] + self.spacing * np.arange(columns)
@@ -88,16 +72,14 @@ class Grid(NamedTuple):
 class Samples(NamedTuple):
     """A grid of cells over which the field is summed.
 
-    place : (5,) float64, see `sample_region`. to_markers : (rows, columns, N) float64, the kernel between
-        cells and markers.
-    between : (rows, 2 columns - 1) float64, the kernel between two cells, by how many rows and columns they
-        are apart, 0 columns in the middle.
-    """
+    place : (5,) float64, see `sum_region`. to_markers : (rows, columns, N) float64,
+    the kernel between cells and markers. between : (2 rows - 1, 2 columns - 1) float64, the kernel between
+    two cells, by how many rows and columns they are apart; 0 in the middle."""
 
     grid: Grid
-    place: FloatArray
-    to_markers: FloatArray
-    between: FloatArray
+    place: Floats
+    to_markers: Floats
+    between: Floats
 
 
 class Gradient(NamedTuple):
@@ -185,45 +167,39 @@ class FieldModel:
     [2.0, -1.0]
     """
 
-    def __init__(self, origin: FloatArray, size: tuple[int, int]) -> None:
+    def __init__(self, origin: Points, size: tuple[int, int]) -> None:
         if origin.ndim != 2 or origin.shape[1] != 2 or len(origin) < FEWEST:
             raise ValueError(f"required an origin of shape (N, 2) with N >= {FEWEST}, got {origin.shape}")
         if min(size) < 1:
             raise ValueError(f"required a size of at least 1 x 1 px, got {size}")
-        self.origin = np.array(origin, np.float64)
+        self.origin: Points = np.array(origin, np.float64)
         self.pitch = max(pitch_of(self.origin), 1.0)
+        self.rest: Floats = np.ascontiguousarray(self.origin.T)
+        """(2, N), x and y of each marker in the reference, px."""
         self._length = LENGTH * self.pitch
         kernel = self._kernel(self.origin)
-        self.inverse: FloatArray = np.asarray(
-            np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64
-        )
-        self.rest = np.ascontiguousarray(self.origin.T)
-        """(2, N), x and y of each marker in the reference, px."""
+        self.inverse: Floats = np.asarray(np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64)
         grid = _grid(size, self.pitch)
         self._margin = OVERSHOOT * self.pitch + grid.spacing
         self.fine, self.coarse = self._samples(grid), self._samples(grid.coarser())
-        """For small and for large regions. Both are fixed to the frame, so that what is told of a region does
+        """For small and for large regions. Both are fixed to the frame, so that what is said of a region does
         not depend on where its bounding box begins."""
 
     def _samples(self, grid: Grid) -> Samples:
-        """What the loops need to know of a grid."""
-        (rows, columns), spacing = grid.shape, grid.spacing
-        side = 2 * round((spacing - 1) / 2) + 1
-        place = np.array([*grid.first, spacing, self._margin, side])
+        rows, columns = grid.shape
         to_markers = self._kernel(grid.points.reshape(-1, 2)).reshape(rows, columns, -1)
-        down, across = np.mgrid[:rows, 1 - columns : columns] * spacing
+        down, across = np.mgrid[1 - rows : rows, 1 - columns : columns] * grid.spacing
+        side = 2 * round((grid.spacing - 1) / 2) + 1
+        place = np.array([*grid.first, grid.spacing, self._margin, side])
         return Samples(grid, place, to_markers, matern(np.hypot(down, across) / self._length))
 
-    def _kernel(self, points: FloatArray) -> FloatArray:
+    def _kernel(self, points: Points) -> Floats:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
-        kernel = np.empty((len(points), len(self.origin)))
-        for first in range(0, len(points), BLOCK):
-            x, y = points[first : first + BLOCK].T[:, :, None] - self.origin.T[:, None]
-            kernel[first : first + BLOCK] = matern(np.sqrt(x * x + y * y) / self._length)
-        return kernel
+        x, y = points.T[:, :, None] - self.origin.T[:, None]
+        return matern(np.sqrt(x * x + y * y) / self._length)
 
     @cached_property
-    def weights(self) -> FloatArray:
+    def weights(self) -> Floats:
         """(cells, N): how much each marker counts in each cell where all are seen."""
         return self.fine.to_markers.reshape(-1, len(self.origin)) @ self.inverse
 
@@ -235,13 +211,7 @@ class FieldModel:
         if markers.position.shape != self.origin.shape:
             raise ValueError(f"required {len(self.origin)} markers, got {len(markers.position)}")
         seen = markers.status == _TRACKED
-        errors = np.asarray(markers.stderr, np.float64)[seen]
-        if len(errors) < FEWEST:
-            return None
-        errors.sort()
-        # What is unknown, infinite or NaN, comes last.
-        known = len(errors) if math.isfinite(errors[-1]) else int(errors.searchsorted(np.inf))
-        return DisplacementField(self, markers, seen, float(errors[known // 2]) if known else 0.0)
+        return DisplacementField(self, markers, seen) if np.count_nonzero(seen) >= FEWEST else None
 
 
 class DisplacementField:
@@ -251,97 +221,87 @@ class DisplacementField:
     that was at `grid.points[row, column]` in the reference frame.
 
     model : of the reference. markers : of the frame. seen : (N,) bool, those that were seen, three or more.
-    noise : median standard error of a marker, px; 0 where none is known.
 
-    grid : where the field is told.
+    grid : where the field is known. noise : median standard error of a marker, px; 0 where none is known.
     """
 
-    def __init__(self, model: FieldModel, markers: Markers, seen: NDArray[np.bool_], noise: float) -> None:
-        self.grid, self.noise = model.fine.grid, noise
+    def __init__(self, model: FieldModel, markers: Markers, seen: Flags) -> None:
+        self.grid = model.fine.grid
         self._model, self._seen = model, seen
         position = np.ascontiguousarray(markers.position, np.float64)
         stderr = np.ascontiguousarray(markers.stderr, np.float64)
-        self._planes = np.empty((6, len(seen)))
-        removed = np.empty_like(model.inverse)
+        errors = np.sort(stderr[seen])
+        # What is unknown, infinite or NaN, comes last.
+        known = len(errors) if math.isfinite(errors[-1]) else int(errors.searchsorted(np.inf))
+        self.noise = float(errors[known // 2]) if known else 0.0
+        self._planes, removed = np.empty((6, len(seen))), np.empty_like(model.inverse)
+        largest = POOR * self.noise
         count = weigh_markers(
-            position, model.rest, seen, stderr, noise, POOR * noise, model.inverse, self._planes, removed
+            position, model.rest, seen, stderr, self.noise, largest, model.inverse, self._planes, removed
         )
-        self._removed = removed[:count].copy()
+        self._removed: Floats = removed[:count].copy()
+        """(S, N): the inverse is less by their squares, removed.T @ removed."""
 
     @cached_property
-    def displacement(self) -> FloatArray:
+    def displacement(self) -> Floats:
         """(rows, columns, 2) float64, px."""
         return np.asarray(self._model.fine.to_markers @ self._planes[COEFFICIENTS].T)
 
     @cached_property
-    def stderr(self) -> FloatArray:
+    def stderr(self) -> Floats:
         """(rows, columns) float64, standard error of each component of `displacement`, px."""
         kernel = self._model.fine.to_markers.reshape(-1, len(self._seen))
         weights = self._model.weights - kernel @ self._removed.T @ self._removed
         unknown = np.maximum(1 - np.einsum("gn,gn->g", weights, kernel), 0)
-        squares = self._scale(kernel) * unknown + (weights * weights) @ self._planes[VARIANCE]
+        variances = (self._planes[COEFFICIENTS] ** 2).sum(axis=0) * self._planes[PRECISION]
+        scale = kernel @ variances / np.maximum(kernel @ self._seen, 1e-12)
+        squares = scale * unknown + (weights * weights) @ self._planes[VARIANCE]
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
 
-    def motion(self, mask: NDArray[np.uint8], box: Sequence[int] | None = None) -> GelMotion | None:
+    def share(self, mask: Mask) -> Floats:
+        """(rows, columns), how much of the gel of each cell is in a region now, 0 to 1.
+
+        mask : (H, W) uint8, 255 inside, else 0. Raises ValueError if it is not.
+        """
+        check_mask(mask)
+        return self._sums(mask, cv2.boundingRect(mask), self._model.fine)[0]
+
+    def motion(self, mask: Mask) -> GelMotion | None:
         """How the gel inside a region has moved, each bit of it counted by its area at rest.
 
         mask : (H, W) uint8, 255 inside, else 0, in the current frame: what counts is where the gel is now.
-        box : (left, top, width, height) of the region, px, where it is known.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
-        check_mask(mask, 0)
-        box = box or cv2.boundingRect(mask)
-        model, many = self._model, MANY * self.grid.spacing**2
-        samples = model.fine if box[2] * box[3] < many else model.coarse
-        window, cells = self._cells(mask, box, samples)
-        spacing = samples.grid.spacing
-        # Between region and markers, and how much each marker counts.
-        kernel, counts = np.zeros((3, len(model.origin))), np.empty((3, len(model.origin)))
-        sums = np.zeros(26)
-        sum_region(cells, samples.to_markers, window, spacing, samples.between, sums, kernel)
-        sum_markers(kernel, model.inverse, self._removed, self._planes, counts, sums)
-        numbers = sums.tolist()
-        return _motion(numbers, spacing) if numbers[0] > 0 else None
+        check_mask(mask)
+        box = cv2.boundingRect(mask)
+        large = box[2] * box[3] >= MANY * self.grid.spacing**2
+        samples = self._model.coarse if large else self._model.fine
+        _, sums = self._sums(mask, box, samples)
+        return _motion(sums.tolist(), samples.grid.spacing) if sums[0] > 0 else None
 
-    def part(self, mask: NDArray[np.uint8]) -> Part | None:
-        """The cells of the gel that are in a region now, (H, W) uint8, 255 inside; None if there are none."""
-        check_mask(mask, 0)
-        window, cells = self._cells(mask, cv2.boundingRect(mask), self._model.fine)
-        top, left, rows, columns = window.tolist()
-        inside = cells[SHARE, : rows * columns]
-        total = float(inside.sum())
-        return Part(inside.reshape(rows, columns), total, (top, left)) if total > 0 else None
-
-    def _cells(
-        self, mask: NDArray[np.uint8], box: Sequence[int], samples: Samples
-    ) -> tuple[NDArray[np.int64], FloatArray]:
-        """The cells around a region that lies in a box, px: window and cells of `sample_region`."""
+    def _sums(self, mask: Mask, box: Sequence[int], samples: Samples) -> tuple[Floats, Floats]:
+        """Shares and sums of a region in a box, see `sum_region`."""
         left, top, width, height = box
-        place, to_markers = samples.place, samples.to_markers
-        window, cells = np.empty(4, np.int64), np.empty((6, math.prod(samples.grid.shape)))
+        shares, sums = np.zeros(samples.grid.shape), np.zeros(26)
         covered = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
-        sample_region(covered, left, top, place, self._planes, to_markers, window, cells)
-        return window, cells
-
-    def _scale(self, kernel: FloatArray) -> FloatArray:
-        """(M,) px^2: variance of the field near places whose kernels with the markers are (M, N)."""
-        squares = (self._planes[COEFFICIENTS] ** 2).sum(axis=0) * self._planes[PRECISION]
-        return np.asarray(kernel @ squares / np.maximum(kernel @ self._seen, 1e-12))
-
-
-class Part(NamedTuple):
-    """A part of the gel: the cells of a window of the grid, so many rows and columns of them.
-
-    inside : (rows, columns), how much of each cell belongs to the part, 0 to 1. cells : their sum.
-    begin : row and column of the grid where the window begins.
-    """
-
-    inside: FloatArray
-    cells: float
-    begin: tuple[int, int]
+        model = self._model
+        sum_region(
+            covered,
+            left,
+            top,
+            samples.place,
+            self._planes,
+            samples.to_markers,
+            samples.between,
+            model.inverse,
+            self._removed,
+            shares,
+            sums,
+        )
+        return shares, sums
 
 
-def matern(distance: FloatArray) -> FloatArray:
+def matern(distance: Floats) -> Floats:
     """The Matern kernel of order 5/2 of distances in correlation lengths: 1 at 0.
 
     >>> float(matern(np.array(0.0)))
@@ -361,13 +321,10 @@ def _grid(size: tuple[int, int], pitch: float) -> Grid:
 
 
 def _motion(sums: list[float], spacing: float) -> GelMotion:
-    """The motion of a region from sums over its cells, and over the markers, see `loops`.
-
-    spacing : of the cells, px.
-    """
+    """The motion of a region. sums : of `sum_region`. spacing : of the cells, px."""
     cells, u, v, xx, xy, yy, xu, xv, yu, yv, squares, at_x, at_y = sums[:13]
-    prior, scale, told, noise = sums[13:17], sums[17], sums[18:22], sums[22:]
-    left = max(prior[0] - told[0], 0.0)
+    prior, scale, known, noise = sums[13:17], sums[17], sums[18:22], sums[22:]
+    left = max(prior[0] - known[0], 0.0)
     # An outline that is d too far out at s adds (m(s) - mean) d ds / area. Across it, the share of a cell
     # falls from 1 to 0 within its width: share (1 - share) is 1 / 6 for a whole side.
     unit = OUTLINE * 6 * spacing / (cells * spacing * spacing) ** 2
@@ -379,17 +336,16 @@ def _motion(sums: list[float], spacing: float) -> GelMotion:
     if determinant <= (xx + yy) * spacing * spacing / 12:
         return GelMotion((u, v), stderr, outline, spread, None, None, left / prior[0])
     x, y, z = yy / determinant, -xy / determinant, xx / determinant
-    unknown = [left, prior[1] - told[1], prior[2] - told[2], prior[3] - told[3]]
-    dx_stderr = math.sqrt(scale * max(_square(unknown, x, y), 0.0) + _square(noise, x, y))
-    dy_stderr = math.sqrt(scale * max(_square(unknown, y, z), 0.0) + _square(noise, y, z))
+    unknown = [before - after for before, after in zip(prior[1:], known[1:], strict=True)]
+    dx_stderr = math.sqrt(scale * max(_square(unknown, x, y), 0.0) + _square(noise[1:], x, y))
+    dy_stderr = math.sqrt(scale * max(_square(unknown, y, z), 0.0) + _square(noise[1:], y, z))
     dx, dy = (x * xu + y * yu, x * xv + y * yv), (y * xu + z * yu, y * xv + z * yv)
     gradient = Gradient(dx, dy, dx_stderr, dy_stderr)
     growth, turn = gradient.growth
     rest = squares - 2 * (growth * (xu + yv) + turn * (xv - yu)) + (growth**2 + turn**2) * (xx + yy)
-    residual = math.sqrt(max(rest, 0.0))
-    return GelMotion((u, v), stderr, outline, spread, gradient, residual, left / prior[0])
+    return GelMotion((u, v), stderr, outline, spread, gradient, math.sqrt(max(rest, 0.0)), left / prior[0])
 
 
-def _square(form: list[float], x: float, y: float) -> float:
-    """The square of a vector by a form, of which the last three numbers are xx, xy and yy."""
-    return x * x * form[1] + 2 * x * y * form[2] + y * y * form[3]
+def _square(form: Sequence[float], x: float, y: float) -> float:
+    """The square of a vector by a symmetric form (xx, xy, yy)."""
+    return x * x * form[0] + 2 * x * y * form[1] + y * y * form[2]

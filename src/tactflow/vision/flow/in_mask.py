@@ -6,46 +6,47 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Flags, Mask
 from tactflow.vision.flow.displacement_field import DisplacementField, GelMotion
 from tactflow.vision.flow.inside import inside_mask
-from tactflow.vision.flow.similarity import Similarity, fit_similarity
-from tactflow.vision.geometry.moments import RegionProperties
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 UNKNOWN: Final = 0.1
 """Share of what the mean flow could be that markers may leave open. Simulated contacts within the grid of
 markers leave less than 0.04; those beyond the last markers leave more, and there the mean is wrong by
 pixels."""
+_FLAT: Final = 1e-3
+"""Spread of markers across a line over that along it, 1, up to which they do not span a plane. Chosen by
+hand."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
 _LOST: Final = int(MarkerStatus.LOST)
 
 
-def flow_in_mask(markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0.0) -> Flow:
+def flow_in_mask(markers: Markers, mask: Mask, *, dilate: float = 0.0) -> Flow:
     """Summarise the displacement of the markers inside the contact.
 
+    Parameters
+    ----------
     markers : as the tracker gives them, processed pixels.
-    mask : (H, W) uint8, non-zero inside the contact.
+    mask : (H, W) uint8, not 0 inside the contact.
     dilate : px; a marker is inside if its *current* centre lies at most this far outside of the region. More
         takes in more markers (a steadier mean), also such as move less because they lie outside the contact.
-        The distance is that between the pixel that a centre falls on and the nearest pixel of the mask.
 
-    Tracked and inferred markers have equal weight, since the mean is one over the contact's area and not over
-    how well each marker is seen; but a single tracked marker stands alone, since an inferred one has its
-    motion from neighbours, which are then outside and move otherwise. Lost ones count nowhere.
+    Returns
+    -------
+    Flow : its mean is that over all markers inside, tracked or inferred; if only one of them is tracked,
+        that of this one, since the others have their motion from markers outside. Rotation and divergence
+        are those of the similarity that takes the markers' origins to their positions, by least squares.
+        stderr is the scatter that it leaves unexplained over the square root of the number of *tracked*
+        markers; None with fewer than two of those.
 
-    rotation and divergence come from the least-squares similarity that takes the markers' origins to their
-    positions. Both and the residual are the same about every point, so also about the contact's centroid.
-    stderr is the scatter that the similarity leaves unexplained (with fewer than three markers, or in a line:
-    the scatter of the displacements), over the square root of the number of *tracked* markers, since an
-    inferred one is no observation of its own; None with fewer than two of those.
+    Raises
+    ------
+    ValueError : mask is not (H, W) uint8, or dilate is negative or not finite.
 
-    Computed in float64. Markers in float32 give the same to their own rounding: a mean to 2^-23 of the
-    largest coordinate, a rotation to that over the distance of the markers.
-
-    Raises ValueError if mask is not (H, W) uint8, or if dilate is negative or not finite.
-
+    Examples
+    --------
     >>> origin = np.array([[10.0, 10], [20, 10], [10, 20], [90, 90]])
     >>> markers = Markers(origin, origin + [1.5, -0.5], np.zeros(4, np.uint8), np.full(4, 0.02))
     >>> mask = np.zeros((100, 100), np.uint8)
@@ -60,35 +61,55 @@ def flow_in_mask(markers: Markers, mask: NDArray[np.uint8], *, dilate: float = 0
         chosen = tracked
     if len(chosen) == 0:
         return Flow(None, 0)
-    origin, position = np.asarray(markers.origin, np.float64), np.asarray(markers.position, np.float64)
-    return _summary(fit_similarity(origin, position, chosen), len(chosen), len(tracked))
+    arms = np.asarray(markers.origin[chosen], np.float64)
+    rest = np.asarray(markers.position[chosen], np.float64) - arms
+    mean = rest.mean(axis=0)
+    rest, arms = rest - mean, arms - arms.mean(axis=0)
+    x, y = arms.T
+    xx, yy = float(x @ x), float(y @ y)
+    rotation = divergence = residual = None
+    parameters = 1
+    # Product over squared sum of the principal scatters; about their ratio where one is small.
+    if len(arms) >= 3 and xx * yy - float(x @ y) ** 2 > (_FLAT * (xx + yy)) ** 2:
+        parameters = 2
+        u, v = rest.T
+        spread, turn = float(x @ u + y @ v) / (xx + yy), float(x @ v - y @ u) / (xx + yy)
+        rest = rest - np.column_stack([spread * x - turn * y, turn * x + spread * y])
+        rotation, divergence = _rotation(spread, turn), _divergence(spread, turn)
+        residual = math.sqrt(float((rest * rest).sum()) / len(arms))
+    stderr = None
+    if len(tracked) >= 2:
+        # The similarity has four parameters, two for each axis; the mean has one for each.
+        variance = (rest * rest).sum(axis=0) / ((len(arms) - parameters) * len(tracked))
+        stderr = (math.sqrt(variance[0]), math.sqrt(variance[1]))
+    return Flow((float(mean[0]), float(mean[1])), len(arms), stderr, rotation, divergence, residual)
 
 
 def flow_of_field(
-    field: DisplacementField,
-    markers: Markers,
-    mask: NDArray[np.uint8],
-    *,
-    dilate: float = 0.0,
-    coarse: bool = False,
-    region: RegionProperties | None = None,
+    field: DisplacementField, markers: Markers, mask: Mask, *, dilate: float = 0.0, coarse: bool = False
 ) -> Flow:
     """Summarise the displacement of the gel inside the contact, between its markers.
 
-    field : of this frame. mask : (H, W) uint8, 255 inside the contact, else 0.
-    markers, dilate : as `flow_in_mask` takes them; with the mask they tell `count`.
-    coarse : whether the mask is only where a contact is to be found, as one that markers alone show: then the
-        standard error of the mean is how much the displacement differs within it.
-    region : properties of the mask, where they are known; those of another one do not count.
+    Parameters
+    ----------
+    field : of this frame.
+    markers, dilate : as for `flow_in_mask`; they only give the flow's `count`.
+    mask : (H, W) uint8, 255 inside the contact, else 0.
+    coarse : whether the mask only says roughly where the contact is, as one does that markers alone show. The
+        standard error of the mean then is how much the displacement differs within it.
 
-    The mean is an integral over the contact, each bit of gel counted by its area at rest. A marker at the
-    outline in or out makes no jump: it counts as much as before. Rotation, divergence and shear are those of
-    the affine motion nearest to the field. Standard errors are those of the field between its markers; that
-    of the mean has the error of the contact's outline besides. The mean is None where no marker is inside,
-    and where markers are too far away: where more than `UNKNOWN` of what it could be is open.
+    Returns
+    -------
+    Flow : its mean is the integral of the field over the contact, by area of the gel at rest; so a marker
+        that enters makes no jump. None where no marker is inside, or where markers are too far away to tell.
+        Rotation, divergence and shear are those of the affine motion nearest to the field.
 
-    Raises ValueError if mask is not (H, W) uint8, or if dilate is negative or not finite.
+    Raises
+    ------
+    ValueError : mask is not (H, W) uint8, or dilate is negative or not finite.
 
+    Examples
+    --------
     >>> from tactflow.vision.flow.displacement_field import FieldModel
     >>> x, y = np.meshgrid(np.arange(10.0, 100, 20), np.arange(10.0, 100, 20))
     >>> origin = np.column_stack([x.ravel(), y.ravel()])
@@ -100,20 +121,18 @@ def flow_of_field(
     ([1.5, -0.5], 1)
     """
     count = int(np.count_nonzero(_inside(markers, mask, dilate)))
-    box = region.box if region is not None and region.mask is mask else None
-    motion = field.motion(mask, box) if count else None
+    motion = field.motion(mask) if count else None
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)
-    return _field_summary(motion, count, coarse)
+    return _flow_of_motion(motion, count, coarse)
 
 
-def _inside(markers: Markers, mask: NDArray[np.uint8], dilate: float) -> NDArray[np.bool_]:
+def _inside(markers: Markers, mask: Mask, dilate: float) -> Flags:
     """Which markers (N,), lost ones left out, lie inside the mask, or at most `dilate` px outside."""
-    known: NDArray[np.bool_] = markers.status != _LOST
-    return inside_mask(markers.position, mask, dilate) & known
+    return np.asarray(inside_mask(markers.position, mask, dilate) & (markers.status != _LOST))
 
 
-def _field_summary(motion: GelMotion, count: int, coarse: bool) -> Flow:
+def _flow_of_motion(motion: GelMotion, count: int, coarse: bool) -> Flow:
     outline = (motion.spread, motion.spread) if coarse else motion.outline_stderr
     stderr = math.hypot(motion.stderr, outline[0]), math.hypot(motion.stderr, outline[1])
     gradient = motion.gradient
@@ -143,18 +162,3 @@ def _rotation(spread: float, turn: float) -> float:
 def _divergence(spread: float, turn: float) -> float:
     """Relative growth in area of a similarity, 1."""
     return 2 * spread + spread * spread + turn * turn
-
-
-def _summary(fit: Similarity, count: int, tracked: int) -> Flow:
-    """The flow of `count` markers, of which `tracked` were seen."""
-    rotation = divergence = residual = None
-    if fit.fitted:
-        rotation = _rotation(fit.growth_x, fit.growth_y)
-        divergence = _divergence(fit.growth_x, fit.growth_y)
-        residual = math.sqrt((fit.rest_x + fit.rest_y) / count)
-    stderr = None
-    if tracked >= 2:
-        # The similarity has four parameters, two for each axis; the mean has one for each.
-        free = (count - (2 if fit.fitted else 1)) * tracked
-        stderr = (math.sqrt(fit.rest_x / free), math.sqrt(fit.rest_y / free))
-    return Flow((fit.mean_x, fit.mean_y), count, stderr, rotation, divergence, residual)

@@ -6,38 +6,36 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Flags, Floats, Points
 from tactflow.vision.flow.loops import rate_motion
 from tactflow.vision.markers.lattice import LONGEST_LINK, neighbour_graph, pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
-
-FloatArray = NDArray[np.float64]
 
 TOGETHER: Final = 3
 """Neighbouring markers that must have moved: a single one may be mistaken for its neighbour."""
 TRIPLES: Final = 15
 """Pairs among the neighbours of a marker, with which it makes three that move together, at most: of six."""
 STAY: Final = 0.6
-"""Part of the threshold that is enough to go on moving. Chosen by hand."""
+"""Low hysteresis threshold, as a fraction of the threshold for motion. Chosen by hand."""
 ALONE: Final = 3.0
-"""Times the threshold that markers must move for a contact that nothing else shows: their region is coarse,
-and where the light answers at all it shows most contacts before. Chosen on the simulator's press, whose first
-frames had a region of ten times the area, and sts_640 and tactip_video, of which no contact is lost."""
+"""Threshold for a contact that nothing else shows, times that for motion: such a region is coarse, and where
+the light answers at all it shows most contacts earlier. Chosen on the simulator's press, whose first frames
+had a region of ten times the area, and sts_640 and tactip_video, of which no contact is lost."""
 LASTING: Final = 4
-"""Frames of motion in a row that count as one mean, at most: its error is smaller by the square root of their
-number, so less motion will do. Chosen on every second recording of franka_mini."""
+"""Frames of motion in a row that are averaged, at most: n of them have an error smaller by the root of n, so
+less motion is enough. Chosen on every second recording of franka_mini."""
 FADES: Final = 0.7
-"""Part of the motion of the frame before, below which a contact ends and does not last. Chosen by hand."""
+"""Motion relative to the frame before below which a contact is ending and is not averaged. Chosen by hand."""
 STILL: Final = 0.5
 """Part of the threshold up to which a marker is at rest. Chosen by hand."""
 FORGET: Final = 0.96
-"""How fast the strongest recent motion is forgotten, per frame: half in 17 frames, as for the light."""
+"""Decay of the strongest recent motion per frame: half in 17 frames, as for the light."""
 STRETCHED: Final = 0.7
 """Part of the largest strain from which on the gel beside a marker is in contact: a contact drags along all
 gel around, but what it strains most is where it ends. Chosen on the simulator, mini_ball and gelslim_ball,
 where the region then overlaps the true one by 0.3 to 0.7 (IoU, medians), and less where a contact slides."""
-_TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
+_TRACKED: Final = int(MarkerStatus.TRACKED)
 
 
 class Motion(NamedTuple):
@@ -47,17 +45,17 @@ class Motion(NamedTuple):
     clearly : whether they have moved so far that it is a contact whatever else is seen.
     largest : the third largest of their motions, px; 0 with fewer than three tracked markers.
     left : (N,) float64, the motion of each tracked marker that no motion of the whole gel explains, px; 0 of
-    others. bound : (N,) float64, what it takes to be one, px.
+    others. bound : (N,) float64, threshold for motion, px.
     """
 
     moving: bool
     clearly: bool
     largest: float
-    left: FloatArray
-    bound: FloatArray
+    left: Floats
+    bound: Floats
 
-    def still(self, dragged: float = 0.0) -> NDArray[np.bool_]:
-        """Markers (N,) bool that are at rest: their motion is not even half of what `moving` asks for.
+    def still(self, dragged: float = 0.0) -> Flags:
+        """Markers (N,) bool that are at rest: their motion is below half the threshold.
 
         dragged : part of the largest motion up to which a marker rests as well. One whose standard error is
         unknown, as of those that are not tracked, does not rest.
@@ -70,16 +68,16 @@ class MotionTest:
 
     What the whole gel does, or the camera that looks at it, is no contact: both are stiff, so that it is a
     shift and a turn. They are estimated by medians, which follow the majority of the markers, and taken out.
-    What is left of a tracked marker is compared with its standard error, joined by `steadiness`. Markers that
-    are inferred or lost have no vote.
+    The rest of a tracked marker's motion is compared with its standard error, joined by `steadiness`. Markers
+    that are inferred or lost have no vote.
 
     Parameters
     ----------
     origin : (N, 2) float64, markers in the reference frame, px.
-    false_alarms : frames of the untouched gel in which markers are said to move, per frame, in (0, 1). Errors
-        of neighbours are taken for independent.
-    steadiness : how far the markers of an untouched gel stray, standard deviation of each coordinate, px.
-        Higher misses lighter contacts.
+    false_alarms : rate of frames of an untouched gel in which markers seem to move, in (0, 1). Errors of
+        neighbours are taken for independent.
+    steadiness : standard deviation of each coordinate of the markers of an untouched gel, px. Higher misses
+        lighter contacts.
     relaxation : part of the strongest recent motion that a gel may still show after it was released, [0, 1).
 
     Raises
@@ -105,7 +103,7 @@ class MotionTest:
 
     def __init__(
         self,
-        origin: FloatArray,
+        origin: Points,
         *,
         false_alarms: float = 1e-6,
         steadiness: float = 0.14,
@@ -117,20 +115,18 @@ class MotionTest:
             raise ValueError(f"steadiness: required > 0 px, got {steadiness}")
         if not 0 <= relaxation < 1:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
-        origin = np.array(origin, np.float64)
-        self._origin = origin
-        arms = origin - (origin.mean(axis=0) if len(origin) else 0.0)
+        self._origin = np.array(origin, np.float64)
+        count = len(self._origin)
+        arms = self._origin - (self._origin.mean(axis=0) if count else 0.0)
         levers = arms / np.maximum((arms * arms).sum(axis=1, keepdims=True), 1.0)
-        self._rest = np.ascontiguousarray(np.hstack([origin, arms, levers]).T)
+        self._rest = np.ascontiguousarray(np.hstack([self._origin, arms, levers]).T)
         self._variance = steadiness**2
         self._relaxation = relaxation
-        self.pitch = pitch_of(origin) if len(origin) > 1 else 0.0
+        self.pitch = pitch_of(self._origin) if count > 1 else 0.0
         """Median distance of a marker to its nearest neighbour, px; 0 for fewer than two."""
-        self._links = neighbour_graph(origin, LONGEST_LINK * self.pitch)
-        self._one, self._other = self._links.T
-        self._lengths = np.hypot(*(origin[self._one] - origin[self._other]).T)
+        self._links = neighbour_graph(self._origin, LONGEST_LINK * self.pitch)
         # A motion in a plane exceeds k standard deviations with exp(-k^2 / 2); three must at once.
-        alone = (false_alarms / (TRIPLES * max(1, len(origin)))) ** (1 / TOGETHER)
+        alone = (false_alarms / (TRIPLES * max(1, count))) ** (1 / TOGETHER)
         self._limit = math.sqrt(-2 * math.log(alone))
         self._strongest = 0.0
         self._moving = self._clearly = False
@@ -141,16 +137,13 @@ class MotionTest:
 
         Raises ValueError if they are not as many as in the reference.
         """
-        count = len(self._origin)
-        if len(markers.position) != count:
-            raise ValueError(f"required {count} markers, got {len(markers.position)}")
-        resting, rated = self._relaxation * self._strongest, np.empty((5, count))
-        position = np.ascontiguousarray(markers.position, np.float64)
-        stderr = np.ascontiguousarray(markers.stderr, np.float64)
+        if len(markers.position) != len(self._origin):
+            raise ValueError(f"required {len(self._origin)} markers, got {len(markers.position)}")
+        resting, rated = self._relaxation * self._strongest, np.empty((5, len(self._origin)))
         largest, chain = rate_motion(
-            position,
+            np.ascontiguousarray(markers.position, np.float64),
             markers.status,
-            stderr,
+            np.ascontiguousarray(markers.stderr, np.float64),
             self._rest,
             self._links,
             self._limit,
@@ -167,14 +160,16 @@ class MotionTest:
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
         return Motion(self._moving, self._clearly, largest, rated[0], rated[1])
 
-    def stretched(self, markers: Markers) -> FloatArray:
+    def stretched(self, markers: Markers) -> Points:
         """Positions (K, 2), px, of the markers at the most strained links between tracked ones.
 
         Empty where no two neighbours are tracked.
         """
+        first, second = self._links.T
         tracked = markers.status == _TRACKED
-        seen = tracked[self._one] & tracked[self._other]
+        seen = tracked[first] & tracked[second]
         moved = markers.position - self._origin
-        strain = np.hypot(*(moved[self._one] - moved[self._other]).T) * seen / self._lengths
+        length = np.hypot(*(self._origin[first] - self._origin[second]).T)
+        strain = np.hypot(*(moved[first] - moved[second]).T) * seen / length
         most = self._links[seen & (strain >= STRETCHED * strain.max(initial=0.0))]
         return np.asarray(markers.position[np.unique(most)], np.float64)

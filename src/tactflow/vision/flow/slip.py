@@ -123,13 +123,9 @@ class SlipTest:
 
 
 def _touched(field: DisplacementField, mask: NDArray[np.uint8]) -> _Touched | None:
-    part = field.part(mask)
-    if part is None:
-        return None
-    share = np.zeros(field.grid.shape)
-    (top, left), (rows, columns) = part.begin, part.inside.shape
-    share[top : top + rows, left : left + columns] = part.inside
-    return _Touched(share, field.displacement, part.cells)
+    share = field.share(mask)
+    area = float(share.sum())
+    return _Touched(share, field.displacement, area) if area > 0 else None
 
 
 def _exchanged(before: _Touched, now: _Touched) -> float:

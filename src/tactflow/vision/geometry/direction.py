@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import statistics
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.geometry.moments import RegionProperties
+from tactflow.vision.arrays import Floats
 
 FALSE_DIRECTION: Final = 1e-3
 """Share of directionless regions that may be given a direction by chance. Chosen by hand."""
@@ -30,6 +31,10 @@ _LEAST_VARIANCE: Final = 1e-12
 """Variance, px^2, that stands for that across a line of pixels where it is divided by. Chosen by hand."""
 _LEAST_RADIUS: Final = 1e-9
 """Distance of an outline point from the centre, whitened, that is divided by. Chosen by hand."""
+_MEDIAN_RATIO: Final = math.sqrt(1.25 + math.sqrt(1 + 840 / FALSE_DIRECTION)) - 5.5
+"""Power over the median power of seven others, 1, that one harmonic exceeds by chance in a share
+`FALSE_DIRECTION` of cases. Derived in `anisotropy_limit`: the t at which the product equals that share, for
+(t + 4) (t + 5) (t + 6) (t + 7) is a square of (t + 5.5)^2 - 1.25, less 1."""
 
 
 def axis_direction(theta: float) -> tuple[float, float | None]:
@@ -52,10 +57,18 @@ def axis_direction(theta: float) -> tuple[float, float | None]:
     return angle + 0.0, slope
 
 
-def anisotropy_limit(region: RegionProperties, confidence: float) -> float:
+def anisotropy_limit(
+    contours: Callable[[], Sequence[NDArray[Any]]],
+    center: tuple[float, float],
+    covariance: tuple[float, float, float],
+    pixels: int,
+    confidence: float,
+) -> float:
     """Anisotropy that a directionless region reaches by chance in a share `FALSE_DIRECTION` of cases.
 
-    confidence : the region's anisotropy, in [0, 1].
+    contours : gives outer outlines of the region, each (n, 1, 2) int, every pixel of them, px. center : of
+    the region, px. covariance : xx, xy and yy of its pixels, px^2. pixels : how many. confidence : its
+    anisotropy, 0 to 1.
 
     Two causes are known, and the larger limit counts.
 
@@ -71,29 +84,28 @@ def anisotropy_limit(region: RegionProperties, confidence: float) -> float:
     median, because a polygon has a few strong harmonics and is not rough. For n = 7 exponential variables,
     the chance that an eighth exceeds t times their median is the product of j / (j + t) for j = 4 ... 7.
     """
-    count = region.moments.pixels
-    radius = math.sqrt(count / math.pi)
+    radius = math.sqrt(pixels / math.pi)
     limit = math.sqrt(-2 * math.log(FALSE_DIRECTION) * _GRID_NOISE / radius**3)
     if confidence > _LINEAR_LIMIT or confidence <= limit:
         return limit
-    power = _outline_power(region)
+    power = _outline_power(contours(), center, covariance)
     # Of seven numbers, `np.median` takes a hundred times as long.
     rough = 4 * math.sqrt(_MEDIAN_RATIO * statistics.median(power.tolist()))
     return min(max(limit, rough), _LINEAR_LIMIT)
 
 
-def _outline_power(region: RegionProperties) -> NDArray[np.float64]:
-    """Power of the outline's `_HARMONICS`, relative to the ellipse with the region's second moments."""
-    moments, count = region.moments, region.moments.pixels
-    center = moments.x / count + region.box.left, moments.y / count + region.box.top
-    xx, xy, yy = (value / (float(count) * count) for value in moments.central())
+def _outline_power(
+    contours: Sequence[NDArray[Any]], center: tuple[float, float], covariance: tuple[float, float, float]
+) -> Floats:
+    """Power of the outlines' `_HARMONICS`, relative to the ellipse with the region's second moments."""
+    xx, xy, yy = covariance
     # Whitening by the Cholesky factor: in these coordinates the ellipse of second moments is a circle.
     l11 = math.sqrt(xx)
     l21 = xy / l11
     l22 = math.sqrt(max(yy - l21 * l21, _LEAST_VARIANCE))
     deviations = []
     turns = []
-    for contour in region.contours:
+    for contour in contours:
         z = np.empty(len(contour), np.complex128)
         z.real = (contour[:, 0, 0] - center[0]) / l11
         z.imag = (contour[:, 0, 1] - center[1] - l21 * z.real) / l22
@@ -109,23 +121,4 @@ def _outline_power(region: RegionProperties) -> NDArray[np.float64]:
     np.multiply(turn * turn, turn * np.concatenate(deviations), out=powers[0])
     for k in range(1, len(powers)):
         np.multiply(powers[k - 1], turn, out=powers[k])
-    # Summed by numpy itself: a library of linear algebra would start threads for this.
-    power: NDArray[np.float64] = np.abs(powers.sum(axis=1)) ** 2
-    return power
-
-
-def _median_ratio(probability: float) -> float:
-    """t with prod j / (j + t), j = 4 ... 7, equal to `probability`, by bisection."""
-    low, high = 0.0, 1e6
-    for _ in range(200):
-        t = (low + high) / 2
-        if math.prod(j / (j + t) for j in range(4, 8)) > probability:
-            low = t
-        else:
-            high = t
-    return low
-
-
-_MEDIAN_RATIO: Final = _median_ratio(FALSE_DIRECTION)
-"""Power over the median power of seven others, 1, that one harmonic exceeds by chance in a share
-`FALSE_DIRECTION` of cases. Derived in `anisotropy_limit`."""
+    return np.asarray(np.abs(powers.sum(axis=1)) ** 2)

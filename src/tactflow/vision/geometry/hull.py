@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Mask, Points, check_mask
 from tactflow.vision.geometry.direction import anisotropy_limit, axis_direction
-from tactflow.vision.geometry.moments import Box, RegionProperties
+from tactflow.vision.geometry.region import Region, measure_region
 from tactflow.vision.types import Contact, Ellipse, Evidence
 
 Contours = Sequence[NDArray[Any]]
+"""Outer outlines, each (n, 1, 2) int32, x and y of every pixel on it, px of the frame."""
 
 _FEWEST_PIXELS: Final = 5
 """Pixels that a region needs for an ellipse. Derived: an ellipse has five parameters."""
@@ -23,46 +26,49 @@ _WIDTH_OF_A_LINE: Final = 1 / 12 + 1e-9
 1/12; the rest is for rounding."""
 
 
-def contact_geometry(
-    mask: NDArray[np.uint8] | RegionProperties,
-    *,
-    min_area: float = 1.0,
-    min_confidence: float = 0.0,
-) -> Contact | None:
-    """Describe the contact region of a mask, all its components as one contact; None where there is none.
+def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float = 0.0) -> Contact | None:
+    """Describe the contact region of a mask, all its components as one contact.
 
-    mask : (H, W) uint8, non-zero inside the contact; or its properties, where they are known.
+    Parameters
+    ----------
+    mask : (H, W) uint8, not 0 inside the contact.
     min_area : px^2; components (8-connected, holes filled) with fewer pixels are ignored. Larger is safer
         against specks and misses small contacts.
-    min_confidence : 0 to 1; a region whose confidence is not above it gets no direction. For errors that the
-        mask makes in one direction (light from one side), which no statistics of its outline can tell from
-        shape; 0.3 is an axis ratio of 1.36. Higher withholds the direction of stubby shapes.
+    min_confidence : 0 to 1; a region whose confidence is not above it gets no direction: 0.3 is an axis ratio
+        of 1.36. Light from one side lengthens a mask in a way that no statistics of its outline can tell from
+        shape. Higher withholds the direction of stubby shapes.
 
-    area counts the pixels whose centre lies in or on the hull (Pick's theorem). For a convex region this is
-    its number of pixels, so it carries no bias from the half pixel between the outermost centres and the
-    region's true border; the polygon of the vertices, which are pixel centres, is smaller by about that
-    border. The direction comes from second central moments, computed in whole numbers (exact); it is None
-    where the anisotropy is no larger than chance makes it (`tactflow.vision.geometry.direction`). The ellipse
-    has the region's second moments (exact for an elliptical region); None where the region is no wider than
-    one pixel or has fewer than five.
+    Returns
+    -------
+    Contact or None, where nothing is large enough. `area` counts the pixels whose centre lies in or on the
+        hull (Pick's theorem): for a convex region its number of pixels, without the bias of the half pixel
+        between the outermost centres and the true border. The direction and the ellipse are those of the
+        second central moments; the direction is None where the anisotropy is no larger than chance makes it
+        (see `tactflow.vision.geometry.direction`), the ellipse where the region is no wider than a pixel or
+        has fewer than five. `confidence` is (l1 - l2) / (l1 + l2) of the principal variances l1 >= l2: 0 for
+        a disc, 0.6 for an ellipse of axis ratio 2, 1 for a line.
 
-    confidence is (l1 - l2) / (l1 + l2) for the principal variances l1 >= l2: 0 for a disc, 0.6 for an ellipse
-    of axis ratio 2, 1 for a line.
+    Raises
+    ------
+    ValueError : mask is not (H, W) uint8, or a parameter is out of its range.
 
-    Raises ValueError if mask is not (H, W) uint8, or for a parameter out of its range.
-
+    Examples
+    --------
     >>> mask = np.zeros((60, 80), np.uint8)
     >>> mask[20:30, 10:50] = 255
     >>> contact = contact_geometry(mask)
     >>> contact.center, contact.area, contact.angle
     ((29.5, 24.5), 400.0, 0.0)
     """
-    seen = _region(mask, min_area, min_confidence)
-    return None if seen is None else _describe(seen, min_confidence)
+    region = _measured(mask, min_area, min_confidence)
+    if region.in_one_piece:
+        return _describe(mask, region, min_confidence) if region.pixels >= min_area else None
+    contours = _large_contours(mask, region, min_area)
+    return _describe_some(mask, contours, min_confidence) if contours else None
 
 
 def contact_parts(
-    mask: NDArray[np.uint8] | RegionProperties,
+    mask: Mask,
     *,
     min_area: float = 1.0,
     max_gap: float = 0.0,
@@ -71,11 +77,16 @@ def contact_parts(
 ) -> list[Contact]:
     """Describe each separate contact region of a mask, the one with the most pixels first.
 
+    Parameters
+    ----------
     max_gap : px; components whose nearest pixels are at most this far apart (to within 1 px and 2 %) belong
         together, also by way of others.
-    evidence : what shows them. The other parameters and what is raised are those of `contact_geometry`, which
-    describes all of them as one.
+    evidence : what shows the contacts.
 
+    The other parameters and what is raised are those of `contact_geometry`, which describes all as one.
+
+    Examples
+    --------
     >>> mask = np.zeros((60, 80), np.uint8)
     >>> mask[20:30, 10:50] = mask[50:55, 10:20] = 255
     >>> [contact.region_area for contact in contact_parts(mask)]
@@ -83,70 +94,81 @@ def contact_parts(
     """
     if not max_gap >= 0:
         raise ValueError(f"required max_gap >= 0 px, got {max_gap}")
-    seen = _region(mask, min_area, min_confidence)
-    if seen is None:
-        return []
-    if seen.connected:
-        return [_describe(seen, min_confidence, evidence)]
-    groups = sorted(_groups(seen.contours, seen.box, max_gap), key=_pixels, reverse=True)
-    return [_describe(_only(seen, group), min_confidence, evidence) for group in groups]
+    region = _measured(mask, min_area, min_confidence)
+    if region.in_one_piece:
+        return [_describe(mask, region, min_confidence, evidence)] if region.pixels >= min_area else []
+    groups = _groups(_large_contours(mask, region, min_area), max_gap)
+    groups.sort(key=_pixels, reverse=True)
+    return [_describe_some(mask, group, min_confidence, evidence) for group in groups]
 
 
-def _region(
-    mask: NDArray[np.uint8] | RegionProperties, min_area: float, min_confidence: float
-) -> RegionProperties | None:
-    """The regions of a mask that are large enough; None where there is none.
-
-    Raises ValueError if anything is out of its range.
-    """
+def _measured(mask: Mask, min_area: float, min_confidence: float) -> Region:
+    """All that is set in a mask. Raises ValueError if anything is out of its range."""
     if not (min_area >= 0 and math.isfinite(min_area)):
         raise ValueError(f"required min_area >= 0 px^2, got {min_area}")
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
-    if isinstance(mask, RegionProperties):
-        region = mask
-    elif mask.ndim != 2 or mask.dtype != np.uint8:
-        raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
-    else:
-        region = RegionProperties(mask)
-    if region.connected and region.moments.pixels >= min_area:
-        return region
-    kept = [contour for contour in region.contours if _filled_area(contour) >= min_area]
-    return _only(region, kept) if kept else None
+    check_mask(mask)
+    return measure_region(mask)
 
 
-def _only(region: RegionProperties, contours: Contours) -> RegionProperties:
-    """Those regions that some of the contours are of, with what lies in their holes."""
-    if len(contours) == len(region.contours):
-        return region
-    left, top, width, height = cv2.boundingRect(np.concatenate(contours))
-    filled = np.zeros((height, width), np.uint8)
-    cv2.drawContours(filled, contours, -1, 255, cv2.FILLED, offset=(-left, -top))
-    x, y = left - region.corner[0], top - region.corner[1]
-    seen = cv2.bitwise_and(region.mask[y : y + height, x : x + width], filled)
-    return RegionProperties(np.asarray(seen, np.uint8), (left, top), contours)
+def _contours(mask: Mask, region: Region, method: int = cv2.CHAIN_APPROX_NONE) -> Contours:
+    """Outlines of all components of a mask."""
+    left, top, width, height = region[:4]
+    window = mask[top : top + height, left : left + width]
+    return cv2.findContours(window, cv2.RETR_EXTERNAL, method, offset=(left, top))[0] if width else ()
 
 
-def _describe(seen: RegionProperties, min_confidence: float, evidence: Evidence = "light") -> Contact:
-    """The contact that these regions are together."""
-    polygon, area = seen.hull()
+def _large_contours(mask: Mask, region: Region, min_area: float) -> Contours:
+    return [contour for contour in _contours(mask, region) if _filled_area(contour) >= min_area]
+
+
+def _describe_some(
+    mask: Mask, contours: Contours, min_confidence: float, evidence: Evidence = "light"
+) -> Contact:
+    """The contact that some components of a mask are together."""
+    only = np.zeros_like(mask)
+    cv2.drawContours(only, contours, -1, 255, cv2.FILLED)
+    only &= mask
+    return _describe(only, measure_region(only), min_confidence, evidence)
+
+
+def _describe(mask: Mask, region: Region, min_confidence: float, evidence: Evidence = "light") -> Contact:
+    """The contact that all that is set in a mask is."""
     # Whole numbers: no cancellation, a vertical bar is exactly vertical.
-    moments = seen.moments
-    xx, xy, yy = moments.central()
-    count = moments.pixels
+    count, x, y = region.pixels, region.x, region.y
+    xx, xy, yy = count * region.xx - x * x, count * region.xy - x * y, count * region.yy - y * y
     spread = math.hypot(xx - yy, 2 * xy)
     square = float(count) * count
     major = (xx + yy + spread) / (2 * square)
     minor = (xx * yy - xy * xy) / (square * square * major) if major > 0 else 0.0
     confidence = min(1.0, spread / (xx + yy)) if xx + yy > 0 else 0.0
-    center = (moments.x / count + seen.box.left, moments.y / count + seen.box.top)
+    center = (x / count, y / count)
     angle = slope = None
-    if confidence > min_confidence and confidence > anisotropy_limit(seen, confidence):
-        angle, slope = axis_direction(0.5 * math.atan2(2 * xy, xx - yy))
+    if confidence > min_confidence:
+        covariance = xx / square, xy / square, yy / square
+        contours = partial(_contours, mask, region)
+        if confidence > anisotropy_limit(contours, center, covariance, count, confidence):
+            angle, slope = axis_direction(0.5 * math.atan2(2 * xy, xx - yy))
     ellipse = None
     if count >= _FEWEST_PIXELS and minor > _WIDTH_OF_A_LINE:
         ellipse = Ellipse(center, (4 * math.sqrt(major), 4 * math.sqrt(minor)), angle)
+    polygon, area = _hull(region.ends)
     return Contact(area, center, angle, slope, polygon, ellipse, confidence, float(count), evidence)
+
+
+def _hull(points: NDArray[np.int32]) -> tuple[Points, float]:
+    """Convex hull of pixels (n, 2): its corners (m, 2), clockwise on the screen; pixels in it."""
+    corners = cv2.convexHull(points)[:, 0].tolist()
+    # The left one of the first row comes last.
+    first = min(range(len(corners)), key=lambda k: corners[k][::-1]) + 1
+    corners = corners[first:] + corners[:first]
+    # Pick's theorem: twice the area, and the pixels on the border.
+    twice = on_border = 0
+    for (x, y), (u, v) in zip(corners, corners[1:] + corners[:1], strict=True):
+        twice += x * v - u * y
+        on_border += math.gcd(u - x, v - y)
+    return np.array(corners, np.float64), (abs(twice) + on_border) / 2 + 1
 
 
 def _filled_area(contour: NDArray[Any]) -> float:
@@ -159,17 +181,15 @@ def _pixels(contours: Contours) -> float:
     return sum(map(_filled_area, contours))
 
 
-def _groups(contours: Contours, box: Box, max_gap: float) -> list[Contours]:
-    """The contours in groups that are linked by gaps of at most max_gap px.
-
-    box : the window that holds them.
-    """
-    if max_gap == 0 or len(contours) == 1:
+def _groups(contours: Contours, max_gap: float) -> list[Contours]:
+    """The contours in groups that are linked by gaps of at most max_gap px."""
+    if max_gap == 0 or len(contours) < 2:
         return [[contour] for contour in contours]
-    reach = min(max_gap, float(box.height + box.width))
+    left, top, width, height = cv2.boundingRect(np.concatenate(contours))
+    reach = min(max_gap, float(height + width))
     border = math.ceil(reach / 2) + 1
-    left, top = box.left - border, box.top - border
-    free = np.full((box.height + 2 * border, box.width + 2 * border), 255, np.uint8)
+    left, top = left - border, top - border
+    free = np.full((height + 2 * border, width + 2 * border), 255, np.uint8)
     cv2.drawContours(free, contours, -1, 0, cv2.FILLED, offset=(-left, -top))
     # Two components grown by half the gap each touch where the gap was bridged.
     distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)

@@ -50,7 +50,6 @@ class Preprocessor:
         rounded to 1/32 pixel (the same in every frame, so displacements are not affected).
 
     Raises ValueError for values out of range, a degenerate homography or a crop outside the frame.
-    Not to be shared between threads: it reuses intermediate buffers. What it returns is never written again.
 
     >>> preprocess = Preprocessor((800, 600), rotate=90, downsample=2)
     >>> preprocess(np.zeros((600, 800, 3), np.uint8)).shape
@@ -94,7 +93,7 @@ class Preprocessor:
         """Exact mapping between raw and processed pixels."""
         self._rotate = rotate
         self._method = method
-        self._shrunk: list[NDArray[np.uint8]] = []
+        self._half: NDArray[np.uint8] | None = None
         self._resampler: Resampler | None = None
         if lens is not None or homography is not None:
             self._resampler = Resampler(self.mapping if method == "area" else before_pyramid)
@@ -120,9 +119,15 @@ class Preprocessor:
         if self._method == "pyramid" and self._levels:
             return self._pyramid(block if self._rotate == 0 else cv2.rotate(block, _ROTATIONS[self._rotate]))
         if self._levels:
-            block = self._shrink(image)
+            # By halves: three times as fast as one step of four, for 1/8 grey level of bias. The first
+            # result is as large as the processed frame, and costs less where it is in the caches.
+            block = self._half = halved(image, self._block, into=self._half)
+            for _ in range(self._levels - 1):
+                block = halved(block)
+            if block is self._half and not self._rotate:
+                return block.copy()
         if self._rotate:
-            return self._turn(block)
+            return cv2.rotate(block, _ROTATIONS[self._rotate])  # type: ignore[return-value]
         if self._levels:
             return block
         if block.shape == image.shape:
@@ -130,36 +135,6 @@ class Preprocessor:
             same.flags.writeable = False
             return same
         return np.ascontiguousarray(block)
-
-    def _turn(self, block: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture turned; for a turn by 90 degrees, one that was shrunk comes upside down."""
-        height, width = block.shape[:2]
-        if self._rotate == 180:
-            return cv2.rotate(block, cv2.ROTATE_180)  # type: ignore[return-value]
-        turned = np.empty((width, height, 3), np.uint8)
-        # Written once from its begin to its end, it is in the caches when its columns are written: 0.6 of the
-        # time.
-        turned.fill(0)
-        if self._levels and self._rotate == 90:
-            # To exchange rows and columns takes two thirds of the time of turning.
-            cv2.transpose(block, turned)
-        else:
-            cv2.rotate(block, _ROTATIONS[self._rotate], turned)
-        return turned
-
-    def _shrink(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Block averages, by halving: three times as fast as one step of four, for 1/8 grey level of bias."""
-        block: tuple[slice, slice] | None = self._block
-        for level in range(self._levels):
-            if level == self._levels - 1 and self._rotate == 0:
-                return halved(image, block, far=level == 0)
-            # What is halved or rotated afterwards can live in a buffer of our own.
-            if len(self._shrunk) <= level:
-                self._shrunk.append(halved(image, block))
-            turned = self._rotate == 90 and level == 0
-            image = halved(image, block, into=self._shrunk[level], far=level == 0, upside_down=turned)
-            block = None
-        return image
 
     def _pyramid(self, image: NDArray[Any]) -> NDArray[Any]:
         for _ in range(self._levels):

@@ -7,8 +7,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -68,17 +66,15 @@ class MarkerGraph:
         grids = [np.flatnonzero(home == name) for name in np.unique(home)]
         self.grids = [grid for grid in grids if len(grid) >= LEAST_GRID] or [np.arange(count)]
         """The marks of each grid without links to others, small groups left out unless all are."""
-        self._votes = np.where(self.border, BORDER_WEIGHT, 1).astype(np.int64)
-        self._grid = home
-        links = [link for of_mark in neighbours for link in of_mark]
-        self._links = np.array(links, np.int64).reshape(-1, 2)
-        self._begin = np.cumsum([0, *degree], dtype=np.int64)
+        self._votes = np.where(self.border, BORDER_WEIGHT, 1).tolist()
+        self._grid = home.tolist()
+        self._neighbours = neighbours
 
     def strain(self, position: FloatArray) -> FloatArray:
         """Strain of each link (E,), of positions (N, 2), px."""
-        strain = np.empty(len(self.edges))
-        link_strains(position, self._origin, self.edges, self.length, strain)
-        return strain
+        moved = position - self._origin
+        x, y = (moved[self.edges[:, 0]] - moved[self.edges[:, 1]]).T
+        return np.asarray(np.sqrt(x * x + y * y) / self.length)
 
     def largest_component(self, seen: BoolArray, strain: FloatArray) -> BoolArray:
         """The seen marks (N,) of the largest component whose links have little strain (E,).
@@ -86,8 +82,24 @@ class MarkerGraph:
         Marks at the border have more votes. Where the marks of the reference form several grids without
         links between them, each has its own component.
         """
+        linked, waiting = (strain < LINKED_STRAIN).tolist(), seen.tolist()
+        best: dict[int, tuple[int, list[int]]] = {}
+        for seed, home in enumerate(self._grid):
+            if not waiting[seed]:
+                continue
+            waiting[seed] = False
+            component = [seed]
+            for mark in component:
+                for other, edge in self._neighbours[mark]:
+                    if waiting[other] and linked[edge]:
+                        waiting[other] = False
+                        component.append(other)
+            votes = sum(self._votes[mark] for mark in component)
+            if votes > best.get(home, (0, []))[0]:
+                best[home] = (votes, component)
         inliers = np.zeros(len(seen), np.bool_)
-        largest_components(seen, strain, self._begin, self._links, self._votes, self._grid, inliers)
+        for _, component in best.values():
+            inliers[component] = True
         return inliers
 
 
@@ -105,65 +117,3 @@ def _grids(neighbours: list[list[tuple[int, int]]]) -> list[int]:
                     grid[other] = seed
                     members.append(other)
     return grid
-
-
-@kernel("void(float64[:, ::1], float64[:, ::1], int64[:, ::1], float64[::1], float64[::1])")
-def link_strains(
-    position: FloatArray, origin: FloatArray, edges: IntArray, length: FloatArray, strain: FloatArray
-) -> None:
-    """What `MarkerGraph.strain` finds."""
-    for e in range(len(edges)):
-        one, other = edges[e, 0], edges[e, 1]
-        change_x = (position[one, 0] - origin[one, 0]) - (position[other, 0] - origin[other, 0])
-        change_y = (position[one, 1] - origin[one, 1]) - (position[other, 1] - origin[other, 1])
-        strain[e] = np.sqrt(change_x * change_x + change_y * change_y) / length[e]
-
-
-@kernel("void(boolean[::1], float64[::1], int64[::1], int64[:, ::1], int64[::1], int64[::1], boolean[::1])")
-def largest_components(
-    seen: BoolArray,
-    strain: FloatArray,
-    first: IntArray,
-    links: IntArray,
-    votes: IntArray,
-    grid: IntArray,
-    inliers: BoolArray,
-) -> None:
-    """What `MarkerGraph.largest_component` finds.
-
-    first : (N + 1,) where the links of each mark begin. links : (2 E, 2), the neighbour and the number of the
-    edge.
-    """
-    count = len(seen)
-    waiting = seen.copy()
-    # The marks of a component, one component after the other.
-    order = np.empty(count, np.int64)
-    heaviest, begin, end = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
-    heaviest[:] = begin[:] = end[:] = 0
-    filled = 0
-    for seed in range(count):
-        if not waiting[seed]:
-            continue
-        waiting[seed] = False
-        start = filled
-        order[filled] = seed
-        filled += 1
-        weight = 0
-        next_mark = start
-        while next_mark < filled:
-            mark = order[next_mark]
-            next_mark += 1
-            weight += votes[mark]
-            for link in range(first[mark], first[mark + 1]):
-                other = links[link, 0]
-                if waiting[other] and strain[links[link, 1]] < LINKED_STRAIN:
-                    waiting[other] = False
-                    order[filled] = other
-                    filled += 1
-        home = grid[seed]
-        if weight > heaviest[home]:
-            heaviest[home], begin[home], end[home] = weight, start, filled
-    inliers[:] = False
-    for home in range(count):
-        for number in range(begin[home], end[home]):
-            inliers[order[number]] = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import threading
+from functools import lru_cache
 from typing import Final, Literal, get_args
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.compiled import kernel
-from tactflow.vision.geometry.downsample import halve_block
+from tactflow.vision.geometry.downsample import halved
 
 Bytes = NDArray[np.uint8]
 Float = NDArray[np.float32]
@@ -131,30 +131,6 @@ def _normalized(image: Bytes, mask: Bytes, radius: float) -> Bytes:
     return np.ascontiguousarray(_fill_cells(whole, hidden, radius)[:height, :width])
 
 
-class _Buffers:
-    """What `_fill_cells` computes in; see the kernels."""
-
-    def __init__(self, height: int, width: int, reach: int) -> None:
-        section = -(-(width + 2 * reach) // LANES) * LANES
-        long = 4 * section
-        self.rows = np.pad(np.arange(height), reach + 1, mode="reflect")
-        self.columns = np.pad(np.arange(width), reach, mode="reflect") + reach
-        self.half = np.empty((2 * height, 6 * width), np.uint8)
-        self.either = np.empty(8 * width, np.uint8)
-        self.valid = np.empty(12 * width, np.uint8)
-        self.sums = np.empty(6 * width, np.uint16)
-        self.cells = np.zeros((height, long), np.uint16)
-        self.masked = np.empty(height, np.bool_)
-        self.tall, self.near = np.zeros((2, long + 2 * reach), np.uint16)
-        self.windows = np.zeros((height, long), np.float32)
-        self.line = np.zeros(3 * section + 2, np.float32)
-        self.fill = np.empty(12 * section, np.uint8)
-
-
-_kept = threading.local()
-"""The buffers of each thread, for frames and windows of one size."""
-
-
 def _fill_cells(whole: Bytes, mask: Bytes, radius: float) -> Bytes:
     """`_normalized` for a picture of whole cells, which is written over and returned.
 
@@ -162,25 +138,26 @@ def _fill_cells(whole: Bytes, mask: Bytes, radius: float) -> Bytes:
     """
     reach = min(math.ceil(radius / CELL + 1), MOST_REACH)
     height, width = mask.shape[0] // CELL, mask.shape[1] // CELL
-    kind = (height, width, reach)
-    if getattr(_kept, "kind", None) != kind:
-        _kept.kind, _kept.buffers = kind, _Buffers(*kind)
-    own: _Buffers = _kept.buffers
-    picture = whole.reshape(len(whole), -1)
-    halve_block(picture, 0, 0, own.half, 0, 0, 2 * height, 2 * width, False, False)
-    sum_valid(mask, own.half, own.columns, own.either, own.valid, own.sums, own.cells, own.masked)
+    rows, columns = _reflected(height, reach + 1), _reflected(width, reach) + reach
+    long = 4 * (-(-(width + 2 * reach) // LANES) * LANES)
+    cells, masked = np.zeros((height, long), np.uint16), np.empty(height, np.bool_)
+    sum_valid(mask, halved(whole).reshape(2 * height, -1), columns, cells, masked)
     far = FAR_WEIGHT * 16 / (2 * reach + 1) ** 2
-    least = 64 * LEAST_WEIGHT
-    if sum_windows(
-        own.cells, own.masked, own.rows, reach, width, far, least, own.tall, own.near, own.windows
-    ):
-        inner = own.cells.reshape(height, 4, -1)[:, :, reach : reach + width]
+    windows = np.zeros((height, long), np.float32)
+    if sum_windows(cells, masked, rows, reach, width, far, 64 * LEAST_WEIGHT, windows):
+        inner = cells.reshape(height, 4, -1)[:, :, reach : reach + width]
         everywhere = inner.mean(axis=(0, 2), dtype=np.float64).astype(np.float32)
         if everywhere[3] == 0:
             return whole
-        own.windows.reshape(height, 4, -1)[:] += 16 * FRAME_WEIGHT * everywhere[:, None]
-    fill_masked(mask, own.masked, own.windows, own.line, own.fill, picture)
+        windows.reshape(height, 4, -1)[:] += 16 * FRAME_WEIGHT * everywhere[:, None]
+    fill_masked(mask, masked, windows, whole.reshape(len(whole), -1))
     return whole
+
+
+@lru_cache(maxsize=32)
+def _reflected(count: int, margin: int) -> Places:
+    """Which of `count` cells is seen at each place of a line, and at `margin` places before and after it."""
+    return np.pad(np.arange(count), margin, mode="reflect")
 
 
 # A line of cells has four sections one after another, the sums of the three channels and the weight. Each has
@@ -192,28 +169,17 @@ _READ: Final = "Array(uint8, 2, 'C', readonly=True)"
 """numba's type of a picture that a caller may have locked."""
 
 
-@kernel(
-    f"void({_READ}, uint8[:, ::1], int64[::1], uint8[::1], uint8[::1], uint16[::1], uint16[:, ::1], "
-    "boolean[::1])"
-)
-def sum_valid(
-    mask: Bytes,
-    half: Bytes,
-    columns: Places,
-    either: Bytes,
-    valid: Bytes,
-    sums: Sums,
-    cells: Sums,
-    masked: Flags,
-) -> None:
+@kernel(f"void({_READ}, uint8[:, ::1], int64[::1], uint16[:, ::1], boolean[::1])")
+def sum_valid(mask: Bytes, half: Bytes, columns: Places, cells: Sums, masked: Flags) -> None:
     """Sums over the valid ones of each cell's 2 x 2 values at half resolution, and 255 for each as weight.
 
     A value is valid where none of its 2 x 2 px is masked. mask : (4 h, 4 w). half : (2 h, 6 w), the picture.
-    columns : (w + 2 reach,), the place in a section of which each place shows the cell. either : (8 w,),
-    valid : (12 w,) and sums : (6 w,) are written over. cells : (h, 4 sections) and masked : (h,), whether a
-    line has a masked px, are filled.
+    columns : (w + 2 reach,), the place in a section of which each place shows the cell. cells :
+    (h, 4 sections) and masked : (h,), whether a line has a masked px, are filled.
     """
     width, wide, section = mask.shape[1] // 4, half.shape[1], cells.shape[1] // 4
+    either, valid = np.empty(8 * width, np.uint8), np.empty(12 * width, np.uint8)
+    sums = np.empty(6 * width, np.uint16)
     reach = (columns.size - width) // 2
     valid_below = valid[wide:]
     for y in range(cells.shape[0]):
@@ -251,10 +217,7 @@ def sum_valid(
                 part_of_line[reach + width + x] = part_of_line[columns[reach + width + x]]
 
 
-@kernel(
-    "boolean(uint16[:, ::1], boolean[::1], int64[::1], int64, int64, float32, float32, uint16[::1], "
-    "uint16[::1], float32[:, ::1])"
-)
+@kernel("boolean(uint16[:, ::1], boolean[::1], int64[::1], int64, int64, float32, float32, float32[:, ::1])")
 def sum_windows(
     cells: Sums,
     masked: Flags,
@@ -263,20 +226,19 @@ def sum_windows(
     width: int,
     far: float,
     least: float,
-    tall: Sums,
-    near: Sums,
     windows: Float,
 ) -> bool:
     """Binomial windows of 3 x 3 cells plus `far` times windows of 2 reach + 1 cells each way.
 
     cells : (h, 4 sections) and masked : (h,), of `sum_valid`. rows : (h + 2 reach + 2,), which line is seen
-    at each, from -reach - 1 on. tall, near : (4 sections + 2 reach,) are written over. windows :
-    (h, 4 sections) is filled in masked lines and those beside them; each section starts with its first cell,
-    and what follows its `width` cells means nothing. Returns whether a weight is below `least`.
+    at each, from -reach - 1 on. windows : (h, 4 sections) is filled in masked lines and those beside them;
+    each section starts with its first cell, and what follows its `width` cells means nothing. Returns whether
+    a weight is below `least`.
     """
     height, long = windows.shape
     last = height - 1
-    tall[:] = 0
+    tall, near = np.empty(long + 2 * reach, np.uint16), np.empty(long + 2 * reach, np.uint16)
+    tall[:] = near[:] = 0
     for y in range(2 * reach + 1):
         line = cells[rows[y]]
         for x in range(long):
@@ -308,14 +270,16 @@ def sum_windows(
     return bool(few)
 
 
-@kernel(f"void({_READ}, boolean[::1], float32[:, ::1], float32[::1], uint8[::1], uint8[:, ::1])")
-def fill_masked(mask: Bytes, masked: Flags, windows: Float, line: Float, fill: Bytes, picture: Bytes) -> None:
+@kernel(f"void({_READ}, boolean[::1], float32[:, ::1], uint8[:, ::1])")
+def fill_masked(mask: Bytes, masked: Flags, windows: Float, picture: Bytes) -> None:
     """Masked px become the sums over their weight, interpolated between the centres of cells.
 
     mask : (4 h, 4 w). masked : (h,) and windows : (h, 4 sections), of `sum_windows`; these become the
-    quotients. line : (3 sections + 2,) and fill : (12 sections,) are written over. picture : (4 h, 12 w).
+    quotients. picture : (4 h, 12 w).
     """
     height, width, section = windows.shape[0], mask.shape[1] // 4, windows.shape[1] // 4
+    line, fill = np.empty(3 * section + 2, np.float32), np.empty(12 * section, np.uint8)
+    line[:] = 0
     last = height - 1
     for y in range(height):
         if masked[max(y - 1, 0)] or masked[y] or masked[min(y + 1, last)]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal
@@ -12,16 +11,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import kernel, prefetch
-from tactflow.vision.geometry.downsample import halve_block
+from tactflow.vision.compiled import kernel
+from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers
 
 Bytes = NDArray[np.uint8]
 Polarity = Literal["dark", "bright"]
 
 CIRCLE_POINTS: Final = 12
-"""Points on the circle around a spot that it is compared with; `contrast_with_circle` spells them out.
-Chosen by hand."""
+"""Points on the circle around a spot that it is compared with. Chosen by hand."""
 
 SHARPEST_CIRCLE: Final = 4.0
 """px; the circle lies at least this far outside a dot, so that the blurred border of a small dot is not taken
@@ -93,7 +91,7 @@ def find_dot(
         found = detect_markers(image, dot_radius=radius, polarity=polarity, valid=valid)
     except NoMarkersError:
         return None
-    contrast = _median_contrast(_even(image), found.dot_radius, found.polarity)
+    contrast = np.median(_contrast(_even(image), found.dot_radius, found.polarity), axis=2)
     columns, rows = np.clip(np.rint((found.centers - 0.5) / 2).astype(int).T, 0, None)
     at = contrast[np.minimum(rows, contrast.shape[0] - 1), np.minimum(columns, contrast.shape[1] - 1)]
     least = max(LEAST_CONTRAST, CONTRAST_FRACTION * float(np.median(at)))
@@ -151,10 +149,9 @@ def marker_mask(image: Bytes, dot: Dot) -> Bytes:
 
 def _mask(whole: Bytes, dot: Dot, radius: float) -> Bytes:
     """The mask of dots of one size, of an image of even height and width."""
-    own = _contrast(whole, radius, dot.polarity)
     mask = np.empty(whole.shape[:2], np.uint8)
-    threshold = min(255, math.floor(dot.contrast))
-    cover_spots(own.contrast, threshold, own.reach, _corner(radius), own.spots, own.doubled, mask)
+    contrast = _contrast(whole, radius, dot.polarity)
+    _cover_spots(contrast, min(255, math.floor(dot.contrast)), _corner(radius), mask)
     return mask
 
 
@@ -166,62 +163,13 @@ def _even(image: Bytes) -> Bytes:
     return np.ascontiguousarray(image)
 
 
-class _Buffers:
-    """What `_contrast` computes in. Pictures at half size have a margin of `reach` px, the circle's."""
-
-    def __init__(self, height: int, width: int, radius: float, polarity: Polarity) -> None:
-        outer = _circle_radius(radius)
-        rows, columns = _circle_points(outer)
-        reach = self.reach = math.ceil(outer)
-        high, wide = height + 2 * reach, width + 2 * reach
-        # Nothing outside the frame is as dark as a dot, or as bright.
-        self.half = np.full((high, 3 * wide), 255 if polarity == "dark" else 0, np.uint8)
-        self.inverted = np.empty_like(self.half)
-        self.steps = 3 * (rows * wide + columns)
-        self.contrast = np.zeros(self.half.size, np.uint8)
-        self.spots = np.empty((high, wide), np.uint8)
-        self.doubled = np.empty(2 * self.spots.size, np.uint8)
-
-
-KINDS_KEPT: Final = 6
-"""Kinds of frames and dots whose buffers a thread keeps: sizes of dots in one picture. Chosen by hand."""
-
-_kept = threading.local()
-"""The buffers of each thread, for the kinds of frames and dots that it saw last."""
-
-
-def _contrast(whole: Bytes, radius: float, polarity: Polarity) -> _Buffers:
-    """Buffers whose `contrast` is that of an image of even height and width, at half resolution."""
-    height, width = whole.shape[0] // 2, whole.shape[1] // 2
-    kind = (height, width, radius, polarity)
-    buffers: dict[tuple[int, int, float, Polarity], _Buffers] = _kept.__dict__.setdefault("buffers", {})
-    if kind not in buffers:
-        if len(buffers) >= KINDS_KEPT:
-            buffers.clear()
-        buffers[kind] = _Buffers(*kind)
-    own = buffers[kind]
-    picture = own.half
-    halve_block(
-        whole.reshape(len(whole), -1), 0, 0, picture, own.reach, own.reach, height, width, False, False
-    )
-    if polarity == "bright":
-        # A bright dot is a dark one in the negative.
-        picture = np.invert(own.half, out=own.inverted)
-    contrast_with_circle(picture, own.reach, own.steps, own.contrast)
-    return own
-
-
-def _median_contrast(whole: Bytes, radius: float, polarity: Polarity) -> Bytes:
-    """Median contrast of the three channels, half as high and wide; 0 in the corners of the frame."""
-    own = _contrast(whole, radius, polarity)
-    reach, (high, wide) = own.reach, own.spots.shape
-    channels = own.contrast.reshape(high, wide, 3)[reach : high - reach, reach : wide - reach]
-    median = np.sort(channels, axis=2)[:, :, 1]
-    side = _corner(radius)
-    for rows in (slice(0, side), slice(-side, None)):
-        median[rows, :side] = 0
-        median[rows, -side:] = 0
-    return median
+def _contrast(whole: Bytes, radius: float, polarity: Polarity) -> Bytes:
+    """By how much each px differs from all of a circle around it: (H / 2, W / 2, 3) uint8, grey levels."""
+    half, circle = halved(whole), _circle(_circle_radius(radius))
+    # What lies outside the frame does not count.
+    if polarity == "dark":
+        return np.asarray(cv2.subtract(cv2.erode(half, circle), half), np.uint8)
+    return np.asarray(cv2.subtract(half, cv2.dilate(half, circle)), np.uint8)
 
 
 def _circle_radius(radius: float) -> float:
@@ -238,80 +186,44 @@ def _corner(radius: float) -> int:
 
 
 @lru_cache(maxsize=32)
-def _circle_points(radius: float) -> NDArray[np.int64]:
-    """Rows and columns of the points of a circle, from its centre: (2, CIRCLE_POINTS)."""
+def _circle(radius: float) -> Bytes:
+    """Structuring element: 1 at `CIRCLE_POINTS` points of a circle."""
     turn = np.arange(CIRCLE_POINTS) * (2 * np.pi / CIRCLE_POINTS)
-    return np.rint(radius * np.stack([np.sin(turn), np.cos(turn)])).astype(np.int64)
+    reach = math.ceil(radius)
+    rows, columns = np.rint(radius * np.stack([np.sin(turn), np.cos(turn)])).astype(int) + reach
+    circle = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
+    circle[rows, columns] = 1
+    return circle
 
 
-# The kernels run over pictures as one long line. Shifted by a fixed number of bytes, such a line is what each
-# pixel has beside it in some direction, so every loop is one over whole vectors of bytes. What wraps from the
-# end of a row to the start of the next lies in the margin, which is 255 and never a spot.
+@kernel("void(uint8[:, :, ::1], int64, int64, uint8[:, ::1])")
+def _cover_spots(contrast: Bytes, threshold: int, corner: int, mask: Bytes) -> None:
+    """Fill `mask`, (2 h, 2 w): 255 on and next to px whose median contrast exceeds a threshold, else 0.
 
-
-@kernel("void(uint8[:, ::1], int64, int64[::1], uint8[::1])")
-def contrast_with_circle(picture: Bytes, reach: int, steps: NDArray[np.int64], contrast: Bytes) -> None:
-    """How much darker each value is than the least of twelve places around it; 0 where it is not.
-
-    picture : (h + 2 reach, 3 (w + 2 reach)), with a margin of 255. steps : (12,), from a value to the twelve
-    of its circle, in bytes; none leads out of a frame of `reach` px. contrast : as long as the picture;
-    its first and last `reach` rows and px are left as they are.
+    contrast : (h, w, 3). threshold : grey levels. corner : side of squares in the corners without spots, px.
     """
-    values = picture.reshape(-1)
-    start = reach * (picture.shape[1] + 3)
-    count = values.size - 2 * start
-    here, out = values[start : start + count], contrast[start : start + count]
-    # One name for each of the twelve: a loop over them would go through memory for every one.
-    a, b = values[start + steps[0] :][:count], values[start + steps[1] :][:count]
-    c, d = values[start + steps[2] :][:count], values[start + steps[3] :][:count]
-    e, f = values[start + steps[4] :][:count], values[start + steps[5] :][:count]
-    g, h = values[start + steps[6] :][:count], values[start + steps[7] :][:count]
-    i, j = values[start + steps[8] :][:count], values[start + steps[9] :][:count]
-    k, m = values[start + steps[10] :][:count], values[start + steps[11] :][:count]
-    for at in range(count):
-        least = min(min(min(a[at], b[at]), min(c[at], d[at])), min(min(e[at], f[at]), min(g[at], h[at])))
-        least = min(least, min(min(i[at], j[at]), min(k[at], m[at])))
-        out[at] = max(least, here[at]) - here[at]
-
-
-@kernel("void(uint8[::1], int64, int64, int64, uint8[:, ::1], uint8[::1], uint8[:, ::1])")
-def cover_spots(
-    contrast: Bytes, threshold: int, reach: int, corner: int, spots: Bytes, doubled: Bytes, mask: Bytes
-) -> None:
-    """255 on and next to every px whose median contrast exceeds a threshold, at twice the size.
-
-    contrast : of `contrast_with_circle`. threshold : grey levels, 0 to 255. corner : px; squares of that side
-    in the picture's corners hold no spot. spots : (h + 2 reach, w + 2 reach), reach >= 1, and doubled, of
-    twice its length, are written over. mask : (2 h, 2 w) is filled.
-    """
-    wide, flat = spots.shape[1], spots.reshape(-1)
+    height, width, _ = contrast.shape
+    # With a px more on all sides.
+    spots, line = np.empty((height + 2, width + 2), np.uint8), np.empty(width + 2, np.uint8)
+    spots[:] = 0
     least = np.uint8(threshold)
-    for at in range(flat.size):
-        first, second, third = contrast[3 * at], contrast[3 * at + 1], contrast[3 * at + 2]
-        median = max(min(first, second), min(max(first, second), third))
-        flat[at] = 255 if median > least else 0
-    height, width = mask.shape[0] // 2, mask.shape[1] // 2
-    side = min(corner, width)
-    for y in range(min(corner, height)):
-        for row in (reach + y, reach + height - 1 - y):
-            spots[row, reach : reach + side] = 0
-            spots[row, reach + width - side : reach + width] = 0
-    start = reach * wide
-    count = flat.size - 2 * start
-    above, here, below = flat[start - wide - 1 :], flat[start - 1 :], flat[start + wide - 1 :]
-    for x in range(count):
-        near = above[x] | here[x] | below[x]
-        near |= above[x + 1] | here[x + 1] | below[x + 1]
-        near |= above[x + 2] | here[x + 2] | below[x + 2]
-        doubled[2 * x] = near
-        doubled[2 * x + 1] = near
-    pixels = mask.reshape(-1)
     for y in range(height):
-        # The mask is new, in no cache: its lines are asked for ahead, 64 bytes at a time.
-        for place in range(4 * (y + 8) * width, 4 * (y + 9) * width, 64):
-            prefetch(pixels, place)
-        # Copied value by value, which becomes whole vectors; a slice assigned to a slice does not.
-        line, upper, lower = doubled[2 * (y * wide + reach) :], mask[2 * y], mask[2 * y + 1]
+        row, values = spots[y + 1, 1:], contrast[y].reshape(-1)
+        for x in range(width):
+            first, second, third = values[3 * x], values[3 * x + 1], values[3 * x + 2]
+            median = max(min(first, second), min(max(first, second), third))
+            row[x] = np.uint8(255) if median > least else np.uint8(0)
+        if min(y, height - 1 - y) < corner:
+            for x in range(min(corner, width)):
+                row[x] = row[width - 1 - x] = 0
+    for y in range(height):
+        upper, here, lower = spots[y], spots[y + 1], spots[y + 2]
+        for x in range(width + 2):
+            line[x] = upper[x] | here[x] | lower[x]
+        first_row, second_row = mask[2 * y], mask[2 * y + 1]
+        for x in range(width):
+            near = line[x] | line[x + 1] | line[x + 2]
+            first_row[2 * x] = near
+            first_row[2 * x + 1] = near
         for x in range(2 * width):
-            upper[x] = line[x]
-            lower[x] = line[x]
+            second_row[x] = first_row[x]

@@ -16,8 +16,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -116,14 +114,13 @@ def choose_spots(
         raise IndexError(f"required marks 0 to {len(origin) - 1} in edges and free, got others")
     slot: IntArray = np.full(len(origin), -1, np.int64)
     slot[free] = np.arange(count)
-    origin, spots = (np.ascontiguousarray(array, np.float64) for array in (origin, spots))
-    edges, free = np.ascontiguousarray(edges, np.int64), np.ascontiguousarray(free, np.int64)
-    links = _Links(_complex(origin), edges, free, slot, np.asarray(inliers, np.bool_), _complex(displacement))
-    label, unary = _near_spots(_complex(expected), _complex(spots), strength, pitch, farthest)
-    chosen = _own_best(links, _complex(spots), label, unary)
+    known = np.asarray(inliers, np.bool_)
+    links = _Links(_complex(origin), edges, free, slot, known, _complex(displacement))
+    places = _complex(spots)
+    label, unary = _near_spots(_complex(expected), places, strength, pitch, farthest)
+    chosen = _own_best(links, places, label, unary)
     if chosen is None:
-        chosen = np.empty(count, np.int64)
-        propagate_beliefs(origin, edges, free, slot, spots, label, unary, label.shape[1], chosen)
+        chosen = _assign(_beliefs(unary, *_link_costs(links, places, label)), label)
     return chosen
 
 
@@ -208,162 +205,59 @@ def _is_smooth(links: _Links, moved: ComplexArray) -> bool:
     return bool((np.abs(now[other] - now[one]) < SMOOTH_STRAIN * np.abs(rest[other] - rest[one])).all())
 
 
-@helper
-def link_cost(change_x: float, change_y: float, span_x: float, span_y: float, scale: float) -> float:
-    """Cost of a difference of displacements of neighbours that are `span` apart; scale : 1 / span^2."""
-    squared_strain = (change_x * change_x + change_y * change_y) * scale
-    cost = min(STRAIN_COST * squared_strain, MOST_STRAIN_COST)
-    if (change_x * span_x + change_y * span_y) * scale < FOLD_STRAIN:
-        cost += FOLD_COST
-    return cost
+def _link_costs(links: _Links, spots: ComplexArray, label: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """First and second mark of each link between free marks; and what their labels, (n, L), cost together.
 
-
-@helper
-def link_costs(
-    origin: FloatArray,
-    edges: IntArray,
-    slot: IntArray,
-    spots: FloatArray,
-    label: IntArray,
-    source: IntArray,
-    target: IntArray,
-    pair: FloatArray,
-) -> None:
-    """Link by link, there and back: who sends to whom, and what its label costs with the receiver's.
-
-    source, target : (2 links,). pair : (2 links, labels + 1, labels + 1).
+    Returns (links,), (links,) and (links, L + 1, L + 1); the last label is that of no spot.
     """
-    labels, link = pair.shape[1] - 1, 0
-    pair[:] = MISSING_LINK_COST
-    for e in range(len(edges)):
-        one, other = edges[e, 0], edges[e, 1]
-        first, second = slot[one], slot[other]
-        if first < 0 or second < 0:
-            continue
-        source[link], target[link], source[link + 1], target[link + 1] = first, second, second, first
-        span_x, span_y = origin[other, 0] - origin[one, 0], origin[other, 1] - origin[one, 1]
-        scale = 1.0 / (span_x * span_x + span_y * span_y)
-        for k in range(labels):
-            here = label[first, k]
-            for m in range(labels):
-                there = label[second, m]
-                change_x = (spots[there, 0] - origin[other, 0]) - (spots[here, 0] - origin[one, 0])
-                change_y = (spots[there, 1] - origin[other, 1]) - (spots[here, 1] - origin[one, 1])
-                cost = link_cost(change_x, change_y, span_x, span_y, scale)
-                if here == there:
-                    cost += SHARED_COST
-                pair[link, k, m] = pair[link + 1, m, k] = cost
-        link += 2
+    labels = label.shape[1]
+    inner = links.edges[(links.slot[links.edges] >= 0).all(axis=1)]
+    first, second = links.slot[inner].T
+    moved = spots[label] - links.rest[links.free][:, None]
+    span = (links.rest[inner[:, 1]] - links.rest[inner[:, 0]])[:, None, None]
+    change = (moved[second][:, None, :] - moved[first][:, :, None]) / span
+    squared = change.real**2 + change.imag**2
+    cost = np.minimum(STRAIN_COST * squared, MOST_STRAIN_COST) + FOLD_COST * (change.real < FOLD_STRAIN)
+    pair = np.full((len(inner), labels + 1, labels + 1), MISSING_LINK_COST)
+    pair[:, :labels, :labels] = cost + SHARED_COST * (label[first][:, :, None] == label[second][:, None, :])
+    return first, second, pair
 
 
-@helper
-def pass_messages(
-    belief: FloatArray,
-    source: IntArray,
-    target: IntArray,
-    pair: FloatArray,
-    message: FloatArray,
-    latest: FloatArray,
-    total: FloatArray,
-) -> None:
-    """One round: new messages (2 links, labels + 1) into `latest`, their sums at each mark into `total`."""
-    states = belief.shape[1]
-    total[:] = 0.0
-    for link in range(len(source)):
-        fresh = latest[link]
-        fresh[:] = np.inf
-        for k in range(states):
-            # The way back is the other of the two.
-            outgoing = belief[source[link], k] - message[link ^ 1, k]
-            for m in range(states):
-                fresh[m] = min(fresh[m], outgoing + pair[link, k, m])
-        least = fresh[0]
-        for m in range(1, states):
-            least = min(least, fresh[m])
-        for m in range(states):
-            fresh[m] = (1 - DAMPING) * (fresh[m] - least) + DAMPING * message[link, m]
-            total[target[link], m] += fresh[m]
+def _beliefs(unary: FloatArray, first: IntArray, second: IntArray, pair: FloatArray) -> FloatArray:
+    """Costs of each mark's labels, (n, L + 1), by min-sum belief propagation; of all links at once.
 
-
-@helper
-def cheapest(cost: FloatArray) -> int:
-    """The first of the least; with `np.argmin`, the kernel takes a tenth longer to compile."""
-    best = 0
-    for k in range(1, cost.size):
-        if cost[k] < cost[best]:
-            best = k
-    return best
-
-
-@helper
-def assign_spots(
-    belief: FloatArray, choice: IntArray, label: IntArray, owner: IntArray, chosen: IntArray
-) -> None:
-    """The cheapest label of each mark, into `chosen`; of two marks that want one spot, the surer one gets it.
-
-    owner : (M,), -1, is written over.
+    unary : (n, L + 1). first, second, pair : of `_link_costs`.
     """
-    labels = belief.shape[1] - 1
-    surplus = np.empty(len(choice))
-    chosen[:] = -1
-    for n in range(len(choice)):
-        surplus[n] = belief[n, choice[n]] - belief[n, labels]
-        if choice[n] == labels:
-            continue
-        spot = label[n, choice[n]]
-        rival = owner[spot]
-        if rival >= 0:
-            if surplus[rival] <= surplus[n]:
-                continue
-            chosen[rival] = -1
-        owner[spot], chosen[n] = n, spot
-
-
-@kernel(
-    "void(float64[:, ::1], int64[:, ::1], int64[::1], int64[::1], float64[:, ::1], int64[:, ::1],"
-    "float64[:, ::1], int64, int64[::1])"
-)
-def propagate_beliefs(
-    origin: FloatArray,
-    edges: IntArray,
-    free: IntArray,
-    slot: IntArray,
-    spots: FloatArray,
-    label: IntArray,
-    unary: FloatArray,
-    labels: int,
-    chosen: IntArray,
-) -> None:
-    """The second half of `choose_spots`: propagation and decision, into `chosen`.
-
-    slot : (N,), the number of each mark among the free ones, or -1. label : (n, labels), the spots that each
-    of these may choose. unary : (n, labels + 1), what they cost it alone, and last what no spot costs.
-    """
-    count, states, links = len(free), labels + 1, 0
-    for e in range(len(edges)):
-        links += slot[edges[e, 0]] >= 0 and slot[edges[e, 1]] >= 0
-    source, target = np.empty(2 * links, np.int64), np.empty(2 * links, np.int64)
-    pair = np.empty((2 * links, states, states))
-    link_costs(origin, edges, slot, spots, label, source, target, pair)
-    message, latest = np.empty((2 * links, states)), np.empty((2 * links, states))
-    message[:] = 0.0
-    belief, total = unary.copy(), np.empty((count, states))
-    choice, owner = np.empty(count, np.int64), np.empty(len(spots), np.int64)
-    owner[:] = -1
-    for n in range(count):
-        choice[n] = cheapest(belief[n])
-    unchanged = 0
-    for _ in range(MOST_ROUNDS if links else 0):
-        pass_messages(belief, source, target, pair, message, latest, total)
-        message, latest = latest, message
-        same = True
-        for n in range(count):
-            for m in range(states):
-                belief[n, m] = unary[n, m] + total[n, m]
-            best = cheapest(belief[n])
-            same = same and best == choice[n]
-            choice[n] = best
-        unchanged = unchanged + 1 if same else 0
+    source, target = np.concatenate([first, second]), np.concatenate([second, first])
+    cost = np.concatenate([pair, pair.transpose(0, 2, 1)])
+    message = np.zeros((len(source), unary.shape[1]))
+    belief, choice, unchanged = unary, unary.argmin(axis=1), 0
+    for _ in range(MOST_ROUNDS if len(first) else 0):
+        outgoing = belief[source] - np.roll(message, len(first), axis=0)
+        fresh = (outgoing[:, :, None] + cost).min(axis=1)
+        fresh -= fresh.min(axis=1, keepdims=True)
+        message = (1 - DAMPING) * fresh + DAMPING * message
+        belief = unary.copy()
+        np.add.at(belief, target, message)
+        latest = belief.argmin(axis=1)
+        unchanged = unchanged + 1 if (latest == choice).all() else 0
         if unchanged == STABLE_ROUNDS:
             break
-    assign_spots(belief, choice, label, owner, chosen)
+        choice = latest
+    return belief
+
+
+def _assign(belief: FloatArray, label: IntArray) -> IntArray:
+    """The cheapest spot of each mark, (n,), -1 for none; of two that want one spot, the surer one gets it."""
+    choice, labels = belief.argmin(axis=1), label.shape[1]
+    rows = np.arange(len(choice))
+    chosen: IntArray = np.where(choice < labels, label[rows, np.minimum(choice, labels - 1)], -1)
+    surplus = belief[rows, choice] - belief[:, labels]
+    taken: set[int] = set()
+    for mark in np.argsort(surplus, kind="stable").tolist():
+        spot = int(chosen[mark])
+        if spot in taken:
+            chosen[mark] = -1
+        elif spot >= 0:
+            taken.add(spot)
+    return chosen

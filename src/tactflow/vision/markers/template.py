@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel, prefetch
+from tactflow.vision.compiled import helper, kernel
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 Levels = NDArray[np.int16]
 
 PHASES: Final = 4
@@ -45,20 +46,8 @@ are never trusted. Chosen by hand."""
 ONE_TEMPLATE: Final = 1.5
 """Ratio of radii of marks whose templates have one size, at most. Chosen by hand."""
 
-LANES: Final = 32
-"""Rows of weights are padded to multiples of so many values: whole vector registers."""
-
-LARGEST_LEVEL: Final = 2**15 - 2
-"""Largest weight as a whole number: so it takes 16 bits, half of what has to be read for each mark."""
-
-LARGEST_SUM: Final = 2**23
-"""Largest sum of the sizes of such weights: times grey levels less 128 it fits in 32 bits. Derived: 2**30."""
-
-LARGEST_BLOCK: Final = 2**16
-"""Pixels whose squares, less than 2**15 each, have a sum that fits in 32 bits. Derived."""
-
-CACHE_LINE: Final = 32
-"""Whole numbers of 16 bits that memory gives at a time, on most processors."""
+LARGEST_LEVEL: Final = 2**15 - 1
+"""Largest weight as a whole number of 16 bits."""
 
 LEAST_RESIDUAL: Final = np.float32(1e-3)
 """Sum of squares, grey levels^2, that always counts as unexplained: keeps r_squared below 1 and errors
@@ -127,25 +116,25 @@ class MarkerTemplates:
         axis = np.arange(-reach, reach + 1)
         grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
         disc = np.hypot(grid_x, grid_y) <= extent
-        self._disc = np.array([grid_x[disc], grid_y[disc]], np.int64)
         pixels, count = int(disc.sum()), len(origin)
         steps = ((np.arange(PHASES) + 0.5) / PHASES - 0.5).tolist()
-        # The pixels after the patch's own weigh nothing.
-        length = -(-pixels // LANES) * LANES
-        weights = np.zeros((PHASES, PHASES, count, 5, length), np.int16)
-        terms = np.zeros((PHASES, PHASES, count, 16), np.float32)
+        # Of 16 bits, since reading the weights of all marks is what takes most of the time.
+        weights = np.empty((PHASES, PHASES, count, 5, pixels), np.int16)
+        terms = np.empty((PHASES, PHASES, count, 15), np.float32)
         sampler = _Sampler(reference, origin, reach, disc)
-        scaled = self._disc / radius
+        scaled = np.array([grid_x[disc], grid_y[disc]]) / radius
         for row, phase_y in enumerate(steps):
             for column, phase_x in enumerate(steps):
                 model = _normal_equations(*sampler.with_slopes(phase_x, phase_y), scaled, dark)
-                weights[row, column, :, :, :pixels], terms[row, column, :, 10:15] = whole_numbers(model[0])
+                unit = np.maximum(np.abs(model[0]).max(axis=2), np.finfo(np.float32).tiny) / LARGEST_LEVEL
+                weights[row, column] = np.rint(model[0] / unit[:, :, None])
+                terms[row, column, :, 10:] = unit
                 terms[row, column, :, :9] = model[1].reshape(count, 9)
                 terms[row, column, :, 9] = model[2] / max(pixels - 6, 1)
         self._all = np.arange(count)
-        self._weights = weights.reshape(PHASES * PHASES * count, 5, length)
-        self._terms = terms.reshape(PHASES * PHASES * count, 16)
-        self._reach = reach
+        self._weights = weights.reshape(PHASES * PHASES * count, 5, pixels)
+        self._terms = terms.reshape(PHASES * PHASES * count, 15)
+        self._widths = disc.sum(axis=1)
         self._radius = float(radius)
 
     def align(self, image: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None) -> Alignment:
@@ -155,20 +144,10 @@ class MarkerTemplates:
         marks these are; None for all.
         """
         marks = self._all if marks is None else marks
-        view = np.ascontiguousarray(image if image.ndim == 3 else image[:, :, None])
         position, found = np.empty((len(marks), 2)), np.empty((3, len(marks)), np.float32)
-        align_marks(
-            view,
-            np.ascontiguousarray(start),
-            marks,
-            self._weights,
-            self._terms,
-            self._disc,
-            self._reach,
-            self._radius,
-            position,
-            found,
-        )
+        picture = np.ascontiguousarray(image if image.ndim == 3 else image[:, :, None])
+        model = self._weights, self._terms, self._widths
+        align_marks(picture, np.ascontiguousarray(start), marks, *model, self._radius, position, found)
         return Alignment(position, found[0], found[1], found[2])
 
 
@@ -250,18 +229,6 @@ def _normal_equations(
     return weights, gram, 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
 
 
-def whole_numbers(weights: FloatArray) -> tuple[Levels, FloatArray]:
-    """Rows of weights (N, 5, p) as whole numbers, and the unit of each row (N, 5).
-
-    What one is rounded by, the next takes on: so sums over neighbours, which are alike in a patch, are right.
-    """
-    size = np.abs(weights)
-    unit = np.maximum(size.max(axis=2) / LARGEST_LEVEL, size.sum(axis=2) / LARGEST_SUM)
-    unit = np.maximum(unit, np.finfo(np.float32).tiny)
-    total = np.rint(np.cumsum(weights / unit[:, :, None], axis=2))
-    return np.diff(total, axis=2, prepend=0.0).astype(np.int16), unit
-
-
 def _interpolate(image: Float32Array, points: FloatArray, reach: int) -> FloatArray:
     """Patches (N, 2 reach + 1, 2 reach + 1) centred on sub-pixel points, by a windowed sinc of six taps."""
     pad = reach + 4
@@ -298,159 +265,70 @@ def nearest_phase(x: float, y: float, width: int, height: int) -> Any:
 
 
 @helper
-def ask_for_template(weights: Levels, terms: Float32Array, which: int) -> None:
-    """Have what `fit_template` reads brought into the caches."""
-    all_weights, all_terms, size = weights.reshape(-1), terms.reshape(-1), weights.shape[1] * weights.shape[2]
-    prefetch(all_terms, which * terms.shape[1])
-    for place in range(which * size, (which + 1) * size, CACHE_LINE):
-        prefetch(all_weights, place)
+def read_patch(image: Bytes, left: int, top: int, widths: IntArray, patch: Float32Array) -> float:
+    """Fill `patch` with the grey levels of a disc around a pixel; beyond the border those of the border.
 
-
-@helper
-def ask_for_patch(flat: NDArray[np.uint8], shape: Any, left: int, top: int, reach: int) -> None:
-    """Have the ends of all rows of a patch brought into the caches: rows lie far apart in memory."""
-    height, width, channels = shape
-    for row in range(max(top - reach, 0), min(top + reach + 1, height)):
-        prefetch(flat, (row * width + left - reach) * channels)
-        prefetch(flat, (row * width + left + reach) * channels)
-
-
-@helper
-def read_patch(
-    flat: NDArray[np.uint8],
-    shape: Any,
-    left: int,
-    top: int,
-    reach: int,
-    disc: IntArray,
-    offsets: IntArray,
-    words: NDArray[np.int32],
-) -> None:
-    """Pixels of a patch into `words` (p,), blue in the lowest byte; beyond the border those of the border."""
-    height, width, channels = shape
-    byte, two_bytes, three_bytes = np.int32(8), np.int32(16), np.int32(24)
-    # Unsigned indices spare numba the question whether they count from the end.
-    one, two, three = np.uintp(1), np.uintp(2), np.uintp(3)
-    # With the pixel after it, which is read too, the patch is inside the image.
-    if left >= reach and top >= reach and left + reach + 1 < width and top + reach < height:
-        base = (top * width + left) * channels
-        for p in range(len(words)):
-            i = np.uintp(base + offsets[p])
-            if channels == 3:
-                # Four bytes, so that the compiler makes one load of them.
-                word = np.int32(flat[i]) | np.int32(flat[i + one]) << byte
-                word |= np.int32(flat[i + two]) << two_bytes
-                words[p] = word | np.int32(flat[i + three]) << three_bytes
-            else:
-                words[p] = np.int32(flat[i])
-        return
-    for p in range(len(words)):
-        row = min(max(top + disc[1, p], 0), height - 1)
-        column = min(max(left + disc[0, p], 0), width - 1)
-        i = np.uintp((row * width + column) * channels)
-        words[p] = np.int32(flat[i])
-        if channels == 3:
-            words[p] |= np.int32(flat[i + one]) << byte
-            words[p] |= np.int32(flat[i + two]) << two_bytes
-
-
-@helper
-def to_centred_gray(words: NDArray[np.int32], channels: int, patch: Levels) -> None:
-    """Grey levels as OpenCV makes them of BGR, less 128."""
-    blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
-    bits, middle, low = np.int32(15), np.int32(128), np.int32(255)
-    byte, two_bytes = np.int32(8), np.int32(16)
-    if channels == 3:
-        for p in range(len(words)):
-            level = blue * (words[p] & low) + green * ((words[p] >> byte) & low)
-            level += red * ((words[p] >> two_bytes) & low) + half
-            patch[p] = np.int16((level >> bits) - middle)
-    else:
-        for p in range(len(words)):
-            patch[p] = np.int16(words[p] - middle)
-
-
-@helper
-def variation(patch: Levels, pixels: int) -> float:
-    """Sum of squares of a patch about its mean; what follows its `pixels` is 0."""
-    total = squares = np.int64(0)
-    for start in range(0, len(patch), LARGEST_BLOCK):
-        block = patch[start : start + LARGEST_BLOCK]
-        sum_of_block = squares_of_block = np.int32(0)
-        for p in range(len(block)):
-            value = np.int32(block[p])
-            sum_of_block = np.int32(sum_of_block + value)
-            squares_of_block = np.int32(squares_of_block + value * value)
-        total, squares = total + sum_of_block, squares + squares_of_block
-    return squares - float(total) * total / pixels
-
-
-@helper
-def fit_template(weight: Levels, term: Float32Array, patch: Levels, varies: float) -> Any:
-    """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained.
-
-    varies : the patch's `variation`.
+    widths : of the disc's rows, px. Returns the sum of squares about the mean.
     """
-    first = second = third = fourth = fifth = np.int32(0)
-    # Whole numbers below 2**31, exact in whatever order.
-    for p in range(len(patch)):
-        value = np.int32(patch[p])
-        first = np.int32(first + weight[0, p] * value)
-        second = np.int32(second + weight[1, p] * value)
-        third = np.int32(third + weight[2, p] * value)
-        fourth = np.int32(fourth + weight[3, p] * value)
-        fifth = np.int32(fifth + weight[4, p] * value)
-    gain, shift_x, shift_y = term[10] * first, term[11] * second, term[12] * third
-    explained = gain * (term[0] * gain + term[1] * shift_x + term[2] * shift_y)
-    explained += shift_x * (term[3] * gain + term[4] * shift_x + term[5] * shift_y)
-    explained += shift_y * (term[6] * gain + term[7] * shift_x + term[8] * shift_y)
-    slope_x, slope_y = term[13] * fourth, term[14] * fifth
-    contrast = varies - slope_x * slope_x - slope_y * slope_y
-    gain, shift_x, shift_y = np.float32(gain), np.float32(shift_x), np.float32(shift_y)
-    explained, contrast = np.float32(explained), np.float32(contrast)
-    rest = max(contrast - explained, LEAST_RESIDUAL)
-    return gain, shift_x, shift_y, explained / (explained + rest), rest
+    height, width, channels = image.shape
+    flat, reach, first = image.reshape(-1), widths.size // 2, 0
+    inside = left >= reach and top >= reach and left + reach < width and top + reach < height
+    for row in range(widths.size):
+        count, begin, y = widths[row], left - widths[row] // 2, top - reach + row
+        line = patch[first : first + count]
+        if inside:
+            to_gray(flat[(y * width + begin) * channels :], channels, line)
+        else:
+            y = min(max(y, 0), height - 1)
+            for column in range(count):
+                x = min(max(begin + column, 0), width - 1)
+                to_gray(flat[(y * width + x) * channels :], channels, line[column : column + 1])
+        first += count
+    total = squares = 0.0
+    for p in range(patch.size):
+        total, squares = total + patch[p], squares + patch[p] * patch[p]
+    return squares - total * total / patch.size
+
+
+@helper
+def to_gray(pixels: Bytes, channels: int, levels: Float32Array) -> None:
+    """Fill `levels` with grey levels as OpenCV makes them of BGR, or of grey pixels themselves; less 128."""
+    blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
+    if channels == 1:
+        for x in range(levels.size):
+            levels[x] = np.float32(pixels[x]) - np.float32(128)
+        return
+    for x in range(levels.size):
+        level = blue * np.int32(pixels[3 * x]) + green * np.int32(pixels[3 * x + 1])
+        level += red * np.int32(pixels[3 * x + 2]) + half
+        levels[x] = np.float32(level >> np.int32(15)) - np.float32(128)
 
 
 @kernel(
     "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int16[:, :, ::1],"
-    "float32[:, ::1], int64[:, ::1], int64, float64, float64[:, ::1], float32[:, ::1])",
-    reorder=True,
+    "float32[:, ::1], int64[::1], float64, float64[:, ::1], float32[:, ::1])",
 )
 def align_marks(
-    image: NDArray[np.uint8],
+    image: Bytes,
     start: FloatArray,
     marks: IntArray,
     weights: Levels,
     terms: Float32Array,
-    disc: IntArray,
-    reach: int,
+    widths: IntArray,
     radius: float,
     position: FloatArray,
     found: Float32Array,
 ) -> None:
     """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
 
-    image : (H, W, 3) BGR or (H, W, 1) grey. start : (n, 2). marks : (n,), of those in `weights`.
-    weights : (PHASES^2 N, 5, P), of `whole_numbers`. terms : (PHASES^2 N, 16), 9 of the Gram matrix, variance
-    per pixel, 5 units of weights. disc : (2, p) dx and dy of the pixels, p <= P; other weights are zero.
-    reach : of a patch, px. radius : of a mark, px; no step is longer along an axis.
-    """
-    height, width, channels = image.shape
-    longest = np.float32(radius)
-    count, flat = weights.shape[0] // (PHASES * PHASES), image.reshape(-1)
-    offsets = np.empty(disc.shape[1], np.int64)
-    for p in range(len(offsets)):
-        offsets[p] = (disc[1, p] * width + disc[0, p]) * channels
-    words, patch = np.empty(len(offsets), np.int32), np.empty(weights.shape[2], np.int16)
-    patch[:] = 0
+    image : (H, W, 3) BGR or (H, W, 1). start : (n, 2). marks : (n,), of those in `weights`. weights :
+    (PHASES^2 N, 5, p), of the pixels of a disc. terms : (PHASES^2 N, 15), 9 of the Gram matrix, variance per
+    pixel, 5 units of the weights. widths : of the disc's rows, px. radius : of a mark, px; no step is longer
+    along an axis."""
+    height, width, _ = image.shape
+    longest, count = np.float32(radius), weights.shape[0] // (PHASES * PHASES)
+    patch = np.empty(weights.shape[2], np.float32)
     for n in range(len(marks)):
-        # The next mark's template and patch are asked for while this one is aligned.
-        if n + 1 < len(marks):
-            phase_x, phase_y = nearest_phase(start[n + 1, 0], start[n + 1, 1], width, height)
-            which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + marks[n + 1]
-            ask_for_template(weights, terms, which)
-            ask_for_patch(flat, image.shape, phase_x // PHASES, phase_y // PHASES, reach)
         x, y = start[n, 0], start[n, 1]
         seen_left, seen_top, varies = -1, -1, 0.0
         for number in range(ROUNDS + 1):
@@ -460,11 +338,10 @@ def align_marks(
             # A step of less than a pixel often sees the same patch from another phase.
             if left != seen_left or top != seen_top:
                 seen_left, seen_top = left, top
-                read_patch(flat, image.shape, left, top, reach, disc, offsets, words)
-                to_centred_gray(words, channels, patch)
-                varies = variation(patch, len(offsets))
-            fitted = fit_template(weights[which], terms[which], patch, varies)
-            gain, shift_x, shift_y, r_squared, rest = fitted
+                varies = read_patch(image, left, top, widths, patch)
+            gain, shift_x, shift_y, r_squared, rest = fit_template(
+                weights[which], terms[which], patch, varies
+            )
             safe = max(gain, LEAST_DIVISOR)
             now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
             now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
@@ -477,3 +354,26 @@ def align_marks(
         found[2, n] = np.sqrt(
             rest * terms[which, 9] / (safe * safe) + np.float32(SAMPLING_ERROR * SAMPLING_ERROR)
         )
+
+
+@helper
+def fit_template(weight: Levels, term: Float32Array, patch: Float32Array, varies: float) -> Any:
+    """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained.
+
+    varies : the patch's sum of squares about its mean.
+    """
+    gain = shift_x = shift_y = slope_x = slope_y = np.float32(0)
+    for p in range(patch.size):
+        gain += np.float32(weight[0, p]) * patch[p]
+        shift_x += np.float32(weight[1, p]) * patch[p]
+        shift_y += np.float32(weight[2, p]) * patch[p]
+        slope_x += np.float32(weight[3, p]) * patch[p]
+        slope_y += np.float32(weight[4, p]) * patch[p]
+    gain, shift_x, shift_y = gain * term[10], shift_x * term[11], shift_y * term[12]
+    slope_x, slope_y = slope_x * term[13], slope_y * term[14]
+    explained = gain * (term[0] * gain + term[1] * shift_x + term[2] * shift_y)
+    explained += shift_x * (term[3] * gain + term[4] * shift_x + term[5] * shift_y)
+    explained += shift_y * (term[6] * gain + term[7] * shift_x + term[8] * shift_y)
+    contrast = varies - slope_x * slope_x - slope_y * slope_y
+    rest = max(contrast - explained, float(LEAST_RESIDUAL))
+    return gain, shift_x, shift_y, explained / (explained + rest), rest

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.detection import (
     Detection,
     detect_markers,
@@ -238,19 +238,21 @@ class MarkerTracker:
     def _check(self, found: Alignment) -> tuple[BoolArray, FloatArray, int]:
         """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
         may have missed or mistaken one."""
-        seen, strain = np.empty(self._count, np.bool_), self._graph.strain(found.position)
+        seen, strain = np.empty(self._count, np.bool_), np.empty(len(self._graph.edges))
         doubt = check_marks(
             found.position,
             self._position,
+            self._origin,
             found.gain,
             found.r_squared,
             self._graph.edges,
-            strain,
+            self._graph.length,
             self._steepest,
             self._seen,
             LONGEST_STEP * self._radius,
             RESTLESS_STEP * self._pitch,
             seen,
+            strain,
         )
         return seen, strain, doubt
 
@@ -389,30 +391,31 @@ def _lengths(vectors: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)), np.float64)
 
 
-@helper
 def trusted(gain: Any, r_squared: Any) -> Any:
     """Whether a mark is seen, from how its template fits; of numbers or arrays."""
     return (gain > LEAST_GAIN) & (gain < MOST_GAIN) & (r_squared > LEAST_R_SQUARED)
 
 
 @kernel(
-    "int64(float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1], float64[::1],"
-    "float64[::1], boolean[::1], float64, float64, boolean[::1])"
+    "int64(float64[:, ::1], float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1],"
+    "float64[::1], float64[::1], boolean[::1], float64, float64, boolean[::1], float64[::1])"
 )
 def check_marks(
     position: FloatArray,
     before: FloatArray,
+    origin: FloatArray,
     gain: NDArray[np.float32],
     r_squared: NDArray[np.float32],
     edges: IntArray,
-    strain: FloatArray,
+    length: FloatArray,
     steepest: FloatArray,
     seen_before: BoolArray,
     longest: float,
     restless: float,
     seen: BoolArray,
+    strain: FloatArray,
 ) -> int:
-    """Which marks are seen, into `seen`; returns SURE, INCOMPLETE or DOUBTFUL.
+    """Fill `seen`, (N,), and `strain`, (E,), of each link; returns SURE, INCOMPLETE or DOUBTFUL.
 
     longest : step of a mark that is seen, px. restless : step that calls for a search where something is
     missing, px. steepest : (E,), strain of each link beyond which there is doubt.
@@ -422,16 +425,17 @@ def check_marks(
     for n in range(len(position)):
         move_x, move_y = position[n, 0] - before[n, 0], position[n, 1] - before[n, 1]
         move = np.sqrt(move_x * move_x + move_y * move_y)
-        seen[n] = trusted(gain[n], r_squared[n]) and move < longest
-        if seen[n]:
-            farthest = max(farthest, move)
-        else:
-            missing = True
-            lost = lost or seen_before[n]
+        fits = gain[n] > LEAST_GAIN and gain[n] < MOST_GAIN and r_squared[n] > LEAST_R_SQUARED
+        seen[n] = fits and move < longest
+        missing, lost = missing or not seen[n], lost or (seen_before[n] and not seen[n])
+        farthest = max(farthest, move if seen[n] else 0.0)
     for e in range(len(edges)):
+        one, other = edges[e, 0], edges[e, 1]
+        x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
+        y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
+        strain[e] = np.sqrt(x * x + y * y) / length[e]
         most = max(most, strain[e])
-        if strain[e] > steepest[e]:
-            rough = rough or (seen[edges[e, 0]] and seen[edges[e, 1]])
+        rough = rough or (strain[e] > steepest[e] and seen[one] and seen[other])
     if lost or rough:
         return DOUBTFUL
     if not missing and most < STEEP_STRAIN:

@@ -1,0 +1,41 @@
+"""Types of arrays, constants and checks that the rooms of `tactflow.vision` share."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+GrayImage = NDArray[np.uint8]
+"""(H, W), grey levels."""
+ColorImage = NDArray[np.uint8]
+"""(H, W, 3), grey levels, blue, green, red."""
+Mask = NDArray[np.uint8]
+"""(H, W), not 0 inside."""
+Points = NDArray[np.float64]
+"""(N, 2), px, x right, y down."""
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+MAD_TO_SIGMA: Final = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+SATURATED: Final = 250
+"""Grey levels from which on a camera is taken for saturated: it cannot become brighter. Chosen by hand."""
+
+
+def check_color_image(image: NDArray[Any]) -> None:
+    """Raise ValueError if an array is not a non-empty (H, W, 3) uint8 image."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+        raise ValueError(
+            f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
+        )
+
+
+def check_mask(mask: NDArray[Any], shape: tuple[int, ...] | None = None) -> None:
+    """Raise ValueError if an array is not an (H, W) uint8 mask, or not of a shape."""
+    wanted = "(H, W)" if shape is None else shape
+    if mask.ndim != 2 or mask.dtype != np.uint8 or (shape is not None and mask.shape != shape):
+        raise ValueError(f"required a mask of shape {wanted} and dtype uint8, got {mask.shape} {mask.dtype}")
