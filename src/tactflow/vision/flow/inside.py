@@ -13,6 +13,8 @@ from tactflow.vision.flow.loops import look_up
 
 _ROUNDING: Final = 1e-9
 """Added to the squared reach, px^2, so that a pixel exactly at the reach counts. Chosen by hand."""
+_FARTHEST: Final = 1e9
+"""Coordinates, px, that stand for those farther out, whose squares might overflow. Chosen by hand."""
 
 
 def inside_mask(points: Points, mask: Mask, dilate: float = 0.0) -> Flags:
@@ -48,7 +50,7 @@ def inside_mask(points: Points, mask: Mask, dilate: float = 0.0) -> Flags:
     if contours:
         # The pixel of the mask that is nearest to a point outside is one of its border.
         border = np.concatenate(contours)[:, 0]
-        outside, (x, y) = np.flatnonzero(~inside), np.rint(points).T
+        outside, (x, y) = np.flatnonzero(~inside), np.clip(np.rint(points), -_FARTHEST, _FARTHEST).T
         away_x, away_y = x[outside, None] - border[:, 0], y[outside, None] - border[:, 1]
         nearest = (away_x * away_x + away_y * away_y).min(axis=1)
         inside[outside] = nearest <= min(dilate, 1e150) ** 2 + _ROUNDING
