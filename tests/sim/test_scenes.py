@@ -36,8 +36,12 @@ MOVING += [
     "dense",
     "tilted",
     "strong_shear",
+    "block",
     "coin",
+    "key",
     "finger",
+    "painted",
+    "stutter",
 ]
 """Scenes that differ in their contacts or in where their markers are, not in the picture alone."""
 
@@ -102,11 +106,11 @@ def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
             np.testing.assert_allclose(truth.mean_flow, moved, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", [n for n in MOVING if n not in ("tap", "jumps")])
+@pytest.mark.parametrize("name", [n for n in MOVING if n not in ("tap", "jumps", "stutter")])
 def test_markers_move_smoothly_in_time(name: str) -> None:
     scene = open_scene(name)
     steps = [largest_step(scene, index) for index in range(28, 110)]
-    # Half a pitch is what nearest-neighbour matching can follow; only taps and jumps are faster.
+    # Half a pitch is what nearest-neighbour matching can follow; taps, jumps and lost frames are faster.
     assert 0 < max(steps) < 0.5 * scene.layout.pitch
 
 
@@ -317,6 +321,47 @@ def test_outside_the_aperture_there_is_neither_light_nor_contact_nor_marker() ->
     cut = open_scene("press?aperture=0.3").truth(50).contact_mask
     assert cut.any()
     assert not cut[distance > 90].any()
+
+
+def test_dropped_moments_are_missing_and_repeated_frames_identical() -> None:
+    scene, plain = open_scene("idle?frames=40&dropped=0.2&repeated=0.2"), open_scene("idle?frames=80")
+    # The noise differs from moment to moment, so that it tells which one a frame shows.
+    moments = {plain.frame(index)[0].tobytes(): index for index in range(len(plain))}
+    shown = [moments[scene.frame(index)[0].tobytes()] for index in range(len(scene))]
+    assert shown[0] == 0
+    assert set(np.diff(shown).tolist()) == {0, 1, 2}
+    repeated = int(np.flatnonzero(np.diff(shown) == 0)[0])
+    np.testing.assert_array_equal(scene.frame(repeated), scene.frame(repeated + 1))
+
+
+def test_a_stray_reflection_is_not_a_contact_and_lies_far_from_it() -> None:
+    scene, plain = open_scene("stray?noise=0"), open_scene("press?noise=0")
+    np.testing.assert_array_equal(scene.frame(0), plain.frame(0))
+    stray = (scene.clean(50).astype(int) - plain.clean(50)).min(axis=-1) > 10
+    truth = scene.truth(50)
+    np.testing.assert_array_equal(truth.contact_mask, plain.truth(50).contact_mask)
+    assert stray.sum() > 500
+    near = cv2.dilate(truth.contact_mask.astype(np.uint8), np.ones((201, 201), np.uint8)) > 0
+    assert not (stray & near).any()
+
+
+def test_painted_markers_differ_in_size_and_leds_glare_beside_bright_ones() -> None:
+    layout = open_scene("painted").layout
+    assert layout.radii.min() < 0.6 * layout.radius
+    assert layout.radii.max() > 1.4 * layout.radius
+    scene = open_scene("leds?noise=0")
+    glare = (scene.clean(0).min(axis=-1) == 255).astype(np.uint8)
+    assert cv2.connectedComponents(glare)[0] == 1 + 6
+    assert not glare[tuple(np.rint(scene.truth(0).position).astype(int).T[::-1])].any()
+
+
+@pytest.mark.parametrize("name", ["block", "coin", "key", "finger", "long_edge"])
+def test_the_contact_of_a_large_object_is_in_one_piece(name: str) -> None:
+    scene = open_scene(name)
+    contact = scene.truth(deepest(scene)).contact_mask.astype(np.uint8)
+    stats = cv2.connectedComponentsWithStats(contact)[2]
+    assert stats[1:, cv2.CC_STAT_AREA].max() > 0.98 * contact.sum()
+    assert contact.mean() > 2 * open_scene("press").truth(50).contact_mask.mean()
 
 
 def test_blotches_move_with_the_gel_and_are_no_markers() -> None:

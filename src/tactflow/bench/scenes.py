@@ -58,8 +58,8 @@ FULL = (
 """Every kind of contact, light, marker and camera trouble."""
 
 TROUBLES = (
-    *_cases("warm_up:140 stale:100 lamp:100 round_gel:56 coin:56 long_edge:56 finger:56 dark_channel:56"),
-    *_cases("halo:56 speckle:56"),
+    *_cases("warm_up:140 stale:100 lamp:100 round_gel:56 block:56 coin:56 key:56 long_edge:56 finger:56"),
+    *_cases("dark_channel:56 halo:56 painted:56 speckle:56 leds:56 stray:56"),
 )
 """What went wrong on recordings of real gels, one trouble in each scene."""
 

@@ -151,6 +151,25 @@ def lamp(size: tuple[int, int], strength: float) -> NDArray[np.float32]:
     return np.ascontiguousarray(np.broadcast_to(row, (size[1], size[0], 3)), dtype=np.float32)
 
 
+def spot(size: tuple[int, int], center: tuple[float, float], spread: tuple[float, float]) -> Array:
+    """(H, W) float32: a Gaussian, 1 at `center` (x, y), with standard deviations `spread` (x, y), px."""
+    across, down = (
+        np.exp(-0.5 * ((np.arange(length) - middle) / deviation) ** 2).astype(np.float32)
+        for length, middle, deviation in zip(size, center, spread, strict=True)
+    )
+    return np.outer(down, across)
+
+
+def leds(size: tuple[int, int], count: int) -> Array:
+    """(H, W) float32: LEDs, 1 at their centres, alternating between the upper and the lower border."""
+    width, height = size
+    total = np.zeros((height, width), np.float32)
+    for number in range(count):
+        y = height - 16.0 if number % 2 else 16.0
+        total += spot(size, ((number + 0.5) * width / count, y), (18.0, 13.0))
+    return total
+
+
 def add_mirror_spots(image: NDArray[np.float32], x: Array, y: Array, strength: float, seed: int) -> None:
     """Add specular reflections of lamps to the untouched gel (H, W, 3), grey levels; x, y : (H, W)
     coordinates."""

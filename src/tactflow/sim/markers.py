@@ -29,12 +29,14 @@ class Layout:
 
     rest : (N, 2) float64, positions on the untouched gel, px. contrast : (N,) in [0, 1], 1 for a fresh
     marker.
-    group : (N,) int; markers of the same group never overlap. pitch, radius : px.
+    group : (N,) int; markers of the same group never overlap. radii : (N,), px. pitch, radius : px; `radius`
+    is the mean.
     """
 
     rest: NDArray[np.float64]
     contrast: NDArray[np.float64]
     group: NDArray[np.int64]
+    radii: NDArray[np.float64]
     pitch: float
     radius: float
 
@@ -55,7 +57,9 @@ def layout(settings: Settings, size: tuple[int, int]) -> Layout:
     contrast = np.where(faded, rng.uniform(0.35, 0.8, len(rest)), 1.0)
     kept = rng.random(len(rest)) >= settings.missing
     group = (parity[:, 0] + 2 * parity[:, 1]).astype(np.int64)
-    return Layout(rest[kept], contrast[kept], group[kept], pitch, settings.dot or 0.135 * pitch)
+    radius = settings.dot or 0.135 * pitch
+    radii = radius * (1.0 + settings.sizes * rng.uniform(-1.0, 1.0, len(rest)))
+    return Layout(rest[kept], contrast[kept], group[kept], radii[kept], pitch, radius)
 
 
 def _ramp(inside: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -67,11 +71,11 @@ def _ramp(inside: NDArray[np.float32]) -> NDArray[np.float32]:
 def coverage(
     x: NDArray[np.float32],
     y: NDArray[np.float32],
-    radius: float,
+    radius: float | NDArray[np.float32],
     shape: str,
 ) -> NDArray[np.float32]:
     """Fraction of a pixel at offset (x, y), px, from a marker's centre that the marker covers."""
-    r = np.float32(radius)
+    r = np.asarray(radius, np.float32)
     if shape == "square":
         return _ramp(r - np.abs(x)) * _ramp(r - np.abs(y))
     if shape == "doubled":
@@ -93,7 +97,7 @@ def draw(
     centers: NDArray[np.float64],
     strength: NDArray[np.float64],
     group: NDArray[np.int64],
-    radius: float,
+    radii: NDArray[np.float64],
     *,
     half: int,
     shape: str = "round",
@@ -104,7 +108,7 @@ def draw(
 
     canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT`.
     centers : (N, 2) positions without the padding, px. strength : (N,) opacity, 0 to 1.
-    radius : px. half : see `half_patch`.
+    radii : (N,), px. half : see `half_patch`.
     bright : grey level of a bright marker, None for dark ones. deform : (N, 2, 2), Jacobian from the image to
     the gel; None for the identity.
     """
@@ -126,6 +130,7 @@ def draw(
         if deform is not None:
             m = deform[chosen].astype(np.float32)[:, :, :, None, None]
             dx, dy = m[:, 0, 0] * dx + m[:, 0, 1] * dy, m[:, 1, 0] * dx + m[:, 1, 1] * dy
+        radius = radii[chosen, None, None].astype(np.float32)
         opaque = coverage(dx, dy, radius, shape) * strength[chosen].astype(np.float32)[:, None, None]
         rows = anchor[chosen, 1, None] + half + span
         columns = anchor[chosen, 0, None] + half + span

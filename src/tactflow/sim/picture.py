@@ -46,7 +46,7 @@ class Painter:
         self._layout = layout
         self._light = light.LIGHTS[settings.light]
         widened = 1.0 if camera.identity else 1.6 if settings.perspective else 1.2
-        self._half = markers.half_patch(layout.radius, settings.shape, widened)
+        self._half = markers.half_patch(layout.radius * (1.0 + settings.sizes), settings.shape, widened)
 
     def frame(
         self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_]
@@ -105,6 +105,8 @@ class Painter:
         if settings.speckle:
             shade = self._speckle(pressed) if pressed else self._resting_speckle
             canvas = np.asarray(cv2.multiply(canvas, cv2.merge([shade] * 3), dtype=cv2.CV_16S), np.int16)
+        if settings.stray:
+            canvas = self._with_reflections(canvas, pressed)
         if settings.blur:
             canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), settings.blur), dtype=np.int16)
         if settings.gain:
@@ -164,6 +166,8 @@ class Painter:
             image *= (np.float32(1.0) - np.float32(settings.vignette) * radius)[..., None]
         if settings.perspective:
             image *= self._gel_window()
+        if settings.leds:
+            image += np.float32(255.0) * light.leds(SIZE, settings.leds)[..., None]
         if settings.aperture:
             image *= self._aperture[..., None]
         np.clip(image, 0, 500, out=image)
@@ -200,7 +204,8 @@ class Painter:
             centers = camera.to_raw(rest + gel.displacement(pressed, rest))
             # Specks may overlap, so each is drawn separately.
             groups = np.arange(len(rest))
-            markers.draw(canvas, centers, strength, groups, layout.radius, half=self._half, deform=deform)
+            radii = np.full(len(rest), layout.radius)
+            markers.draw(canvas, centers, strength, groups, radii, half=self._half, deform=deform)
         now = layout.rest + gel.displacement(pressed, layout.rest)
         raw = camera.to_raw(now)
         markers.draw(
@@ -208,7 +213,7 @@ class Painter:
             raw,
             layout.contrast * shown * camera.aperture(raw),
             layout.group,
-            layout.radius,
+            layout.radii,
             shape=settings.shape,
             bright=_BRIGHT_MARKER if settings.polarity == "bright" else None,
             half=self._half,
@@ -244,6 +249,18 @@ class Painter:
         x, y = source[..., 0].astype(np.float32), source[..., 1].astype(np.float32)
         shade = cv2.remap(pattern, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         return np.asarray(shade, dtype=np.float32)
+
+    def _with_reflections(self, canvas: Canvas, pressed: Sequence[gel.Press]) -> Canvas:
+        """Add the stray reflection of each contact, a bright streak on the opposite side of the frame."""
+        center = np.array(SIZE) / 2.0
+        for press in pressed:
+            away = center - self._camera.to_raw(np.array([press.x, press.y]))
+            away /= max(float(np.hypot(*away)), 1.0)
+            x, y = center + away * (320.0, 220.0)
+            level = 90.0 * self._settings.stray * press.depth / press.shape.depth * FIXED_POINT
+            streak = np.float32(level) * light.spot(SIZE, (x, y), (16.0, 48.0))
+            canvas = np.asarray(cv2.add(canvas, cv2.merge([streak] * 3), dtype=cv2.CV_16S), np.int16)
+        return canvas
 
     def _shade(self, padded: Canvas, press: gel.Press) -> None:
         """Shade the part of a padded canvas that a contact deforms, in place."""

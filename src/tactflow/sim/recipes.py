@@ -135,6 +135,7 @@ SCENES: dict[str, Recipe] = {
         _PRESS,
         {"noise": 6.0, "shot": 3.0, "hot": 40, "jpeg": 70, "blur": 1.0},
     ),
+    "stutter": Recipe("a camera that drops and repeats frames", _PRESS, {"dropped": 0.1, "repeated": 0.1}),
     "strong_shear": Recipe(
         "a ball that moves markers by up to 1.5 pitches",
         Programme(_sphere, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2),
@@ -156,9 +157,17 @@ SCENES: dict[str, Recipe] = {
         _PRESS,
         {"aperture": 0.95, "vignette": 0.7, "drift": 0.18},
     ),
+    "block": Recipe(
+        "a grooved block that covers a quarter of the gel",
+        Programme(lambda _: (shapes.block(),), wander=(60.0, 50.0), angles=(-40.0, 40.0), dilation=0.1),
+    ),
     "coin": Recipe(
         "a coin: a large disc with a raised rim and figures",
         Programme(lambda _: (shapes.coin(),), wander=(120.0, 80.0), angles=(-90.0, 90.0), dilation=0.1),
+    ),
+    "key": Recipe(
+        "a flat key",
+        Programme(lambda _: (shapes.key(),), wander=(90.0, 60.0), angles=(-40.0, 40.0), dilation=0.1),
     ),
     "long_edge": Recipe(
         "the edge of a box, one flank steep and one flat, at several angles",
@@ -182,5 +191,16 @@ SCENES: dict[str, Recipe] = {
         _PRESS,
         {"light": "darkening", "markers": (0, 0)},
     ),
+    "painted": Recipe(
+        "markers of many sizes without a regular grid, seen by a tilted camera",
+        _PRESS,
+        {"markers": (13, 10), "sizes": 0.7, "jitter": 0.06, "perspective": 0.12},
+    ),
     "speckle": Recipe("random blotches instead of markers", _PRESS, {"markers": (0, 0), "speckle": 0.6}),
+    "leds": Recipe(
+        "faint bright markers, and six glaring LEDs beside them",
+        _PRESS,
+        {"polarity": "bright", "worn": 1.0, "leds": 6, "markers": (13, 10)},
+    ),
+    "stray": Recipe("presses that cause a reflection on the far side of the gel", _PRESS, {"stray": 0.8}),
 }  # fmt: skip

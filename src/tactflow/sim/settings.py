@@ -42,6 +42,7 @@ class Settings(BaseModel):
     )
     dot: float = _number(0, 0, 60, "radius of a marker, px; 0 fits it to the pitch")
     pitch: float = _number(0, 0, 400, "distance between markers, px; 0 fits the grid to the frame")
+    sizes: float = _number(0, 0, 0.8, "largest deviation of a marker's radius from the mean, relative")
     shape: Literal["round", "square", "doubled"] = Field(
         "round", description="shape of a marker (round|square|doubled)"
     )
@@ -67,11 +68,15 @@ class Settings(BaseModel):
     lamp: float = _number(0, -0.5, 0.5, "light of a lamp that comes on before the second half, relative")
     vignette: float = _number(0.2, 0, 1, "loss of light in the corners, relative")
     specular: float = _number(0, 0, 1, "strength of mirror-like highlights")
+    stray: float = _number(0, 0, 1, "strength of the reflection of a contact on the far side of the gel")
+    leds: int = _number(0, 0, 40, "number of glaring LEDs at the upper and lower border of the frame")
     texture: float = _number(1, 0, 10, "grain of the gel's coating, % of the light")
     blur: float = _number(0, 0, 20, "standard deviation of a Gaussian blur in addition to the lens's own, px")
     jpeg: int = _number(0, 0, 100, "quality of a JPEG round trip; 0 for none")
     gain: float = _number(0, 0, 0.5, "amplitude of bands of gain that roll over the frame, relative")
     hot: int = _number(0, 0, 10_000, "number of hot pixels")
+    dropped: float = _number(0, 0, 0.9, "fraction of moments that the camera misses")
+    repeated: float = _number(0, 0, 0.9, "fraction of frames that are delivered twice")
     perspective: float = _number(
         0, 0, 0.4, "tilt of the camera: how far the lower corners move in, of half the width"
     )

@@ -200,6 +200,35 @@ def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Sha
     return Shape("coin", gap, radius + 90, depth, np.zeros((1, 2)), 0.8 * radius)
 
 
+def block(half_width: float = 215.0, half_height: float = 135.0, depth: float = 12.0) -> Shape:
+    """A large flat punch with grooves across it, 5 px deep, that also make contact."""
+    plain = box(half_width, half_height, 14.0, depth)
+
+    def gap(x: Array, y: Array) -> Array:
+        groove = np.float32(0.5) - np.float32(0.5) * np.cos(x * np.float32(2 * np.pi / 43.0))
+        return np.asarray(plain.gap(x, y) + np.float32(5.0) * groove**4, dtype=np.float32)
+
+    return Shape("block", gap, plain.reach, depth, plain.sources, plain.spread)
+
+
+def key(depth: float = 11.0) -> Shape:
+    """A flat key along x: a bow with a hole, a shaft, and teeth of several lengths."""
+    canvas = np.full((330, 560), 255, np.uint8)
+    cv2.circle(canvas, (145, 165), 85, (0.0,), -1)
+    cv2.circle(canvas, (115, 165), 26, (255.0,), -1)
+    cv2.rectangle(canvas, (215, 142), (485, 182), (0.0,), -1)
+    for number, length in enumerate((26, 14, 34, 20)):
+        cv2.rectangle(canvas, (330 + 40 * number, 182), (350 + 40 * number, 182 + length), (0.0,), -1)
+    distance = cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # The blur smooths the steps of distances between pixels along the outline.
+    outside = _lookup(np.asarray(cv2.GaussianBlur(distance, (0, 0), 1.2), dtype=np.float32), 60.0)
+
+    def gap(x: Array, y: Array) -> Array:
+        return _flank(outside(x, y))
+
+    return Shape("key", gap, 290.0, depth, _segment(150.0, 7), 75.0)
+
+
 def screw(
     radius: float = 62.0,
     half_length: float = 190.0,
