@@ -29,8 +29,7 @@ from tactflow.vision.contact import detector as contact
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import PixelMapping, Preprocessor
 from tactflow.vision.markers import detection as markers
-from tactflow.vision.markers import inpaint, template, tracking
-from tactflow.vision.markers import mask as marker_mask
+from tactflow.vision.markers import template, tracking
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
 from tactflow.vision.types import Contact, Ellipse, Markers
 from tests.oracles import border as oracle
@@ -186,15 +185,6 @@ def test_single_precision_costs_the_fit_of_the_light_nothing() -> None:
     assert double.dtype == np.float64
     # The bound of the docstring, grey levels; measured 2.4e-6.
     assert np.abs(single - double).max() <= 1e-3
-
-
-def test_single_precision_costs_the_filling_at_most_a_rounding() -> None:
-    pictures = gel()
-    dot = marker_mask.find_dot(pictures.reference)
-    assert dot is not None
-    mask = marker_mask.marker_mask(pictures.touched, dot)
-    single, double = both(lambda: inpaint.remove_markers(pictures.touched, mask), inpaint)
-    assert int(np.abs(single.astype(int) - double).max()) <= 1
 
 
 def test_single_precision_moves_the_border_of_the_scripts_mask_by_at_most_a_pixel() -> None:

@@ -32,6 +32,8 @@ from functools import cached_property
 from importlib import import_module
 from typing import Any, Final, Generic, ParamSpec, TypeVar
 
+import numpy as np
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -60,8 +62,20 @@ class Kernel(Generic[P, R]):
         self._signature = signature
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        found: R = self.compiled(*args, **kwargs)
-        return found
+        try:
+            result: R = self.compiled(*args, **kwargs)
+        except TypeError:
+            # To numba a read-only array, such as the image of a frame, is of another type.
+            copies: Any = [_writable(value) for value in args]
+            if all(copy is value for copy, value in zip(copies, args, strict=True)):
+                raise
+            result = self.compiled(*copies, **kwargs)
+            given: Any = args
+            if not all(np.array_equal(copy, value) for copy, value in zip(copies, given, strict=True)):
+                raise TypeError(
+                    f"{self.__name__}: required an array to write to, got a read-only one"
+                ) from None
+        return result
 
     @cached_property
     def compiled(self) -> Any:
@@ -85,6 +99,11 @@ class Kernel(Generic[P, R]):
         if not found.stats.cache_hits:
             _say_progress(sum("compiled" not in vars(each) for each in _kernels) - 1)
         return found
+
+
+def _writable(value: object) -> object:
+    """A copy of a read-only array; anything else unchanged."""
+    return value.copy() if isinstance(value, np.ndarray) and not value.flags.writeable else value
 
 
 class Helper(Generic[P, R]):
