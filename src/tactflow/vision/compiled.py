@@ -71,7 +71,9 @@ class Kernel(Generic[P, R]):
                 raise
             result = self.compiled(*copies, **kwargs)
             given: Any = args
-            if not all(np.array_equal(copy, value) for copy, value in zip(copies, given, strict=True)):
+            if not all(
+                np.array_equal(copy, value, equal_nan=True) for copy, value in zip(copies, given, strict=True)
+            ):
                 raise TypeError(
                     f"{self.__name__}: required an array to write to, got a read-only one"
                 ) from None
