@@ -82,7 +82,7 @@ def raise_mask(level: Float, top: int, left: int, mask: Mask) -> bool:
     return bool(any_bits)
 
 
-@kernel("void(uint8[:, ::1], int64, int64, uint8[:, ::1], uint8[:, ::1])")
+@kernel("void(Array(uint8, 2, 'C', readonly=True), int64, int64, uint8[:, ::1], uint8[:, ::1])")
 def halve_window(mask: Mask, top: int, left: int, inside: Mask, halved: Mask) -> None:
     """What `window_mask` does at half resolution; `halved`, (2 h, 2 w), is filled."""
     (rows, columns), (high, wide) = mask.shape, halved.shape
