@@ -77,6 +77,18 @@ def test_a_recording_that_kills_its_worker_fails_and_the_others_are_done(
     assert not list((folder / "out" / "unfinished").iterdir())
 
 
+def test_python_files_beside_the_recordings_are_not_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("signal", "socket", "struct", "select", "pickle", "array", "cv2"):
+        (folder / f"{module}.py").write_text("open('ran', 'w'); raise SystemError('not this one')")
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    command = [sys.executable, "-P", "-m", "tactflow", *batch("a.npy", "b.npy", "--workers", "2")]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not (folder / "ran").exists()
+
+
 def is_running(pid: int) -> bool:
     try:
         os.kill(pid, 0)

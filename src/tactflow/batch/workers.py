@@ -65,7 +65,9 @@ class LocalProcesses:
     def _new_pool(self) -> ProcessPoolExecutor:
         # Not fork: this process has threads, and OpenCV may hold locks.
         context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.slots, context, initializer=_begin)
+        # The queues of a pool start multiprocessing's resource tracker.
+        with starting_children():
+            return ProcessPoolExecutor(self.slots, context, initializer=_begin)
 
     def submit(self, task: Task) -> Future[Outcome]:
         """See `Workers.submit`."""
