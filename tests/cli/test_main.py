@@ -200,3 +200,11 @@ def test_a_line_of_statistics_and_the_summary_are_printed_on_standard_error(
     assert out == ""
     assert " frames/s; " in err
     assert " frames in " in err
+
+
+def test_a_limit_on_which_opencv_would_abort_is_refused() -> None:
+    environment = {**os.environ, "OPENCV_IO_MAX_IMAGE_PIXELS": "abc"}
+    command = [sys.executable, "-m", "tactflow", "check", "default"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "OPENCV_IO_MAX_IMAGE_PIXELS is 'abc'; required: a number" in done.stderr

@@ -377,3 +377,41 @@ sinks:
         ConfigError, match=r"pipeline\.yaml:5:3  sinks\.jsonl: .*is what stages\.capture reads"
     ):
         load_pipeline(tmp_path / "pipeline.yaml")
+
+
+@pytest.mark.parametrize(
+    ("written", "what"), [("pipeline.yaml", "the pipeline file"), ("mine.py", "the code of mine")]
+)
+def test_a_sink_never_writes_over_the_pipeline_or_its_code(tmp_path: Path, written: str, what: str) -> None:
+    (tmp_path / "mine.py").write_text(
+        """
+from tactflow import Stage
+from tactflow.ports import Image
+
+class Mine(Stage):
+    memory = "pure"
+
+    def process(self, image: Image) -> Image:
+        return image
+"""
+    )
+    text = f"""
+stages:
+  capture: {{source: "sim:press"}}
+  mine: {{use: ./mine.py, in: {{image: capture.image}}}}
+sinks:
+  jsonl: {{path: "{tmp_path / written}", overwrite: true}}
+"""
+    (tmp_path / "pipeline.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=f"{written} is {what}; choose another path"):
+        load_pipeline(tmp_path / "pipeline.yaml")
+    assert (tmp_path / "pipeline.yaml").read_text() == text
+
+
+@pytest.mark.parametrize("file", ["/dev/zero", "./large.py"])
+def test_code_is_read_from_regular_files_of_a_sane_size(tmp_path: Path, file: str) -> None:
+    (tmp_path / "large.py").write_text("#" * (1 << 20) + "\n")
+    text = f'stages: {{capture: {{source: "sim:press"}}, mine: {{use: "{file}"}}}}'
+    (tmp_path / "pipeline.yaml").write_text(text)
+    with pytest.raises(ConfigError, match="required a Python file of up to 1024 KiB"):
+        load_pipeline(tmp_path / "pipeline.yaml")

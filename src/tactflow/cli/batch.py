@@ -138,7 +138,9 @@ class _Call:
     def _work(self, request: Request, store: Store, scratch: Path, plan: Plan) -> Result:
         args = self._args
         workers = (
-            DaskCluster(args.scheduler) if args.scheduler else LocalProcesses(args.workers or processors())
+            DaskCluster(args.scheduler)
+            if args.scheduler is not None
+            else LocalProcesses(args.workers or processors())
         )
         self._say(f"on {workers.description}")
         batch = Batch(store, scratch, request, workers, lambda: self.signals, args.fail_fast)

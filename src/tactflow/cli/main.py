@@ -13,7 +13,7 @@ from typing import Final, NoReturn
 
 from tactflow import __version__
 from tactflow.cli.terminal import printable
-from tactflow.engine.errors import TactflowError
+from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.spelling import closest, did_you_mean
 
@@ -61,6 +61,7 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
     before_run : called when the command is imported and its arguments are valid.
     """
     try:
+        _check_environment()
         args = _parse(argv)
         before_run()
         return int(args.run(args))
@@ -74,6 +75,17 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
         return INTERRUPTED
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else 0
+
+
+def _check_environment() -> None:
+    """Refuse limits that are not numbers: importing OpenCV would abort the process."""
+    for name in ("PIXELS", "WIDTH", "HEIGHT"):
+        variable = f"OPENCV_IO_MAX_IMAGE_{name}"
+        value = os.environ.get(variable, "1")
+        if not value.isdecimal():
+            raise ConfigError(
+                f"the environment variable {variable} is {value!r}; required: a number, or unset it"
+            )
 
 
 def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
 from tactflow.config import sensors, wiring
 from tactflow.config.document import Document, described, dotted, read_document
-from tactflow.config.files_used import file_id, files_named, files_written
+from tactflow.config.files_used import FileId, file_id, files_named, files_written
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import Override, add_sinks, apply
 from tactflow.config.registry import Section, code_place, resolve
@@ -58,11 +59,14 @@ def load_pipeline(
     for draft in drafts:
         draft.settings = document.mapping(*draft.keys)
         draft.params = _params(draft, document)
-    drafts = _check_files(drafts, extra_sinks or {}, path.parent, document)
+    calibration = _calibration(document, path.parent)
+    used = {file_id(path): "the pipeline file"} | (
+        {file_id(calibration): "the calibration"} if calibration else {}
+    )
+    drafts = _check_files(drafts, extra_sinks or {}, path.parent, document, used)
     wiring.connect(drafts, document)
     drafts = wiring.ordered(drafts, document)
     _check_needs(drafts, document)
-    calibration = _calibration(document, path.parent)
     document.raise_if_mistaken()
     assert file is not None, "its mistakes were raised"
     entries: dict[str, Entry] = {**file.stages, **file.sinks}
@@ -170,17 +174,28 @@ def _params(draft: Draft, document: Document) -> StageParams | None:
 
 
 def _check_files(
-    drafts: Sequence[Draft], options: Collection[str], directory: Path, document: Document
+    drafts: Sequence[Draft],
+    options: Collection[str],
+    directory: Path,
+    document: Document,
+    used: Mapping[FileId | None, str],
 ) -> list[Draft]:
-    """Report sinks that write the same file, or what a stage reads: its source, a reference.
+    """Report sinks that write the same file, or one that the run reads: source, reference, code, pipeline.
 
+    used : identity of a file that the run reads besides -> what it is.
     Returns the drafts without those that an option adds for a file which the same sink writes anyway.
     """
-    readers = {
-        file_id(path): draft
+    readers = dict(used)
+    readers |= {
+        file_id(path): f"what {dotted(draft.keys)} reads"
         for draft in drafts
         if draft.section == "stages" and draft.params is not None
         for path in files_named(draft.params, directory)
+    }
+    readers |= {
+        file_id(path): f"the code of {draft.id}"
+        for draft in drafts
+        if draft.component and (path := vars(sys.modules[draft.component.cls.__module__]).get("__file__"))
     }
     writers: dict[str, Draft] = {}
     kept = []
@@ -196,8 +211,8 @@ def _check_files(
             document.report(draft.keys, message, at_key=True)
         for path in written:
             writers.setdefault(path, draft)
-            if (reader := readers.get(file_id(path))) and file_id(path):
-                message = f"{path} is what {dotted(reader.keys)} reads; choose another path"
+            if file_id(path) and (reader := readers.get(file_id(path))):
+                message = f"{path} is {reader}; choose another path"
                 document.report(draft.keys, message, at_key=True)
     return kept
 
