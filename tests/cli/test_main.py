@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import subprocess
 import sys
@@ -83,11 +82,6 @@ def test_what_a_command_does_not_need_at_its_start_is_not_imported(imports: str,
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=True
     )
     assert done.stdout.splitlines()[-1] == "set()"
-
-
-def test_garbage_is_collected_while_a_command_runs() -> None:
-    assert main(["pipelines"]) == 0
-    assert gc.isenabled()
 
 
 def test_without_a_name_the_pipeline_in_the_current_folder_is_taken_else_the_packaged_one(

@@ -127,6 +127,20 @@ def test_latest_gives_the_newest_and_counts_what_it_skipped(publisher: Publisher
         assert messages.lost == 99 - (len(seqs) - 1)
 
 
+@pytest.mark.parametrize("latest", [False, True])
+def test_messages_of_several_parts_are_passed_over(latest: bool) -> None:
+    with zmq.Context() as context, context.socket(zmq.XPUB) as foreign:
+        port = foreign.bind_to_random_port("tcp://127.0.0.1")
+        with Subscriber(f"tcp://127.0.0.1:{port}", latest=latest, timeout=LONG) as messages:
+            assert foreign.poll(1000 * LONG)
+            foreign.recv()
+            for _ in range(50):
+                foreign.send_multipart([b"tactflow.main {}", b"second", b"third"])
+            foreign.send(b'tactflow.main {"last": true}')
+            assert messages.receive_json() == b'{"last": true}'
+        foreign.close(linger=0)
+
+
 def test_a_sensor_can_be_chosen_and_its_name_is_matched_whole() -> None:
     publisher = Publisher("main2")
     with (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import os
 import re
 import sys
@@ -113,12 +112,7 @@ def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     command = next((word for word in argv if not word.startswith("-")), None)
-    # Nothing that is imported becomes garbage; looking for it takes a twelfth of the start of a run.
-    gc.disable()
-    try:
-        parser = make_parser([command] if command in COMMANDS else [])
-    finally:
-        gc.enable()
+    parser = make_parser([command] if command in COMMANDS else [])
     if command is not None and command not in COMMANDS:
         parser.error(f"there is no command {command}{did_you_mean(command, COMMANDS, 'there are ')}")
     args, unknown = parser.parse_known_args(argv)

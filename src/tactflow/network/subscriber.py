@@ -55,13 +55,13 @@ class Subscriber(Connection):
     ----------
     endpoint : address that tactflow publishes on.
     sensor : receive only this sensor; None for all.
-    latest : keep only the newest message: for control loops, which want the present and not what is waiting.
-        Otherwise messages wait until they are read.
+    latest : skip to the newest message that waits: for control loops, which want the present. Otherwise
+        messages are received in turn.
     timeout : s without any message after which waiting ends in a TimeoutError, 1e6 at most; None waits for
         ever.
     clock : measures the timeout.
-    backlog : messages that may wait until they are read, without `latest`; what comes then is lost, and
-        counted. 10,000 are nearly three minutes at 60 Hz, and some 140 MB.
+    backlog : messages that may wait until they are read; what comes then is lost, and counted. 10,000 are
+        nearly three minutes at 60 Hz, and some 140 MB.
     keys : the subscriber's folder that `tactflow keys new` makes, where the publisher asks for keys.
 
     Attributes
@@ -104,8 +104,10 @@ class Subscriber(Connection):
         self.malformed = 0
         self._sensor = sensor
         self._last_seq: dict[str, int] = {}
-        kept: dict[int, int | bytes] = {zmq.CONFLATE: 1} if latest else {zmq.RCVHWM: backlog}
-        options = kept | {
+        # Not zmq.CONFLATE, with which a message of several parts aborts the process.
+        self._skipped_at_most = backlog if latest else 0
+        options: dict[int, int | bytes] = {
+            zmq.RCVHWM: backlog,
             zmq.RECONNECT_IVL: FIRST_RETRY_MS,
             zmq.RECONNECT_IVL_MAX: LAST_RETRY_MS,
             # A publisher that has lost its power says no goodbye.
@@ -142,13 +144,24 @@ class Subscriber(Connection):
         while True:
             left = deadline - self._clock.now()
             if self._wait(min(max(left, 0.0), LONGEST_WAIT)):
-                topic, _, body = self._socket.recv().partition(b" ")
-                # The statistics of a run share the beginning of our topic.
-                if body.startswith(b"{") and topic != STATISTICS:
+                body = self._read()
+                for _ in range(self._skipped_at_most):
+                    if not self._socket.poll(0):
+                        break
+                    body = self._read() or body
+                if body:
                     self.received += 1
                     return body
             elif self._clock.now() >= deadline:
                 raise TimeoutError(self._silence())
+
+    def _read(self) -> bytes:
+        """The JSON of the message that waits; empty for one of another kind."""
+        message, *more = self._socket.recv_multipart()
+        topic, _, body = message.partition(b" ")
+        # The statistics of a run share the beginning of our topic.
+        is_result = not more and body.startswith(b"{") and topic != STATISTICS
+        return body if is_result else b""
 
     def _silence(self) -> str:
         what = f"no message from {self.endpoint} for {self.timeout:g} s"
