@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import BinaryIO
 
 import zstandard
@@ -34,6 +35,13 @@ DAMAGE = (
 
 MAGIC = b"\x89MCAP0\r\n"
 """How every MCAP file begins."""
+
+LARGEST_CHUNK = 256 << 20
+"""Bytes of an unpacked chunk, above which it counts as damaged: twice a raw picture of 8K."""
+RECORD_HEAD = 9
+"""Bytes of a record before its content: its kind and its length."""
+MOST_RECORDS = 1_000_000
+"""Records of a chunk, above which it counts as damaged: hours of a sensor's messages."""
 
 _DATA = (Attachment, Channel, DataEnd, Header, Message, Metadata, Schema)
 """All records outside of chunks but the index, which follows from the rest."""
@@ -101,8 +109,36 @@ def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
 def _unpacked(chunk: Chunk, place: Damage) -> Iterator[McapRecord | Damage]:
     """The records of a chunk, or its place if it is damaged."""
     try:
-        records = breakup_chunk(chunk, validate_crc=True)
+        data = _content(chunk)
+        _check_lengths(data)
+        records = breakup_chunk(replace(chunk, data=data, compression=""), validate_crc=True)
     except DAMAGE:
         yield place
     else:
         yield from records
+
+
+def _content(chunk: Chunk) -> bytes:
+    """The unpacked bytes of a chunk. Raises ValueError, before memory is taken, if they are too many."""
+    limit = min(chunk.uncompressed_size, LARGEST_CHUNK)
+    if chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(limit + 1)
+    elif chunk.compression == "lz4":
+        data = import_module("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, max_length=limit + 1)
+    elif chunk.compression:
+        raise ValueError(f"chunks of compression {chunk.compression!r} cannot be read")
+    else:
+        data = chunk.data
+    if len(data) != chunk.uncompressed_size or len(data) > LARGEST_CHUNK:
+        raise ValueError(f"required {chunk.uncompressed_size} bytes, {LARGEST_CHUNK} at most")
+    return data
+
+
+def _check_lengths(data: bytes) -> None:
+    """Raise ValueError if a chunk has a record of kind 0, which no file may have, or too many records."""
+    at = count = 0
+    while at < len(data):
+        count += 1
+        if data[at] == 0 or count > MOST_RECORDS:
+            raise ValueError("is no sequence of records")
+        at += RECORD_HEAD + int.from_bytes(data[at + 1 : at + RECORD_HEAD], "little")
