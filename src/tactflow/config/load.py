@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 from tactflow.config import sensors, wiring
 from tactflow.config.document import Document, described, dotted, read_document
-from tactflow.config.files_used import FileId, file_id, files_named, files_written
+from tactflow.config.files_used import file_id, files_named, files_written
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import Override, add_sinks, apply
 from tactflow.config.registry import Section, code_place, resolve
@@ -60,10 +60,7 @@ def load_pipeline(
         draft.settings = document.mapping(*draft.keys)
         draft.params = _params(draft, document)
     calibration = _calibration(document, path.parent)
-    used = {file_id(path): "the pipeline file"} | (
-        {file_id(calibration): "the calibration"} if calibration else {}
-    )
-    drafts = _check_files(drafts, extra_sinks or {}, path.parent, document, used)
+    drafts = _check_files(drafts, extra_sinks or {}, path, calibration, document)
     wiring.connect(drafts, document)
     drafts = wiring.ordered(drafts, document)
     _check_needs(drafts, document)
@@ -176,21 +173,22 @@ def _params(draft: Draft, document: Document) -> StageParams | None:
 def _check_files(
     drafts: Sequence[Draft],
     options: Collection[str],
-    directory: Path,
+    pipeline: Path,
+    calibration: Path | None,
     document: Document,
-    used: Mapping[FileId | None, str],
 ) -> list[Draft]:
     """Report sinks that write the same file, or one that the run reads: source, reference, code, pipeline.
 
-    used : identity of a file that the run reads besides -> what it is.
     Returns the drafts without those that an option adds for a file which the same sink writes anyway.
     """
-    readers = dict(used)
+    readers = {file_id(pipeline): "the pipeline file"}
+    if calibration:
+        readers[file_id(calibration)] = "the calibration"
     readers |= {
         file_id(path): f"what {dotted(draft.keys)} reads"
         for draft in drafts
         if draft.section == "stages" and draft.params is not None
-        for path in files_named(draft.params, directory)
+        for path in files_named(draft.params, pipeline.parent)
     }
     readers |= {
         file_id(path): f"the code of {draft.id}"
