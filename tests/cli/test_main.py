@@ -196,9 +196,19 @@ def test_a_line_of_statistics_and_the_summary_are_printed_on_standard_error(
     assert " frames in " in err
 
 
-def test_a_limit_on_which_opencv_would_abort_is_refused() -> None:
-    environment = {**os.environ, "OPENCV_IO_MAX_IMAGE_PIXELS": "abc"}
-    command = [sys.executable, "-m", "tactflow", "check", "default"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "OPENCV_IO_MAX_IMAGE_PIXELS is 'abc'; required: a number" in done.stderr
+@pytest.mark.parametrize(("value", "code"), [("abc", 2), ("", 2), ("5kB", 2), ("10Mb", 0), ("1048576", 0)])
+def test_a_limit_on_which_opencv_would_abort_is_refused(
+    value: str, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", value)
+    assert main(["check", "default"]) == code
+    refused = f"OPENCV_IO_MAX_IMAGE_PIXELS is {value!r}; required: a number" in capsys.readouterr().err
+    assert refused == (code != 0)
+
+
+def test_no_name_of_a_file_forges_a_line_of_the_messages(capsys: pytest.CaptureFixture[str]) -> None:
+    for mark in ("\n", "\r", "\u2028", "\u2029", "\x85", "\u202e", "\x1b["):
+        assert main(["run", "--source", f"left{mark}tactflow: INFO: all frames delivered"]) == 4
+        lines = capsys.readouterr().err.splitlines()
+        assert [line for line in lines if line.startswith("tactflow: ")] == lines[:1]
+        assert not any(letter in "".join(lines) for letter in "\x1b\u202e")

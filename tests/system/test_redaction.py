@@ -20,8 +20,21 @@ SECRET = "a-secret-of-some-length"
         f"sensors: {{left: {{sinks.view.token: {SECRET}}}}}",
         f"stages: {{capture: {{source: 'rtsp://me:{SECRET}@camera/1'}}}}",
         f"stages: {{capture: {{source: 'rtsp://me:p@{SECRET}@camera/1'}}}}",
-        f"stages: {{capture: {{source: 'http://camera/video?channel=1&PWD={SECRET}'}}}}",
-        f"stages: {{capture: {{source: 'http://camera/video?access_token={SECRET}'}}}}",
+        *(
+            f"stages: {{capture: {{source: 'http://camera/{path}'}}}}"
+            for path in (
+                f"video?channel=1&PWD={SECRET}",
+                f"video?access_token={SECRET}",
+                f"video?credential={SECRET}",
+                f"video?sig={SECRET}",
+                f"video#token={SECRET}",
+                f"video;password={SECRET}",
+                f"user=admin_password={SECRET}_channel=1.sdp",
+                f"{SECRET}/stream",
+            )
+        ),
+        f"stages: {{capture: {{source: 'rtsp://me:pass/{SECRET}@camera/1'}}}}",
+        f"stages: {{capture: {{source: 'rtsp://{SECRET}/word@camera/1'}}}}",
         f'stages: {{capture: {{source: "rtsp://me:it\'s{SECRET}@camera/1"}}}}',
     ],
 )
@@ -49,7 +62,17 @@ def test_no_error_message_tells_a_secret_of_the_command_line(
     assert said
 
 
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_message_shows_the_host_and_all_of_the_address_when_asked(
+    asked: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TACTFLOW_SHOW_ADDRESSES", "1" if asked else "")
+    assert main(["run", "--source", "ftp://camera:81/gel?channel=2"]) in (2, 4)
+    shown = "--source ftp://camera:81/gel?channel=2)" if asked else "--source ftp://camera:81/...)"
+    assert shown in capsys.readouterr().err
+
+
 def test_what_is_no_secret_stays() -> None:
-    text = "stages: {capture: {source: 'http://camera:81/video?channel=2'}}\nsinks: {view: {token: null}}\n"
+    text = "stages: {capture: {source: 'http://camera:81'}}\nsinks: {view: {token: null, path: 'ipc:///tmp/a'}}\n"
     assert without_secrets(text) == text
     assert public_address("/data/press@2x.avi") == "/data/press@2x.avi"

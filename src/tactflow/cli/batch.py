@@ -128,7 +128,8 @@ class _Call:
             if plan.left and not self.signals:
                 result = self._work(request, store, scratch, plan)
             # Before the table is written, which a full disk may not take.
-            self._say("\n".join(_closing(result, len(plan.done))))
+            for line in _closing(result, len(plan.done)):
+                self._say(line)
             runs = self._runs(request, store, result)
             write_runs(store, runs, self._args.format)
             page = write_page(store, runs, f"{Path(request.file).stem}: {len(runs)} recordings")

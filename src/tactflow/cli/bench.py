@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     worse = regressions(result, stored, scenes)
     verdict = f"{len(worse)} results got worse than in" if worse else "nothing got worse than in"
-    say("\n  ".join([f"tactflow: {verdict} {args.against}", *worse]))
+    say("\n".join([f"tactflow: {verdict} {args.against}", *worse]))
     return WORSE if worse else 0
 
 

@@ -37,7 +37,11 @@ def run(args: argparse.Namespace) -> int:
     if not cameras:
         say(NO_CAMERA)
     for camera in cameras:
-        print(orjson.dumps(asdict(camera)).decode() if args.json else printable("\n".join(describe(camera))))
+        print(
+            orjson.dumps(asdict(camera)).decode()
+            if args.json
+            else "\n".join(map(printable, describe(camera)))
+        )
     return 0
 
 

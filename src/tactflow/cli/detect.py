@@ -73,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
     without = 0.0 if valid is None else float(np.mean(valid == 0))
     if without > 0:
         lines.append(f"dim: {100 * without:.0f} % of the picture show no gel; --all looks there, too")
-    text = "\n".join([title, *lines])
-    print(printable(text))
+    text = "\n".join(map(printable, [title, *lines]))
+    print(text)
     if args.picture is not None:
         _write(args.picture, draw_detection(image, marks, text, rival=rival, valid=valid))
     return 0

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         print(orjson.dumps({**facts, "checks": [asdict(finding) for finding in findings]}).decode())
     else:
         lines = [line for finding in findings for line in _lines(finding)]
-        print(printable("\n".join([title, *lines, summary])))
+        print("\n".join(map(printable, [title, *lines, summary])))
     return StageError.exit_code if verdict == "fault" else 0
 
 

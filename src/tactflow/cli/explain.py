@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph for each stage and sink."""
-    print(printable("\n".join(explanation(*_load(args)))))
+    print("\n".join(map(printable, explanation(*_load(args)))))
     return 0
 
 
@@ -39,7 +39,7 @@ add_arguments_graph = add_arguments
 
 def run_graph(args: argparse.Namespace) -> int:
     """Print the flowchart."""
-    print(printable("\n".join(mermaid(*_load(args)))))
+    print("\n".join(map(printable, mermaid(*_load(args)))))
     return 0
 
 

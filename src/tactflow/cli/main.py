@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import sys
 from collections.abc import Callable, Collection, Sequence
 from importlib import import_module
 from typing import Final, NoReturn
 
 from tactflow import __version__
-from tactflow.cli.terminal import printable
+from tactflow.cli.terminal import say
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.spelling import closest, did_you_mean
@@ -66,9 +65,15 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
         return int(args.run(args))
     except TactflowError as error:
         # Imported here: it reads YAML, which not every command does.
-        from tactflow.system.redaction import public_address
+        from tactflow.system.redaction import shown_address
 
-        print(printable(public_address(f"tactflow: {error}")), file=sys.stderr)
+        mistakes = error.mistakes if isinstance(error, ConfigError) else ()
+        if len(mistakes) > 1:
+            say(f"tactflow: {len(mistakes)} mistakes")
+            for mistake in mistakes:
+                say(shown_address(mistake))
+        else:
+            say(shown_address(f"tactflow: {error}"))
         return error.exit_code
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -77,14 +82,12 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
 
 
 def _check_environment() -> None:
-    """Refuse limits that are not numbers: importing OpenCV would abort the process."""
+    """Refuse limits that OpenCV cannot read: importing it would abort the process."""
     for name in ("PIXELS", "WIDTH", "HEIGHT"):
         variable = f"OPENCV_IO_MAX_IMAGE_{name}"
         value = os.environ.get(variable, "1")
-        if not value.isdecimal():
-            raise ConfigError(
-                f"the environment variable {variable} is {value!r}; required: a number, or unset it"
-            )
+        if not re.fullmatch(r"\d+(MB|Mb|mb|KB|Kb|kb)?", value, re.ASCII):
+            raise ConfigError(f"the environment variable {variable} is {value!r}; required: a number")
 
 
 def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:

@@ -29,7 +29,7 @@ from tactflow.fleet.heartbeat import HANG_AFTER, Headway, start_beating
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 from tactflow.system.files import is_device, next_name
-from tactflow.system.redaction import public_address
+from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED
 
 REPORTS = {"--stats": '{\n "frames":', "--trace": TRACE_BEGINS}
@@ -166,7 +166,7 @@ def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
 def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks) -> Pipeline:
     source_values = []
     if args.source is not None:
-        address = f" {public_address(args.source)}" if args.source.isprintable() else ""
+        address = f" {shown_address(args.source)}" if args.source.isprintable() else ""
         source_values.append(Override("source", args.source, f"--source{address}"))
     if args.realtime:
         source_values.append(Override("realtime", value=True, origin="--realtime"))

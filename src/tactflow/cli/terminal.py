@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import shlex
 import subprocess
 import sys
@@ -11,16 +10,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
+def printable(line: str) -> str:
+    """One line from files, cameras and the network, without characters that control a terminal.
 
-def printable(text: str) -> str:
-    """Text from files, cameras and the network without characters that would control the terminal.
+    Line breaks and marks that turn the direction of writing are among them: no name can forge a second line.
 
-    >>> printable("left\\x1b[2J, no\\ttab")
-    'left?[2J, no\\ttab'
+    >>> printable("left\\x1b[2J, no\\ttab, \\u202etxt\\nOK")
+    'left?[2J, no\\ttab, ?txt?OK'
     """
-    return _CONTROL.sub("?", text)
+    return "".join(letter if letter.isprintable() or letter == "\t" else "?" for letter in line)
 
 
 def typed(*words: str) -> str:
@@ -33,8 +32,11 @@ def typed(*words: str) -> str:
 
 
 def say(text: str) -> None:
-    """Print what is not a result: on standard error, safe for a terminal."""
-    print(printable(text), file=sys.stderr)
+    """Print what is not a result, on standard error. Lines behind the first are indented.
+
+    So every line that is not indented is one of the program's own, whatever a name in the text holds.
+    """
+    print("\n  ".join(map(printable, text.split("\n"))), file=sys.stderr)
 
 
 def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:

@@ -94,14 +94,14 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(orjson.dumps(report.as_json(tuned), option=orjson.OPT_NON_STR_KEYS).decode())
     else:
-        print(printable("\n".join(report.lines(tuned))))
+        print("\n".join(map(printable, report.lines(tuned))))
     if page is not None:
         report.write_page(page, tuned)
     if tuned.chosen is None:
         say(impossible(tuned))
         return StageError.exit_code
     # YAML takes no control characters, which a name in a comment may have.
-    text = printable(report.pipeline_text(tuned, file, args.out))
+    text = "\n".join(map(printable, report.pipeline_text(tuned, file, args.out).split("\n")))
     try:
         with completed(args.out) as unfinished:
             unfinished.write_text(text, encoding="utf-8")

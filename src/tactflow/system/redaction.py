@@ -2,29 +2,44 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 import yaml
 
-# Up to the last @, since a password may have one in it, and quotes too.
-_USER = re.compile(r"(?<=//)[^/\s]*@")
-_IN_QUERY = re.compile(
-    r"([?&][\w.-]*(?:user|usr|login|pass|pwd|token|auth|key|secret)[\w.-]*=)[^&\s'\"]+", re.IGNORECASE
-)
+_ADDRESS = re.compile(r"\b(?!ipc:|file:)([A-Za-z][A-Za-z0-9+.-]*://)(\S*)")
+SHOW: Final = "TACTFLOW_SHOW_ADDRESSES"
+"""The environment variable that lets messages on the terminal show addresses as they were given."""
 _KEYS = ("token", "password")
 """Parameters of stages and sinks whose values are secret."""
 _SETTING = re.compile(rf"\b({'|'.join(_KEYS)})(\s*[=:]\s*)[^\s,}}]+")
 
 
 def public_address(text: str) -> str:
-    """Addresses without user names and passwords.
+    """Addresses with their scheme and host only: user, path and query may be, or hold, a password.
 
-    >>> public_address("rtsp://me:p@ss@camera/1?channel=2&pwd=1234")
-    'rtsp://camera/1?channel=2&pwd=removed'
+    >>> public_address("rtsp://me:p@ss@camera:554/1?channel=2&pwd=1234: no stream")
+    'rtsp://camera:554/...: no stream'
     """
-    return _IN_QUERY.sub(r"\1removed", _USER.sub("", text))
+    return _ADDRESS.sub(_scheme_and_host, text)
+
+
+def shown_address(text: str) -> str:
+    """`public_address`, unless the environment variable TACTFLOW_SHOW_ADDRESSES asks for all of it."""
+    return text if os.environ.get(SHOW) else public_address(text)
+
+
+def _scheme_and_host(address: re.Match[str]) -> str:
+    scheme, rest = address[1], address[2].rstrip("]:;,.'\")}>")
+    behind = address[2][len(rest) :]  # belongs to the sentence or the YAML around the address
+    front = re.split(r"[/?#;]", rest, maxsplit=1)[0]
+    host = front.rpartition("@")[2]
+    if "@" in rest[len(front) :]:
+        # A password may hold a slash, so what stands in front of it is not known to be the host.
+        return f"{scheme}...{behind}"
+    return f"{scheme}{host}{'' if rest == front else '/...'}{behind}"
 
 
 def public_setting(text: str) -> str:
@@ -40,7 +55,7 @@ def without_secrets(text: str) -> str:
     """The text of a pipeline without passwords in addresses and without tokens, for files that are shared.
 
     >>> print(without_secrets("{source: rtsp://me:pass@camera/1, token: abc, host: null}"))
-    {source: rtsp://camera/1, token: removed, host: null}
+    {source: rtsp://camera/..., token: removed, host: null}
     """
     try:
         document = yaml.safe_load(text)
