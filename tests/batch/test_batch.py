@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -76,6 +77,24 @@ def test_the_page_has_pictures_and_plots_in_one_file(call: Call) -> None:
     assert page.count("data:image/jpeg;base64,") == 2
     assert page.count("time, s</text>") == 2
     assert not re.search(r"(?:src|href)=\"?https?:", page)
+
+
+def test_a_worker_does_not_import_matplotlib_and_the_page_of_an_older_folder_is_kept(call: Call) -> None:
+    assert call("--workers", "1") == 0
+    code = (
+        "import sys\nfrom tactflow.batch.recordings import find_recordings\n"
+        "from tactflow.batch.work import Task, resolved, work\nfrom pathlib import Path\n"
+        "task = Task(find_recordings(['rec'])[0], resolved(Path('p.yaml'), [], None, 'jsonl'), 'out', '.')\n"
+        "assert work(task).status == 'done'\nassert 'matplotlib' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    # Older versions stored the drawn page alone.
+    for preview in (call.folder / "out" / "records").glob("*.preview"):
+        preview.with_suffix(".html").write_text("<p>drawn before</p>")
+        preview.unlink()
+    assert call() == 0
+    assert "0 done now, 2 done before, 0 failed" in call.told
+    assert (call.folder / "out" / "index.html").read_text().count("drawn before") == 2
 
 
 def test_only_what_has_changed_is_done_again(call: Call) -> None:

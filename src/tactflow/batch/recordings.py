@@ -12,19 +12,11 @@ from itertools import count
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.sources import recording_suffixes
 from tactflow.sources.files import IMAGE_SUFFIXES, matching, natural_key
 from tactflow.sources.paths import find_path, split_prefix
 from tactflow.system.files import expanded, is_utf8
 
-FILE_SUFFIXES = frozenset(
-    [
-        *(".avi", ".bag", ".h5", ".hdf5", ".m4v", ".mcap", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg"),
-        *(".npy", ".ogv", ".webm", ".wmv"),
-    ]
-)
-"""Suffixes of recordings within a folder; a file named explicitly may have any suffix."""
-FOLDERS = frozenset([".zarr"])
-"""Suffixes of folders that are a single recording."""
 LISTS = frozenset([".txt", ".list"])
 """Suffixes of files that list recordings, one per line."""
 _MAX_MISTAKES = 10
@@ -125,7 +117,7 @@ def _sources(word: str, directory: Path | None) -> Iterator[str]:
     path = find_path(plain, directory)
     if path.suffix.lower() in LISTS and path.is_file():
         raise SourceError(f"{word}: is a list of recordings; lists cannot be nested")
-    if path.is_dir() and not mark and path.suffix.lower() not in FOLDERS:
+    if path.is_dir() and not mark and not _is_recording(path.name):
         recordings = list(_inside(path))
         if not recordings:
             raise SourceError(f"{word}: this folder contains no recordings")
@@ -151,22 +143,27 @@ def _matching(pattern: str, directory: Path | None) -> Iterator[str]:
         yield os.path.abspath(full)
         return
     for path in paths:
-        if path.is_dir() and path.suffix.lower() not in FOLDERS:
-            yield from _inside(path)
-        elif path.suffix.lower() in FILE_SUFFIXES | FOLDERS:
+        if _is_recording(path.name):
             yield os.path.abspath(path)
+        elif path.is_dir():
+            yield from _inside(path)
+
+
+def _is_recording(name: str) -> bool:
+    """Whether a file or folder found in a folder is a recording; one named explicitly may have any suffix."""
+    return os.path.splitext(name)[1].lower() in recording_suffixes()
 
 
 def _inside(folder: Path) -> Iterator[str]:
     """Recordings in a folder and its subfolders; a folder of pictures is a single recording."""
     for parent, folders, files in os.walk(folder):
-        stores = sorted((n for n in folders if Path(n).suffix.lower() in FOLDERS), key=natural_key)
+        stores = [name for name in folders if _is_recording(name)]
         folders[:] = sorted((n for n in folders if n[0] != "." and n not in stores), key=natural_key)
-        names = sorted((name for name in files if name[0] != "."), key=natural_key)
+        names = [name for name in files if name[0] != "."]
         if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
             yield os.path.abspath(parent)
-        for name in (*stores, *(n for n in names if Path(n).suffix.lower() in FILE_SUFFIXES)):
-            yield os.path.abspath(Path(parent, name))
+        for found in (stores, filter(_is_recording, names)):
+            yield from (os.path.abspath(Path(parent, name)) for name in sorted(found, key=natural_key))
 
 
 def _short_names(sources: Sequence[str]) -> list[str]:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import base64
+import functools
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import orjson
+from numpy.typing import NDArray
 
 from tactflow.batch.recordings import Recording
 from tactflow.batch.store import Format, Outcome, Store
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.report import Html, Section, Table, link, mark, write_report
+from tactflow.report import COLORS, Html, Section, Table, figure, link, mark, picture, write_report
 from tactflow.system.extras import missing
 from tactflow.system.files import completed
 
@@ -68,7 +73,10 @@ def write_page(store: Store, runs: Runs, title: str) -> Path:
     shown = ordered[:MAX_DETAILS]
     if len(shown) < len(ordered):
         text += f"\n\nDetails of {len(shown)} of {len(ordered)} recordings, failed ones first."
-    sections = [Section("Runs", tables=[_table(ordered)]), *(_details(store, *run) for run in shown)]
+    try:
+        sections = [Section("Runs", tables=[_table(ordered)]), *(_details(store, *run) for run in shown)]
+    except OSError as error:
+        raise StageError(f"{store.records}: cannot be used: {error.strerror or error}") from error
     return write_report(store.path / "index.html", title, sections, text)
 
 
@@ -93,5 +101,43 @@ def _details(store: Store, recording: Recording, outcome: Outcome) -> Section:
     """Error of a failed recording, or plot and pictures of a finished one."""
     path = recording.source if recording.source != recording.name else None
     text = "\n\n".join(filter(None, (outcome.error, outcome.warnings, path)))
-    pictures = [Html(store.preview(recording))] if outcome.status == "done" else []
+    pictures = [Html(store.preview_html(recording, _preview))] if outcome.status == "done" else []
     return Section(recording.name, text, pictures)
+
+
+def _preview(preview: bytes) -> str:
+    """Plot and pictures of `Summary.preview` as HTML; only the pictures without matplotlib."""
+    content = orjson.loads(preview)
+    pictures = [picture(base64.b64decode(jpeg), f"{t:.2f} s") for t, jpeg in content["pictures"]]
+    with suppress(ConfigError):
+        # JSON has null for NaN.
+        pictures.insert(0, picture(_plot(np.array(content["points"], float).reshape(-1, 4))))
+    return "".join(pictures)
+
+
+@functools.cache
+def _axes() -> tuple[Any, Any]:
+    """A figure reused for all recordings: a new one for each takes three times as long (0.2 s)."""
+    drawing, axes = figure(3, 1, size=(4.2, 2.8), sharex=True)
+    for axis, label, color in zip(axes, ("area, px²", "flow, px", "angle, °"), COLORS[:3], strict=True):
+        axis.plot([], [], color=color)
+        axis.set_ylabel(label, fontsize=8)
+        axis.tick_params(labelsize=8)
+    axes[2].set_xlabel("time, s", fontsize=8)
+    drawing.align_ylabels()
+    # Freeze the layout with the widest labels expected, px^2.
+    axes[0].set_ylim(0, 90_000)
+    drawing.draw_without_rendering()
+    drawing.set_layout_engine("none")
+    return drawing, axes
+
+
+def _plot(points: NDArray[np.float64]) -> Any:
+    """Plot the points (N, 4) of a recording."""
+    drawing, axes = _axes()
+    for axis, curve in zip(axes, points.T[1:], strict=True):
+        axis.lines[0].set_data(points[:, 0], curve)
+        axis.relim()
+        axis.autoscale(axis="both")
+    axes[2].set_ylim(-90, 90)
+    return drawing

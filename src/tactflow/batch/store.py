@@ -2,7 +2,8 @@
 
     results/NAME            per recording: a folder of Parquet tables, or NAME.jsonl
     records/NAME.json       its outcome, written after the result
-    records/NAME.html       its plot and pictures for the page
+    records/NAME.preview    the points of its plot and its pictures, JSON
+    records/NAME.html       both as HTML, once the page has shown them
     unfinished/SHARD/       results being written; removed at the end
     runs.parquet, index.html
 
@@ -17,7 +18,7 @@ import hashlib
 import os
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -128,7 +129,7 @@ class Store:
     def outcome(self, recording: Recording) -> Outcome | None:
         """The last outcome of a recording; None without a record, or if it is damaged."""
         try:
-            return _OUTCOME.validate_json((self.records / f"{file_name(recording)}.json").read_bytes())
+            return _OUTCOME.validate_json(self._file(recording, "json").read_bytes())
         except (OSError, ValueError):
             return None
 
@@ -142,20 +143,25 @@ class Store:
         except OSError:
             return False
 
-    def save(self, recording: Recording, outcome: Outcome, preview: str = "") -> None:
-        """Write the record of a recording. preview : HTML for the page. Raises OSError."""
-        name = file_name(recording)
-        for file, content in (
-            (f"{name}.html", preview.encode()),
-            (f"{name}.json", orjson.dumps(asdict(outcome))),
-        ):
-            with completed(self.records / file) as partial:
+    def save(self, recording: Recording, outcome: Outcome, preview: bytes = b"") -> None:
+        """Write the record of a recording. preview : of `Summary.preview`. Raises OSError."""
+        self._file(recording, "html").unlink(missing_ok=True)
+        for suffix, content in (("preview", preview), ("json", orjson.dumps(asdict(outcome)))):
+            with completed(self._file(recording, suffix)) as partial:
                 partial.write_bytes(content)
 
-    def preview(self, recording: Recording) -> str:
-        """Plot and pictures of a recording as HTML, possibly empty."""
-        path = self.records / f"{file_name(recording)}.html"
-        return path.read_text(encoding="utf-8") if path.is_file() else ""
+    def preview_html(self, recording: Recording, draw: Callable[[bytes], str]) -> str:
+        """Plot and pictures of a recording, possibly empty; drawn once. draw : converts its preview."""
+        path = self._file(recording, "html")
+        if not path.is_file():
+            preview = self._file(recording, "preview")
+            html = draw(preview.read_bytes()) if preview.is_file() else ""
+            with completed(path) as partial:
+                partial.write_text(html, encoding="utf-8")
+        return path.read_text(encoding="utf-8")
+
+    def _file(self, recording: Recording, suffix: str) -> Path:
+        return self.records / f"{file_name(recording)}.{suffix}"
 
 
 def file_name(recording: Recording) -> str:

@@ -1,20 +1,21 @@
-"""Content of the page for one recording: contact area, flow and angle over time, and contact pictures."""
+"""Content of the page for one recording: contact area, flow and angle over time, and contact pictures.
+
+The page draws the plot: workers do not import matplotlib, which takes longer than a short recording.
+"""
 
 from __future__ import annotations
 
-import functools
+import base64
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+import orjson
 
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.drawing.results import Annotator
-from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
-from tactflow.report import COLORS, Html, figure, picture
 
 MAX_POINTS = 480
 """Points of a curve after merging neighbours, about two per pixel of the plot; merged at twice as many."""
@@ -94,43 +95,11 @@ class Summary:
         new = _Picture(result.seq, result.t, area, _jpeg(result))
         self._pictures = sorted([*self._pictures, new], key=lambda p: -p.area)[:MAX_PICTURES]
 
-    def html(self) -> str:
-        """Plot and pictures for the page; only the pictures without matplotlib."""
+    def preview(self) -> bytes:
+        """JSON: `points`, (t, area, flow, angle) of each; `pictures`, (t, JPEG in Base64) of each."""
         self._end_contact()
-        pictures = [picture(p.jpeg, f"{p.t:.2f} s") for p in sorted(self._pictures)]
-        try:
-            plot = picture(_plot(np.array(self.points, float).reshape(-1, 4)))
-        except ConfigError:
-            plot = Html()
-        return "".join([plot, *pictures])
-
-
-@functools.cache
-def _axes() -> tuple[Any, Any]:
-    """A figure reused for all recordings: a new one for each takes three times as long (0.2 s)."""
-    drawing, axes = figure(3, 1, size=(4.2, 2.8), sharex=True)
-    for axis, label, color in zip(axes, ("area, px²", "flow, px", "angle, °"), COLORS[:3], strict=True):
-        axis.plot([], [], color=color)
-        axis.set_ylabel(label, fontsize=8)
-        axis.tick_params(labelsize=8)
-    axes[2].set_xlabel("time, s", fontsize=8)
-    drawing.align_ylabels()
-    # Freeze the layout with the widest labels expected, px^2.
-    axes[0].set_ylim(0, 90_000)
-    drawing.draw_without_rendering()
-    drawing.set_layout_engine("none")
-    return drawing, axes
-
-
-def _plot(points: NDArray[np.float64]) -> Any:
-    """Plot the points (N, 4) of a recording."""
-    drawing, axes = _axes()
-    for axis, curve in zip(axes, points.T[1:], strict=True):
-        axis.lines[0].set_data(points[:, 0], curve)
-        axis.relim()
-        axis.autoscale(axis="both")
-    axes[2].set_ylim(-90, 90)
-    return drawing
+        pictures = [(p.t, base64.b64encode(p.jpeg).decode()) for p in sorted(self._pictures)]
+        return orjson.dumps({"points": [tuple(p) for p in self.points], "pictures": pictures})
 
 
 def _jpeg(result: Result) -> bytes:

@@ -201,7 +201,7 @@ def _publish(task: Task, outcome: Outcome, unfinished: Path, summary: Summary) -
         # A rename cannot overwrite a folder.
         remove(path)
     unfinished.replace(path)
-    Store(Path(task.out)).save(task.recording, outcome, summary.html())
+    Store(Path(task.out)).save(task.recording, outcome, summary.preview())
 
 
 def _pipeline_for(task: Task, path: Path) -> Pipeline:

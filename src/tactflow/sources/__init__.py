@@ -35,6 +35,7 @@ __all__ = [
     "Watch",
     "Watched",
     "open_source",
+    "recording_suffixes",
 ]
 
 KINDS = (
@@ -118,6 +119,16 @@ def open_source(
         return Recording(spec, directory)
     opener = _plugin(name, directory)
     return opener(spec, directory, fps) if opener is not None else open_recording(spec, directory, fps)
+
+
+def recording_suffixes() -> frozenset[str]:
+    """Suffixes of files and folders that are a single recording: built-in kinds and those of plug-ins.
+
+    >>> {".avi", ".npy", ".mcap"} <= recording_suffixes()
+    True
+    """
+    registered = (point.name for point in plugins(GROUP))
+    return VIDEO_SUFFIXES | {".npy", ".mcap"} | {name for name in registered if name.startswith(".")}
 
 
 def _open_stream(spec: str, scheme: str, watch: Watch | None) -> FrameReader:
