@@ -91,6 +91,26 @@ def test_what_is_no_frames_is_refused(query: str, tmp_path: Path) -> None:
         open_source(f"{path}{query}")
 
 
+@pytest.mark.parametrize("name", KINDS)
+def test_an_array_whose_chunks_are_not_stored_is_refused(name: str, tmp_path: Path) -> None:
+    path, shape, chunks = KINDS[name](tmp_path / name, frames=IMAGES), (10**12, 12, 16, 3), (2, 12, 16, 3)
+    if name.endswith(".zarr"):
+        array = pytest.importorskip("zarr").create_array(
+            path, name="long", shape=shape, chunks=chunks, dtype="u1"
+        )
+        array[:4] = 7
+    else:
+        with pytest.importorskip("h5py").File(path, "a") as file:
+            file.create_dataset("long", shape, np.uint8, chunks=chunks)[:4] = 7
+            file.create_dataset("nothing", IMAGES.shape, np.uint8)
+        with pytest.raises(SourceError, match="/nothing: 0 of 1 chunks are stored"):
+            open_source(f"{path}?dataset=/nothing")
+    with pytest.raises(
+        SourceError, match="/long: 2 of 500000000000 chunks are stored; was it written to its"
+    ):
+        open_source(f"{path}?dataset=/long")
+
+
 def test_pixels_in_another_file_are_not_read(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra hdf5 is not installed")
     (tmp_path / "secret").write_bytes(bytes(IMAGES.nbytes))

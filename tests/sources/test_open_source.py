@@ -16,7 +16,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tactflow.cli.main import main
 from tactflow.engine.errors import SourceError
+from tactflow.engine.frame import Frame
+from tactflow.message.result import Result
+from tactflow.sinks.record import Record
 from tactflow.sources import FrameReader, base, open_source
 
 Pixels = NDArray[np.uint8]
@@ -132,6 +136,49 @@ def test_16_bit_arrays_have_either_order_of_bytes_and_few_bits_are_pointed_out(
     np.save(tmp_path / "a.npy", FRAMES.astype(">u2") * 257)
     found = read_all(open_source(str(tmp_path / "a.npy")))
     np.testing.assert_array_equal([image for image, _ in found], FRAMES)
+
+
+def one_odd_frame(path: Path, kind: str) -> str:
+    """A recording whose third picture is smaller than those before, or whose pictures are one pixel."""
+    images = [*FRAMES[:2], FRAMES[2, 4:]]
+    if kind == "tactflow":
+        sink = Record(Record.Params(path=f"{path}.mcap", preview=0))
+        sink.open()
+        for index, image in enumerate(images):
+            sink.write(Result(Frame("main", index, index / 30, image, reference=not index)))
+        sink.close()
+        return f"{path}.mcap"
+    if kind == "ROS":
+        pytest.importorskip("rosbags", reason="the extra bags is not installed")
+        from tests.adapters.bags import TOPIC, write_bag
+
+        return f"{write_bag(path, images, 'mcap')}?topic={TOPIC}"
+    pixels = np.full((3, 1, 1, 3), 90, np.uint8)
+    if kind == "HDF5":
+        with pytest.importorskip("h5py", reason="the extra hdf5 is not installed").File(
+            f"{path}.h5", "w"
+        ) as file:
+            file["frames"] = pixels
+        return f"{path}.h5?dataset=/frames"
+    np.save(f"{path}.npy", pixels)
+    return f"{path}.npy"
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("tactflow", "press.mcap, frame 2: this frame is 32 x 20 pixels, the ones before it are 32 x 24"),
+        ("ROS", "press, /gel/image, frame 2: this frame is 32 x 20 pixels"),
+        ("array", "press.npy, frame 0: its pictures are 1 x 1; required 2 x 2 pixels or more"),
+        ("HDF5", "press.h5, /frames, frame 0: its pictures are 1 x 1"),
+    ],
+)
+def test_a_picture_of_a_wrong_size_ends_the_run_with_the_recording_and_the_frame(
+    kind: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = one_odd_frame(tmp_path / "press", kind)
+    assert main(["run", "markerless", "--source", spec, "--set", "sinks={}"]) == 4
+    assert said in capsys.readouterr().err
 
 
 def test_pictures_behind_the_first_of_a_file_are_pointed_out(

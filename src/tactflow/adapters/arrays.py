@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,8 @@ BLOCK = 64 << 20
 """Frames are read chunk by chunk, but not more than so many bytes together. Chosen by hand."""
 LARGEST_CHUNK = 1 << 30
 """Bytes of an uncompressed chunk at most, so that a damaged file does not take all memory. Chosen by hand."""
+ZARR_METADATA = frozenset(["zarr.json", ".zarray", ".zattrs"])
+"""Files that lie beside the chunks of a Zarr array."""
 REQUIRED = "required uint8 or uint16 of N x H x W x 3 (BGR) or N x H x W (gray), or N JPEG or PNG files"
 """What an array of frames is, for messages."""
 
@@ -58,12 +60,18 @@ class ArrayDataset(FrameReader):
         path = find_path(name, directory)
         super().__init__(f"{path}, {settings.get('dataset', '')}")
         self._swapped = settings.get("order") == "rgb"
-        arrays, self._release = _open(path)
+        self._file = file = _open(path)
         try:
-            self._array = _choose(spec, settings.get("dataset"), arrays, "dataset")
+            self._array = _choose(spec, settings.get("dataset"), file.arrays, "dataset")
             self.total = _count(self._array, self.name)
+            # A chunk that nobody wrote reads as the fill value, so that a few bytes can claim any length.
+            stored, needed = file.chunks(self._array)
+            if stored < needed:
+                raise SourceError(
+                    f"{self.name}: {stored} of {needed} chunks are stored; was it written to its end?"
+                )
             if "times" in settings:
-                self._times = self._seconds(_choose(spec, settings["times"], arrays, "times"))
+                self._times = self._seconds(_choose(spec, settings["times"], file.arrays, "times"))
             else:
                 self.fps = fps or DEFAULT_FPS
                 self._times = np.arange(self.total) / self.fps
@@ -76,7 +84,7 @@ class ArrayDataset(FrameReader):
     def close(self) -> None:
         """Close the file."""
         super().close()
-        self._release()
+        self._file.close()
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         for index, (frame, t) in enumerate(zip(_read_chunks(self._array), self._times, strict=True)):
@@ -100,51 +108,77 @@ class ArrayDataset(FrameReader):
         return np.maximum.accumulate(seconds)
 
 
-def _open(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
-    """The arrays of a file by name, and what closes it."""
-    what, extra, package, opener = (
-        ("Zarr files", "zarr", "zarr", _open_zarr)
-        if path.suffix.lower() == ".zarr"
-        else ("HDF5 files", "hdf5", "h5py", _open_hdf5)
-    )
-    problem = missing(what, extra, [package])
+class _Hdf5:
+    """The arrays of an HDF5 file by name."""
+
+    package, extra, what = "h5py", "hdf5", "HDF5 files"
+
+    def __init__(self, path: Path) -> None:
+        import h5py  # type: ignore[import-untyped]
+
+        file = h5py.File(path, "r")
+        self.close = file.close
+        self.arrays: dict[str, Any] = {}
+
+        def visit(name: str, item: Any) -> None:
+            # Not those whose pixels lie in other files, which may be any file of this machine.
+            if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
+                self.arrays[f"/{name}"] = item
+
+        file.visititems(visit)
+
+    @staticmethod
+    def chunks(array: Any) -> tuple[int, int]:
+        """Stored chunks, and how many there are along the first axis."""
+        if array.chunks is None:
+            return array.id.get_storage_size(), 1
+        return array.id.get_num_chunks(), math.ceil(array.shape[0] / array.chunks[0])
+
+
+class _Zarr:
+    """The arrays of a Zarr folder by name."""
+
+    package, extra, what = "zarr", "zarr", "Zarr files"
+
+    def __init__(self, path: Path) -> None:
+        import zarr
+
+        root = zarr.open(str(path), mode="r")
+        members = [("", root)] if isinstance(root, zarr.Array) else root.members(max_depth=None)
+        self.arrays: dict[str, Any] = {
+            f"/{name}": item
+            for name, item in members
+            if isinstance(item, zarr.Array) and not self._is_pickled(item)
+        }
+
+    @staticmethod
+    def _is_pickled(array: Any) -> bool:
+        """Whether reading an array may execute code in it: only new versions of numcodecs refuse to."""
+        codecs = (*(array.filters or ()), *(array.compressors or ()))
+        return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
+
+    @staticmethod
+    def chunks(array: Any) -> tuple[int, int]:
+        """Stored chunks, and how many there are along the first axis."""
+        # Each chunk or shard is a file; the zarr package itself would look for every chunk that may be.
+        files = Path(array.store.root, array.path).rglob("*")
+        stored = sum(file.is_file() and file.name not in ZARR_METADATA for file in files)
+        return stored, math.ceil(array.shape[0] / (array.shards or array.chunks)[0])
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+
+def _open(path: Path) -> _Hdf5 | _Zarr:
+    kind = _Zarr if path.suffix.lower() == ".zarr" else _Hdf5
+    problem = missing(kind.what, kind.extra, [kind.package])
     if problem is not None:
         raise SourceError(f"{path}: {problem}")
     refuse_devices(path)
     try:
-        return opener(path)
+        return kind(path)
     except Exception as error:
         raise damaged(str(path), error) from error
-
-
-def _open_hdf5(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
-    import h5py  # type: ignore[import-untyped]
-
-    file = h5py.File(path, "r")
-    arrays: dict[str, Any] = {}
-
-    def visit(name: str, item: Any) -> None:
-        # Not those whose pixels lie in other files, which may be any file of this machine.
-        if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
-            arrays[f"/{name}"] = item
-
-    file.visititems(visit)
-    return arrays, file.close
-
-
-def _open_zarr(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
-    import zarr
-
-    root = zarr.open(str(path), mode="r")
-    members = [("", root)] if isinstance(root, zarr.Array) else root.members(max_depth=None)
-    arrays = {f"/{name}": item for name, item in members if isinstance(item, zarr.Array)}
-    return {name: array for name, array in arrays.items() if not _is_pickled(array)}, lambda: None
-
-
-def _is_pickled(array: Any) -> bool:
-    """Whether reading a Zarr array may execute code in it: only new versions of numcodecs refuse to."""
-    codecs = (*(array.filters or ()), *(array.compressors or ()))
-    return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
 
 
 def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:

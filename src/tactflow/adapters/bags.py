@@ -100,7 +100,7 @@ class Bag(FrameReader):
         super().__init__(str(path))
         try:
             self._topic = _choose(spec, settings.get("topic"), self._store.topics)
-            self.name = self._normalise.name = f"{path}, {self._topic}"
+            self.name = f"{path}, {self._topic}"
             self.total = self._store.topics[self._topic].number
             self._read_first()
         except SourceError:

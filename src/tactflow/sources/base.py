@@ -28,6 +28,9 @@ SPARSE_PEAK = 4096
 FEWEST_BITS = 10
 """Sensors whose pixels are stored in 16 bits have at least so many."""
 
+SHORTEST_SIDE = 2
+"""Fewer rows or columns are no picture, px: stages halve them."""
+
 BgrImage = NDArray[np.uint8]
 
 
@@ -56,13 +59,13 @@ class FrameReader:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._normalise = Normaliser(name)
-        self._iterator: Iterator[tuple[Any, ...]] | None = None
-        self._peeked: deque[tuple[Any, ...]] = deque()
-        self._error: SourceError | None = None
+        self._picture = ""
+        """What messages call the picture that `_frames` yields next; its index if empty."""
+        self._items: Iterator[tuple[Any, ...]] = self._converted()
+        self._peeked: deque[tuple[Any, ...] | SourceError] = deque()
 
     def _frames(self) -> Iterator[tuple[Any, ...]]:
-        """Yield every picture, as `Normaliser` takes them, and its time, s; ends at the last one."""
+        """Yield every picture, as `to_bgr` takes them, and its time, s; ends at the last one."""
         raise NotImplementedError
 
     def read(self) -> tuple[BgrImage, float] | None:
@@ -87,9 +90,9 @@ class FrameReader:
         None at the end, and where reading fails: `read` then raises in its turn.
         """
         try:
-            item = None if self._error is not None else self._next()
+            item = next(self._items, None)
         except SourceError as error:
-            self._error = error
+            self._peeked.append(error)
             return None
         if item is None:
             return None
@@ -98,37 +101,49 @@ class FrameReader:
 
     def close(self) -> None:
         """Release the file or device; `read` then returns None. May be called twice."""
-        self._iterator, self._error = iter(()), None
+        self._items = iter(())
         self._peeked.clear()
 
     def _read_first(self, empty: str = "there is no picture in it") -> None:
         """Read the first frame ahead, so that `size` is known. Raises SourceError if there is none."""
         if self.peek() is None:
-            error = self._error or SourceError(f"{self.name}: {empty}")
+            error = self._peeked.pop() if self._peeked else None
             self.close()
-            raise error
+            raise error if isinstance(error, SourceError) else SourceError(f"{self.name}: {empty}")
 
     def _read(self) -> tuple[Any, ...] | None:
-        if self._peeked:
-            return self._peeked.popleft()
-        if self._error is not None:
-            raise self._error
-        return self._next()
+        item = self._peeked.popleft() if self._peeked else next(self._items, None)
+        if isinstance(item, SourceError):
+            raise item
+        return item
 
-    def _next(self) -> tuple[Any, ...] | None:
-        if self._iterator is None:
-            self._iterator = self._frames()
+    def _converted(self) -> Iterator[tuple[Any, ...]]:
+        """What `_frames` yields, with pictures in BGR and of one size."""
+        first = None
         try:
-            item = next(self._iterator, None)
+            for index, (image, *rest) in enumerate(self._frames()):
+                place = self._picture or f"{self.name}, frame {index}"
+                bgr = to_bgr(image, place, note=first is None)
+                size = (bgr.shape[1], bgr.shape[0])
+                if first is None:
+                    check_pixel_count(place, *size)
+                    if min(size) < SHORTEST_SIDE:
+                        raise SourceError(
+                            f"{place}: its pictures are {size[0]} x {size[1]}; required {SHORTEST_SIDE} x "
+                            f"{SHORTEST_SIDE} pixels or more"
+                        )
+                    self.size = first = size
+                if size != first:
+                    raise SourceError(
+                        f"{place}: this frame is {size[0]} x {size[1]} pixels, the ones before it are "
+                        f"{first[0]} x {first[1]}; a source must keep its size. "
+                        "Remove the odd frame, or run the two recordings one after the other"
+                    )
+                yield bgr, *rest
         except SourceError:
             raise
         except self.parser_errors as error:
             raise damaged(self.name, error) from error
-        if item is None:
-            return None
-        image = self._normalise(item[0])
-        self.size = self._normalise.size
-        return image, *item[1:]
 
 
 class Stamp(NamedTuple):
@@ -198,83 +213,52 @@ class CaptureReader(FrameReader):
             self._capture = None
 
 
-class Normaliser:
-    """Converts pictures to (H, W, 3) uint8 BGR, and checks that all have the size of the first.
+def to_bgr(image: NDArray[Any], name: str, *, note: bool = True) -> BgrImage:
+    """Convert a gray, BGR, BGRA or 16-bit picture to (H, W, 3) uint8 BGR.
 
-    Gray, BGRA and 16-bit pictures are converted, with one note in the log for each kind of conversion.
-
-    >>> bgr = Normaliser("example")(np.full((2, 2), 65535, np.uint16))
+    >>> bgr = to_bgr(np.full((2, 2), 65535, np.uint16), "example")
     >>> bgr.shape, bgr.dtype, int(bgr.max())
     ((2, 2, 3), dtype('uint8'), 255)
 
     Parameters
     ----------
-    name : what notes and errors call the source, or the file of the next picture.
+    image : (H, W) or (H, W, C) with C in 1, 3, 4; uint8 or uint16.
+    name : what messages call the picture.
+    note : whether the log tells what is converted.
+
+    Raises
+    ------
+    SourceError
+        If the pixels are of another kind.
     """
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.size: tuple[int, int] | None = None
-        self._noted: set[str] = set()
-
-    def __call__(self, image: NDArray[Any]) -> BgrImage:
-        """Convert one picture.
-
-        Parameters
-        ----------
-        image : (H, W) or (H, W, C) with C in 1, 3, 4; uint8 or uint16.
-
-        Raises
-        ------
-        SourceError
-            If the pixels are of another kind, or the picture is not as large as the ones before it.
-        """
-        channels = image.shape[2] if image.ndim == 3 else 1
-        if image.ndim not in (2, 3) or channels not in (1, 3, 4):
-            raise SourceError(f"{self.name}: required 1, 3 or 4 channels, got shape {image.shape}")
-        self._check_size(image.shape[1], image.shape[0])
-        if image.dtype != np.uint8:
-            image = self._from_16_bits(image)
-        if channels == 3:
-            return image if image.flags.c_contiguous else np.ascontiguousarray(image)
-        if channels == 1:
-            return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-        self._note("the fourth channel (alpha) is ignored")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2BGR), np.uint8)
-
-    def _check_size(self, width: int, height: int) -> None:
-        if self.size is None:
-            check_pixel_count(self.name, width, height)
-            self.size = (width, height)
-        if self.size != (width, height):
-            raise SourceError(
-                f"{self.name}: this frame is {width} x {height} pixels, the ones before it are "
-                f"{self.size[0]} x {self.size[1]}; a source must keep its size. "
-                "Remove the odd frame, or run the two recordings one after the other"
-            )
-
-    def _from_16_bits(self, image: NDArray[Any]) -> NDArray[np.uint8]:
+    channels = image.shape[2] if image.ndim == 3 else 1
+    if image.ndim not in (2, 3) or channels not in (1, 3, 4):
+        raise SourceError(f"{name}: required 1, 3 or 4 channels, got shape {image.shape}")
+    if image.dtype != np.uint8:
         # A file may have 16-bit pixels in the other byte order.
         if image.dtype.newbyteorder("=") != np.uint16:
-            raise SourceError(f"{self.name}: required 8- or 16-bit unsigned pixels, got {image.dtype}")
+            raise SourceError(f"{name}: required 8- or 16-bit unsigned pixels, got {image.dtype}")
         image = image.astype(np.uint16, copy=False)
-        if self._note("16-bit values are scaled to 8 bit (divided by 257)") and image.size:
-            peak = int(image.max())
-            if 0 < peak < SPARSE_PEAK:
-                bits = max(peak.bit_length(), FEWEST_BITS)
-                log.warning(
-                    "%s: no value above %d: a sensor with %d bits in a 16-bit file? It will be dark; "
-                    "multiply the values by %d beforehand",
-                    *(self.name, peak, bits, 1 << (16 - bits)),
-                )
-        return np.asarray(cv2.convertScaleAbs(image, alpha=255.0 / 65535.0), np.uint8)
+        if note:
+            _note_16_bits(image, name)
+        image = cv2.convertScaleAbs(image, alpha=255.0 / 65535.0)
+    if channels == 3:
+        return np.ascontiguousarray(image)
+    if channels == 4 and note:
+        log.info("%s: the fourth channel (alpha) is ignored", name)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if channels == 1 else cv2.COLOR_BGRA2BGR))
 
-    def _note(self, text: str) -> bool:
-        if text in self._noted:
-            return False
-        self._noted.add(text)
-        log.info("%s: %s", self.name, text)
-        return True
+
+def _note_16_bits(image: NDArray[np.uint16], name: str) -> None:
+    log.info("%s: 16-bit values are scaled to 8 bit (divided by 257)", name)
+    peak = int(image.max(initial=0))
+    if 0 < peak < SPARSE_PEAK:
+        bits = max(peak.bit_length(), FEWEST_BITS)
+        log.warning(
+            "%s: no value above %d: a sensor with %d bits in a 16-bit file? It will be dark; "
+            "multiply the values by %d beforehand",
+            *(name, peak, bits, 1 << (16 - bits)),
+        )
 
 
 def check_pixel_count(name: str, width: int, height: int) -> None:

@@ -19,10 +19,10 @@ from tactflow.sources.base import (
     BgrImage,
     CaptureReader,
     FrameReader,
-    Normaliser,
     check_pixel_count,
     damaged,
     log,
+    to_bgr,
 )
 from tactflow.sources.paths import find_path
 from tactflow.system.files import expanded
@@ -104,7 +104,7 @@ def decode_image(data: bytes, name: str) -> NDArray[Any]:
 def load_image(spec: str, directory: Path | None = None) -> BgrImage:
     """Find and decode one image file: (H, W, 3) uint8 BGR. Raises as `find_path` and `read_image` do."""
     path = find_path(spec, directory)
-    return Normaliser(str(path))(read_image(path))
+    return to_bgr(read_image(path), str(path))
 
 
 def _is_cut_off(data: bytes) -> bool:
@@ -153,7 +153,7 @@ class ImageFiles(FrameReader):
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         for index, path in enumerate(self._files):
-            self._normalise.name = str(path)
+            self._picture = str(path)
             yield read_image(path), index / (self.fps or DEFAULT_FPS)
 
 

@@ -71,10 +71,11 @@ class Recording(StampedReader):
 
         try:
             for frame, paced in self._stored_frames():
+                self._picture = f"{self._path}, frame {frame.seq}"
                 try:
                     image = frame.image()
                 except ValueError as error:
-                    raise SourceError(f"{self._path}, frame {frame.seq}: {error}") from error
+                    raise SourceError(f"{self._picture}: {error}") from error
                 yield image, frame.t, Stamp(frame.seq, frame.reference, frame.epoch, paced)
         except DAMAGE as error:
             raise SourceError(

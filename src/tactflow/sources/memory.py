@@ -51,7 +51,7 @@ class MemoryFrames(FrameReader):
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         for index, image in enumerate(self._pictures):
-            self._normalise.name = f"picture {index}"
+            self._picture = f"picture {index}"
             if not isinstance(image, np.ndarray):
                 raise SourceError(f"picture {index}: required an array, got {type(image)}")
             yield image, index / (self.fps or DEFAULT_FPS)
