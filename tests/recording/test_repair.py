@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import lz4.frame
@@ -11,6 +13,7 @@ import zstandard
 from mcap.reader import make_reader
 
 from tactflow.engine.errors import SourceError
+from tactflow.recording.records import LARGEST_CHUNK
 from tactflow.recording.repair import repair
 from tactflow.sources import open_source
 from tests.recording.test_recorder import opened, seqs_in, write
@@ -107,3 +110,21 @@ def test_a_chunk_that_cannot_be_unpacked_is_passed_over(
     result = repair(path, fixed)
     assert not result.finished
     assert seqs_in(fixed) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("compress", "compression"), [(zstandard.compress, "zstd"), (lz4.frame.compress, "lz4")]
+)
+def test_a_chunk_that_states_too_many_bytes_is_not_unpacked(
+    tmp_path: Path, compress: Callable[[bytes], bytes], compression: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    whole = record(path, 1)
+    size = LARGEST_CHUNK + 1
+    path.write_bytes(whole[:8] + chunk(compress(bytes(size)), compression, size) + whole[8:])
+    tracemalloc.start()
+    try:
+        assert repair(path, tmp_path / "fixed.mcap").lost
+        assert tracemalloc.get_traced_memory()[1] < LARGEST_CHUNK // 8
+    finally:
+        tracemalloc.stop()

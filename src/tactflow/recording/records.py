@@ -120,17 +120,20 @@ def _unpacked(chunk: Chunk, place: Damage) -> Iterator[McapRecord | Damage]:
 
 def _content(chunk: Chunk) -> bytes:
     """The unpacked bytes of a chunk. Raises ValueError, before memory is taken, if they are too many."""
-    limit = min(chunk.uncompressed_size, LARGEST_CHUNK)
+    size = chunk.uncompressed_size
+    if size > LARGEST_CHUNK:
+        raise ValueError(f"required a chunk of {LARGEST_CHUNK} bytes at most, got {size}")
+    # One byte more than stated, to notice a chunk that is larger than it says.
     if chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(limit + 1)
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
     elif chunk.compression == "lz4":
-        data = import_module("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, max_length=limit + 1)
+        data = import_module("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
     elif chunk.compression:
         raise ValueError(f"chunks of compression {chunk.compression!r} cannot be read")
     else:
         data = chunk.data
-    if len(data) != chunk.uncompressed_size or len(data) > LARGEST_CHUNK:
-        raise ValueError(f"required {chunk.uncompressed_size} bytes, {LARGEST_CHUNK} at most")
+    if len(data) != size:
+        raise ValueError(f"required a chunk of {size} bytes, got {len(data)}")
     return data
 
 
