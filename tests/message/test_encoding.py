@@ -215,39 +215,6 @@ def test_an_infinite_standard_error_is_refused() -> None:
         )
 
 
-def test_origins_that_change_in_place_or_are_copied_are_written_as_they_are() -> None:
-    origin = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
-    for value in (1.0, 7.0, 1.0):
-        origin[0, 0] = value
-        for array in (origin, origin.copy()):
-            message = build_message(TICK, Results(None, None, None, replace(MARKERS, origin=array)))
-            assert message["markers"]["origin"] == [[value, 2.0], [3.0, 4.0], [5.0, 6.0]]
-
-
-def test_markers_that_stay_partly_the_same_are_written_as_they_are() -> None:
-    """What is kept of the last message's text goes by the values: in place, copied, in other number types."""
-    position = np.array([[1.5, 2.5], [3.5, 4.5], [5.5, 6.5]])
-    status = np.array([0, 1, 2], np.uint8)
-    for x, first in ((1.5, 0), (1.5, 2), (7.25, 2), (1.5, 0)):
-        position[0, 0], status[0] = x, first
-        for kind in (np.uint8, np.int64):
-            for real in (np.float64, np.float32):
-                moved = replace(MARKERS, position=position.astype(real), status=status.astype(kind))
-                for markers in (moved, replace(moved, position=moved.position[::-1])):
-                    message = build_message(TICK, Results(None, None, None, markers))["markers"]
-                    assert message["position"] == markers.position.tolist()
-                    assert message["status"] == [STATUS_NAMES[value] for value in markers.status]
-
-
-def test_a_bad_position_is_refused_every_time_and_forgotten() -> None:
-    bad = replace(MARKERS, position=np.array([[1.0, np.nan]]))
-    for _ in range(2):
-        with pytest.raises(ValueError, match=r"markers\.position"):
-            encode_message(result_of(TICK, Results(None, None, None, bad)))
-    message = build_message(TICK, Results(None, None, None, MARKERS))
-    assert message["markers"]["position"] == MARKERS.position.tolist()
-
-
 def test_status_names_follow_the_enum() -> None:
     assert [STATUS_NAMES[status] for status in MarkerStatus] == ["tracked", "inferred", "lost"]
 

@@ -18,7 +18,8 @@ from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
-from tactflow.message.result import SCHEMA, Result, encode_message
+from tactflow.message.encoding import SCHEMA
+from tactflow.message.result import Result, encode_message
 from tactflow.recording.provenance import facts, texts
 from tactflow.system.extras import missing
 from tactflow.system.files import expanded, make_folder

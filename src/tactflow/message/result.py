@@ -14,18 +14,13 @@ import numpy as np
 import orjson
 
 from tactflow.engine.frame import NO_PICTURE, Frame, Tick
-from tactflow.message import encoding
 from tactflow.message.decoding import decode_values
+from tactflow.message.encoding import SCHEMA, encode
 from tactflow.ports import ContactMask, Image
 from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Scale, Slip
 
 if TYPE_CHECKING:
     from tactflow.vision.flow.displacement_field import DisplacementField
-
-SCHEMA = "tactflow.frame/1"
-
-_EXPLAINED = frozenset({"contact", "flow", "markers", "reference"})
-"""What `skipped` of a message may name: the ports that every message has, and the reference."""
 
 
 class Result(Tick):
@@ -190,30 +185,7 @@ def encode_message(result: Result, *, detail: bool = False, field: bool = False)
     Raises
     ------
     ValueError
-        If a number is NaN or infinite (except in `markers.stderr`, where NaN stands for unknown).
+        If a number is infinite, or NaN (except in standard errors, where NaN stands for unknown).
     """
-    if result._message is not None:
-        return orjson.dumps(result._message)
-    flow, markers, scale = result.flow, result.markers, result.scale
-    whole, contacts = encoding.encode_contacts(result.contact, scale, result.depth, detail)
-    message: dict[str, Any] = {
-        "schema": SCHEMA,
-        "sensor": result.sensor,
-        "seq": result.seq,
-        "t": encoding.finite(result.t, "t"),
-        "size": result.size,
-        "contact": whole,
-        "contacts": contacts,
-        "flow": None if flow is None else encoding.encode_flow(flow, scale, detail),
-        "markers": None if markers is None else encoding.encode_markers(markers, detail),
-        "skipped": {port: reason for port, reason in result.skipped.items() if port in _EXPLAINED},
-    }
-    if scale is not None:
-        message["scale"] = encoding.encode_scale(scale)
-    if result.slip is not None:
-        message["slip"] = encoding.encode_slip(result.slip)
-    if result.force is not None:
-        message["force"] = encoding.encode_force(result.force)
-    if field:
-        message["field"] = None if result.field is None else encoding.encode_field(result.field)
-    return orjson.dumps(message, option=encoding.OPTIONS)
+    message = encode(result, detail, field) if result._message is None else result._message
+    return orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY)

@@ -1,4 +1,4 @@
-"""The JSON Schema of the result message `tactflow.frame/1`: what `message.py` may write."""
+"""The JSON Schema of the result message `tactflow.frame/1`: what `encoding.py` may write."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import GenerateJsonSchema
 
-from tactflow.message.result import SCHEMA
+from tactflow.message.encoding import SCHEMA
 from tactflow.vision.types import Evidence
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
