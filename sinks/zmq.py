@@ -17,8 +17,7 @@ from tactflow.message.result import Result, encode_message
 from tactflow.network.address import Address
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
-from tactflow.network.publisher import SEND_BUFFER
-from tactflow.network.topics import TopicPublisher
+from tactflow.network.publisher import SEND_BUFFER, Publisher
 from tactflow.ports import Image
 
 log = logging.getLogger("tactflow")
@@ -161,7 +160,7 @@ class Zmq(Sink):
         self._topic, self._picture_topic, self._depth_topic = (
             f"tactflow{kind}.{sensor} ".encode() for kind in ("", "_picture", "_depth")
         )
-        self._publisher: TopicPublisher | None = None
+        self._publisher: Publisher | None = None
         self._rate = RateLimit(params.pictures or None)
         self._had_depth = False
         self._serialised = 0
@@ -200,7 +199,7 @@ class Zmq(Sink):
             If an address is taken or cannot be bound, or the keys are wrong.
         """
         p = self.params
-        self._publisher = TopicPublisher(p.endpoint, p.backlog, p.send_buffer, p.keys)
+        self._publisher = Publisher(p.endpoint, p.backlog, p.send_buffer, p.keys)
         self.endpoint = self._publisher.endpoint
         self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
         log.info("publishing %s", self.description)
@@ -267,7 +266,7 @@ class Zmq(Sink):
         flat = self._had_depth and result.contact is None
         return np.zeros(image.shape[:2], "<f4").tobytes() if flat else None
 
-    def _publish_statistics(self, publisher: TopicPublisher, control: Control) -> None:
+    def _publish_statistics(self, publisher: Publisher, control: Control) -> None:
         """Body of the thread that publishes the statistics while somebody has asked for them."""
         while not self._closing.wait(self.params.stats_every):
             if publisher.is_subscribed(STATS_TOPIC, by_name=True):

@@ -7,7 +7,6 @@ import logging
 
 import numpy as np
 import orjson
-import zmq
 from pydantic import Field, model_validator
 
 from tactflow.drawing.jpeg import encode_jpeg
@@ -64,7 +63,6 @@ class LerobotCamera(Sink):
         self.endpoint = self.description = params.endpoint
         self._sensor = sensor
         self._publisher: Publisher | None = None
-        self._readers = 0
         self._sent = 0
 
     def open(self) -> None:
@@ -80,17 +78,13 @@ class LerobotCamera(Sink):
     def write(self, tick: Tick, image: Image) -> None:
         """Send one picture to whoever reads; never waits."""
         publisher = self._publisher
-        if publisher is None:
-            return
-        while (event := publisher.next_event()) is not None:
-            self._readers += 1 if event[:1] == b"\x01" else -1
-        if self._readers <= 0:
+        if publisher is None or not publisher.is_subscribed(b""):
             return
         # LeRobot takes what it decodes for RGB, whereas a JPEG is decoded to BGR.
         jpeg = encode_jpeg(np.ascontiguousarray(image[:, :, ::-1]), self.params.quality)
         images = {self._sensor: base64.b64encode(jpeg).decode()}
         message = {"timestamps": {self._sensor: tick.frame.t}, "images": images}
-        publisher.socket.send(orjson.dumps(message), zmq.NOBLOCK)
+        publisher.send(orjson.dumps(message))
         self._sent += 1
 
     def close(self) -> None:

@@ -6,12 +6,6 @@ import ipaddress
 import re
 from dataclasses import dataclass
 
-LOOPBACK_INTERFACES = frozenset({"lo", "lo0"})
-"""Names of the loopback interface on Linux and macOS, which an address may give instead of a number."""
-
-HIGHEST_PORT = 65535
-"""Ports are numbers of 16 bits. ZeroMQ wraps larger ones around silently."""
-
 
 @dataclass(frozen=True, slots=True)
 class Address:
@@ -43,8 +37,9 @@ class Address:
             example = "tcp://127.0.0.1:5556, tcp://*:5556 or ipc:///tmp/tactflow"
             raise ValueError(f"required an address such as {example}, got {text!r}")
         port = 0 if tcp[2] == "*" else int(tcp[2])
-        if port > HIGHEST_PORT:
-            raise ValueError(f"required a port up to {HIGHEST_PORT}, got {port}")
+        # ZeroMQ would take it modulo 65536.
+        if port > 65535:
+            raise ValueError(f"required a port up to 65535, got {port}")
         return cls(text, tcp[1].strip("[]"), port or None)
 
     @property
@@ -54,7 +49,8 @@ class Address:
         >>> Address.parse("tcp://[::1]:5556").is_local, Address.parse("tcp://*:5556").is_local
         (True, False)
         """
-        return self.host is None or self.host in LOOPBACK_INTERFACES or is_loopback(self.host)
+        # lo, lo0 : the loopback interface on Linux and macOS.
+        return self.host in (None, "lo", "lo0") or is_loopback(str(self.host))
 
     @property
     def picks_a_port(self) -> bool:
@@ -69,9 +65,7 @@ class Address:
 
 def is_loopback(host: str) -> bool:
     """Whether a host name or number can be reached from this machine only."""
-    if host == "localhost":
-        return True
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False

@@ -23,10 +23,14 @@ if TYPE_CHECKING:
 LONGEST_REQUEST = 4096
 """Bytes of a subscription or a command, which have some twenty. ZeroMQ keeps subscriptions in a tree and
 takes a step on the stack for each of their bytes: one of a megabyte ends the process."""
-HANDSHAKE_MS = 5000
-"""A connection that has not finished its handshake by then is closed, ms. Chosen by hand."""
-KEEPALIVE_S = 10
-"""After so much silence the system asks whether the other machine is still there, s. Chosen by hand."""
+OPTIONS = {
+    zmq.MAXMSGSIZE: LONGEST_REQUEST,
+    # A connection that has not finished its handshake by then is closed, ms. Chosen by hand.
+    zmq.HANDSHAKE_IVL: 5000,
+    # After so much silence the system asks whether the other machine is still there, s. Chosen by hand.
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 10,
+}
 
 
 class BoundSocket:
@@ -35,20 +39,17 @@ class BoundSocket:
     Parameters
     ----------
     kind : ZeroMQ's type of the socket. endpoint : address to bind.
-    hint : what to try where the address is taken.
-    options : ZeroMQ's option -> value.
+    hint : what to try where the address is taken. options : ZeroMQ's option -> value.
     keys : the publisher's folder made by `tactflow keys new`: only those who have a key in it are admitted,
         and everything is encrypted. None admits everybody who can reach the address.
 
     Raises
     ------
-    StageError
-        If the address is invalid, taken or cannot be bound, or the keys are wrong. Nothing is left open.
+    StageError : the address is invalid, taken or cannot be bound, or the keys are wrong. Nothing stays open.
 
     Attributes
     ----------
-    socket : belongs to one thread at a time.
-    endpoint : the real address, with the port that the system picked.
+    socket : belongs to one thread at a time. endpoint : the real address, with the port that was picked.
     """
 
     def __init__(
@@ -63,26 +64,20 @@ class BoundSocket:
         self._authenticator: ThreadAuthenticator | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.socket = self._context.socket(kind)
-        limits: dict[int, int] = {
-            zmq.MAXMSGSIZE: LONGEST_REQUEST,
-            zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
-            zmq.TCP_KEEPALIVE: 1,
-            zmq.TCP_KEEPALIVE_IDLE: KEEPALIVE_S,
-            zmq.IPV6: address.is_ipv6,
-        }
-        for option, value in {**limits, **options}.items():
+        for option, value in {**OPTIONS, zmq.IPV6: address.is_ipv6, **options}.items():
             self.socket.setsockopt(option, value)
         try:
             if keys is not None:
                 self._authenticator = require_keys(self.socket, self._context, expanded(keys))
             self.socket.bind(endpoint)
-        except (ValueError, zmq.ZMQError) as error:
+        except ValueError as error:
             self.close()
-            if not isinstance(error, zmq.ZMQError):
-                raise StageError(f"keys: {error}") from error
-            if error.errno == errno.EADDRINUSE:
-                raise StageError(f"{endpoint} is in use: {hint}") from error
-            raise StageError(f"{endpoint} cannot be bound: {error.strerror}") from error
+            raise StageError(f"keys: {error}") from error
+        except zmq.ZMQError as error:
+            self.close()
+            is_taken = error.errno == errno.EADDRINUSE
+            reason = f"is in use: {hint}" if is_taken else f"cannot be bound: {error.strerror}"
+            raise StageError(f"{endpoint} {reason}") from error
         self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def close(self, linger: float = 0.0) -> None:

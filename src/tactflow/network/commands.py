@@ -16,21 +16,16 @@ class RefusedError(Exception):
 
 
 class Commands:
-    """Carries out commands to a run, or says why not. From any thread.
+    """Carries out commands to a run, from any thread. Raises RefusedError where `refusal` gives a reason.
 
     control : handle on the run; None: nothing is possible.
-
-    Every command raises RefusedError where `refusal` gives a reason.
     """
 
     def __init__(self, control: Control | None) -> None:
         self._control = control
 
     def refusal(self, name: str) -> str | None:
-        """Why a command is not possible now, or None.
-
-        name : pause, step, reference, record or stop.
-        """
+        """Why pause, step, reference, record or stop is not possible now, or None."""
         control = self._control
         if control is None:
             return "the run cannot be controlled"
@@ -44,6 +39,12 @@ class Commands:
         if name == "record" and control.recorder() is None:
             return "no record sink in this pipeline; --set 'sinks.record={trigger: button}' adds one"
         return None
+
+    def _admitted(self, name: str) -> Control:
+        refusal = self.refusal(name)
+        if self._control is None or refusal is not None:
+            raise RefusedError(refusal)
+        return self._control
 
     def pause(self, paused: bool) -> Answer:
         """Hold capturing, or go on."""
@@ -60,22 +61,15 @@ class Commands:
         return {"message": "the next frame is taken as the reference"}
 
     def record(self, on: bool) -> Answer:
-        """Begin or finish a recording.
-
-        It touches the disk, so it may take a while. Raises StageError if the file cannot be written.
-        """
+        """Begin or finish a recording, which touches the disk; raises StageError if it cannot be written."""
         recorder = self._admitted("record").recorder()
         assert recorder is not None
         was_recording = recorder.recording
-        if on:
-            recorder.start_recording()
-            text = "is recording already" if was_recording else "recording"
-        else:
-            recorder.stop_recording()
-            text = "recorded"
-            if not was_recording:
-                return {"message": "nothing was being recorded"}
-        return {"message": f"{text} to {recorder.description}", "path": recorder.description}
+        (recorder.start_recording if on else recorder.stop_recording)()
+        if not on and not was_recording:
+            return {"message": "nothing was being recorded"}
+        done = ("is recording already" if was_recording else "recording") if on else "recorded"
+        return {"message": f"{done} to {recorder.description}", "path": recorder.description}
 
     def stop(self) -> None:
         """End the run."""
@@ -99,11 +93,3 @@ class Commands:
         except RuntimeError:
             # The run is still opening its sinks, and its tables grew while they were read.
             return {}
-
-    def _admitted(self, name: str) -> Control:
-        """The run, if it can carry out a command now; else raises RefusedError."""
-        refusal = self.refusal(name)
-        if refusal is not None:
-            raise RefusedError(refusal)
-        assert self._control is not None
-        return self._control

@@ -37,18 +37,8 @@ _HINT = (
 class ControlSocket:
     """Takes commands for a run until it is closed.
 
-    Parameters
-    ----------
-    endpoint : address to bind. keys : as for `BoundSocket`. sensor : of the run. commands : to the run.
-
-    Raises
-    ------
-    StageError
-        If the address is invalid, taken or cannot be bound, or the keys are wrong.
-
-    Attributes
-    ----------
-    endpoint : the real address, with the port that the system picked.
+    endpoint, keys, Raises : as for `BoundSocket`. sensor : of the run. commands : to the run. The attribute
+    `endpoint` is the real address.
     """
 
     def __init__(self, endpoint: str, keys: str | None, sensor: str, commands: Commands) -> None:
@@ -77,7 +67,6 @@ class ControlSocket:
         self._bound.close(LINGER)
 
     def _serve(self) -> None:
-        """Body of the thread."""
         socket = self._bound.socket
         while not self._closing.is_set():
             # A client that leaves can wake us without a message to receive.
@@ -90,14 +79,13 @@ class ControlSocket:
                         socket.send_multipart([*parts[:end], self._answer(parts[end:])])
 
     def _answer(self, request: list[bytes]) -> bytes:
-        """The answer to a request, whatever it is."""
         try:
             answer = {"ok": True, **self._carry_out(request)}
         except (RefusedError, StageError) as error:
             answer = {"ok": False, "message": str(error)}
         except Exception as error:
-            log.warning("zmq: a command failed: %s: %s", type(error).__name__, error)
             answer = {"ok": False, "message": f"{type(error).__name__}: {error}"}
+            log.warning("zmq: a command failed: %s", answer["message"])
         answer["state"] = {"sensor": self._sensor, **self._commands.state()}
         return orjson.dumps(answer, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY)
 
