@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 LONGEST_REQUEST = 4096
 """Bytes of a subscription or a command, which have some twenty. ZeroMQ keeps subscriptions in a tree and
 takes a step on the stack for each of their bytes: one of a megabyte ends the process."""
-OPTIONS = {
+OPTIONS: dict[int, int] = {
     zmq.MAXMSGSIZE: LONGEST_REQUEST,
     # A connection that has not finished its handshake by then is closed, ms. Chosen by hand.
     zmq.HANDSHAKE_IVL: 5000,

@@ -28,16 +28,12 @@ hand."""
 class Connection:
     """A connected socket with a context of its own that notices when it is not admitted; a context manager.
 
-    Parameters
-    ----------
-    kind : ZeroMQ's type of the socket. endpoint : address to connect to.
-    options : ZeroMQ's option -> value.
+    kind : ZeroMQ's type of the socket. endpoint : address to connect to. options : ZeroMQ's option -> value.
     keys : the subscriber's folder made by `tactflow keys new`; None where the run requires no keys.
 
     Raises
     ------
-    ValueError
-        If the endpoint is not an address, or the folder has no valid keys.
+    ValueError : the endpoint is not an address, or the folder has no valid keys.
     """
 
     def __init__(
@@ -51,8 +47,7 @@ class Connection:
         self._socket = self._context.socket(kind)
         for option, value in {zmq.LINGER: 0, zmq.IPV6: address.is_ipv6, **options}.items():
             self._socket.setsockopt(option, value)
-        events = REFUSED | HUNG_UP | zmq.EVENT_HANDSHAKE_SUCCEEDED
-        self._handshakes = self._socket.get_monitor_socket(events)
+        self._handshakes = self._socket.get_monitor_socket(REFUSED | HUNG_UP | zmq.EVENT_HANDSHAKE_SUCCEEDED)
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
         self._poller.register(self._handshakes, zmq.POLLIN)
@@ -60,25 +55,20 @@ class Connection:
             if keys is not None:
                 use_keys(self._socket, expanded(str(keys)))
             self._socket.connect(endpoint)
-        except zmq.ZMQError as error:
+        except (ValueError, zmq.ZMQError) as error:
             self.close()
-            raise ValueError(f"cannot connect to {endpoint!r}: {error.strerror}") from None
-        except ValueError:
-            self.close()
+            if isinstance(error, zmq.ZMQError):
+                raise ValueError(f"cannot connect to {endpoint!r}: {error.strerror}") from None
             raise
 
-    def _wait(self, seconds: float) -> bool:
-        """Wait until a message can be received; False if none came in time.
+    def _wait(self, until: float) -> bool:
+        """Wait for a message until this time of `time.monotonic`; False if none came.
 
-        Raises
-        ------
-        PermissionError
-            If the other side does not admit us.
+        Raises PermissionError if the other side does not admit us.
         """
-        end = time.monotonic() + seconds
         while self._hang_ups < MOST_HANG_UPS:
-            left = max(end - time.monotonic(), 0.0)
-            ready = dict(self._poller.poll(math.ceil(left * 1000)))
+            left = max(until - time.monotonic(), 0.0)
+            ready = dict(self._poller.poll(None if math.isinf(left) else math.ceil(left * 1000)))
             if self._handshakes not in ready:
                 return bool(ready)
             event = recv_monitor_message(self._handshakes)["event"]

@@ -10,8 +10,8 @@ the other goes to the subscriber NAME, and to nobody else:
     NAME/subscriber.key_secret         proves that it is NAME
     NAME/publisher.key                 which publisher it trusts
 
-The files are certificates as pyzmq writes them. CURVE (https://rfc.zeromq.org/spec/26/) and the check of who
-connects (https://rfc.zeromq.org/spec/27/) are those of libzmq and pyzmq.
+The files are certificates as pyzmq writes them, which also checks who connects (ZAP,
+https://rfc.zeromq.org/spec/27/); CURVE (https://rfc.zeromq.org/spec/26/) is libzmq's.
 """
 
 from __future__ import annotations
@@ -29,8 +29,6 @@ import zmq.auth
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
-KEY_LETTERS = 40
-"""Length of a key, as text in ZeroMQ's Z85."""
 DOMAIN = "tactflow"
 """What an authenticator is asked about (ZAP): who may read results."""
 HINT = "tactflow keys new makes keys"
@@ -41,21 +39,15 @@ class WrongKeysError(ValueError):
 
 
 def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
-    """Make keys for one subscriber, and for the publisher unless it has some.
+    """Make keys for one subscriber, and for the publisher unless it has some; return the folder of each.
 
-    folder : gets a folder for each of the two; made if it is not there. name : of the subscriber: letters,
-    digits, - and _.
-
-    Returns
-    -------
-    The publisher's folder, and the subscriber's.
+    folder : gets these two folders; made if it is not there. name : of the subscriber: letters, digits, - and
+    _.
 
     Raises
     ------
     WrongKeysError : the name is invalid or taken. OSError : the files cannot be written.
 
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     publisher, laptop = make_keys(Path(folder, "keys"), "laptop")
@@ -88,11 +80,7 @@ def require_keys(
 ) -> ThreadAuthenticator:
     """Let a socket that is not bound yet admit only the subscribers whose keys are in the publisher's folder.
 
-    Returns the authenticator that checks them, which the caller stops.
-
-    Raises
-    ------
-    WrongKeysError : the folder has no keys of a publisher, or of a subscriber.
+    Returns the authenticator that checks them, which the caller stops. Raises WrongKeysError.
     """
     socket.curve_publickey, socket.curve_secretkey = _load(folder / "publisher.key_secret")
     socket.curve_server = True
@@ -117,9 +105,7 @@ def require_keys(
 def use_keys(socket: zmq.Socket[bytes], folder: Path) -> None:
     """Let a socket that is not connected yet prove who it is, and talk to the right publisher alone.
 
-    Raises
-    ------
-    WrongKeysError : the folder has no keys of a subscriber.
+    Raises WrongKeysError.
     """
     socket.curve_publickey, socket.curve_secretkey = _load(folder / "subscriber.key_secret")
     socket.curve_serverkey = _load(folder / "publisher.key")[0]
@@ -138,6 +124,7 @@ def _load(file: Path) -> tuple[bytes, bytes]:
         raise WrongKeysError(f"{file}: {error.strerror}; {HINT}") from None
     except ValueError as error:
         raise WrongKeysError(str(error)) from None
-    if len(public) != KEY_LETTERS or (is_secret and len(secret or b"") != KEY_LETTERS):
-        raise WrongKeysError(f"{file}: required keys of {KEY_LETTERS} letters; {HINT}")
+    # Keys of 32 bytes, as text in ZeroMQ's Z85.
+    if len(public) != 40 or (is_secret and len(secret or b"") != 40):
+        raise WrongKeysError(f"{file}: required keys of 40 letters; {HINT}")
     return public, secret or b""

@@ -20,7 +20,7 @@ from tactflow.network.connection import Connection
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5557"
 """Where `tactflow control` looks for a run that takes commands."""
 LONGEST_ANSWER = 1 << 20
-"""Largest answer, bytes; statistics have some ten thousand. Chosen by hand."""
+"""Longest answer, bytes; statistics have some ten thousand. Chosen by hand."""
 Answer = dict[str, Any]
 
 
@@ -37,15 +37,11 @@ class RemoteControl(Connection):
 
     Raises
     ------
-    ValueError
-        From the constructor: the endpoint is not an address, the folder has no valid keys, the timeout is not
-        positive.
-    TimeoutError
-        From every method: no answer came. It is not known whether the command was carried out.
-    PermissionError
-        From every method: the run does not admit us: it requires keys, or other ones.
-    RuntimeError
-        From every method: the run says that it is not possible, and why.
+    ValueError : from the constructor: the endpoint is not an address, the folder has no valid keys, the
+        timeout is not positive.
+    TimeoutError : from every method: no answer came; it is not known whether the command was carried out.
+    PermissionError : from every method: the run does not admit us: it requires keys, or other ones.
+    RuntimeError : from every method: the run says that it is not possible, and why.
 
     Examples
     --------
@@ -101,7 +97,7 @@ class RemoteControl(Connection):
         with suppress(zmq.Again):
             self._socket.send(orjson.dumps({"do": command}), zmq.NOBLOCK)
         end = time.monotonic() + self.timeout
-        while self._wait(end - time.monotonic()):
+        while self._wait(end):
             # A late answer to an earlier command wakes us, and is dropped by the socket.
             with suppress(zmq.Again):
                 return self._checked(self._socket.recv(zmq.NOBLOCK))
@@ -112,7 +108,6 @@ class RemoteControl(Connection):
         )
 
     def _checked(self, received: bytes) -> Answer:
-        """The answer; raises RuntimeError if it is a refusal, or does not come from tactflow."""
         try:
             answer: Answer = orjson.loads(received)
             is_done, message, _ = answer["ok"], str(answer["message"]), answer["state"]["sensor"]

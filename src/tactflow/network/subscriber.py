@@ -1,16 +1,12 @@
 """A subscriber for programs that use what a running tactflow publishes.
 
->>> from tactflow.network.subscriber import Subscriber
->>> with Subscriber(latest=True, timeout=5) as results:      # doctest: +SKIP
-...     for result in results:
-...         print(result.seq, result.contact)
-
 Any ZeroMQ library in any language can do the same: a message is a topic, a space, and JSON.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +14,6 @@ import zmq
 
 from tactflow.message.result import Result
 from tactflow.network.connection import Connection
-from tactflow.system.clock import SYSTEM, Clock
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Where tactflow publishes unless its pipeline says otherwise."""
@@ -26,22 +21,18 @@ DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 LONGEST_WAIT = 1e6
 """Longest timeout, s (11 days): ZeroMQ counts milliseconds in 31 bits."""
 
-HEARTBEAT_MS = 2000
-"""Time between two questions whether the publisher is alive, ms. Chosen by hand."""
-FIRST_RETRY_MS = 50
-LAST_RETRY_MS = 250
-"""Back-off between attempts to reconnect, ms, doubled from the first to the last: after the publisher has
-paused, the connection is back within a quarter of a second. Chosen by hand."""
+OPTIONS: dict[int, int | bytes] = {
+    # Back-off between attempts to reconnect, doubled from the first to the last, ms. Chosen by hand.
+    zmq.RECONNECT_IVL: 50,
+    zmq.RECONNECT_IVL_MAX: 250,
+    # A publisher that has lost its power says no goodbye: ask it so often, ms. Chosen by hand.
+    zmq.HEARTBEAT_IVL: 2000,
+    zmq.HEARTBEAT_TIMEOUT: 6000,
+}
 
 LONGEST_MESSAGE = 16 << 20
 """Longest message, bytes; one with 140 dots has about 14,000. The connection to a publisher that sends a
 longer one is closed before memory is taken for it. Chosen by hand."""
-
-LARGEST_BACKLOG = 2**31 - 1
-"""ZeroMQ takes it as an `int` of C; 0 would mean no limit."""
-
-STATISTICS = b"tactflow.stats"
-"""Topic of a run's statistics; no sensor may have its name."""
 
 
 class Subscriber(Connection):
@@ -59,7 +50,6 @@ class Subscriber(Connection):
         messages are received in turn.
     timeout : s without any message after which waiting ends in a TimeoutError, 1e6 at most; None waits for
         ever.
-    clock : measures the timeout.
     backlog : messages that may wait until they are read; what comes then is lost, and counted. 10,000 are
         nearly three minutes at 60 Hz, and some 140 MB.
     keys : the subscriber's folder that `tactflow keys new` makes, where the publisher asks for keys.
@@ -73,8 +63,7 @@ class Subscriber(Connection):
 
     Raises
     ------
-    ValueError
-        If the endpoint is not an address, the folder has no keys, or timeout or backlog is out of range.
+    ValueError : the endpoint is no address, the folder has no keys, timeout or backlog is out of range.
 
     Examples
     --------
@@ -89,15 +78,14 @@ class Subscriber(Connection):
         sensor: str | None = None,
         latest: bool = False,
         timeout: float | None = None,
-        clock: Clock = SYSTEM,
         backlog: int = 10_000,
         keys: str | Path | None = None,
     ) -> None:
         if timeout is not None and not 0 <= timeout <= LONGEST_WAIT:
             raise ValueError(f"timeout: required None or 0 to {LONGEST_WAIT:g} seconds, got {timeout}")
-        if not 1 <= backlog <= LARGEST_BACKLOG:
-            raise ValueError(f"backlog: required 1 to {LARGEST_BACKLOG} messages, got {backlog}")
-        self._clock = clock
+        # ZeroMQ takes it as an `int` of C; 0 would mean no limit.
+        if not 1 <= backlog < 2**31:
+            raise ValueError(f"backlog: required 1 to {2**31 - 1} messages, got {backlog}")
         self.timeout = timeout
         self.lost = 0
         self.received = 0
@@ -107,12 +95,8 @@ class Subscriber(Connection):
         # Not zmq.CONFLATE, with which a message of several parts aborts the process.
         self._skipped_at_most = backlog if latest else 0
         options: dict[int, int | bytes] = {
+            **OPTIONS,
             zmq.RCVHWM: backlog,
-            zmq.RECONNECT_IVL: FIRST_RETRY_MS,
-            zmq.RECONNECT_IVL_MAX: LAST_RETRY_MS,
-            # A publisher that has lost its power says no goodbye.
-            zmq.HEARTBEAT_IVL: HEARTBEAT_MS,
-            zmq.HEARTBEAT_TIMEOUT: 3 * HEARTBEAT_MS,
             zmq.MAXMSGSIZE: LONGEST_MESSAGE,
             # The space ends the topic: `main` must not receive `main2`.
             zmq.SUBSCRIBE: b"tactflow." if sensor is None else f"tactflow.{sensor} ".encode(),
@@ -124,10 +108,8 @@ class Subscriber(Connection):
 
         Raises
         ------
-        TimeoutError
-            If nothing comes for `timeout` seconds.
-        PermissionError
-            If the publisher does not admit us: it asks for keys, or for others.
+        TimeoutError : nothing came for `timeout` seconds.
+        PermissionError : the publisher does not admit us: it asks for keys, or for others.
         """
         while True:
             try:
@@ -135,49 +117,41 @@ class Subscriber(Connection):
             except ValueError:
                 self.malformed += 1
                 continue
-            self._count(result.sensor, result.seq)
+            # A smaller number than before means that tactflow was started again.
+            expected = self._last_seq.get(result.sensor, result.seq) + 1
+            self.lost += max(result.seq - expected, 0)
+            self._last_seq[result.sensor] = result.seq
             return result
 
     def receive_json(self) -> bytes:
         """Wait for the next message: JSON in UTF-8; not counted in `lost`. Raises as `receive`."""
-        deadline = math.inf if self.timeout is None else self._clock.now() + self.timeout
-        while True:
-            left = deadline - self._clock.now()
-            if self._wait(min(max(left, 0.0), LONGEST_WAIT)):
-                body = self._read()
-                for _ in range(self._skipped_at_most):
-                    if not self._socket.poll(0):
-                        break
-                    body = self._read() or body
-                if body:
-                    self.received += 1
-                    return body
-            elif self._clock.now() >= deadline:
-                raise TimeoutError(self._silence())
+        deadline = math.inf if self.timeout is None else time.monotonic() + self.timeout
+        while self._wait(deadline):
+            body = self._read()
+            for _ in range(self._skipped_at_most):
+                if not self._socket.poll(0):
+                    break
+                body = self._read() or body
+            if body:
+                self.received += 1
+                return body
+        raise TimeoutError(self._silence())
 
     def _read(self) -> bytes:
         """The JSON of the message that waits; empty for one of another kind."""
         message, *more = self._socket.recv_multipart()
         topic, _, body = message.partition(b" ")
-        # The statistics of a run share the beginning of our topic.
-        is_result = not more and body.startswith(b"{") and topic != STATISTICS
+        # The statistics of a run share the beginning of our topic; no sensor may have their name.
+        is_result = not more and body.startswith(b"{") and topic != b"tactflow.stats"
         return body if is_result else b""
 
     def _silence(self) -> str:
         what = f"no message from {self.endpoint} for {self.timeout:g} s"
         if self.received:
             return f"{what}; has the run ended?"
-        hint = "is tactflow running and publishing there"
-        named = f", and is its sensor called {self._sensor}" if self._sensor else ""
-        known = ", and are these keys for it" if self._has_keys else ""
-        return f"{what}; {hint}{named}{known}?"
-
-    def _count(self, sensor: str, seq: int) -> None:
-        last = self._last_seq.get(sensor)
-        # A smaller number than before means that tactflow was started again.
-        if last is not None and seq > last + 1:
-            self.lost += seq - last - 1
-        self._last_seq[sensor] = seq
+        name_hint = f", and is its sensor called {self._sensor}" if self._sensor else ""
+        keys_hint = ", and are these keys for it" if self._has_keys else ""
+        return f"{what}; is tactflow running and publishing there{name_hint}{keys_hint}?"
 
     def __iter__(self) -> Iterator[Result]:
         while True:
