@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_pixel_count, damaged
+from tactflow.sources.base import FrameReader, check_pixel_count, damaged, require
 from tactflow.sources.files import DEFAULT_FPS, decode_image, holds_frames
 from tactflow.sources.paths import find_path, refuse_devices, split_query
-from tactflow.system.extras import missing
 
 SETTINGS = {
     "dataset": "name of the frames",
@@ -171,9 +170,7 @@ class _Zarr:
 
 def _open(path: Path) -> _Hdf5 | _Zarr:
     kind = _Zarr if path.suffix.lower() == ".zarr" else _Hdf5
-    problem = missing(kind.what, kind.extra, [kind.package])
-    if problem is not None:
-        raise SourceError(f"{path}: {problem}")
+    require(path, kind.what, kind.extra, kind.package)
     refuse_devices(path)
     try:
         return kind(path)

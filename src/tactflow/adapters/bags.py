@@ -7,36 +7,29 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_pixel_count, damaged, log
+from tactflow.sources.base import FrameReader, check_pixel_count, damaged, log, require
 from tactflow.sources.files import decode_image
 from tactflow.sources.paths import find_path, refuse_devices, split_query
-from tactflow.system.extras import missing
 
 if TYPE_CHECKING:
     import av
-    from mcap.records import Channel, McapRecord, Schema
+    from mcap.records import Channel, Schema
 
 SETTINGS = {"topic": "name of a topic with pictures"}
 MOST_NAMED = 20
 """Topics that a message lists at most. Chosen by hand."""
-MAGIC = b"\x89MCAP0\r\n"
-"""First bytes of an MCAP file."""
-LARGEST_CHUNK = 1 << 30
-"""Bytes of an uncompressed chunk at most: a thousand times what writers make, and less than memory."""
 
 DECODERS = {"cdr": "rosbags", "ros1": "rosbags", "protobuf": "mcap_protobuf", "json": "json"}
 """Encoding of the messages in an MCAP file -> package that decodes them."""
-KINDS = {"Image": "raw", "RawImage": "raw", "CompressedImage": "file", "CompressedVideo": "video"}
-"""Message type -> how it holds a picture: as pixels, an image file, or a piece of a video."""
 PACKAGES = ("sensor_msgs/msg", "sensor_msgs", "foxglove", "foxglove_msgs/msg", "foxglove_msgs")
-"""Where those types are defined."""
+"""Where the types of messages with pictures are defined."""
 CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
 """Format of a `CompressedVideo` -> FFmpeg's decoder."""
 ENCODINGS: dict[str, tuple[int, int | None]] = {
@@ -56,21 +49,8 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 Foxglove. Those with 16 in their name have 16-bit pixels."""
 
 
-class Topic(NamedTuple):
-    """type : of its messages. number : of them; None if unknown."""
-
-    type: str
-    number: int | None
-
-    @property
-    def kind(self) -> str | None:
-        """How its messages hold a picture; None if they do not.
-
-        >>> Topic("foxglove.RawImage", 3).kind, Topic("std_msgs/msg/String", 3).kind
-        ('raw', None)
-        """
-        package, _, name = self.type.replace(".", "/").rpartition("/")
-        return KINDS.get(name) if package in PACKAGES else None
+Topics = Mapping[str, tuple[str, int | None]]
+"""Topic -> type and number of its messages; None if that is unknown."""
 
 
 class Bag(FrameReader):
@@ -101,7 +81,7 @@ class Bag(FrameReader):
         try:
             self._topic = _choose(spec, settings.get("topic"), self._store.topics)
             self.name = f"{path}, {self._topic}"
-            self.total = self._store.topics[self._topic].number
+            self._type, self.total = self._store.topics[self._topic]
             self._read_first()
         except SourceError:
             self.close()
@@ -110,11 +90,12 @@ class Bag(FrameReader):
         self.description = f"{spec}, {count} messages"
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        to_image = self._converter(self._store.topics[self._topic].kind)
+        to_image = _decoder(self._type)
+        assert to_image is not None
         first: int | None = None
         t, went_back = 0.0, False
         for written, message in self._store.messages(self._topic):
-            image = to_image(message)
+            image = to_image(message, self.name)
             if image is None:
                 continue
             taken = _stamp(message) or written
@@ -126,39 +107,33 @@ class Bag(FrameReader):
             t = max(t, seconds)
             yield image, t
 
-    def _converter(self, kind: str | None) -> Callable[[Any], NDArray[Any] | None]:
-        """What takes the picture out of a message; None where a video has not begun."""
-        if kind == "video":
-            return VideoDecoder(self.name)
-        return lambda message: (raw_image if kind == "raw" else compressed_image)(message, self.name)
-
     def close(self) -> None:
         """Close the file."""
         super().close()
         self._store.close()
 
 
-def _choose(spec: str, topic: str | None, topics: Mapping[str, Topic]) -> str:
+def _choose(spec: str, topic: str | None, topics: Topics) -> str:
     """The requested topic, if it is there and has pictures."""
-    if topic is not None and topic in topics and topics[topic].kind:
-        return topic
+    listed: dict[bool, list[str]] = {True: [], False: []}
+    for name, (kind, count) in sorted(topics.items()):
+        has_pictures = _decoder(kind) is not None
+        if name == topic and has_pictures:
+            return name
+        listed[has_pictures].append(f"{name} ({kind}{'' if count is None else f', {count}'})")
     if topic is None:
         problem = "add ?topic="
     elif topic in topics:
-        problem = f"{topic} has messages of type {topics[topic].type}, which hold no picture; required"
+        problem = f"{topic} has messages of type {topics[topic][0]}, which hold no picture; required"
     else:
         problem = f"there is no topic {topic}; required"
-
-    def listed(with_pictures: bool) -> str:
-        found = [
-            f"{name} ({of.type}{'' if of.number is None else f', {of.number}'})"
-            for name, of in sorted(topics.items())
-            if bool(of.kind) == with_pictures
-        ]
-        more = [f"and {len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else []
-        return ", ".join(found[:MOST_NAMED] + more) or "none"
-
-    raise SourceError(f"{spec}: {problem} one of: {listed(True)}; topics without pictures: {listed(False)}")
+    found, rest = (
+        ", ".join(names[:MOST_NAMED] + [f"and {len(names) - MOST_NAMED} more"] * (len(names) > MOST_NAMED))
+        for names in listed.values()
+    )
+    raise SourceError(
+        f"{spec}: {problem} one of: {found or 'none'}; topics without pictures: {rest or 'none'}"
+    )
 
 
 # -- files with messages ------------------------------------------------------------------------------------
@@ -168,9 +143,7 @@ class RosBag:
     """A rosbag2 folder (sqlite3 or MCAP), a .db3 file, or a ROS 1 .bag, read by rosbags."""
 
     def __init__(self, path: Path) -> None:
-        problem = missing("ROS bags", "bags", ["rosbags"])
-        if problem is not None:
-            raise SourceError(f"{path}: {problem}")
+        require(path, "ROS bags", "bags", "rosbags")
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
 
@@ -180,8 +153,8 @@ class RosBag:
             self._reader.open()
         except Exception as error:
             raise damaged(str(path), error) from error
-        self.topics: Mapping[str, Topic] = {
-            name: Topic(info.msgtype or "several types", info.msgcount)
+        self.topics: Topics = {
+            name: (info.msgtype or "several types", info.msgcount)
             for name, info in self._reader.topics.items()
         }
 
@@ -201,94 +174,55 @@ class McapFile:
     """An .mcap file, whoever wrote it, also one that was cut off."""
 
     def __init__(self, path: Path) -> None:
-        problem = missing("MCAP files", "bags", ["mcap"])
-        if problem is not None:
-            raise SourceError(f"{path}: {problem}")
+        require(path, "MCAP files", "bags", "mcap", "zstandard")
         from mcap.records import Channel, Schema
+        from mcap.summary import Summary
+
+        from tactflow.recording.records import NotARecordingError, intact_records, read_summary
 
         self._path = path
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
         try:
-            counts = self._read_summary()
-            for record in self._records() if counts is None else ():
-                if isinstance(record, Schema):
-                    self._schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    self._channels[record.id] = record
-        except SourceError:
-            raise
+            with path.open("rb") as file:
+                self._summary = read_summary(file) or Summary()
+                if self._summary.statistics is None:
+                    for record in intact_records(file):
+                        if isinstance(record, Schema):
+                            self._summary.schemas[record.id] = record
+                        elif isinstance(record, Channel):
+                            self._summary.channels[record.id] = record
+        except NotARecordingError as error:
+            raise SourceError(f"{path}: {error}") from None
         except Exception as error:
             raise damaged(str(path), error) from error
-        self.topics: dict[str, Topic] = {}
-        for channel in self._channels.values():
-            schema = self._schemas.get(channel.schema_id)
-            # A topic may have several channels, one for each of its writers.
-            before = self.topics[channel.topic].number or 0 if channel.topic in self.topics else 0
-            count = before + counts.get(channel.id, 0) if counts else None
-            self.topics[channel.topic] = Topic(schema.name if schema else "no type", count)
-
-    def _read_summary(self) -> dict[int, int] | None:
-        """Channel -> number of its messages, from the index at the end; None if the file was cut off."""
-        from mcap.reader import SeekingReader
-
-        with self._path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                raise SourceError(f"{self._path}: is not an MCAP file")
-            file.seek(0)
-            try:
-                summary = SeekingReader(file, record_size_limit=self._path.stat().st_size).get_summary()
-            except Exception:
-                summary = None
-        if summary is None or summary.statistics is None:
-            return None
-        self._schemas, self._channels = summary.schemas, summary.channels
-        return summary.statistics.channel_message_counts
-
-    def _records(self) -> Iterator[McapRecord]:
-        """Every record; a file that was cut off ends at its last whole chunk."""
-        from mcap.records import Chunk
-        from mcap.stream_reader import StreamReader, breakup_chunk
-
-        size = self._path.stat().st_size
-        with self._path.open("rb") as file:
-            reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-            try:
-                for record in reader.records:
-                    if not isinstance(record, Chunk):
-                        yield record
-                    elif record.uncompressed_size > LARGEST_CHUNK:
-                        raise ValueError(f"a chunk of {record.uncompressed_size} bytes")
-                    else:
-                        yield from breakup_chunk(record, validate_crc=True)
-            except Exception:
-                if file.tell() < size:
-                    raise
+        statistics = self._summary.statistics
+        self.topics: dict[str, tuple[str, int | None]] = {}
+        # A topic may have several channels, one for each of its writers.
+        for channel in self._summary.channels.values():
+            schema = self._summary.schemas.get(channel.schema_id)
+            count = None
+            if statistics is not None:
+                _, before = self.topics.get(channel.topic, ("", 0))
+                count = (before or 0) + statistics.channel_message_counts.get(channel.id, 0)
+            self.topics[channel.topic] = (schema.name if schema else "no type", count)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """As `RosBag.messages`."""
-        from mcap.records import Message
+        from tactflow.recording.reader import messages
 
-        decoders = {
-            channel.id: self._decoder(channel)
-            for channel in self._channels.values()
-            if channel.topic == topic
-        }
-        for record in self._records():
-            if isinstance(record, Message) and record.channel_id in decoders:
-                yield record.log_time, decoders[record.channel_id](record.data)
+        channels = self._summary.channels.values()
+        parsers = {channel.id: self._parser(channel) for channel in channels if channel.topic == topic}
+        for message in messages(self._path, [topic]):
+            yield message.log_time, parsers[message.channel_id](message.data)
 
-    def _decoder(self, channel: Channel) -> Callable[[bytes], Any]:
+    def _parser(self, channel: Channel) -> Callable[[bytes], Any]:
         """What decodes the messages of a channel."""
-        schema, encoding = self._schemas[channel.schema_id], channel.message_encoding
+        schema, encoding = self._summary.schemas[channel.schema_id], channel.message_encoding
         if encoding not in DECODERS:
             raise SourceError(
                 f"{self._path}, {channel.topic}: messages are encoded as {encoding!r}; required one of: "
                 + ", ".join(DECODERS)
             )
-        problem = missing(f"messages encoded as {encoding}", "bags", [DECODERS[encoding]])
-        if problem is not None:
-            raise SourceError(f"{self._path}: {problem}")
+        require(self._path, f"messages encoded as {encoding}", "bags", DECODERS[encoding])
         if encoding == "json":
             return _from_json
         if encoding == "protobuf":
@@ -334,17 +268,20 @@ def _stamp(message: Any) -> int:
     return int(getattr(time, seconds)) * 1_000_000_000 + int(getattr(time, rest))
 
 
+def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any] | None] | None:
+    """What takes the picture out of a message of this type; None where messages hold none."""
+    package, _, name = kind.replace(".", "/").rpartition("/")
+    if package not in PACKAGES:
+        return None
+    if name == "CompressedVideo":
+        return VideoDecoder()
+    return {"Image": raw_image, "RawImage": raw_image, "CompressedImage": compressed_image}.get(name)
+
+
 def raw_image(message: Any, name: str) -> NDArray[Any]:
-    """The pixels of an `Image` or `RawImage`.
+    """The pixels of an `Image` or `RawImage`: (H, W) or (H, W, 3) uint8 or uint16, in the order BGR.
 
-    Returns
-    -------
-    image : (H, W) or (H, W, 3) uint8 or uint16, in the order BGR.
-
-    Raises
-    ------
-    SourceError
-        If the encoding is unknown, or there are fewer bytes than the message promises.
+    Raises SourceError if the encoding is unknown, or there are fewer bytes than the message promises.
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     check_pixel_count(name, width, height)
@@ -377,29 +314,25 @@ def compressed_image(message: Any, name: str) -> NDArray[Any]:
 
 
 class VideoDecoder:
-    """Decodes a video that comes in pieces, one picture each.
+    """Decodes a video that comes in pieces, one picture each."""
 
-    name : of the topic, for messages. Raises SourceError if PyAV is not installed.
-    """
-
-    def __init__(self, name: str) -> None:
-        problem = missing("videos in messages", "av", ["av"])
-        if problem is not None:
-            raise SourceError(f"{name}: {problem}")
-        self._name = name
+    def __init__(self) -> None:
         self._codec: av.VideoCodecContext | None = None
         self._begun = False
 
-    def __call__(self, message: Any) -> NDArray[np.uint8] | None:
-        """The picture of one piece, (H, W, 3) uint8 BGR; None as long as the video has not begun."""
+    def __call__(self, message: Any, name: str) -> NDArray[np.uint8] | None:
+        """The picture of one piece, (H, W, 3) uint8 BGR; None as long as the video has not begun.
+
+        Raises SourceError if PyAV is not installed, or the codec is unknown.
+        """
+        require(name, "videos in messages", "av", "av")
         import av
 
         if self._codec is None:
-            codec = CODECS.get(message.format)
-            if codec is None:
+            if message.format not in CODECS:
                 known = ", ".join(CODECS)
-                raise SourceError(f"{self._name}: a video as {message.format!r}; required one of: {known}")
-            self._codec = cast("av.VideoCodecContext", av.CodecContext.create(codec, "r"))
+                raise SourceError(f"{name}: a video as {message.format!r}; required one of: {known}")
+            self._codec = cast("av.VideoCodecContext", av.CodecContext.create(CODECS[message.format], "r"))
             # With threads of its own, FFmpeg returns a picture only several pictures later.
             self._codec.thread_type = "NONE"
         try:
@@ -411,6 +344,6 @@ class VideoDecoder:
             return None
         for frame in frames:
             self._begun = True
-            check_pixel_count(self._name, frame.width, frame.height)
+            check_pixel_count(name, frame.width, frame.height)
             return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
         return None

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_pixel_count, damaged
+from tactflow.sources.base import FrameReader, check_pixel_count, damaged, require
 from tactflow.sources.files import decode_image, refuse_playlist
 from tactflow.sources.paths import find_path, refuse_devices, split_query
-from tactflow.system.extras import missing
 
 SCHEME = "lerobot:"
 SETTINGS = {"camera": "key of a camera", "episode": "number of an episode"}
@@ -50,9 +49,7 @@ class LeRobotEpisode(FrameReader):
     parser_errors = (Exception,)
 
     def __init__(self, spec: str, directory: Path | None = None, _fps: float | None = None) -> None:
-        problem = missing("LeRobot datasets", "lerobot", ["pyarrow", "av"])
-        if problem is not None:
-            raise SourceError(f"{spec}: {problem}")
+        require(spec, "LeRobot datasets", "lerobot", "pyarrow", "av")
         name, settings = split_query(spec.removeprefix(SCHEME), directory, SETTINGS)
         root = find_path(name, directory)
         refuse_devices(root / "meta")

@@ -91,9 +91,9 @@ def attachments(path: Path) -> dict[str, bytes]:
 
 
 def messages(
-    path: Path, contents: Contents, topics: Collection[str], start: int | None = None, end: int | None = None
+    path: Path, topics: Collection[str], start: int | None = None, end: int | None = None
 ) -> Iterator[Message]:
-    """The messages of some channels, in the order they were written.
+    """The messages of some channels of an MCAP file, in the order they were written.
 
     start, end : those with start <= time < end, ns. A file without an index ends at its last whole chunk.
 
@@ -102,12 +102,13 @@ def messages(
     ValueError : the file is damaged here, and not only cut off. OSError : it cannot be read.
     """
     with path.open("rb") as file:
-        summary = read_summary(file) or Summary()
-        wanted = {channel.id for channel in summary.channels.values() if channel.topic in topics}
+        summary = read_summary(file)
+        channels = [] if summary is None else summary.channels.values()
+        wanted = {channel.id for channel in channels if channel.topic in topics}
         size = path.stat().st_size
         for record in intact_records(file):
             if isinstance(record, Damage):
-                if contents.finished or record.end < size:
+                if summary is not None or record.end < size:
                     raise ValueError(f"bytes {record.start} to {record.end} are not as they were written")
             elif isinstance(record, Channel) and record.topic in topics:
                 wanted.add(record.id)

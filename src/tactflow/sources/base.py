@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
+from tactflow.system.extras import missing
 
 log = logging.getLogger("tactflow")
 
@@ -276,6 +277,13 @@ def check_pixel_count(name: str, width: int, height: int) -> None:
             f"{name}: its pictures are {width} x {height}, more than {MOST_PIXELS} pixels; if that is right, "
             "set the environment variable OPENCV_IO_MAX_IMAGE_PIXELS"
         )
+
+
+def require(name: object, what: str, extra: str, *modules: str) -> None:
+    """Raise SourceError unless these packages are installed; arguments as for `missing`."""
+    problem = missing(what, extra, modules)
+    if problem is not None:
+        raise SourceError(f"{name}: {problem}")
 
 
 def damaged(name: str, error: Exception) -> SourceError:

@@ -90,12 +90,12 @@ class Recording(StampedReader):
 
         contents, start = self._contents, self._start
         topics = {contents.frame_topic, contents.reference_topic}
-        played = messages(self._path, contents, topics, start=start)
+        played = messages(self._path, topics, start=start)
         if start is not None:
             first = next(played, None)
             if first is None:
                 return
-            before = messages(self._path, contents, {contents.reference_topic}, end=start)
+            before = messages(self._path, {contents.reference_topic}, end=start)
             references = [self._stored(message) for message in before]
             epoch = max((frame.epoch for frame in references), default=0)
             yield from ((frame, False) for frame in references if frame.epoch == epoch)
