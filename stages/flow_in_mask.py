@@ -34,8 +34,7 @@ class FlowInMask(Stage):
             "pixels; more markers make a mean over markers steadier and mix in gel that moves less",
         )
 
-    def __init__(self, params: Params) -> None:
-        self._params = params
+    params: Params
 
     def process(
         self,
@@ -45,7 +44,7 @@ class FlowInMask(Stage):
         evidence: Evidence | None = None,
     ) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside, or none near."""
-        dilate = self._params.dilate
-        if field is None or self._params.method == "mean":
+        dilate = self.params.dilate
+        if field is None or self.params.method == "mean":
             return flow_in_mask(markers, contact_mask, dilate=dilate)
         return flow_of_field(field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots")

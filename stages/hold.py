@@ -31,7 +31,7 @@ class Hold(Stage):
 
     def __init__(self, params: Params) -> None:
         """Start as if the signal had never been true."""
-        self.params = params
+        super().__init__(params)
         self.reset()
 
     def reset(self) -> None:

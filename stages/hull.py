@@ -51,8 +51,7 @@ class Hull(Stage):
                 raise ValueError("max_gap is for merge: near, not for merge: largest")
             return self
 
-    def __init__(self, params: Params) -> None:
-        self._params = params
+    params: Params
 
     def process(
         self,
@@ -60,7 +59,7 @@ class Hull(Stage):
         evidence: Evidence | None = None,
     ) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
-        params = self._params
+        params = self.params
         parts = contact_parts(
             contact_mask,
             min_area=params.min_area,

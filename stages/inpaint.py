@@ -24,9 +24,8 @@ class Inpaint(Stage):
         )
         radius: float = Field(RADIUS, gt=0, le=100, description="neighbourhood, processed px")
 
-    def __init__(self, params: Params) -> None:
-        self._params = params
+    params: Params
 
     def process(self, image: Image, marker_mask: MarkerMask) -> Unmarked:
         """The image with its markers filled."""
-        return remove_markers(image, marker_mask, method=self._params.method, radius=self._params.radius)
+        return remove_markers(image, marker_mask, method=self.params.method, radius=self.params.radius)

@@ -31,7 +31,7 @@ class MarkerMaskStage(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        self._params = params
+        super().__init__(params)
         self._dot: Dot | None = None
         self._known = False
 
@@ -51,7 +51,7 @@ class MarkerMaskStage(Stage):
         return marker_mask(image, self._dot)
 
     def _find(self, image: Image, valid: Valid | None) -> Dot | None:
-        params = self._params
+        params = self.params
         radius = None if params.dot == "auto" else params.dot
         found = find_dot(image, radius=radius, polarity=params.polarity, valid=valid)
         if found is None or params.contrast == "auto":

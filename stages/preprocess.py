@@ -80,7 +80,7 @@ class Preprocess(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        self._params = params
+        super().__init__(params)
         self._preprocessor: Preprocessor | None = None
 
     def process(self, frame: Frame) -> Preprocessed:
@@ -95,7 +95,7 @@ class Preprocess(Stage):
 
     def _report(self, before: tuple[int, int], after: tuple[int, int]) -> None:
         """Log how the picture is changed, once. before, after : (width, height), px."""
-        params = self._params
+        params = self.params
         steps = [
             *(["straightened"] if params.undistort else []),
             *(["rectified"] if params.homography else []),
@@ -108,7 +108,7 @@ class Preprocess(Stage):
             logger.info("%d x %d %s to %d x %d: stages.preprocess", *before, done, *after)
 
     def _build(self, width: int, height: int) -> Preprocessor:
-        params = self._params
+        params = self.params
         lens, plane = params.undistort, params.homography
         return Preprocessor(
             (width, height),

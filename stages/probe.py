@@ -49,7 +49,7 @@ class Probe(Stage):
 
     def __init__(self, params: Params, skipping: bool = True) -> None:
         """Prepare; the first frame says where to look. Where nothing is skipped, nothing is looked at."""
-        self.params = params
+        super().__init__(params)
         self._skipping = skipping
         self._probe: ChangeProbe | None = None
         self._gel = slice(None), slice(None)

@@ -41,7 +41,7 @@ class Tracker(Stage):
         )
 
     def __init__(self, params: Params) -> None:
-        self._params = params
+        super().__init__(params)
         self.reset()
 
     def reset(self) -> None:
@@ -68,11 +68,11 @@ class Tracker(Stage):
 
     def _first_tracker(self, image: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> MarkerTracker:
         self._detection = detect_markers(
-            image, dot_radius=self._params.dot, polarity=self._params.polarity, valid=valid
+            image, dot_radius=self.params.dot, polarity=self.params.polarity, valid=valid
         )
         if self._detection.doubt is not None:
             logger.warning("tracker: %s", self._detection.doubt)
         return self._tracker_of([image], self._detection)
 
     def _tracker_of(self, references: list[NDArray[np.uint8]], detection: Detection) -> MarkerTracker:
-        return MarkerTracker(references, detection, max_displacement=self._params.max_displacement)
+        return MarkerTracker(references, detection, max_displacement=self.params.max_displacement)

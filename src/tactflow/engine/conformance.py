@@ -54,8 +54,6 @@ def build(cls: type[Any], params: StageParams, offered: Mapping[str, Any]) -> Pa
     """
     wanted = inspect.signature(cls).parameters
     part: Part = cls(params, **{name: value for name, value in offered.items() if name in wanted})
-    # Whether or not the constructor calls that of its base class.
-    part.params = params
     return part
 
 

@@ -77,12 +77,20 @@ class Part:
     description: str | None = None
     """For people: what it reads or where it writes. May be set by the constructor or by `open`."""
 
+    params: Any
+    """Its parameters. Every part keeps them, whether or not its constructor calls that of this class."""
+
+    def __new__(cls, params: Any = None, *_: Any, **__: Any) -> Self:
+        """Keep the parameters."""
+        part = super().__new__(cls)
+        part.params = params
+        return part
+
     def __init__(self, params: Any) -> None:
-        """Prepare, and keep the parameters; nothing is opened yet.
+        """Prepare; nothing is opened yet.
 
         params : of the class's own `Params`.
         """
-        self.params = params
 
     def open(self) -> None:
         """Take what the run needs: files, sockets, devices.
