@@ -63,7 +63,7 @@ def scale() -> Scale:
 def session_of(scene: Scene) -> Session:
     """Every press of a scene at its deepest, with the true outline and without markers."""
     preprocess = _preprocessor()
-    rest = scene.truth(0, preprocess).unmarked
+    rest = preprocess(scene.clean(0))
     presses = [_press(scene, index, preprocess) for index in deepest(scene)]
     return Session(rest, preprocess.mapping, presses, np.zeros((0, 2)), len(scene))
 
@@ -83,7 +83,8 @@ def _press(scene: Scene, index: int, preprocess: Preprocessor) -> Press:
     mask = np.where(truth.contact_mask, 255, 0).astype(np.uint8)
     radius = float(np.sqrt(np.count_nonzero(mask) / np.pi))
     center = truth.center or (0.0, 0.0)
-    return Press(index, noisy(truth.unmarked, index), mask, np.zeros(mask.shape, np.bool_), center, radius)
+    image = noisy(preprocess(scene.clean(index)), index)
+    return Press(index, image, mask, np.zeros(mask.shape, np.bool_), center, radius)
 
 
 def noisy(image: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
@@ -98,7 +99,7 @@ def _compare(photometry: Photometry, scene: Scene, tally: Tally, honest: Tally) 
     honest : gets the errors of the greatest depth against their standard errors.
     """
     preprocess = _preprocessor()
-    rest = Rest(scene.truth(0, preprocess).unmarked)
+    rest = Rest(preprocess(scene.clean(0)))
     surface = Surface(photometry.model, scale(), photometry.found.errors())
     for index in deepest(scene):
         press = _press(scene, index, preprocess)

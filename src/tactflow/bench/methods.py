@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.bench import metrics, score
 from tactflow.bench.pipelines import Bench
@@ -56,9 +57,13 @@ def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Nod
 
 @dataclass(frozen=True, slots=True)
 class _Given:
-    """What the stages of the default pipeline hand to each other in one frame, and the truth about it."""
+    """What the stages of the default pipeline hand to each other in one frame, and the truth about it.
+
+    clean : (H, W, 3) uint8, the processed frame without markers.
+    """
 
     frame: Frame
+    clean: NDArray[np.uint8]
     truth: Truth
     deep: bool
     ports: Mapping[str, Any]
@@ -82,6 +87,7 @@ def _run_chain(pipeline: Pipeline, rendered: Rendered) -> Iterator[_Given]:
         pixels = np.array(rendered.frames[index])
         pixels.flags.writeable = False
         frame = Frame("bench", index, index / rendered.scene.fps, pixels, reference=index == 0)
+        clean = process["preprocess"](frame=replace(frame, image=rendered.scene.clean(index))).image.copy()
         image, mapping = process["preprocess"](frame=frame)
         marker_mask = process["marker_mask"](image=image)
         markers = process["tracker"](image=image, frame=frame)
@@ -96,7 +102,7 @@ def _run_chain(pipeline: Pipeline, rendered: Rendered) -> Iterator[_Given]:
             "field": None if isinstance(field, Absent) else field.field,
             "contact_mask": np.where(truth.contact_mask, 255, 0).astype(np.uint8),
         }
-        yield _Given(frame, truth, rendered.deep(index), ports)
+        yield _Given(frame, clean, truth, rendered.deep(index), ports)
 
 
 class _Judge:
@@ -112,10 +118,8 @@ class _Judge:
     def inpaint(self, given: _Given, found: Any) -> None:
         mask = given.ports["marker_mask"]
         if mask.any():
-            mae = metrics.masked_mae(found, given.truth.unmarked, mask)
-            self.tally.add(
-                inpaint_mae=mae, inpaint_psnr=metrics.masked_psnr(found, given.truth.unmarked, mask)
-            )
+            mae = metrics.masked_mae(found, given.clean, mask)
+            self.tally.add(inpaint_mae=mae, inpaint_psnr=metrics.masked_psnr(found, given.clean, mask))
 
     def difference(self, given: _Given, found: Any) -> None:
         if score.add_decision(self.tally, bool(found.touching), given.truth, given.deep):

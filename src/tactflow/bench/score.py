@@ -59,10 +59,10 @@ def add_geometry(tally: Tally, contact: Contact, truth: Truth) -> None:
 
     Directions are judged where the truth is at least `DIRECTED` times as long as wide.
     """
-    tally.add(hull_iou=metrics.convex_iou(contact.hull, truth.hull))
+    shape = truth.contact_mask.shape
+    tally.add(hull_iou=metrics.polygon_iou(contact.hull, truth.hull, shape))
     area = metrics.pixel_area(truth.hull)
-    if area > 0:
-        tally.add(area_error=100 * abs(contact.area - area) / area)
+    tally.add(area_error=100 * abs(contact.area - area) / area)
     if truth.center is not None:
         tally.add(center_error=metrics.distance(contact.center, truth.center))
     if truth.angle is None:
@@ -165,7 +165,11 @@ class PipelineScore(Judge):
             if result.contact_mask is not None:
                 add_mask(self.tally, result.contact_mask, truth)
         if deep and truth.touching:
-            overlap = 0.0 if contact is None else metrics.convex_iou(contact.hull, truth.hull)
+            overlap = (
+                0.0
+                if contact is None
+                else metrics.polygon_iou(contact.hull, truth.hull, truth.contact_mask.shape)
+            )
             self.worst.add(overlap, result, truth.contact_mask)
         if result.markers is not None:
             self._markers.add(result.markers, truth)

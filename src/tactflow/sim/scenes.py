@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +10,9 @@ from tactflow.sim.camera import SIZE, Camera, delivered_frames
 from tactflow.sim.picture import Painter
 from tactflow.sim.recipes import SCENES
 from tactflow.sim.settings import Settings, parse_query
-from tactflow.sim.truth import Truth, measure
+from tactflow.sim.truth import Truth
 from tactflow.system.spelling import did_you_mean
+from tactflow.vision.geometry import PixelMapping, Preprocessor
 
 FPS = 60.0
 """Frames per second of every scene."""
@@ -68,6 +66,7 @@ class Scene:
         self.settings = settings
         self.camera = Camera(SIZE, settings.perspective, settings.distortion, settings.aperture)
         self.layout = markers.layout(settings, SIZE)
+        self._raw = PixelMapping.identity(SIZE)
         self._programme = programme
         self._shapes = programme.build(settings.bend) if programme else ()
         self._delivered = delivered_frames(len(self), settings.dropped, settings.repeated, settings.seed)
@@ -100,17 +99,16 @@ class Scene:
         moment = self._moment(index)
         return self._painter.clean(index, moment, self._contact(moment)[0])
 
-    def truth(self, index: int, mapping: Any = None) -> Truth:
+    def truth(self, index: int, mapping: PixelMapping | Preprocessor | None = None) -> Truth:
         """Ground truth of frame `index`.
 
-        mapping : a `PixelMapping` or `Preprocessor` of `tactflow.vision.geometry` gives the truth in
-            coordinates of the processed frame, with the contact evaluated at its pixel centres; a
-            `Preprocessor` also computes `unmarked` exactly as it does the frame. None: raw coordinates.
+        mapping : gives the truth in coordinates of the processed frame, with the contact evaluated at its
+            pixel centres. None: raw coordinates.
         """
-        pressed, cycle = self._contact(self._moment(index))
-        origin, position = self.markers(index)
-        clean = partial(self.clean, index)
-        return measure(pressed, self.camera, origin, position, ~self._hidden(cycle), mapping, clean)
+        pixels = mapping.mapping if isinstance(mapping, Preprocessor) else mapping or self._raw
+        presses, cycle = self._contact(self._moment(index))
+        shown = ~self._hidden(cycle)
+        return Truth(presses, self.camera, pixels, self.layout.rest, shown)
 
     def markers(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Origin and position (N, 2) of the markers in frame `index`, raw px; faster than `truth`."""
