@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -92,7 +93,9 @@ def test_a_direction_is_invented_for_a_disc_and_missing_only_where_the_contact_i
     nearly_round = np.zeros_like(truth.contact_mask)
     nearly_round[10:20, 10:25] = True
     without = replace(perfect(truth), angle=None)
-    score.add_geometry(tally, without, replace(truth, contact_mask=nearly_round))
+    stubby = copy(truth)
+    stubby.contact_mask = nearly_round
+    score.add_geometry(tally, without, stubby)
     assert "angle_missing" not in tally.errors()
     score.add_geometry(tally, without, truth)
     assert tally.errors()["angle_missing"] == 100

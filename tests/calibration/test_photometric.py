@@ -61,13 +61,13 @@ def test_heights_of_other_contacts_are_right_to_a_few_hundredths_of_the_depth(
     learned: Photometry, scene: str, worst: float
 ) -> None:
     shown = open_scene(scene)
-    rest = Rest(shown.truth(0, PREPROCESS).unmarked)
+    rest = Rest(PREPROCESS(shown.clean(0)))
     surface = Surface(learned.model, SCALE, learned.found.errors())
     for index in (60, 120):
         truth = shown.truth(index, PREPROCESS)
         sunk = truth.sunk * RAW_MM
         mask = np.where(truth.contact_mask, 255, 0).astype(np.uint8)
-        found = surface.depth(truth.unmarked, rest, mask)
+        found = surface.depth(PREPROCESS(shown.clean(index)), rest, mask)
         around = sunk > 0.02 * sunk.max()
         assert np.sqrt(np.mean((found.heights - sunk)[around] ** 2)) < worst * sunk.max()
         assert found.volume == pytest.approx(sunk.sum() * SCALE.area(1.0), rel=0.15)
@@ -78,13 +78,13 @@ def test_heights_of_other_contacts_are_right_to_a_few_hundredths_of_the_depth(
 def test_heights_are_right_where_one_of_the_lights_does_not_reach_every_slope() -> None:
     learned = fit_photometry(session_of(open_scene("ball?frames=260&light=dark_channel")), SCALE, BALL)
     shown = open_scene("cable?seed=11&frames=200&light=dark_channel")
-    rest = Rest(shown.truth(0, PREPROCESS).unmarked)
+    rest = Rest(PREPROCESS(shown.clean(0)))
     surface, errors = Surface(learned.model, SCALE), []
     for index in deepest(shown):
         truth = shown.truth(index, PREPROCESS)
         sunk = truth.sunk * RAW_MM
         mask = np.where(truth.contact_mask, 255, 0).astype(np.uint8)
-        off = surface.depth(noisy(truth.unmarked, index), rest, mask).heights - sunk
+        off = surface.depth(noisy(PREPROCESS(shown.clean(index)), index), rest, mask).heights - sunk
         errors.append(np.sqrt(np.mean(off[sunk > 0.02 * sunk.max()] ** 2)) / sunk.max())
     # With colours that are averaged there, too, it is 0.06.
     assert max(errors) < 0.053
@@ -97,11 +97,11 @@ def test_stated_errors_of_the_depth_grow_where_slopes_are_steeper_than_the_ball_
     surface = Surface(learned.model, SCALE, learned.found.errors())
     for name in ("finger", "cable", "long_edge", "box", "coin"):
         shown = open_scene(f"{name}?seed=11&frames=200")
-        rest = Rest(shown.truth(0, PREPROCESS).unmarked)
+        rest = Rest(PREPROCESS(shown.clean(0)))
         for index in deepest(shown)[:2]:
             truth = shown.truth(index, PREPROCESS)
             mask = np.where(truth.contact_mask, 255, 0).astype(np.uint8)
-            found = surface.depth(truth.unmarked, rest, mask)
+            found = surface.depth(PREPROCESS(shown.clean(index)), rest, mask)
             assert found.greatest_stderr is not None
             stated[name] = found.greatest_stderr / found.greatest
             off.append((found.greatest - float(truth.sunk.max()) * RAW_MM) / found.greatest_stderr)

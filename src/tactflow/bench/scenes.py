@@ -63,7 +63,7 @@ TROUBLES = (
 )
 """What went wrong on recordings of real gels, one trouble in each scene."""
 
-QUICK_STAGES = _cases("press:20 bright_cable:20 jumps:16")
+QUICK_STAGES = _cases("press:10 bright_cable:10 jumps:10")
 """For methods alone; short, because OpenCV's inpainting is slow."""
 
 FULL_STAGES = _cases(

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PIPELINE",
         help="measure these as well, beside the packaged ones; ./pipeline.yaml is measured if it is there",
     )
-    add("--quick", action="store_true", help="three short scenes, below a minute")
+    add("--quick", action="store_true", help="three short scenes, half a minute")
     add(
         "--scene",
         action="append",

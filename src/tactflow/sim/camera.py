@@ -114,8 +114,8 @@ class Camera:
         return np.asarray(0.5 + 0.5 * np.tanh(inside / _APERTURE_EDGE), dtype=np.float64)
 
     def sees(self, raw: Points) -> NDArray[np.bool_]:
-        """(N,) bool: whether raw positions (N, 2) lie in the frame and are lit."""
-        inside = np.all((raw >= -0.5) & (raw <= np.array(self.size) - 0.5), axis=1)
+        """(...) bool: whether raw positions (..., 2) lie in the frame and are lit."""
+        inside = np.all((raw >= -0.5) & (raw <= np.array(self.size) - 0.5), axis=-1)
         return np.asarray(inside & (self.aperture(raw) >= 0.5))
 
     def local_inverse(self, gel: Points) -> NDArray[np.float64]:

@@ -104,14 +104,17 @@ class Truth:
         high = np.array([columns.max(), rows.max()]) - markers.min(axis=0, initial=0)
         step = max(2.0, float(np.sqrt(np.prod(high - low) / FLOW_POINTS)))
         x, y = (np.arange(low[axis] - 2 * step, high[axis] + 2 * step, step) for axis in (0, 1))
-        rest = np.stack(np.meshgrid(x, y), axis=-1)
-        coarse = self.displacement(rest.reshape(-1, 2)).reshape(rest.shape)
+        rest = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        coarse = self.displacement(rest)
+        raw = self._mapping.to_raw(rest + coarse)
+        gel = self._camera.to_gel(raw)
         parts = round(step / FLOW_FINE)
         fine = (len(x) * parts, len(y) * parts)
-        moved = np.asarray(cv2.resize(coarse, fine), np.float64).reshape(-1, 2)
-        raw = self._mapping.to_raw(np.asarray(cv2.resize(rest, fine)).reshape(-1, 2) + moved)
-        gel = self._camera.to_gel(raw).astype(np.float32)
-        inside = self._camera.sees(raw) & in_contact(self._presses, gel[:, 0], gel[:, 1])
+        moved, raw, gel = (
+            np.asarray(cv2.resize(grid.reshape(len(y), len(x), 2), fine)) for grid in (coarse, raw, gel)
+        )
+        gel_x, gel_y = np.moveaxis(gel.astype(np.float32), -1, 0)
+        inside = self._camera.sees(raw) & in_contact(self._presses, gel_x, gel_y)
         if not inside.any():
             return None
         dx, dy = moved[inside].mean(axis=0)

@@ -103,7 +103,7 @@ def test_normalized_is_as_close_to_the_unmarked_gel_as_telea(scene: str) -> None
     recording = open_scene(f"{scene}{'&' if '?' in scene else '?'}frames=60")
     dot = find_dot(recording.frame(0))
     assert dot is not None
-    image, truth = recording.frame(25), recording.truth(25).unmarked.astype(float)
+    image, truth = recording.frame(25), recording.clean(25).astype(float)
     mask = marker_mask(image, dot)
 
     def error(method: InpaintMethod) -> float:
