@@ -111,7 +111,8 @@ class Truth:
         parts = round(step / FLOW_FINE)
         fine = (len(x) * parts, len(y) * parts)
         moved, raw, gel = (
-            np.asarray(cv2.resize(grid.reshape(len(y), len(x), 2), fine)) for grid in (coarse, raw, gel)
+            np.asarray(cv2.resize(grid.reshape(len(y), len(x), 2), fine), np.float64)
+            for grid in (coarse, raw, gel)
         )
         gel_x, gel_y = np.moveaxis(gel.astype(np.float32), -1, 0)
         inside = self._camera.sees(raw) & in_contact(self._presses, gel_x, gel_y)
