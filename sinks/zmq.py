@@ -236,7 +236,7 @@ class Zmq(Sink):
 
     def counters(self) -> dict[str, int]:
         """serialised : messages encoded. subscriptions : distinct ones now."""
-        subscriptions = 0 if self._publisher is None else len(self._publisher.subscriptions)
+        subscriptions = 0 if self._publisher is None else self._publisher.subscriptions
         return {"serialised": self._serialised, "subscriptions": subscriptions}
 
     def write(self, result: Result) -> None:

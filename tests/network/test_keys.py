@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -184,6 +185,17 @@ def test_keys_that_other_users_can_read_or_replace_are_refused(folders: tuple[Pa
         with pytest.raises(StageError, match=f"{path}: other users can read or change it; chmod go-rwx"):
             Publisher(ANY_PORT, 1, 32768, str(publisher))
         os.chmod(path, before)
+    for above, mode, refused in ((publisher.parent, 0o777, True), (publisher.parent, 0o1777, False)):
+        before = above.stat().st_mode
+        os.chmod(above, mode)
+        with pytest.raises(StageError, match=f"{above}: other") if refused else nullcontext():
+            Publisher(ANY_PORT, 1, 32768, str(publisher)).close()
+        os.chmod(above, before)
+    if os.geteuid() == 0:
+        os.chown(publisher, 12345, -1)
+        with pytest.raises(StageError, match=f"{publisher}: belongs to another user"):
+            Publisher(ANY_PORT, 1, 32768, str(publisher))
+        os.chown(publisher, 0, -1)
     os.chmod(subscriber / "subscriber.key_secret", 0o604)
     with pytest.raises(WrongKeysError, match="other users can read"):
         Subscriber(keys=subscriber)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import stat
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -115,10 +116,7 @@ def _load(file: Path) -> tuple[bytes, bytes]:
     """The public and the secret key in a file; the latter is empty in a file of a public key."""
     is_secret = file.suffix == ".key_secret"
     try:
-        # Whoever may change a key, or its folder, decides who is admitted.
-        for path, forbidden in ((file, 0o077 if is_secret else 0o022), (file.parent, 0o022)):
-            if sys.platform != "win32" and path.stat().st_mode & forbidden:
-                raise WrongKeysError(f"{path}: other users can read or change it; chmod go-rwx {path}")
+        _refuse_shared(file, is_secret)
         public, secret = zmq.auth.load_certificate(file)
     except OSError as error:
         raise WrongKeysError(f"{file}: {error.strerror}; {HINT}") from None
@@ -128,3 +126,22 @@ def _load(file: Path) -> tuple[bytes, bytes]:
     if len(public) != 40 or (is_secret and len(secret or b"") != 40):
         raise WrongKeysError(f"{file}: required keys of 40 letters; {HINT}")
     return public, secret or b""
+
+
+def _refuse_shared(file: Path, is_secret: bool) -> None:
+    """Refuse a key that another user can change, replace by renaming a folder above it, or read (if secret)."""
+    if sys.platform == "win32":
+        return
+    for key in {file.absolute(), file.resolve()}:
+        for path in (key, *key.parents):
+            found = path.stat()
+            forbidden = 0o002
+            if path in (key, key.parent):
+                forbidden = 0o077 if is_secret and path == key else 0o022
+            elif found.st_mode & stat.S_ISVTX:
+                # In a sticky folder, such as /tmp, nobody renames what belongs to somebody else.
+                forbidden = 0
+            if found.st_mode & forbidden:
+                raise WrongKeysError(f"{path}: other users can read or change it; chmod go-rwx {path}")
+            if found.st_uid not in (0, os.geteuid()):
+                raise WrongKeysError(f"{path}: belongs to another user, who can change it; chown it")
