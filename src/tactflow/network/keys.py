@@ -129,7 +129,7 @@ def _load(file: Path) -> tuple[bytes, bytes]:
 
 
 def _refuse_shared(file: Path, is_secret: bool) -> None:
-    """Refuse a key that another user can change, replace by renaming a folder above it, or read (if secret)."""
+    """Refuse a key that others can change, replace by renaming a folder above it, or read (if secret)."""
     if sys.platform == "win32":
         return
     for key in {file.absolute(), file.resolve()}:
