@@ -12,17 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.classic import functions as classic
-from tactflow.classic.tracker import GridTracker
-from tactflow.engine.frame import Absent, Frame
-from tactflow.vision.contact import ContactDetector, ContactResult
-from tactflow.vision.flow import flow_in_mask
-from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.engine.frame import Absent
+from tactflow.vision.contact import ContactDetector
 from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
-from tactflow.vision.markers.mask import find_dot, marker_mask
+from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 from tactflow.vision.markers.tracking import MarkerTracker
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.vision.types import Markers
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float64]
@@ -121,10 +117,6 @@ class Transformation:
     scale: float = 1.0
 
 
-def _turned(k: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
-    return lambda picture: np.ascontiguousarray(np.rot90(picture, k))
-
-
 def _twice(picture: NDArray[Any]) -> NDArray[Any]:
     """Twice as large: masks by repetition, which is exact; pictures by interpolation, since blocks of equal
     pixels have no slope inside and are not what a lens makes."""
@@ -136,46 +128,24 @@ def _stack(x: NDArray[Any], y: NDArray[Any]) -> Points:
     return np.column_stack([x, y]).astype(np.float64)
 
 
-ROTATIONS = (
-    Transformation("turned by 0", _turned(0), lambda p, _w, _h: p, lambda a: a),
-    Transformation(
-        "turned by 90", _turned(1), lambda p, w, _h: _stack(p[:, 1], w - 1 - p[:, 0]), lambda a: a + 90
-    ),
-    Transformation(
-        "turned by 180", _turned(2), lambda p, w, h: _stack(w - 1 - p[:, 0], h - 1 - p[:, 1]), lambda a: a
-    ),
-    Transformation(
-        "turned by 270", _turned(3), lambda p, _w, h: _stack(h - 1 - p[:, 1], p[:, 0]), lambda a: a + 90
-    ),
+TURNED = Transformation(
+    "turned by 90",
+    lambda picture: np.ascontiguousarray(np.rot90(picture)),
+    lambda p, w, _h: _stack(p[:, 1], w - 1 - p[:, 0]),
+    lambda a: a + 90,
 )
-MIRRORS = (
-    Transformation(
-        "mirrored left to right",
-        lambda picture: np.ascontiguousarray(picture[:, ::-1]),
-        lambda p, w, _h: _stack(w - 1 - p[:, 0], p[:, 1]),
-        lambda a: -a,
-    ),
-    Transformation(
-        "mirrored top to bottom",
-        lambda picture: np.ascontiguousarray(picture[::-1]),
-        lambda p, _w, h: _stack(p[:, 0], h - 1 - p[:, 1]),
-        lambda a: -a,
-    ),
+MIRRORED = Transformation(
+    "mirrored left to right",
+    lambda picture: np.ascontiguousarray(picture[:, ::-1]),
+    lambda p, w, _h: _stack(w - 1 - p[:, 0], p[:, 1]),
+    lambda a: -a,
 )
 DOUBLED = Transformation("doubled", _twice, lambda p, _w, _h: 2 * p + 0.5, lambda a: a, 2.0)
-MOTIONS = (*ROTATIONS, *MIRRORS)
 
 
 def axis_difference(a: float, b: float) -> float:
     """Angle between two axes, degrees, 0 to 90."""
     return abs((a - b + 90) % 180 - 90)
-
-
-def matched(found: Points, expected: Points) -> NDArray[np.float64]:
-    """Distance of each expected point to the nearest found one, px; infinite where none was found."""
-    if len(found) == 0:
-        return np.full(len(expected), np.inf)
-    return np.asarray(np.hypot(*(expected[:, None] - found[None]).transpose(2, 0, 1)).min(axis=1))
 
 
 def apart(a: NDArray[Any], b: NDArray[Any]) -> float:
@@ -192,90 +162,44 @@ def apart(a: NDArray[Any], b: NDArray[Any]) -> float:
     return far
 
 
-def overlap(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Intersection over union of two masks; 1 for two empty ones."""
-    both, either = np.count_nonzero((a > 0) & (b > 0)), np.count_nonzero((a > 0) | (b > 0))
-    return both / either if either else 1.0
-
-
 # -- every method of every stage that looks at pictures ---------------------------------------------------
 
 
 def dog_mask(reference: Image, image: Image) -> Image:
-    """The default marker mask; empty where the reference shows no markers, as in the stage."""
+    """The marker mask; empty where the reference shows no markers, as in the stage."""
     dot = find_dot(reference)
     return np.zeros(image.shape[:2], np.uint8) if dot is None else marker_mask(image, dot)
 
 
-MARKER_MASKS: Mapping[str, Callable[[Image, Image], Image]] = {
-    "dog": dog_mask,
-    "classic": lambda _reference, image: classic.mask_marker(image),
-}
-INPAINTING = ("normalized", "telea", "ns", "none")
-HULLS: Mapping[str, Callable[..., Contact | None]] = {
-    "moments": contact_geometry,
-    "classic": lambda mask, **_: classic.get_convex_hull_area(mask),
-}
-FLOWS: Mapping[str, Callable[..., Flow]] = {
-    "mean": flow_in_mask,
-    "classic": lambda markers, mask, dilate=0.0: classic.mean_flow(markers, mask, round(dilate)),
-}
-
-
-class ClassicDetector:
-    """The original script's comparison, used like a `ContactDetector`."""
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        self._reference: Image | None = None
-
-    def add_reference(self, image: Image) -> None:
-        self._reference = image.copy()
-
-    def detect(self, image: Image) -> ContactResult:
-        assert self._reference is not None
-        mask = classic.difference(image, self._reference)
-        return ContactResult(mask, bool(mask.any()))
-
-
-DIFFERENCES: Mapping[str, Callable[[], ContactDetector | ClassicDetector]] = {
-    "noise": ContactDetector,
-    "colour": partial(ContactDetector, "colour"),
-    "classic": ClassicDetector,
-}
+def detector(method: str, reference: Image) -> ContactDetector:
+    """A detector with one reference."""
+    made = ContactDetector(method)  # type: ignore[arg-type]
+    made.add_reference(reference)
+    return made
 
 
 def contact_mask(method: str, reference: Image, image: Image) -> Image:
     """The contact mask of one image against one reference."""
-    detector = DIFFERENCES[method]()
-    detector.add_reference(reference)
-    return detector.detect(image).mask
+    return detector(method, reference).detect(image).mask
 
 
-TRACKERS: Mapping[str, Callable[[Image], Any]] = {
-    "appearance": lambda reference: MarkerTracker(reference, detect_markers(reference)),
-    "classic": GridTracker,
-}
-
-
-def tracked(make: Callable[[Image], Any], reference: Image, image: Image) -> Markers:
+def tracked(reference: Image, image: Image) -> Markers:
     """The markers of the reference in one image."""
-    markers: Markers = make(reference).track(image)
-    return markers
+    return MarkerTracker(reference, detect_markers(reference)).track(image)
 
 
 def filled(method: Any, _reference: Image, image: Image) -> Image:
-    """The image without what the script's mask takes for markers."""
-    return remove_markers(image, classic.mask_marker(image), method=method)
+    """The image without what looks like markers of radius 3 px."""
+    return remove_markers(image, marker_mask(image, Dot(3.0)), method=method)
 
 
+DIFFERENCES = ("noise", "colour")
+INPAINTING = ("normalized", "telea", "ns", "none")
 PICTURE_METHODS: Mapping[str, Callable[[Image, Image], Any]] = {
-    **{f"marker_mask-{name}": method for name, method in MARKER_MASKS.items()},
+    "marker_mask": dog_mask,
     **{f"inpaint-{name}": partial(filled, name) for name in INPAINTING},
     **{f"difference-{name}": partial(contact_mask, name) for name in DIFFERENCES},
-    **{f"tracker-{name}": partial(tracked, make) for name, make in TRACKERS.items()},
+    "tracker": tracked,
 }
 """Name -> callable of (reference, image)."""
 
@@ -310,10 +234,3 @@ def assert_mask(mask: Image, shape: tuple[int, int]) -> None:
     assert mask.shape == shape
     assert mask.dtype == np.uint8
     assert set(np.unique(mask).tolist()) <= {0, 255}
-
-
-def frame(image: Image, seq: int = 0, *, reference: bool = False) -> Frame:
-    """A frame as the capture stage hands it over: read-only."""
-    image = image.copy()
-    image.flags.writeable = False
-    return Frame("stress", seq, seq / 60, image, reference=reference)

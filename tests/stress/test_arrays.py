@@ -5,29 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from tactflow.drawing.results import Annotator
 from tactflow.vision.change import ChangeProbe
-from tactflow.vision.flow import inside_mask
+from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
+from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
-from tactflow.vision.markers.mask import Dot, marker_mask
+from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.stress.builders import (
-    DIFFERENCES,
-    FLOWS,
-    HULLS,
-    INPAINTING,
-    PICTURE_METHODS,
-    SIZE,
-    TRACKERS,
-    gel,
-)
+from tests.stress.builders import PICTURE_METHODS, SIZE, detector, gel
 
 Array = NDArray[Any]
 
@@ -38,24 +29,11 @@ def _strided(array: Array) -> Array:
     return large[::2, ::3]
 
 
-def _backwards(array: Array) -> Array:
-    return np.ascontiguousarray(array[::-1, ::-1])[::-1, ::-1]
-
-
-def _window(array: Array) -> Array:
-    """A part of a larger array, as a crop of a camera's frame is."""
-    large = np.full((array.shape[0] + 5, array.shape[1] + 7, *array.shape[2:]), 77, array.dtype)
-    large[2:-3, 3:-4] = array
-    return large[2:-3, 3:-4]
-
-
 LAYOUTS: dict[str, Callable[[Array], Array]] = {
     "strided": _strided,
-    "backwards": _backwards,
-    "a window": _window,
+    "backwards": lambda array: np.ascontiguousarray(array[::-1, ::-1])[::-1, ::-1],
     "Fortran order": np.asfortranarray,
 }
-
 PLAIN = gel()
 CONTACT = contact_geometry(PLAIN.mask)
 MARKERS = Markers(PLAIN.origin, PLAIN.position, np.zeros(24, np.uint8), np.full(24, np.nan))
@@ -66,32 +44,26 @@ def _probed(reference: Array, image: Array) -> Any:
     return [probe.look(picture) for picture in (reference,) * 8 + (image, image)]
 
 
-def _preprocessed(**settings: Any) -> Callable[[Array, Array], Any]:
-    return lambda _reference, image: Preprocessor(SIZE, **settings)(image)
-
-
 CORNERS = [[3.0, 2], [170, 5], [1, 120], [174, 125]]
 SQUARE = [[0.0, 0], [99, 0], [0, 79], [99, 79]]
+PREPROCESS: dict[str, dict[str, Any]] = {
+    "area": {"downsample": 2, "rotate": 90},
+    "pyramid": {"downsample": 2, "method": "pyramid"},
+    "crop": {"crop": (5, 7, 50, 40)},
+    "remap": {"homography": (CORNERS, SQUARE, (100, 80))},
+}
 PICTURES: dict[str, Callable[[Array, Array], Any]] = {
     **PICTURE_METHODS,
     "probe": _probed,
-    "preprocess-area": _preprocessed(downsample=2, rotate=90),
-    "preprocess-area 4": _preprocessed(downsample=4),
-    "preprocess-pyramid": _preprocessed(downsample=2, method="pyramid"),
-    "preprocess-crop": _preprocessed(crop=(5, 7, 50, 40)),
-    "preprocess-remap": _preprocessed(homography=(CORNERS, SQUARE, (100, 80))),
+    **{name: lambda _, image, s=s: Preprocessor(SIZE, **s)(image) for name, s in PREPROCESS.items()},
     "draw": lambda _reference, image: Annotator()(image, contact=CONTACT, markers=MARKERS),
 }
-
 MASKS: dict[str, Callable[[Array], Any]] = {
-    **{f"hull-{name}": lambda mask, name=name: HULLS[name](mask) for name in HULLS},
-    "hull-groups": lambda mask: contact_parts(mask, min_area=5, max_gap=2)[0],
-    **{f"flow-{name}": lambda mask, name=name: FLOWS[name](MARKERS, mask, dilate=3) for name in FLOWS},
+    "hull": contact_geometry,
+    "parts": lambda mask: contact_parts(mask, min_area=5, max_gap=2)[0],
+    "flow": lambda mask: flow_in_mask(MARKERS, mask, dilate=3),
     "inside": lambda mask: inside_mask(PLAIN.position, mask, 2.5),
-    **{
-        f"inpaint-{name}": lambda mask, name=name: remove_markers(PLAIN.touched, mask, method=name)
-        for name in INPAINTING
-    },
+    "inpaint": lambda mask: remove_markers(PLAIN.touched, mask),
     "draw": lambda mask: Annotator(view="contact")(PLAIN.touched, contact=CONTACT, contact_mask=mask),
 }
 
@@ -107,122 +79,67 @@ def flat(value: Any) -> list[Any]:
     return [value]
 
 
-def assert_equal(one: Any, other: Any) -> None:
-    for a, b in zip(flat(one), flat(other), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("name", PICTURES)
-def test_the_layout_of_a_picture_in_memory_changes_nothing(name: str, layout: str) -> None:
-    arranged = [LAYOUTS[layout](picture) for picture in (PLAIN.reference, PLAIN.touched)]
-    assert layout == "a window" or not arranged[0].flags.c_contiguous
-    assert_equal(PICTURES[name](*arranged), PICTURES[name](PLAIN.reference, PLAIN.touched))
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("name", MASKS)
-def test_the_layout_of_a_mask_in_memory_changes_nothing(name: str, layout: str) -> None:
-    assert_equal(MASKS[name](LAYOUTS[layout](PLAIN.mask)), MASKS[name](PLAIN.mask))
+def assert_same(compute: Callable[..., Any], *arrays: Array) -> None:
+    """The result is the same in every layout; inputs are neither written nor part of the result."""
+    given = [array.copy() for array in arrays]
+    expected = flat(compute(*given))
+    for array, copy in zip(arrays, given, strict=True):
+        assert np.array_equal(array, copy)
+        assert not any(isinstance(part, np.ndarray) and np.shares_memory(part, copy) for part in expected)
+    for layout in LAYOUTS.values():
+        arranged = [layout(array) for array in arrays]
+        for array in arranged:
+            array.flags.writeable = False
+        for part, other in zip(expected, flat(compute(*arranged)), strict=True):
+            np.testing.assert_array_equal(other, part)
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_inputs_are_neither_written_nor_handed_back(name: str) -> None:
-    given = [PLAIN.reference.copy(), PLAIN.touched.copy()]
-    result = PICTURES[name](*given)
-    assert np.array_equal(given[0], PLAIN.reference)
-    assert np.array_equal(given[1], PLAIN.touched)
-    for part in flat(result):
-        if isinstance(part, np.ndarray):
-            assert not any(np.shares_memory(part, picture) for picture in given)
-    for picture in given:
-        picture.flags.writeable = False
-    assert_equal(PICTURES[name](*given), result)
+def test_pictures_may_have_any_layout_and_are_not_written(name: str) -> None:
+    assert_same(PICTURES[name], PLAIN.reference, PLAIN.touched)
 
 
 @pytest.mark.parametrize("name", MASKS)
-def test_masks_are_neither_written_nor_handed_back(name: str) -> None:
-    mask = PLAIN.mask
-    before = mask.copy()
-    mask.flags.writeable = False
-    result = MASKS[name](mask)
-    assert np.array_equal(mask, before)
-    for part in flat(result):
-        if isinstance(part, np.ndarray):
-            assert not np.shares_memory(part, mask)
+def test_masks_may_have_any_layout_and_are_not_written(name: str) -> None:
+    assert_same(MASKS[name], PLAIN.mask)
 
 
-@pytest.mark.parametrize("name", [name for name in PICTURES if name.startswith("preprocess")])
-def test_a_processed_frame_is_not_written_by_the_next_one(name: str) -> None:
-    settings = {
-        "preprocess-area": {"downsample": 2, "rotate": 90},
-        "preprocess-area 4": {"downsample": 4},
-        "preprocess-pyramid": {"downsample": 2, "method": "pyramid"},
-        "preprocess-crop": {"crop": (5, 7, 50, 40)},
-        "preprocess-remap": {"homography": (CORNERS, SQUARE, (100, 80))},
-    }[name]
-    process = Preprocessor(SIZE, **settings)  # type: ignore[arg-type]
-    first = process(PLAIN.touched)
-    kept = first.copy()
-    process(np.zeros_like(PLAIN.touched))
-    assert np.array_equal(first, kept)
-
-
-@pytest.mark.parametrize("name", TRACKERS)
-def test_what_a_caller_does_with_markers_does_not_come_back(name: str) -> None:
-    clean, spoiled = (TRACKERS[name](PLAIN.reference) for _ in range(2))
-    for image in (PLAIN.touched, PLAIN.reference, PLAIN.touched):
-        expected, markers = clean.track(image), spoiled.track(image)
-        assert_equal(markers, expected)
-        for part in flat(markers):
-            part[...] = 1
-
-
-@pytest.mark.parametrize("name", DIFFERENCES)
-def test_what_a_caller_does_with_a_contact_mask_does_not_come_back(name: str) -> None:
+def test_results_belong_to_the_caller() -> None:
     pictures = gel(dots=False)
-    clean, spoiled = (DIFFERENCES[name]() for _ in range(2))
-    own = pictures.reference.copy()
-    clean.add_reference(pictures.reference)
-    spoiled.add_reference(own)
-    own[...] = 0
-    for image in (pictures.touched, pictures.reference, pictures.touched):
-        expected, mask = clean.detect(image).mask, spoiled.detect(image).mask
-        assert np.array_equal(mask, expected)
-        mask[...] = 1
+    trackers = [MarkerTracker(PLAIN.reference, detect_markers(PLAIN.reference)) for _ in range(2)]
+    detectors = [detector("noise", pictures.reference.copy()) for _ in range(2)]
+    for index in (1, 0, 1):
+        markers = [tracker.track((PLAIN.reference, PLAIN.touched)[index]) for tracker in trackers]
+        masks = [each.detect((pictures.reference, pictures.touched)[index]).mask for each in detectors]
+        for part, other in zip(flat(markers[0]), flat(markers[1]), strict=True):
+            np.testing.assert_array_equal(part, other)
+            other[...] = 1
+        np.testing.assert_array_equal(masks[0], masks[1])
+        masks[1][...] = 1
+    for settings in PREPROCESS.values():
+        process = Preprocessor(SIZE, **settings)
+        first = process(PLAIN.touched)
+        kept = first.copy()
+        process(np.zeros_like(PLAIN.touched))
+        assert np.array_equal(first, kept)
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.int32, np.uint16, np.bool_])
-def test_other_types_than_uint8_are_refused_by_name(kind: type) -> None:
-    picture, mask = PLAIN.reference.astype(kind), PLAIN.mask.astype(kind)
-    for name in PICTURES:
+@pytest.mark.parametrize("kind", [np.float32, np.uint16, np.bool_])
+def test_other_types_than_uint8_are_refused(kind: type) -> None:
+    picture = PLAIN.reference.astype(kind)
+    for compute in PICTURES.values():
         with pytest.raises(ValueError, match="required"):
-            PICTURES[name](picture, picture)
-    for name in MASKS:
+            compute(picture, picture)
+    for of_mask in MASKS.values():
         with pytest.raises(ValueError, match="required"):
-            MASKS[name](mask)
+            of_mask(PLAIN.mask.astype(kind))
 
 
-@pytest.mark.parametrize(
-    "shape", [(), (5,), (5, 6, 1), (5, 6, 2), (5, 6, 4), (2, 5, 6, 3), (0, 6, 3), (5, 0, 3)]
-)
-def test_other_shapes_than_a_picture_are_refused_by_name(shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("shape", [(), (5,), (5, 6, 1), (5, 6, 4), (2, 5, 6, 3), (0, 6, 3)])
+def test_other_shapes_than_a_picture_are_refused(shape: tuple[int, ...]) -> None:
     picture = np.zeros(shape, np.uint8)
-    for name in PICTURES:
-        if name == "probe" and len(shape) == 3 and 0 not in shape:
-            continue
-        if name == "draw" and 0 in shape:
-            continue
+    # The probe takes any number of channels, and an empty picture may be drawn on.
+    allowed = "draw" if 0 in shape else "probe" if len(shape) == 3 else ""
+    for compute in (compute for name, compute in PICTURES.items() if name != allowed):
         with pytest.raises(ValueError, match="required"):
-            PICTURES[name](picture, picture)
-
-
-def test_no_function_leaves_opencv_with_other_settings() -> None:
-    before = cv2.getNumThreads(), cv2.useOptimized()
-    for name in PICTURES:
-        PICTURES[name](PLAIN.reference, PLAIN.touched)
-    assert (cv2.getNumThreads(), cv2.useOptimized()) == before
-
-
-def test_the_marker_mask_of_a_window_has_the_size_of_the_window() -> None:
-    assert marker_mask(_window(PLAIN.touched), Dot(6.0)).shape == PLAIN.touched.shape[:2]
+            compute(picture, picture)

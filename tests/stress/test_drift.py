@@ -9,41 +9,37 @@ import pytest
 
 import tactflow
 from tactflow.sim import Truth
-from tests.stress.builders import DIFFERENCES, TRACKERS, Image, gel
+from tactflow.vision.markers.detection import detect_markers
+from tactflow.vision.markers.tracking import MarkerTracker
+from tests.stress.builders import DIFFERENCES, Image, detector, gel
 
 
 def noisy(picture: Image, random: np.random.Generator) -> Image:
     return np.clip(np.rint(picture + random.normal(0, 1, picture.shape)), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("method", TRACKERS)
-def test_marker_errors_do_not_grow_with_the_number_of_presses(method: str) -> None:
-    pictures = gel(noise=0.0)
-    random = np.random.default_rng(0)
-    tracker = TRACKERS[method](pictures.reference)
-    wanted = pictures.position - pictures.origin
-    errors = []
-    for _ in range(60):
-        for picture, truth in ((pictures.touched, wanted), (pictures.reference, 0 * wanted)):
-            moved = tracker.track(noisy(picture, random))
-            away = np.hypot(*(moved.origin[:, None] - pictures.origin[None]).transpose(2, 0, 1))
-            error = moved.displacement - truth[away.argmin(axis=1)]
-            errors.append(float(np.sqrt((error**2).sum(axis=1).mean())))
-    early, late = np.array(errors[:40]), np.array(errors[-40:])
-    # Independent noise: the difference of two means of 40 is below four of its standard errors.
-    chance = np.sqrt(early.var() / 40 + late.var() / 40)
-    assert late.mean() <= early.mean() + 4 * chance
-
-
 @pytest.mark.parametrize("method", DIFFERENCES)
 def test_a_detector_ends_every_one_of_many_contacts(method: str) -> None:
     pictures = gel(dots=False, noise=0.0)
     random = np.random.default_rng(0)
-    detector = DIFFERENCES[method]()
-    detector.add_reference(noisy(pictures.reference, random))
+    contact = detector(method, noisy(pictures.reference, random))
     for _ in range(60):
-        assert detector.detect(noisy(pictures.touched, random)).touching
-        assert not detector.detect(noisy(pictures.reference, random)).touching
+        assert contact.detect(noisy(pictures.touched, random)).touching
+        assert not contact.detect(noisy(pictures.reference, random)).touching
+
+
+def test_the_same_frame_for_ever_never_drifts() -> None:
+    pictures, dotless = gel(), gel(dots=False)
+    tracker = MarkerTracker(pictures.reference, detect_markers(pictures.reference))
+    contact = detector("noise", dotless.reference)
+    positions = [tracker.track(pictures.touched).position for _ in range(60)]
+    # Half way between two of its sixteen sub-pixel phases a mark may alternate between the same two answers
+    # for ever: measured 0.017 px.
+    assert np.array_equal(positions[10], positions[-2])
+    assert max(np.abs(position - positions[0]).max() for position in positions) < 0.034
+    masks = [contact.detect(dotless.touched).mask for _ in range(60)]
+    assert masks[0].any()
+    assert all(np.array_equal(mask, masks[1]) for mask in masks[1:])
 
 
 def test_the_marker_error_of_the_default_pipeline_does_not_grow(tmp_path: Path) -> None:

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.classic import functions
-from tactflow.drawing.results import Annotator
 from tactflow.vision.change import ChangeProbe, noise, tiles
 from tactflow.vision.change import probe as change_probe
 from tactflow.vision.contact import (
@@ -26,15 +24,17 @@ from tactflow.vision.contact import (
     response,
 )
 from tactflow.vision.contact import detector as contact
-from tactflow.vision.flow import flow_in_mask, inside_mask
-from tactflow.vision.geometry import PixelMapping, Preprocessor
+from tactflow.vision.contact.detector import ContactResult
+from tactflow.vision.flow import flow_in_mask
+from tactflow.vision.geometry import Preprocessor
+from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.markers import detection as markers
 from tactflow.vision.markers import template, tracking
 from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
-from tactflow.vision.types import Contact, Ellipse, Markers
+from tactflow.vision.types import Contact, Markers
 from tests.oracles import border as oracle
 from tests.oracles.border import change_of
-from tests.stress.builders import DIFFERENCES, FLOWS, HULLS, SIZE, apart, axis_difference, gel
+from tests.stress.builders import DIFFERENCES, SIZE, apart, axis_difference, detector, gel
 from tests.stress.doubles import in_double
 
 FAR = 1e6
@@ -45,55 +45,28 @@ ULP = float(np.spacing(FAR))
 # -- coordinates that are far from zero -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", HULLS)
-def test_moments_ellipse_and_line_of_a_contact_a_million_pixels_away(method: str) -> None:
-    """One mask a million pixels wide: the same contact at its left and at its right end."""
-    mask = gel().mask[20:100]
-    wide = np.zeros((mask.shape[0], 1_000_000 + mask.shape[1]), np.uint8)
-    wide[:, -mask.shape[1] :] = mask
-    here, there = (HULLS[method](part) for part in (mask, wide))
-    assert here is not None
-    assert there is not None
-    assert here.angle is not None
-    assert there.angle is not None
-    assert here.ellipse is not None
-    assert there.ellipse is not None
-    assert there.area == here.area
-    np.testing.assert_array_equal(there.hull - (FAR, 0), here.hull)
-    if method == "moments":
-        # Moments are taken relative to the contact, in whole numbers: only the final sum is rounded.
-        assert abs(there.center[0] - FAR - here.center[0]) <= ULP
-        assert there.angle == here.angle
-        assert there.ellipse.axes == here.ellipse.axes
-    else:
-        # Fitted relative to the contact too; the bound of the docstring: float32 rounds coordinates up to
-        # 176 px by 1.5e-5 px, over a length of 68 px: derived 2e-5 degrees, a tenfold for sums.
-        assert axis_difference(there.angle, here.angle) <= 2e-4
-        np.testing.assert_allclose(there.ellipse.axes, here.ellipse.axes, rtol=1e-5)
-        assert abs(there.ellipse.center[0] - FAR - here.ellipse.center[0]) <= 1e-4
-
-
-@pytest.mark.parametrize("method", FLOWS)
-def test_the_flow_of_markers_a_million_pixels_away(method: str) -> None:
-    """A mask that is a million pixels wide, with the markers at its right end."""
+def test_a_contact_and_its_flow_a_million_pixels_away() -> None:
+    """A mask a million pixels wide: the same contact and markers at its left and at its right end."""
     pictures = gel()
     wide = np.zeros((SIZE[1], 1_000_000 + SIZE[0]), np.uint8)
     wide[:, -SIZE[0] :] = pictures.mask
-    far = np.array([FAR, 0.0])
-    given = Markers(pictures.origin, pictures.position, np.zeros(24, np.uint8), np.full(24, 0.1))
-    moved = Markers(pictures.origin + far, pictures.position + far, given.status, given.stderr)
-    here = FLOWS[method](given, pictures.mask, dilate=3)
-    there = FLOWS[method](moved, wide, dilate=3)
-    assert here.mean is not None
-    assert there.mean is not None
-    assert here.count == there.count >= 3
-    # Each displacement is a difference of two rounded coordinates.
-    np.testing.assert_allclose(there.mean, here.mean, rtol=0, atol=2 * ULP)
-    if method == "mean":
-        assert here.rotation is not None
-        assert there.rotation is not None
-        # Over a pitch of 28 px.
-        assert abs(there.rotation - here.rotation) <= math.degrees(4 * ULP / 28)
+    here, there = contact_geometry(pictures.mask), contact_geometry(wide)
+    assert here is not None
+    assert there is not None
+    assert here.ellipse is not None
+    assert there.ellipse is not None
+    np.testing.assert_array_equal(there.hull - (FAR, 0), here.hull)
+    # Moments are taken relative to the contact, in whole numbers: only the final sum is rounded.
+    assert abs(there.center[0] - FAR - here.center[0]) <= ULP
+    assert (there.area, there.angle, there.ellipse.axes) == (here.area, here.angle, here.ellipse.axes)
+    far, status, stderr = np.array([FAR, 0.0]), np.zeros(24, np.uint8), np.full(24, 0.1)
+    near = flow_in_mask(Markers(pictures.origin, pictures.position, status, stderr), pictures.mask)
+    moved = Markers(pictures.origin + far, pictures.position + far, status, stderr)
+    distant = flow_in_mask(moved, wide)
+    assert distant.count == near.count >= 3
+    # Each displacement is a difference of two rounded coordinates, over a pitch of 28 px.
+    assert distant.mean == pytest.approx(near.mean, abs=2 * ULP)
+    assert distant.rotation == pytest.approx(near.rotation, abs=math.degrees(4 * ULP / 28))
 
 
 def test_neighbours_a_million_pixels_away_are_the_same_neighbours() -> None:
@@ -109,14 +82,6 @@ def test_a_mapping_and_its_inverse_a_million_pixels_away() -> None:
     points = np.random.default_rng(0).uniform(-FAR, FAR, (100, 2))
     # Affine: some ten operations, each of half an ulp.
     assert np.abs(mapping.to_raw(mapping.to_processed(points)) - points).max() <= 10 * ULP
-    assert np.array_equal(PixelMapping.identity((3, 3)).to_raw(points), points)
-
-
-def test_results_a_million_pixels_away_are_drawn_without_overflow() -> None:
-    hull = np.array([[FAR, FAR], [FAR + 9, FAR], [FAR, FAR + 9]])
-    far = Contact(40, (FAR, FAR), 30.0, -0.577, hull, Ellipse((FAR, FAR), (9, 5), 30.0))
-    image = np.zeros((40, 60, 3), np.uint8)
-    assert Annotator(ellipse=True, text=False)(image, contact=far).shape == image.shape
 
 
 # -- single against double --------------------------------------------------------------------------------
@@ -135,13 +100,10 @@ def both(compute: Callable[[], Any], *modules: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("method", DIFFERENCES)
 def test_single_precision_costs_the_contact_nothing(method: str) -> None:
     pictures = gel(dots=False)
-
     rooms = border, components, contact_outline, illumination, nearby, resolution, response
 
-    def compute() -> contact.ContactResult:
-        detector = DIFFERENCES[method]()
-        detector.add_reference(pictures.reference)
-        return detector.detect(pictures.touched)
+    def compute() -> ContactResult:
+        return detector(method, pictures.reference).detect(pictures.touched)
 
     single, double = both(compute, contact, background, background_kernels, *rooms)
     # The bound of the docstring; measured 0 px and 1.4e-7.
@@ -187,12 +149,6 @@ def test_single_precision_costs_the_fit_of_the_light_nothing() -> None:
     assert np.abs(single - double).max() <= 1e-3
 
 
-def test_single_precision_moves_the_border_of_the_scripts_mask_by_at_most_a_pixel() -> None:
-    single, double = both(lambda: functions.mask_marker(gel().touched), functions)
-    assert single.any()
-    assert apart(single, double) <= 1
-
-
 def test_single_precision_costs_the_tracker_nothing() -> None:
     pictures = gel()
     found = markers.detect_markers(pictures.reference)
@@ -214,16 +170,6 @@ def test_single_precision_costs_the_search_for_marks_nothing() -> None:
     assert np.array_equal(single.edges, double.edges)
 
 
-def test_centres_do_not_depend_on_the_precision_of_whole_grey_levels() -> None:
-    """Grey levels are exact in float32, and everything after is float64."""
-    gray = markers.to_gray(gel().reference)
-    start = np.rint(gel().origin)
-    single, double = (
-        markers.refine_centers(gray.astype(kind), start, 6.0) for kind in (np.float32, np.float64)
-    )
-    assert np.array_equal(single, double)
-
-
 def test_single_precision_costs_the_probe_nothing() -> None:
     pictures = gel()
 
@@ -241,25 +187,6 @@ def test_single_precision_costs_the_probe_nothing() -> None:
     single, double = both(compute, change_probe, noise, tiles)
     # The bound of the docstring; measured 1.3e-7.
     assert single == pytest.approx(double, rel=1e-5)
-
-
-def test_the_flow_of_single_precision_markers_is_good_to_their_own_rounding() -> None:
-    pictures = gel()
-    double = Markers(pictures.origin, pictures.position, np.zeros(24, np.uint8), np.full(24, 0.1))
-    single = Markers(
-        pictures.origin.astype(np.float32),  # type: ignore[arg-type]
-        pictures.position.astype(np.float32),  # type: ignore[arg-type]
-        double.status,
-        double.stderr,
-    )
-    a, b = (flow_in_mask(given, pictures.mask, dilate=3) for given in (single, double))
-    assert a.mean is not None
-    assert b.mean is not None
-    # The bound of the docstring: two coordinates below 256 px, each rounded by 2^-17 px.
-    np.testing.assert_allclose(a.mean, b.mean, rtol=0, atol=2 * 2.0**-17)
-    assert a.rotation == pytest.approx(b.rotation, abs=math.degrees(2 * 2.0**-17 / 28))
-    inside = [inside_mask(given.position, pictures.mask, 3) for given in (single, double)]
-    assert np.array_equal(*inside)
 
 
 # -- angles across the seam -------------------------------------------------------------------------------
@@ -315,27 +242,3 @@ def test_a_filter_with_a_period_commutes_with_a_turn(make: type, period: float) 
         off = abs(wrapped(b - a - turned))
         # Sums of numbers below one period: some ulps of it.
         assert min(off, period - off) <= 1e-12 * period
-
-
-@pytest.mark.parametrize("method", HULLS)
-def test_the_direction_of_a_bar_is_continuous_through_the_vertical(method: str) -> None:
-    rows, columns = np.indices((121, 121)) - 60.0
-    last = None
-    for angle in np.arange(85.0, 95.5, 0.5):
-        turn = math.radians(angle)
-        along = columns * math.cos(turn) - rows * math.sin(turn)
-        across = columns * math.sin(turn) + rows * math.cos(turn)
-        mask = ((np.abs(along) < 50.3) & (np.abs(across) < 6.3)).astype(np.uint8) * np.uint8(255)
-        found = HULLS[method](mask)
-        assert found is not None
-        assert found.angle is not None
-        assert -90 < found.angle <= 90
-        # moments: the pixel grid turns a bar of 100 x 12; measured 0.073. classic: a line through the hull's
-        # vertices, few and uneven; measured 1.96.
-        assert axis_difference(found.angle, angle) <= {"moments": 0.15, "classic": 4.0}[method]
-        if angle == 90 and method == "moments":
-            assert found.slope is None
-        if last is not None:
-            # A step of half a degree, and both ends' errors.
-            assert axis_difference(found.angle, last) <= {"moments": 0.8, "classic": 8.5}[method]
-        last = found.angle
