@@ -103,51 +103,6 @@ def elliptical(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.flo
     return np.hypot(along / AXES[0], across / AXES[1])
 
 
-# -- transformations --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Transformation:
-    """What is done to a picture, and what that does to points (given the old width, height) and to angles."""
-
-    name: str
-    picture: Callable[[NDArray[Any]], NDArray[Any]]
-    points: Callable[[Points, int, int], Points]
-    angle: Callable[[float], float]
-    scale: float = 1.0
-
-
-def _twice(picture: NDArray[Any]) -> NDArray[Any]:
-    """Twice as large: masks by repetition, which is exact; pictures by interpolation, since blocks of equal
-    pixels have no slope inside and are not what a lens makes."""
-    how = cv2.INTER_NEAREST if picture.ndim == 2 else cv2.INTER_LINEAR
-    return cv2.resize(np.ascontiguousarray(picture), None, fx=2, fy=2, interpolation=how)
-
-
-def _stack(x: NDArray[Any], y: NDArray[Any]) -> Points:
-    return np.column_stack([x, y]).astype(np.float64)
-
-
-TURNED = Transformation(
-    "turned by 90",
-    lambda picture: np.ascontiguousarray(np.rot90(picture)),
-    lambda p, w, _h: _stack(p[:, 1], w - 1 - p[:, 0]),
-    lambda a: a + 90,
-)
-MIRRORED = Transformation(
-    "mirrored left to right",
-    lambda picture: np.ascontiguousarray(picture[:, ::-1]),
-    lambda p, w, _h: _stack(w - 1 - p[:, 0], p[:, 1]),
-    lambda a: -a,
-)
-DOUBLED = Transformation("doubled", _twice, lambda p, _w, _h: 2 * p + 0.5, lambda a: a, 2.0)
-
-
-def axis_difference(a: float, b: float) -> float:
-    """Angle between two axes, degrees, 0 to 90."""
-    return abs((a - b + 90) % 180 - 90)
-
-
 def apart(a: NDArray[Any], b: NDArray[Any]) -> float:
     """Hausdorff distance of two masks, px: no pixel of one is farther from the other than this.
 

@@ -1,4 +1,4 @@
-"""Pictures and contacts that no sensor should give: a defined answer, or an error that says what to do."""
+"""Pictures and markers that no sensor should give: a defined answer, or an error that says what to do."""
 
 from __future__ import annotations
 
@@ -12,17 +12,13 @@ import pytest
 from tactflow.drawing.results import Annotator
 from tactflow.vision.change import ChangeProbe
 from tactflow.vision.flow import flow_in_mask
-from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.geometry.hull import contact_geometry, contact_parts
-from tactflow.vision.markers.detection import NoMarkersError, detect_markers
+from tactflow.vision.markers.detection import NoMarkersError
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
-from tactflow.vision.markers.tracking import MarkerTracker
-from tactflow.vision.types import Markers, MarkerStatus
+from tactflow.vision.types import Markers
 from tests.stress.builders import (
     DIFFERENCES,
     PICTURE_METHODS,
     Image,
-    Points,
     assert_defined,
     assert_mask,
     detector,
@@ -31,7 +27,6 @@ from tests.stress.builders import (
 
 SHAPES = ((1, 1), (1, 7), (7, 1), (3, 5), (17, 31), (64, 48))
 HEIGHT, WIDTH = 60, 80
-ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
 
 
 def checkerboard(shape: tuple[int, int], cell: int) -> Image:
@@ -94,83 +89,6 @@ def test_any_size_of_dot_gives_a_mask_on_any_picture(radius: float, polarity: st
             assert_mask(marker_mask(make(shape), Dot(radius, polarity, 6.0)), shape)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize("method", ["area", "pyramid"])
-def test_preprocess_takes_any_size_or_says_what_is_required(method: Any, shape: tuple[int, int]) -> None:
-    height, width = shape
-    for rotate, downsample in ((0, 1), (90, 2), (180, 4), (270, 16)):
-        if method == "area" and min(shape) < downsample:
-            with pytest.raises(ValueError, match="required both sides of the frame"):
-                Preprocessor((width, height), rotate=rotate, downsample=downsample, method=method)
-            continue
-        process = Preprocessor((width, height), rotate=rotate, downsample=downsample, method=method)
-        assert process(PICTURES["noise"](shape)).shape[1::-1] == process.mapping.size
-
-
-# -- markers and contacts in gels -------------------------------------------------------------------------
-
-
-def dots(centers: Points) -> Image:
-    """Dark dots with soft rims on a grey gel with a little noise."""
-    rows, columns = np.indices((128, 176)).astype(np.float64)
-    cover = np.zeros((128, 176))
-    for x, y in centers:
-        np.maximum(cover, np.clip(5.5 - np.hypot(columns - x, rows - y), 0, 1), out=cover)
-    rough = np.random.default_rng(2).normal(0, 1, (128, 176, 3))
-    return np.clip(np.rint(150 * (1 - 0.8 * cover[..., None]) + rough), 0, 255).astype(np.uint8)
-
-
-GRID = np.stack(np.meshgrid(np.arange(20, 170, 28.0), np.arange(20, 120, 28.0)), axis=-1).reshape(-1, 2)
-
-
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_fewer_than_four_marks_need_a_radius(count: int) -> None:
-    image = dots(GRID[8 : 8 + count])
-    with pytest.raises(NoMarkersError, match="markers found"):
-        detect_markers(image, dot_radius=None if count else 5, polarity="dark")
-    if count:
-        found = detect_markers(image, dot_radius=5, polarity="dark")
-        order = np.argsort(found.centers[:, 0])
-        # Noise of 1 level on 90 levels of contrast: the standard error is below 0.02 px; 10 of them.
-        assert np.abs(found.centers[order] - GRID[8 : 8 + count]).max() < 0.2
-        moved = MarkerTracker(image, found).track(dots(GRID[8 : 8 + count] + np.array([2.25, -1.5])))
-        assert np.abs(moved.displacement - (2.25, -1.5)).max() < 0.2
-
-
-def test_marks_that_vanish_merge_or_multiply_keep_their_identities() -> None:
-    reference = dots(GRID)
-    tracker = MarkerTracker(reference, detect_markers(reference))
-    for image in (dots(GRID[:0]), np.zeros_like(reference), np.full_like(reference, 255)):
-        gone = tracker.track(image)
-        assert_defined(gone)
-        assert (gone.status != MarkerStatus.TRACKED).all()
-    again = tracker.track(reference)
-    assert (again.status == MarkerStatus.TRACKED).all()
-    assert np.abs(again.displacement).max() < 0.05
-    rows, columns = np.indices(reference.shape[:2])
-    blob = np.where((np.hypot(columns - 88, rows - 64) < 90)[..., None], np.uint8(30), reference)
-    assert (tracker.track(blob).status != MarkerStatus.TRACKED).mean() > 0.5
-    tracker = MarkerTracker(reference, detect_markers(reference))
-    for _ in range(3):
-        crowded = tracker.track(dots(np.concatenate([GRID, GRID[:-1] + 14])))
-    assert len(crowded.origin) == len(GRID)
-    # A neighbour's rim 9 px away is inside the patch that a mark is compared with; measured 0.03 px.
-    assert np.abs(crowded.displacement).max() < 0.1
-
-
-@pytest.mark.parametrize("method", DIFFERENCES)
-def test_a_reference_in_contact_shows_what_changes_and_recovers(method: str) -> None:
-    pictures = gel(dots=False)
-    contact = detector(method, pictures.touched)
-    assert not contact.detect(pictures.touched).touching
-    released = contact.detect(pictures.reference)
-    assert released.touching
-    assert not (released.mask[~pictures.contact] > 0).sum() > 0.2 * pictures.contact.sum()
-    contact.reset()
-    contact.add_reference(pictures.reference)
-    assert contact.detect(pictures.touched).touching
-
-
 # The search for dots takes four seconds.
 LARGE: list[Any] = ["inpaint-normalized", "difference-noise", "tracker"]
 SLOW: list[Any] = [pytest.param("marker_mask", marks=pytest.mark.slow)]
@@ -193,67 +111,6 @@ def test_4k_frames_have_an_answer(method: str) -> None:
         assert answer.shape[:2] == (2160, 3840)
 
 
-# -- masks ------------------------------------------------------------------------------------------------
-
-
-def mask(inside: Any) -> Image:
-    return np.broadcast_to(inside, (HEIGHT, WIDTH)).astype(np.uint8) * np.uint8(255)
-
-
-# Name -> mask, area, centre, angle, whether there is an ellipse. By hand.
-KNOWN: dict[str, tuple[Image, float, tuple[float, float], float | None, bool]] = {
-    "one pixel": (mask((ROWS == 20) & (COLUMNS == 30)), 1, (30, 20), None, False),
-    "one row": (mask(ROWS == 7), 80, (39.5, 7), 0.0, False),
-    "one column": (mask(COLUMNS == 79), 60, (79, 29.5), 90.0, False),
-    "a diagonal": (mask((ROWS + 10 == COLUMNS) & (abs(COLUMNS - 39.5) < 20)), 40, (39.5, 29.5), -45.0, False),
-    "a disc": (mask(np.hypot(COLUMNS - 40, ROWS - 30) <= 20), 1257, (40, 30), None, True),
-    "the whole frame": (mask(True), 4800, (39.5, 29.5), 0.0, True),
-    # Two specks of dust always lie on a line: that is no direction.
-    "two far pixels": (mask(ROWS + COLUMNS == 0) | mask(ROWS + COLUMNS == 138), 2, (39.5, 29.5), None, False),
-    "the border alone": (mask((ROWS % 59 == 0) | (COLUMNS % 79 == 0)), 4800, (39.5, 29.5), 0.0, True),
-}
-
-
-@pytest.mark.parametrize("name", KNOWN)
-def test_degenerate_contacts_have_the_geometry_worked_out_by_hand(name: str) -> None:
-    image, area, center, angle, ellipse = KNOWN[name]
-    found = contact_geometry(image)
-    assert found is not None
-    assert_defined((found, *contact_parts(image, max_gap=5.0)))
-    assert found.area == area
-    assert found.region_area == (image > 0).sum()
-    # One division of whole numbers: half a unit in the last place.
-    np.testing.assert_allclose(found.center, center, rtol=1e-15)
-    assert found.angle == (None if angle is None else pytest.approx(angle, abs=1e-12))
-    slope = None if angle in (None, 90.0) else pytest.approx(-np.tan(np.radians(angle)), abs=1e-12)
-    assert found.slope == slope
-    assert (found.ellipse is not None) == ellipse
-    drawn = Annotator(ellipse=True)(np.zeros((HEIGHT, WIDTH, 3), np.uint8), contact=found, contact_mask=image)
-    assert drawn.any()
-
-
-@pytest.mark.parametrize("shape", [(0, 0), (0, 5), (1, 1), (1, 9), (13, 7)], ids=str)
-def test_an_empty_mask_of_any_size_is_no_contact(shape: tuple[int, int]) -> None:
-    assert contact_geometry(np.zeros(shape, np.uint8)) is None
-    if 0 not in shape:
-        assert_defined(contact_geometry(np.full(shape, 255, np.uint8)))
-
-
-@pytest.mark.parametrize("name", KNOWN)
-def test_the_flow_in_degenerate_contacts_is_that_of_the_markers_inside(name: str) -> None:
-    origin = np.stack(np.meshgrid(np.arange(5, 80, 10.0), np.arange(5, 60, 10.0)), axis=-1).reshape(-1, 2)
-    markers = Markers(origin, origin + np.array([3.0, -2.0]), np.zeros(48, np.uint8), np.full(48, 0.1))
-    flow = flow_in_mask(markers, KNOWN[name][0])
-    assert_defined(flow)
-    if name != "a disc":
-        assert flow.count == {"the whole frame": 48, "a diagonal": 0}.get(name, 0)
-    if flow.count:
-        assert flow.mean == pytest.approx((3, -2), abs=1e-12)
-        assert flow.rotation == pytest.approx(0, abs=1e-10)
-    else:
-        assert flow.mean is None
-
-
 FAR = [[-500, 1e9], [40, 30], [1e300, 0]]
 
 
@@ -261,8 +118,9 @@ FAR = [[-500, 1e9], [40, 30], [1e300, 0]]
 def test_few_or_flat_or_far_markers_have_a_defined_flow_and_are_drawn(origin: list[list[float]]) -> None:
     at = np.array(origin, float).reshape(-1, 2)
     markers = Markers(at, at + 1, np.zeros(len(at), np.uint8), np.full(len(at), np.nan))
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     for dilate in (0.0, 7.5, 1e6):
-        flow = flow_in_mask(markers, mask(True), dilate=dilate)
+        flow = flow_in_mask(markers, mask, dilate=dilate)
         assert_defined(flow)
         if len(np.unique(at[:, 1])) < 2:
             assert flow.rotation is None

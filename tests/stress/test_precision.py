@@ -1,8 +1,7 @@
-"""What limited precision costs: large coordinates, single against double, angles across the seam."""
+"""What limited precision costs: large coordinates, single against double."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,16 +24,13 @@ from tactflow.vision.contact import (
 )
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.contact.detector import ContactResult
-from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.markers import detection as markers
 from tactflow.vision.markers import template, tracking
-from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
-from tactflow.vision.types import Contact, Markers
+from tactflow.vision.types import Markers
 from tests.oracles import border as oracle
 from tests.oracles.border import change_of
-from tests.stress.builders import DIFFERENCES, SIZE, apart, axis_difference, detector, gel
+from tests.stress.builders import DIFFERENCES, apart, detector, gel
 from tests.stress.doubles import in_double
 
 FAR = 1e6
@@ -43,30 +39,6 @@ ULP = float(np.spacing(FAR))
 """Distance of neighbouring float64 numbers at `FAR`: 1.2e-10 px."""
 
 # -- coordinates that are far from zero -------------------------------------------------------------------
-
-
-def test_a_contact_and_its_flow_a_million_pixels_away() -> None:
-    """A mask a million pixels wide: the same contact and markers at its left and at its right end."""
-    pictures = gel()
-    wide = np.zeros((SIZE[1], 1_000_000 + SIZE[0]), np.uint8)
-    wide[:, -SIZE[0] :] = pictures.mask
-    here, there = contact_geometry(pictures.mask), contact_geometry(wide)
-    assert here is not None
-    assert there is not None
-    assert here.ellipse is not None
-    assert there.ellipse is not None
-    np.testing.assert_array_equal(there.hull - (FAR, 0), here.hull)
-    # Moments are taken relative to the contact, in whole numbers: only the final sum is rounded.
-    assert abs(there.center[0] - FAR - here.center[0]) <= ULP
-    assert (there.area, there.angle, there.ellipse.axes) == (here.area, here.angle, here.ellipse.axes)
-    far, status, stderr = np.array([FAR, 0.0]), np.zeros(24, np.uint8), np.full(24, 0.1)
-    near = flow_in_mask(Markers(pictures.origin, pictures.position, status, stderr), pictures.mask)
-    moved = Markers(pictures.origin + far, pictures.position + far, status, stderr)
-    distant = flow_in_mask(moved, wide)
-    assert distant.count == near.count >= 3
-    # Each displacement is a difference of two rounded coordinates, over a pitch of 28 px.
-    assert distant.mean == pytest.approx(near.mean, abs=2 * ULP)
-    assert distant.rotation == pytest.approx(near.rotation, abs=math.degrees(4 * ULP / 28))
 
 
 def test_neighbours_a_million_pixels_away_are_the_same_neighbours() -> None:
@@ -187,58 +159,3 @@ def test_single_precision_costs_the_probe_nothing() -> None:
     single, double = both(compute, change_probe, noise, tiles)
     # The bound of the docstring; measured 1.3e-7.
     assert single == pytest.approx(double, rel=1e-5)
-
-
-# -- angles across the seam -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", ["one_euro", "alpha_beta"])
-def test_an_axis_that_turns_through_the_vertical_is_smoothed_without_a_jump(method: str) -> None:
-    smoother = ContactSmoother(method)  # type: ignore[arg-type]
-    last = None
-    for index, raw in enumerate(np.arange(60.0, 480.0, 0.5)):
-        angle = float(raw - 180 * math.ceil(raw / 180 - 0.5))
-        out = smoother.update(touched(angle), index / 60)
-        assert out.angle is not None
-        assert -90 < out.angle <= 90
-        if abs(abs(out.angle) - 90) > 1e-3:
-            assert out.slope == pytest.approx(-math.tan(math.radians(out.angle)), rel=1e-9)
-        if last is not None:
-            # alpha-beta overshoots its first step by less than that step; steps are half a degree.
-            assert axis_difference(out.angle, last) < 1.0
-        last = out.angle
-    assert axis_difference(last or 0.0, angle) < 20
-
-
-def touched(angle: float) -> Contact:
-    return Contact(10.0, (5.0, 5.0), angle, None, np.zeros((3, 2)), None)
-
-
-@pytest.mark.parametrize("method", ["one_euro", "alpha_beta"])
-def test_an_axis_that_trembles_about_the_vertical_stays_there(method: str) -> None:
-    """The mean of +89 and -89 degrees is 90, not 0."""
-    smoother = ContactSmoother(method)  # type: ignore[arg-type]
-    for index in range(200):
-        out = smoother.update(touched(89.0 if index % 2 else -89.0), index / 60)
-        assert out.angle is not None
-        assert abs(out.angle) >= 88.9
-    assert abs(out.angle) > 89
-
-
-@pytest.mark.parametrize("period", [180.0, 360.0, 1.0])
-@pytest.mark.parametrize("make", [OneEuro, AlphaBeta])
-def test_a_filter_with_a_period_commutes_with_a_turn(make: type, period: float) -> None:
-    random = np.random.default_rng(1)
-    values = np.cumsum(random.normal(0, 0.02 * period, 200))
-    turned = 0.31 * period
-
-    def wrapped(value: float) -> float:
-        return float(value - period * math.ceil(value / period - 0.5))
-
-    plain, other = make(period=period), make(period=period)
-    for value in values:
-        a = plain.update(wrapped(value), 0.01)
-        b = other.update(wrapped(value + turned), 0.01)
-        off = abs(wrapped(b - a - turned))
-        # Sums of numbers below one period: some ulps of it.
-        assert min(off, period - off) <= 1e-12 * period
