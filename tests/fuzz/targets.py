@@ -27,7 +27,7 @@ from tactflow.engine.plan import make_plan
 from tactflow.message.result import Result, encode_message
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
-from tactflow.recording.frames import FrameCoder, RawFrame
+from tactflow.recording.frames import RawFrame, encode_frame
 from tactflow.recording.records import NotARecordingError
 from tactflow.recording.repair import repair
 from tactflow.recording.schemas import channel_type
@@ -89,10 +89,9 @@ def recordings(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]
 
 
 def _recording(path: Path, *, finished: bool) -> bytes:
-    coder = FrameCoder()
     writer = RecordingWriter(path, "main", overwrite=True)
     for seq in range(4):
-        data = {"frames": coder.encode(Frame("main", seq, seq / 10, IMAGE, reference=seq == 0))}
+        data = {"frames": encode_frame(Frame("main", seq, seq / 10, IMAGE, reference=seq == 0))}
         writer.write(Entry(round(seq * 1e8), seq, seq == 0, 0, {**data, "results": b"{}"}))
     (writer.finish if finished else writer.close)()
     return path.read_bytes()
@@ -108,7 +107,7 @@ def _recording_of_others(packing: CompressionType) -> bytes:
         "/main/frames", "protobuf", writer.register_schema(kind.name, *kind.schema)
     )
     for seq in range(4):
-        data = FrameCoder().encode(Frame("main", seq, seq / 10, IMAGE))
+        data = encode_frame(Frame("main", seq, seq / 10, IMAGE))
         writer.add_message(channel, round(seq * 1e8), data, round(seq * 1e8), seq)
     writer.finish()
     return file.getvalue()

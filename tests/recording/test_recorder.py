@@ -18,7 +18,7 @@ from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
 from tactflow.message.result import Result
-from tactflow.recording.frames import StoredFrame
+from tactflow.recording.frames import parse_frame
 from tactflow.sinks.record import Record
 from tactflow.sources import open_source
 from tactflow.sources.mcap import Recording
@@ -262,7 +262,7 @@ def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
     return [
         (topic, time, data)
         for topic, time, data in found
-        if topic not in times or time == round(StoredFrame.parse(data).t * 1e9)
+        if topic not in times or time == round(parse_frame(data).t * 1e9)
     ]
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
-from tactflow.recording.frames import StoredFrame
+from tactflow.recording.frames import RawFrame, decode_pixels
 from tactflow.sinks.record import Record
 from tactflow.sources import StampedReader, open_source
 from tactflow.stages.capture import Capture
@@ -205,9 +205,9 @@ def test_a_recording_without_a_frame_is_a_clear_error(tmp_path: Path) -> None:
 
 
 def test_a_frame_that_claims_more_pixels_than_any_camera_has_is_refused() -> None:
-    huge = StoredFrame(0, 0.0, False, 0, (1 << 16, 1 << 16), zstandard.compress(bytes(100)))
+    huge = RawFrame(width=1 << 16, height=1 << 16, data=zstandard.compress(bytes(100)))
     with pytest.raises(ValueError, match="65536 x 65536"):
-        huge.image()
-    bomb = StoredFrame(0, 0.0, False, 0, (8, 4), zstandard.compress(bytes(64 << 20)))
+        decode_pixels(huge)
+    bomb = RawFrame(width=8, height=4, data=zstandard.compress(bytes(64 << 20)))
     with pytest.raises(ValueError, match="required 96 bytes"):
-        bomb.image()
+        decode_pixels(bomb)

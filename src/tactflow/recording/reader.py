@@ -35,31 +35,28 @@ class Contents:
 def look_into(path: Path) -> Contents:
     """Find the frames in a recording.
 
-    Raises
-    ------
-    NotARecordingError
-        If it holds none that tactflow recorded. OSError if it cannot be read.
+    Raises NotARecordingError if it holds none that tactflow recorded, OSError if it cannot be read.
     """
     with path.open("rb") as file:
         summary = read_summary(file)
-        if summary is None:
+        found = Summary() if summary is None else summary
+        if found.statistics is None:
+            start = None
             # Its channels are described before its first message.
-            found = Summary()
             for record in intact_records(file):
                 if isinstance(record, Schema):
                     found.schemas[record.id] = record
                 elif isinstance(record, Channel):
                     found.channels[record.id] = record
                 elif isinstance(record, Message):
-                    return Contents(False, *_frame_topics(found), None, record.log_time, None)
-            return Contents(False, *_frame_topics(found), 0, None, None)
-    topics = _frame_topics(summary)
-    statistics = summary.statistics
-    if statistics is None:
-        return Contents(True, *topics, None, None, None)
-    counts = statistics.channel_message_counts
-    count = sum(counts.get(channel.id, 0) for channel in summary.channels.values() if channel.topic in topics)
-    return Contents(True, *topics, count, statistics.message_start_time, statistics.message_end_time)
+                    start = record.log_time
+                    break
+            return Contents(summary is not None, *_frame_topics(found), None, start, None)
+    topics, counts = _frame_topics(found), found.statistics.channel_message_counts
+    count = sum(counts.get(channel.id, 0) for channel in found.channels.values() if channel.topic in topics)
+    return Contents(
+        True, *topics, count, found.statistics.message_start_time, found.statistics.message_end_time
+    )
 
 
 def _frame_topics(found: Summary) -> tuple[str, str]:
@@ -70,13 +67,13 @@ def _frame_topics(found: Summary) -> tuple[str, str]:
         if schema is not None and schema.name == TYPE_NAME and channel.topic.endswith("/frames"):
             return channel.topic, channel.topic.removesuffix("frames") + "references"
     topics = list(dict.fromkeys(channel.topic for channel in channels))
-    there = f"to play one of its topics, add ?topic={topics[0]}" if topics else "it is empty"
+    hint = f"to play one of its topics, add ?topic={topics[0]}" if topics else "it is empty"
     others = f" or {', '.join(topics[1:MOST_NAMED])}" if len(topics) > 1 else ""
-    raise NotARecordingError(f"holds no frames that tactflow recorded; {there}{others}")
+    raise NotARecordingError(f"holds no frames that tactflow recorded; {hint}{others}")
 
 
 def attachments(path: Path) -> dict[str, bytes]:
-    """Name -> bytes of the files that stand before the frames of a recording, as ours do; {} where none do.
+    """Name -> bytes of the files that stand before the frames of a recording, as ours do.
 
     Raises OSError if it cannot be read, NotARecordingError if it is not an MCAP file.
     """
@@ -97,9 +94,7 @@ def messages(
 
     start, end : those with start <= time < end, ns. A file without an index ends at its last whole chunk.
 
-    Raises
-    ------
-    ValueError : the file is damaged here, and not only cut off. OSError : it cannot be read.
+    Raises ValueError where the file is damaged and not only cut off, OSError if it cannot be read.
     """
     with path.open("rb") as file:
         summary = read_summary(file)

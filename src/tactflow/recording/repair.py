@@ -34,10 +34,7 @@ def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -
 
     path : stays as it is. out : is replaced. report : called now and then with the bytes read so far.
 
-    Raises
-    ------
-    NotARecordingError
-        If it is not an MCAP file. OSError if one cannot be read or the other not written.
+    Raises NotARecordingError if it is not an MCAP file, OSError if one cannot be read or the other written.
     """
     messages = lost = 0
     whole = False

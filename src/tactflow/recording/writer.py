@@ -8,9 +8,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from io import BufferedWriter, FileIO
 from pathlib import Path
-from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
@@ -43,22 +41,14 @@ class Entry:
 class RecordingWriter:
     """One file that is being recorded. After each `write`, everything is with the operating system.
 
-    Parameters
-    ----------
-    path : the file; its folder is created.
-    sensor : names the channels.
+    path : the file; its folder is created. sensor : names the channels. overwrite : replace an existing file.
     control : the run, whose versions, source, pipeline and calibration are attached; or None.
-    overwrite : replace an existing file.
-
-    Attributes
-    ----------
     frames, bytes : written so far. begins : time of the first frame on the file's time line, ns.
 
     Raises
     ------
-    StageError
-        If the file is there already or cannot be written; from every method. After an error, the frames
-        written before can be played.
+    StageError : from every method, if the file is there already or cannot be written. The frames written
+        before can be played.
     """
 
     def __init__(
@@ -67,7 +57,7 @@ class RecordingWriter:
         self.path = path
         self.frames = self.begins = self.bytes = 0
         create(path, overwrite=overwrite)
-        self._file = BufferedWriter(_CountedFile(path, "ab"))
+        self._file = path.open("ab")
         self._writer = Writer(self._file, chunk_size=NEVER, compression=CompressionType.NONE)
         self._writer.start(profile="", library="tactflow")
         with self._errors():
@@ -154,17 +144,3 @@ class RecordingWriter:
         except BaseException:
             self.close()
             raise
-
-
-class _CountedFile(FileIO):
-    """A file to append to, which knows what was written whatever other programs do to it."""
-
-    _written = 0
-
-    def write(self, data: Any, /) -> int:
-        written = super().write(data)
-        self._written += written
-        return written
-
-    def tell(self) -> int:
-        return self._written

@@ -15,7 +15,7 @@ from tactflow.sources.paths import describe_settings, find_path, split_query
 if TYPE_CHECKING:
     from mcap.records import Message
 
-    from tactflow.recording.frames import StoredFrame
+    from tactflow.recording.frames import RawFrame
     from tactflow.recording.reader import Contents
 
 SETTINGS = {"start": "SECONDS (from the beginning)"}
@@ -67,13 +67,14 @@ class Recording(StampedReader):
 
     def _frames(self) -> Iterator[tuple[BgrImage, float, Stamp]]:
         """Each frame, its time, and its stamp."""
+        from tactflow.recording.frames import decode_pixels
         from tactflow.recording.records import DAMAGE
 
         try:
             for frame, paced in self._stored_frames():
                 self._picture = f"{self._path}, frame {frame.seq}"
                 try:
-                    image = frame.image()
+                    image = decode_pixels(frame)
                 except ValueError as error:
                     raise SourceError(f"{self._picture}: {error}") from error
                 yield image, frame.t, Stamp(frame.seq, frame.reference, frame.epoch, paced)
@@ -83,7 +84,7 @@ class Recording(StampedReader):
                 "tactflow repair keeps all that is intact"
             ) from error
 
-    def _stored_frames(self) -> Iterator[tuple[StoredFrame, bool]]:
+    def _stored_frames(self) -> Iterator[tuple[RawFrame, bool]]:
         """The frames, and whether each comes at its time (True) or ahead of it."""
         from tactflow.recording.frames import nanoseconds
         from tactflow.recording.reader import messages
@@ -106,11 +107,11 @@ class Recording(StampedReader):
             late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
             yield frame, not late and frame.seq >= 0
 
-    def _stored(self, message: Message) -> StoredFrame:
-        from tactflow.recording.frames import StoredFrame
+    def _stored(self, message: Message) -> RawFrame:
+        from tactflow.recording.frames import parse_frame
 
         try:
-            return StoredFrame.parse(message.data)
+            return parse_frame(message.data)
         except ValueError as error:
             raise SourceError(f"{self._path}, {message.log_time / 1e9:g} s: {error}") from error
 
