@@ -18,13 +18,13 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Frame
 from tactflow.engine.run import Runner
 from tactflow.message.result import Result
 from tactflow.message.schema import message_schema
 from tactflow.recording.frames import RawFrame, decode_pixels, encode_frame, parse_frame
-from tactflow.recording.layout import layout
 from tactflow.recording.schemas import encode_annotations, plain_schema
 from tactflow.sinks.record import Record
 from tactflow.vision.types import Contact, Ellipse, Flow
@@ -49,13 +49,15 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "a.mcap"
 
 
-def test_pictures_are_foxglove_compressed_images(recording: Path) -> None:
+def test_pictures_are_foxglove_compressed_images(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with recording.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         found = list(reader.iter_decoded_messages("/left/image"))
         topics = {channel.topic for channel in reader.get_summary().channels.values()}
-    # The layout for Foxglove shows channels that are there.
-    assert set(re.findall(r"/left/\w+", json.dumps(layout("left")))) <= topics
+    assert main(["schema", "foxglove-layout", "--sensor", "left"]) == 0
+    shown = set(re.findall(r"/left/\w+", json.dumps(json.loads(capsys.readouterr().out))))
+    assert len(shown) == 3
+    assert shown <= topics
     assert len(found) >= 4
     for schema, channel, message, picture in found:
         assert schema is not None

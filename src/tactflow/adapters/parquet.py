@@ -20,7 +20,7 @@ from tactflow.engine.errors import StageError
 from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
 from tactflow.message.encoding import SCHEMA
 from tactflow.message.result import Result, encode_message
-from tactflow.recording.provenance import facts, texts
+from tactflow.recording.provenance import facts, kept_files
 from tactflow.system.extras import missing
 from tactflow.system.files import expanded, make_folder
 from tactflow.system.outputs import cannot_write
@@ -116,7 +116,9 @@ class Parquet(Sink):
             self._check_existing()
         except OSError as error:
             raise cannot_write(self._folder, error) from error
-        about = {"schema": SCHEMA, **facts(self._sensor, self._control), **texts(self._control)}
+        files = kept_files(self._control).items()
+        texts = {name: data.decode() for name, data in files if name.endswith(".yaml")}
+        about = {"schema": SCHEMA, **facts(self._sensor, self._control), **texts}
         self._schemas = make_schemas(about)
         self._flushed = time.monotonic()
 

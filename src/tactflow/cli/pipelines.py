@@ -6,6 +6,7 @@ import argparse
 import json
 import subprocess
 import time
+from importlib.resources import files
 
 from tactflow.cli.options import add_pipeline, add_quiet, load_plan
 from tactflow.cli.terminal import printable, say, table
@@ -88,9 +89,8 @@ def run_schema(args: argparse.Namespace) -> int:
 
         schema = message_schema()
     elif args.what == "foxglove-layout":
-        from tactflow.recording.layout import layout
-
-        schema = layout(args.sensor)
+        layout = files("tactflow.recording").joinpath("foxglove-layout.json").read_text(encoding="utf-8")
+        schema = json.loads(layout.replace("SENSOR", args.sensor))
     else:
         from tactflow.config.registry import catalogue
         from tactflow.config.schema import pipeline_schema

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-from tactflow.message.schema import message_schema
+from tactflow.message.schema import message_schema, resolved
 
 LEFT_OUT = ("schema", "contacts", "markers", "field")
 """Keys of a message without a column in `frames`: the first never changes, two have tables of their own, and
@@ -84,11 +84,8 @@ def _columns(
     part: Mapping[str, Any], defs: Mapping[str, Any], names: tuple[str, ...], path: tuple[str | int, ...]
 ) -> Iterator[Column]:
     """The columns of one part of the schema; names, path : where it stands, as words and as keys."""
+    part = resolved(part, defs)
     description = part.get("description", "")
-    choices = [choice for choice in part.get("anyOf", [part]) if choice.get("type") != "null"]
-    part = choices[0]
-    if "$ref" in part:
-        part = defs[part["$ref"].rsplit("/", 1)[1]]
     name, kind = "_".join(names), part.get("type", "string")
     if "properties" in part:
         for key, inner in part["properties"].items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -201,3 +202,11 @@ def message_schema() -> dict[str, Any]:
     """
     schema = _Message.model_json_schema(by_alias=True, schema_generator=_NoDefaults)
     return {"$schema": GenerateJsonSchema.schema_dialect, **schema}
+
+
+def resolved(part: Mapping[str, Any], definitions: Mapping[str, Any]) -> dict[str, Any]:
+    """A part of a JSON Schema without `$ref` and `anyOf`: what it is where it is not null."""
+    inner = next((choice for choice in part.get("anyOf", ()) if choice.get("type") != "null"), part)
+    if "$ref" in inner:
+        inner = definitions[inner["$ref"].rpartition("/")[2]]
+    return {key: value for key, value in {**inner, **part}.items() if key not in ("$ref", "anyOf")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import platform
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -39,35 +40,29 @@ def facts(sensor: str, control: Control | None) -> dict[str, str]:
     return found
 
 
-def arrays(control: Control | None) -> dict[str, bytes]:
-    """`calibration.npz`, which belongs to the `calibration.yaml` of `texts`: name -> bytes."""
-    calibration = None if control is None else control.pipeline.calibration
-    if calibration is None:
-        return {}
-    try:
-        return {"calibration.npz": stored_arrays(calibration)}
-    except (OSError, ValueError) as error:
-        log.debug("%s: its arrays are not kept: %s", calibration, error)
-        return {}
-
-
-def texts(control: Control | None) -> dict[str, str]:
-    """The files of a run, without passwords: name -> text.
+def kept_files(control: Control | None) -> dict[str, bytes]:
+    """The files of a run, without passwords: name -> content.
 
     `pipeline.yaml` has every override, `pipeline.original.yaml` is the file as it was written,
-    `calibration.yaml` the sensor's calibration, where it has one.
+    `calibration.yaml` and `calibration.npz` are the sensor's calibration, where it has one.
     """
     if control is None:
         return {}
     pipeline = control.pipeline
-    found = {"pipeline.yaml": without_secrets(yaml.safe_dump(dict(pipeline.settings), sort_keys=False))}
-    files = {"pipeline.original.yaml": Path(pipeline.file)}
-    if pipeline.calibration is not None:
-        files["calibration.yaml"] = pipeline.calibration
-    for name, file in files.items():
+    calibration = pipeline.calibration
+    readers: dict[str, Callable[[], bytes]] = {
+        "pipeline.yaml": lambda: yaml.safe_dump(dict(pipeline.settings), sort_keys=False).encode(),
+        "pipeline.original.yaml": Path(pipeline.file).read_bytes,
+    }
+    if calibration is not None:
+        readers["calibration.yaml"] = lambda: stored_text(calibration)
+        readers["calibration.npz"] = lambda: stored_arrays(calibration)
+    found = {}
+    for name, read in readers.items():
         try:
-            data = stored_text(file) if file == pipeline.calibration else file.read_bytes()
-            found[name] = without_secrets(data.decode("utf-8"))
+            data = read()
+            is_text = name.endswith(".yaml")
+            found[name] = without_secrets(data.decode("utf-8")).encode() if is_text else data
         except (OSError, ValueError) as error:
-            log.debug("%s: not kept: %s", file, error)
+            log.debug("%s is not kept: %s", name, error)
     return found

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
 from tactflow.message.result import Result
-from tactflow.message.schema import message_schema
+from tactflow.message.schema import message_schema, resolved
 from tactflow.recording.frames import timestamp
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -89,11 +90,7 @@ def encode_annotations(result: Result, nanoseconds: int) -> bytes:
             timestamp=stamp, type=kind, points=places, outline_color=colour, thickness=thickness
         )
 
-    parts: list[PointsAnnotation] = []
-    contact = result.contact
-    if contact is not None:
-        separate = contact.separate or (contact,)
-        parts += [drawn(PointsAnnotation.LINE_LOOP, one.hull, CONTACT, LINE) for one in separate]
+    parts = [drawn(PointsAnnotation.LINE_LOOP, part.hull, CONTACT, LINE) for part in result.contacts]
     markers = result.markers
     if markers is not None:
         parts.append(drawn(PointsAnnotation.LINE_LIST, _arrows(markers), ARROWS, LINE))
@@ -114,34 +111,21 @@ def _arrows(markers: Markers) -> NDArray[np.float64]:
     return ends
 
 
-def plain_schema(schema: dict[str, Any]) -> dict[str, Any]:
+def plain_schema(schema: Mapping[str, Any], definitions: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """A JSON Schema for programs that plot: what each field is where it is known.
 
     They want one type per field and no references. So references are filled in, `X or null` becomes a field
     that may be missing, and a tuple becomes an array. Messages with null in them are not valid under it; the
     exact schema is an attachment of the recording.
     """
-    definitions = schema.get("$defs", {})
-
-    def plain(part: dict[str, Any]) -> dict[str, Any]:
-        if "$ref" in part:
-            inner = definitions[part["$ref"].rpartition("/")[2]]
-            return plain(inner | {key: value for key, value in part.items() if key != "$ref"})
-        if "anyOf" in part:
-            known = next(choice for choice in part["anyOf"] if choice.get("type") != "null")
-            return plain(known | {key: value for key, value in part.items() if key != "anyOf"})
-        if "const" in part:
-            return {"type": "string"} | _words(part)
-        kind = part["type"]
-        result = {"type": kind} | _words(part)
-        if kind == "array":
-            result["items"] = plain(part["items"] if "items" in part else part["prefixItems"][0])
-        elif kind == "object" and "properties" in part:
-            result["properties"] = {name: plain(field) for name, field in part["properties"].items()}
-        return result
-
-    return plain(schema)
-
-
-def _words(part: dict[str, Any]) -> dict[str, Any]:
-    return {key: part[key] for key in ("title", "description") if key in part}
+    definitions = schema.get("$defs", {}) if definitions is None else definitions
+    part = resolved(schema, definitions)
+    result: dict[str, Any] = {key: part[key] for key in ("type", "title", "description") if key in part}
+    if part["type"] == "array":
+        result["items"] = plain_schema(
+            part["items"] if "items" in part else part["prefixItems"][0], definitions
+        )
+    elif "properties" in part:
+        fields = part["properties"].items()
+        result["properties"] = {name: plain_schema(field, definitions) for name, field in fields}
+    return result

@@ -19,6 +19,7 @@ from tactflow.recording.frames import RawFrame
 from tactflow.recording.schemas import channel_type, channel_types
 from tactflow.system.outputs import cannot_write, create, refuse_interference
 
+MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".npz": "application/octet-stream"}
 NEVER = 1 << 62
 """Size at which a chunk would end by itself, bytes: each ends with a frame."""
 
@@ -67,21 +68,14 @@ class RecordingWriter:
     def _describe(self, sensor: str, control: Control | None) -> None:
         writer = self._writer
         raw = channel_type(RawFrame)
-        frames = writer.register_schema(raw.name, *raw.schema)
-        self._channels = {
-            name: writer.register_channel(f"/{sensor}/{name}", raw.packing, frames)
-            for name in ("frames", "references")
-        }
-        for name, kind in channel_types().items():
+        self._channels: dict[str, int] = {}
+        for name, kind in {"frames": raw, "references": raw, **channel_types()}.items():
             schema = writer.register_schema(kind.name, *kind.schema)
             self._channels[name] = writer.register_channel(f"/{sensor}/{name}", kind.packing, schema)
         writer.add_metadata("tactflow", provenance.facts(sensor, control))
-        texts = {"message.schema.json": json.dumps(message_schema(), indent=1)} | provenance.texts(control)
-        for name, text in texts.items():
-            media_type = "application/json" if name.endswith(".json") else "application/yaml"
-            writer.add_attachment(0, 0, name, media_type, text.encode())
-        for name, data in provenance.arrays(control).items():
-            writer.add_attachment(0, 0, name, "application/octet-stream", data)
+        attached = {"message.schema.json": json.dumps(message_schema(), indent=1).encode()}
+        for name, data in {**attached, **provenance.kept_files(control)}.items():
+            writer.add_attachment(0, 0, name, MEDIA_TYPES[Path(name).suffix], data)
 
     def write(self, entry: Entry, time: int | None = None) -> None:
         """Add one frame and what belongs to it.
