@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -172,18 +170,14 @@ def _repair(path: Path, out: Path, *, shown: bool) -> str:
     from tactflow.recording.records import NotARecordingError
     from tactflow.recording.repair import repair
 
-    with (
-        tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".tactflow-repair-") as folder,
-        progress_bar(path.name, path.stat().st_size, shown=shown) as update,
-    ):
-        copy = Path(folder, out.name)
+    with completed(out) as copy, progress_bar(path.name, path.stat().st_size, shown=shown) as update:
         try:
             result = repair(path, copy, lambda done: update(completed=done))
         except NotARecordingError as error:
             raise SourceError(f"{path}: {error}") from None
         if result.finished:
+            copy.unlink()
             return f"{path}: is whole already, nothing to repair ({result.messages} messages)"
         copy.chmod(path.stat().st_mode & 0o777)
-        os.replace(copy, out)
     lost = f", {result.lost} bytes belonged to nothing intact" if result.lost else ""
     return f"{out}: {result.messages} messages{lost}; {path} stays as it is"

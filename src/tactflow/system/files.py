@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import glob
 import io
 import os
+import platform
 import re
 import shutil
 import stat
@@ -68,22 +70,47 @@ def next_name(path: Path) -> Path:
 def completed(path: Path) -> Iterator[Path]:
     """A path to write a file or a folder to, renamed to `path` if all went well and removed if not.
 
-    It replaces what is there, but no file replaces a folder. Its name begins with a dot and ends as that of
-    `path` does. Folders above are made. Raises OSError.
+    It replaces what is there, but no file replaces a folder; if nothing was written, nothing is replaced. Its
+    name begins with a dot and ends as that of `path` does. Folders above are made. What a killed process of
+    this machine has left for the same path is removed first. Raises OSError.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    front, end = f".{path.stem}.{platform.node()[:16]}-", f".partial{path.suffix}"
+    for left in path.parent.glob(f"{glob.escape(front)}*{glob.escape(end)}"):
+        process = left.name[len(front) : -len(end)]
+        if process.isdecimal() and _has_ended(int(process)):
+            _remove(left)
+    partial = path.with_name(f"{front}{os.getpid()}{end}")
     try:
         yield partial
         if path.is_dir() and partial.is_dir():
             shutil.rmtree(path)
-        os.replace(partial, path)
+        if partial.exists():
+            os.replace(partial, path)
     finally:
-        if partial.is_dir():
-            shutil.rmtree(partial, ignore_errors=True)
-        else:
-            with suppress(OSError):
-                partial.unlink()
+        _remove(partial)
+
+
+def _has_ended(process: int) -> bool:
+    if sys.platform == "win32":
+        # Signal 0 would end it there.
+        return False
+    else:  # noqa: RET505 (mypy knows branches)
+        try:
+            os.kill(process, 0)
+        except (ProcessLookupError, OverflowError):
+            return True
+        except PermissionError:
+            pass
+        return False
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def make_folder(folder: Path) -> None:
