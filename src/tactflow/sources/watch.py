@@ -79,14 +79,15 @@ class Arrival(NamedTuple):
 
 @dataclass(slots=True)
 class _Fault:
-    """since : on the clock, s. hour : the same for people. attempts : to open the source again.
+    """since : on the clock, s. hour : the same for people. retry_at : when to open the source again, s.
 
-    detail : the last error.
+    attempts : to open it, so far. detail : the last error.
     """
 
     what: str
     since: float
     hour: str
+    retry_at: float
     detail: str = ""
     attempts: int = 0
 
@@ -142,9 +143,10 @@ class Watched(FrameReader):
         self._seq, self._t, self._connection = -1, -math.inf, 0
         self._fault: _Fault | None = None
         self._interval = 1.0 / source.fps if source.fps else 0.0
-        self._arrived_at = self._good_at = clock.now()
-        self._pictures = _PictureCheck(watch, clock.now())
-        self._failures, self._retry_at, self._hangs_at = 0, 0.0, math.inf
+        self._arrived_at = self._good_at = self._lit_at = self._changed_at = clock.now()
+        self._lit = False
+        self._previous: BgrImage | None = None
+        self._hangs_at = math.inf
         self._hung: list[threading.Thread] = []
         self.reader = self._start(source)
         """The thread that frames arrive in; another one after a read that hung."""
@@ -198,11 +200,13 @@ class Watched(FrameReader):
         """Notice what no frame can show: a stall, the end of all patience, a read that hangs."""
         watch = self._watch
         usual = FIRST_FRAME_SECONDS if self._seq < 0 else watch.silent_after
-        if self._fault is None and now - self._arrived_at >= max(usual, SILENT_INTERVALS * self._interval):
+        hangs = watch.reconnect and now >= self._hangs_at
+        stalls = now - self._arrived_at >= max(usual, SILENT_INTERVALS * self._interval)
+        if self._fault is None and (stalls or hangs):
             self._report("no frames", self._arrived_at, now)
         if watch.no_frame_timeout and now - self._good_at >= watch.no_frame_timeout:
             self._failure = self._timeout_error(now)
-        elif watch.reconnect and now >= self._hangs_at:
+        elif hangs:
             self._hung = [thread for thread in self._hung if thread.is_alive()]
             if len(self._hung) < MAX_HUNG:
                 self._hung.append(self.reader)
@@ -220,152 +224,22 @@ class Watched(FrameReader):
 
     def _report(self, what: str, since: float, now: float, detail: str = "") -> None:
         hour = time.strftime("%H:%M:%S", time.localtime(self._clock.unix() - (now - since)))
-        self._fault = _Fault(what, since, hour, detail)
+        retry_at = now + self._watch.first_retry if what == "gone" else now
+        self._fault = _Fault(what, since, hour, retry_at, detail)
         then = "" if not self._watch.reconnect else "; waiting" if what == "no frames" else "; reconnecting"
         words = f"is {what}" if what == "gone" else what
         reason = f": {detail}" if detail else ""
         log.warning("%s: %s since %s (%.1f s)%s%s", self.name, words, hour, now - since, reason, then)
 
     def _recover(self, fault: _Fault, now: float) -> None:
-        self._fault, self._failures = None, 0
+        self._fault = None
         tries = f" and {fault.attempts} attempt{'s'[: fault.attempts > 1]}" if fault.attempts else ""
         log.warning("%s: is back after %.1f s%s (%s)", self.name, now - fault.since, tries, fault.what)
 
-    def _back_off(self) -> None:
-        delay = min(self._watch.first_retry * 2.0 ** min(self._failures, 30), self._watch.last_retry)
-        self._failures += 1
-        self._retry_at = self._clock.now() + delay
-
-    # -- the thread that reads ----------------------------------------------------------------------------
-
-    def _start(self, source: FrameReader | None) -> threading.Thread:
-        name = f"tactflow-read-{self.name}"
-        thread = self.reader = threading.Thread(target=self._work, args=(source,), name=name, daemon=True)
-        thread.start()
-        return thread
-
-    def _work(self, source: FrameReader | None) -> None:
-        """Read the source until it fails, and open it again, for as long as this thread is the reader."""
-        while source is not None or (source := self._reconnect()) is not None:
-            try:
-                with closing(source):
-                    while self._enter(self._watch.hang_after + SILENT_INTERVALS * self._interval):
-                        item = source.read()
-                        if item is None:
-                            self._fail(None)
-                            break
-                        if self._take(*item):
-                            break
-            except Exception as error:
-                self._fail(error)
-            source = None
-
-    def _reconnect(self) -> FrameReader | None:
-        """Try to open the source until it works, with back-off; None if stopped meanwhile."""
-        while self._enter(math.inf):
-            wait = self._retry_at - self._clock.now()
-            if self._clock.sleep(wait, self._stopped) or not self._enter(OPEN_TIMEOUT):
-                return None
-            source, detail = None, "it was opened, but gave no good frame"
-            try:
-                source = self._opener()
-                if self.size and source.size and source.size != self.size:
-                    source.close()
-                    sizes = ("{} x {}".format(*size) for size in (source.size, self.size))
-                    raise SourceError("it came back with {} pixels instead of {}".format(*sizes))
-            except Exception as error:
-                source, detail = None, self._text(error)
-            with self._changed:
-                if self._is_reader():
-                    if self._fault is not None:
-                        self._fault.attempts += 1
-                        self._fault.detail = detail
-                    self._connection += source is not None
-                    self._back_off()
-            if source is not None:
-                return source
-        return None
-
-    def _is_reader(self) -> bool:
-        ended = self._ended or self._failure is not None or self._stopped.is_set()
-        return self.reader is threading.current_thread() and not ended
-
-    def _enter(self, limit: float) -> bool:
-        """Begin something that hangs if it takes longer than `limit`, s; False if this thread is to end."""
-        with self._changed:
-            if self._is_reader():
-                self._hangs_at = self._clock.now() + limit
-                return True
-            return False
-
-    def _take(self, image: BgrImage, t: float) -> bool:
-        """A frame has arrived; True if the source is to be opened again."""
-        now = self._clock.now()
-        with self._changed:
-            if not self._is_reader():
-                return True
-            gap, self._arrived_at = now - self._arrived_at, now
-            self._seq += 1
-            if self._seq and not (self._fault and self._fault.attempts):
-                self._interval = max(gap, INTERVAL_DECAY * self._interval)
-            self.size = self.size or (image.shape[1], image.shape[0])
-            problem = self._pictures.check(image, now)
-            if problem is not None:
-                what, since, reportable = problem
-                if self._fault is None and reportable:
-                    self._report(what, since, now)
-                    self._retry_at = now
-                return self._fault is not None and self._watch.reconnect and now >= self._retry_at
-            if self._fault is not None:
-                self._recover(self._fault, now)
-            self._good_at = now
-            self._t = max(t, float(np.nextafter(self._t, np.inf)))
-            self.missed += self._newest is not None
-            self._newest = Arrival(image, self._t, self._seq, self._connection, now)
-            self._changed.notify_all()
-            return False
-
-    def _fail(self, error: Exception | None) -> None:
-        """Reading failed, or, if there is no error, the source says that it is the end."""
-        now = self._clock.now()
-        detail = "it ended" if error is None else self._text(error)
-        with self._changed:
-            if not self._is_reader():
-                return
-            if not self._watch.reconnect:
-                self._ended = True
-                if error is None:
-                    log.warning("%s: the stream ended after %d frames", self.name, self._seq + 1)
-                else:
-                    self._failure = SourceError(f"{self.name}: {detail}")
-            elif self._fault is None:
-                self._report("gone", self._arrived_at, now, detail)
-                self._back_off()
-            else:
-                self._fault.detail = detail
-            self._changed.notify_all()
-
-    def _text(self, error: Exception) -> str:
-        text = str(error).removeprefix(f"{self.name}: ")
-        return text if isinstance(error, SourceError) else f"{type(error).__name__}: {text}"
-
-
-class _PictureCheck:
-    """Detects black and frozen pictures.
-
-    watch : after how long they are a fault. now : on the clock of `check`, s.
-    """
-
-    def __init__(self, watch: Watch, now: float) -> None:
-        self._watch = watch
-        self._previous: BgrImage | None = None
-        self._lit = False
-        self._lit_at = self._changed_at = now
-
-    def check(self, image: BgrImage, now: float) -> tuple[str, float, bool] | None:
+    def _picture_problem(self, image: BgrImage, now: float) -> tuple[str, float, bool] | None:
         """What is wrong with a picture, since when (s), and whether that has lasted long enough to report it.
 
-        Before anything was seen, black is no picture of the gel: it must not become the reference.
+        Before anything else was there, black is no picture of the gel: it must not become the reference.
         """
         watch = self._watch
         if watch.black_after is not None:
@@ -380,3 +254,110 @@ class _PictureCheck:
             elif now - self._changed_at >= watch.frozen_after:
                 return "a frozen picture", self._changed_at, True
         return None
+
+    # -- the thread that reads ----------------------------------------------------------------------------
+
+    def _start(self, source: FrameReader | None) -> threading.Thread:
+        name = f"tactflow-read-{self.name}"
+        thread = self.reader = threading.Thread(target=self._work, args=(source,), name=name, daemon=True)
+        thread.start()
+        return thread
+
+    def _work(self, source: FrameReader | None) -> None:
+        """Read the source until it fails, and open it again, for as long as this thread is the reader."""
+        while source is not None or self._wait_to_retry():
+            try:
+                with closing(source or self._reopen()) as opened:
+                    while self._enter(self._watch.hang_after + SILENT_INTERVALS * self._interval):
+                        item = opened.read()
+                        if item is None:
+                            self._fail(None)
+                            break
+                        if self._take(*item):
+                            break
+            except Exception as error:
+                self._fail(error)
+            source = None
+
+    def _is_reader(self) -> bool:
+        ended = self._ended or self._failure is not None or self._stopped.is_set()
+        return self.reader is threading.current_thread() and not ended
+
+    def _enter(self, limit: float) -> bool:
+        """Begin something that hangs if it takes longer than `limit`, s; False if this thread is to end."""
+        with self._changed:
+            if self._is_reader():
+                self._hangs_at = self._clock.now() + limit
+                return True
+            return False
+
+    def _wait_to_retry(self) -> bool:
+        """Wait until the source may be opened again, with exponential back-off; False if there is no need."""
+        fault, watch = self._fault, self._watch
+        if fault is None or not self._enter(math.inf):
+            return False
+        stopped = self._clock.sleep(fault.retry_at - self._clock.now(), self._stopped)
+        if stopped or not self._enter(OPEN_TIMEOUT):
+            return False
+        fault.attempts += 1
+        delay = min(watch.first_retry * 2.0 ** min(fault.attempts, 30), watch.last_retry)
+        fault.retry_at = self._clock.now() + delay
+        return True
+
+    def _reopen(self) -> FrameReader:
+        source = self._opener()
+        if self.size and source.size and source.size != self.size:
+            source.close()
+            sizes = ("{} x {}".format(*size) for size in (source.size, self.size))
+            raise SourceError("it came back with {} pixels instead of {}".format(*sizes))
+        with self._changed:
+            if self._is_reader() and self._fault is not None:
+                self._connection += 1
+                self._fault.detail = "it was opened, but gave no good frame"
+        return source
+
+    def _take(self, image: BgrImage, t: float) -> bool:
+        """A frame has arrived; True if the source is to be opened again."""
+        now = self._clock.now()
+        with self._changed:
+            if not self._is_reader():
+                return True
+            gap, self._arrived_at = now - self._arrived_at, now
+            self._seq += 1
+            if self._seq and not (self._fault and self._fault.attempts):
+                self._interval = max(gap, INTERVAL_DECAY * self._interval)
+            self.size = self.size or (image.shape[1], image.shape[0])
+            problem = self._picture_problem(image, now)
+            if problem is not None:
+                what, since, reportable = problem
+                if self._fault is None and reportable:
+                    self._report(what, since, now)
+                return self._fault is not None and self._watch.reconnect and now >= self._fault.retry_at
+            if self._fault is not None:
+                self._recover(self._fault, now)
+            self._good_at = now
+            self._t = max(t, float(np.nextafter(self._t, np.inf)))
+            self.missed += self._newest is not None
+            self._newest = Arrival(image, self._t, self._seq, self._connection, now)
+            self._changed.notify_all()
+            return False
+
+    def _fail(self, error: Exception | None) -> None:
+        """Reading failed, or, if there is no error, the source says that it is the end."""
+        detail = "it ended" if error is None else str(error).removeprefix(f"{self.name}: ")
+        if error is not None and not isinstance(error, SourceError):
+            detail = f"{type(error).__name__}: {detail}"
+        with self._changed:
+            if not self._is_reader():
+                return
+            if not self._watch.reconnect:
+                self._ended = True
+                if error is None:
+                    log.warning("%s: the stream ended after %d frames", self.name, self._seq + 1)
+                else:
+                    self._failure = SourceError(f"{self.name}: {detail}")
+            elif self._fault is None:
+                self._report("gone", self._arrived_at, self._clock.now(), detail)
+            else:
+                self._fault.detail = detail
+            self._changed.notify_all()
