@@ -5,12 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from itertools import chain
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import repeat
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import orjson
 from pydantic import Field, model_validator
 
@@ -22,7 +20,7 @@ from tactflow.message.encoding import SCHEMA
 from tactflow.message.result import Result, encode_message
 from tactflow.recording.provenance import facts, kept_files
 from tactflow.system.extras import missing
-from tactflow.system.files import expanded, make_folder
+from tactflow.system.files import completed, expanded, make_folder
 from tactflow.system.outputs import cannot_write
 
 if TYPE_CHECKING:
@@ -30,12 +28,14 @@ if TYPE_CHECKING:
 
 SEQ = Column("seq", ("seq",), "integer", "the frame's seq in the table frames")
 CONTACT = Column("contact", (), "integer", "0 is the contact with the most pixels")
-TABLES = ("markers", "contacts", "frames")
+TABLES = {
+    "markers": (SEQ, *MARKER_COLUMNS),
+    "contacts": (SEQ, CONTACT, *contact_columns()),
+    "frames": tuple(frame_columns()),
+}
 """In the order in which they are written: what belongs to a frame of `frames` is there before it."""
-UNFINISHED = ".unfinished"
-"""Prefix of a part that is being written: readers of folders leave out names that begin with a dot."""
-PART_BYTES = 64_000_000
-"""A part is written early when its messages take so much memory, bytes: some ten thousand frames."""
+PART_ROWS = 200_000
+"""A part is written early when a table has so many rows: some hundred megabytes of memory."""
 
 
 class Parquet(Sink):
@@ -79,7 +79,7 @@ class Parquet(Sink):
         self._sensor = sensor
         self._control = control
         self._schemas: dict[str, pa.Schema] = {}
-        self._pending: list[bytes] = []
+        self._rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in TABLES}
         self._flushed = 0.0
         self._next = 0
         self._counts = {"frames": 0, "parts": 0}
@@ -134,9 +134,11 @@ class Parquet(Sink):
         StageError
             If the part cannot be written, for instance because the disk is full. The parts before stay.
         """
-        self._pending.append(encode_message(result, detail=True))
+        message = orjson.loads(encode_message(result, detail=True))
+        for name, rows in _rows(message).items():
+            self._rows[name].extend(rows)
         due = time.monotonic() - self._flushed >= self.params.flush
-        if due or len(self._pending) * len(self._pending[-1]) >= PART_BYTES:
+        if due or any(len(rows) >= PART_ROWS for rows in self._rows.values()):
             self._flush()
 
     def close(self) -> None:
@@ -163,35 +165,35 @@ class Parquet(Sink):
         self._next = max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
 
     def _flush(self) -> None:
+        import pyarrow as pa
         import pyarrow.parquet as pq
 
-        messages, self._pending = self._pending, []
+        rows, self._rows = self._rows, {name: [] for name in TABLES}
         self._flushed = time.monotonic()
-        if not messages or not self._schemas:
+        count = len(rows["frames"])
+        if not count or not self._schemas:
             return
-        tables = make_tables([orjson.loads(message) for message in messages], self._schemas)
-        unfinished = self._folder / UNFINISHED
         try:
-            for name in TABLES:
+            for name, schema in self._schemas.items():
+                columns = zip(*rows[name], strict=True) if rows[name] else repeat(())
+                arrays = [
+                    pa.array(column, field.type) for column, field in zip(columns, schema, strict=False)
+                ]
+                # Its name begins with a dot until it is complete: readers of folders leave such files out.
                 part = self._folder / name / f"part-{self._next:05d}.parquet"
-                unfinished = part.with_name(f"{UNFINISHED}-{part.name}")
-                with unfinished.open("wb") as file:
-                    pq.write_table(tables[name], file, compression="zstd")
+                with completed(part) as unfinished, unfinished.open("wb") as file:
+                    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
                     file.flush()
                     # On the disk before it gets its name, so that a power cut leaves no empty part.
                     os.fsync(file.fileno())
-                unfinished.replace(part)
         except OSError as error:
-            with suppress(OSError):
-                unfinished.unlink()
             hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
             kept = (
-                f"the {self._counts['frames']} frames written before are complete; "
-                f"not written: {len(messages)}{hint}"
+                f"the {self._counts['frames']} frames written before are complete; not written: {count}{hint}"
             )
             raise cannot_write(self._folder, error, kept) from error
         self._next += 1
-        self._counts = {"frames": self._counts["frames"] + len(messages), "parts": self._counts["parts"] + 1}
+        self._counts = {"frames": self._counts["frames"] + count, "parts": self._counts["parts"] + 1}
 
 
 def make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
@@ -210,54 +212,30 @@ def make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
         "points": pa.list_(pa.list_(pa.float64())),
         "words": pa.map_(pa.string(), pa.string()),
     }
-    columns = {
-        "frames": frame_columns(),
-        "contacts": (SEQ, CONTACT, *contact_columns()),
-        "markers": (SEQ, *MARKER_COLUMNS),
-    }
     return {
         name: pa.schema(
-            [pa.field(c.name, types[c.kind], metadata={"description": c.description}) for c in table],
+            [pa.field(c.name, types[c.kind], metadata={"description": c.description}) for c in columns],
             metadata=dict(metadata),
         )
-        for name, table in columns.items()
+        for name, columns in TABLES.items()
     }
 
 
-def make_tables(
-    messages: Sequence[Mapping[str, Any]], schemas: Mapping[str, pa.Schema]
-) -> dict[str, pa.Table]:
-    """The tables `frames`, `contacts` and `markers` of parsed result messages."""
-    import pyarrow as pa
-
-    frames = [{column.name: column.value(message) for column in frame_columns()} for message in messages]
+def _rows(message: Mapping[str, Any]) -> dict[str, list[tuple[Any, ...]]]:
+    """The rows of each table that one parsed result message gives."""
+    seq = message["seq"]
     contacts = [
-        {"seq": message["seq"], "contact": index}
-        | {column.name: column.value(contact) for column in contact_columns()}
-        for message in messages
+        (seq, index, *(column.value(contact) for column in contact_columns()))
         for index, contact in enumerate(message["contacts"])
     ]
-    # By columns, as there are thousands of rows a second.
-    seen = [(m["seq"], m["markers"]) for m in messages if m["markers"] and m["markers"]["position"]]
-    counts = [len(markers["position"]) for _, markers in seen]
-    position, origin = (
-        np.concatenate([np.empty((0, 2)), *(np.array(markers[key]) for _, markers in seen)])
-        for key in ("position", "origin")
-    )
-    errors = (m.get("stderr", [None] * count) for (_, m), count in zip(seen, counts, strict=True))
-    columns = [
-        np.repeat(np.array([seq for seq, _ in seen], np.int64), counts),
-        list(chain.from_iterable(map(range, counts))),
-        *position.T,
-        *(position - origin).T,
-        *origin.T,
-        list(chain.from_iterable(markers["status"] for _, markers in seen)),
-        list(chain.from_iterable(errors)),
-    ]
-    schema = schemas["markers"]
-    arrays = [pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)]
-    return {
-        "frames": pa.Table.from_pylist(frames, schemas["frames"]),
-        "contacts": pa.Table.from_pylist(contacts, schemas["contacts"]),
-        "markers": pa.Table.from_arrays(arrays, schema=schema),
-    }
+    frame = tuple(column.value(message) for column in frame_columns())
+    return {"markers": list(_markers(seq, message["markers"])), "contacts": contacts, "frames": [frame]}
+
+
+def _markers(seq: int, markers: Mapping[str, Any] | None) -> Iterator[tuple[Any, ...]]:
+    if markers is None:
+        return
+    errors = markers.get("stderr") or repeat(None)
+    dots = zip(markers["position"], markers["origin"], markers["status"], errors, strict=False)
+    for index, ((x, y), (origin_x, origin_y), status, error) in enumerate(dots):
+        yield (seq, index, x, y, x - origin_x, y - origin_y, origin_x, origin_y, status, error)
