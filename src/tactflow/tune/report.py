@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -11,53 +11,59 @@ from typing import Any, Final
 import yaml
 
 from tactflow.engine.errors import ConfigError
-from tactflow.report import COLORS, Section, Table, figure, mark, picture, write_report
+from tactflow.report import COLORS, Section, Table, figure, picture, write_report
 from tactflow.tune.measure import ANY, CHECKS, ERRORS, Interval, Trial
 from tactflow.tune.search import DEFAULT, Tuned
 
 
-def lines(tuned: Tuned) -> Iterator[str]:
-    """The report as lines of text."""
-    kinds = _kinds(tuned)
-    yield from _facts(tuned)
-    yield ""
-    yield f"  {'':<8} {'ms':>6} {'interval':>14} " + "".join(f"{k:>8} {'interval':>14} " for k in kinds)
-    for trial in tuned.trials:
-        if trial.failure:
-            yield f"  {'fails':<8} {trial.name}: {trial.failure.splitlines()[0]}"
-            continue
-        cells = _cell(trial.ms, 6, 2) + "".join(_cell(trial.errors.get(kind), 8, 3) for kind in kinds)
-        remark = f"  ({trial.unsound})" if trial.unsound else ""
-        yield f"  {_role(tuned, trial):<8} {cells}{trial.name}{remark}"
-    yield ""
-    yield "; ".join(f"{kind}: {ERRORS[kind]}" for kind in kinds)
-    yield from tuned.notes
-    checks = [trial.checks for trial in tuned.trials if _role(tuned, trial) == "CHOSEN"]
-    if checks and checks[0]:
-        yield from ("", "the chosen pipeline on the recording:")
-        yield from (f"  {value:>8.3g}  {CHECKS[check]}" for check, value in checks[0].items())
-
-
-def _facts(tuned: Tuned) -> Iterator[str]:
-    yield f"simulated sensor fitted to {tuned.recording.source}: {tuned.look}"
+def sections(tuned: Tuned) -> list[Section]:
+    """How the pipelines were measured, a table of them, and the chosen one on the recording."""
     rounds = ", ".join(f"{count} on {frames} frames" for count, frames in tuned.rounds)
     timed = "simulated"
     if tuned.timed_on_recording:
         rounds += f"; finalists on {tuned.recording.frames} frames of the recording"
         timed = "on the recording"
-    yield f"tried: {rounds}"
-    yield f"errors: px of the camera image, simulated; time: CPU of a frame with contact, {timed}"
+    facts = [
+        f"simulated sensor fitted to {tuned.recording.source}: {tuned.look}",
+        f"tried: {rounds}",
+        f"errors: px of the camera image, simulated; time: CPU of a frame with contact, {timed}",
+        *tuned.notes,
+    ]
+    kinds = [kind for kind in ERRORS if kind != ANY and any(kind in trial.errors for trial in tuned.trials)]
+    rows = []
+    for trial in tuned.trials:
+        cells = [_cell(trial.ms, 2), *(_cell(trial.errors.get(kind), 3) for kind in kinds)]
+        remark = (trial.failure or trial.unsound).partition("\n")[0]
+        rows.append([_role(tuned, trial), trial.name, *cells, remark])
+    columns = ["", "pipeline", "time, ms", *(f"{kind}, px" for kind in kinds), "remarks"]
+    legend = "; ".join(f"{kind}: {ERRORS[kind]}" for kind in kinds)
+    legend = f"In brackets: 90 % intervals. {legend}"
+    found = [
+        Section("How", "\n\n".join(facts)),
+        Section("Time and error", legend, tables=[Table(columns, rows)]),
+    ]
+    for trial in tuned.trials:
+        if trial.checks and _role(tuned, trial) == "CHOSEN":
+            checks = [[CHECKS[name], f"{value:.3g}"] for name, value in trial.checks.items()]
+            found.append(Section("The chosen pipeline on the recording", tables=[Table(["", ""], checks)]))
+    return found
 
 
-def _kinds(tuned: Tuned) -> list[str]:
-    return [kind for kind in ERRORS if kind != ANY and any(kind in trial.errors for trial in tuned.trials)]
+def lines(tuned: Tuned) -> Iterator[str]:
+    """The sections as lines of text."""
+    for section in sections(tuned):
+        yield from ("", f"{section.title}:", *section.text.split("\n\n"))
+        for table in section.tables:
+            rows = [[str(cell) for cell in row] for row in (table.columns, *table.rows)]
+            widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+            for row in rows:
+                yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
 
 
-def _cell(interval: Interval | None, width: int, digits: int) -> str:
+def _cell(interval: Interval | None, digits: int) -> str:
     if interval is None:
-        return f"{'-':>{width}} {'':>14} "
-    span = f"{interval.low:.{digits}f}-{interval.high:.{digits}f}"
-    return f"{interval.value:>{width}.{digits}f} {span:>14} "
+        return "-"
+    return f"{interval.value:.{digits}f} ({interval.low:.{digits}f}-{interval.high:.{digits}f})"
 
 
 def _role(tuned: Tuned, trial: Trial) -> str:
@@ -130,31 +136,11 @@ def _set(document: dict[str, Any], key: str, value: Any) -> str | None:
 
 
 def write_page(path: Path, tuned: Tuned) -> Path:
-    """Write a page with a plot of time against error and the table. Raises ConfigError without matplotlib."""
-    kinds = _kinds(tuned)
-    columns = ["", "pipeline", "time, ms", *(f"{ERRORS[kind]}, px" for kind in kinds), "remarks"]
-    rows = []
-    for trial in tuned.trials:
-        errors = [trial.errors[kind].value if kind in trial.errors else None for kind in kinds]
-        role = _role(tuned, trial)
-        marked = mark(role, role != "fails")
-        rows.append([marked, trial.name, trial.ms.value, *errors, trial.failure or trial.unsound])
-    chosen: Sequence[Trial] = [trial for trial in tuned.trials if _role(tuned, trial) == "CHOSEN"]
-    checks = [[CHECKS[name], value] for trial in chosen for name, value in trial.checks.items()]
-    sections = [
-        Section(
-            "Time and error",
-            f"Error: {ERRORS[tuned.goal.kind]}. Bars are 90 % intervals.",
-            [picture(_plot(tuned))],
-            [Table(columns, rows)],
-        )
-    ]
-    if checks:
-        sections.append(
-            Section("The chosen pipeline on the recording", tables=[Table(["check", ""], checks)])
-        )
-    text = "\n\n".join([*_facts(tuned), *tuned.notes])
-    return write_report(path, f"Pipelines for {tuned.recording.source}", sections, text)
+    """Write a page with a plot of time against error and the sections. Raises ConfigError without
+    matplotlib."""
+    error = f"Error: {ERRORS[tuned.goal.kind]}. Bars are 90 % intervals."
+    plot = Section("The choice", error, [picture(_plot(tuned))])
+    return write_report(path, f"Pipelines for {tuned.recording.source}", [plot, *sections(tuned)])
 
 
 def _plot(tuned: Tuned) -> Any:
