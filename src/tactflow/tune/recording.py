@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -61,7 +62,9 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
     SourceError
         The source cannot be read, is live or too short, or shows no contact.
     """
-    changes = _changes(source)
+    frames = _frames(source, MAX_READ)
+    first = next(frames, None)
+    changes = [] if first is None else [0.0, *(change_between(first, image) for image in frames)]
     if len(changes) < MIN_FRAMES:
         raise SourceError(
             f"{source}: {len(changes)} frames are too few to tune on; required {MIN_FRAMES} or more"
@@ -74,72 +77,37 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
         )
     start = max(HEAD, min(touched - MAX_USED // 2, len(changes) - MAX_USED + HEAD))
     indices = [*range(HEAD), *range(start, min(len(changes), start + MAX_USED - HEAD))]
-    frames = _copy(source, indices, folder / "recording.npy")
-    transform = _geometry(pipeline)
+    path, transform = folder / "recording.npy", _geometry(pipeline)
+    used = [image for index, image in enumerate(_frames(source, indices[-1] + 1)) if index in indices]
+    np.save(path, used)
     pairs = [
-        Pair(n, transform(frames[n]), transform(frames[n + 1]))
-        for n in range(0, len(frames) - 1, max(1, len(frames) // KEPT))
+        Pair(n, transform(used[n]), transform(used[n + 1]))
+        for n in range(0, len(used) - 1, max(1, len(used) // KEPT))
     ]
-    observation = Observation(source, source, False, frames=len(frames), pairs=pairs)
+    observation = Observation(source, source, False, frames=len(used), pairs=pairs)
     height, width = pairs[0].image.shape[:2]
-    used = [changes[index] for index in indices]
-    return Recording(source, folder / "recording.npy", len(frames), (width, height), observation, used)
+    return Recording(source, path, len(used), (width, height), observation, [changes[i] for i in indices])
 
 
-def _changes(source: str) -> list[float]:
-    """Maximum relative change of light of each frame from the first."""
-    reader = open_source(source)
-    try:
+def _frames(source: str, count: int) -> Iterator[Image]:
+    """The first frames of a recording."""
+    with closing(open_source(source)) as reader:
         if reader.live:
             raise SourceError(f"{source}: tune needs a recording; make one: tactflow record --out FILE.mcap")
-        first: NDArray[np.float32] | None = None
-        changes: list[float] = []
-        while len(changes) < MAX_READ and (frame := reader.read()) is not None:
-            small = _small(frame[0])
-            first = small if first is None else first
-            changes.append(_change(first, small))
-        return changes
-    finally:
-        reader.close()
+        for _ in range(count):
+            if (frame := reader.read()) is None:
+                return
+            yield frame[0].copy()
 
 
 def change_between(first: Image, now: Image) -> float:
     """Maximum relative change of light between two pictures (H, W, 3) uint8."""
-    return _change(_small(first), _small(now))
-
-
-def _small(image: Image) -> NDArray[np.float32]:
     # 96 px are enough for a contact to cover several pixels.
-    size = (96, max(1, round(96 * image.shape[0] / image.shape[1])))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _change(first: NDArray[np.float32], now: NDArray[np.float32]) -> float:
-    ratio = np.where(first > DIM, now / np.maximum(first, DIM), 1.0)
+    size = (96, max(1, round(96 * first.shape[0] / first.shape[1])))
+    before, after = (cv2.resize(i, size, interpolation=cv2.INTER_AREA).astype(float) for i in (first, now))
+    ratio = np.where(before > DIM, after / np.maximum(before, DIM), 1.0)
     ratio = ratio / np.maximum(np.median(ratio, axis=(0, 1)), 0.1)
-    smooth = cv2.blur(np.abs(ratio - 1.0).max(axis=2).astype(np.float32), (7, 7))
-    return float(smooth.max())
-
-
-def _copy(source: str, indices: list[int], path: Path) -> NDArray[np.uint8]:
-    """Write the frames (N, H, W, 3) with these indices to a file."""
-    reader = open_source(source)
-    frames: NDArray[np.uint8] | None = None
-    positions = {index: position for position, index in enumerate(indices)}
-    try:
-        for index in range(indices[-1] + 1):
-            frame = reader.read()
-            if frame is None:
-                raise SourceError(f"{source}: ended earlier when read a second time")
-            if frames is None:
-                shape = (len(indices), *frame[0].shape)
-                frames = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
-            if index in positions:
-                frames[positions[index]] = frame[0]
-    finally:
-        reader.close()
-    assert frames is not None
-    return frames
+    return float(cv2.blur(np.abs(ratio - 1.0).max(axis=2), (7, 7)).max())
 
 
 def _geometry(pipeline: Pipeline) -> Callable[[Image], Image]:

@@ -17,7 +17,7 @@ from tactflow.engine.graph import Pipeline
 from tactflow.tune.measure import ANY, ERRORS, Trial, judge, mark_unsound, set_time, show_recording
 from tactflow.tune.recording import Recording
 from tactflow.tune.sensor import Fitted, Look, fit
-from tactflow.tune.space import Candidate, candidates, with_more_references
+from tactflow.tune.space import Candidate, candidates
 
 FIRST: Final = (Case("press", 24),)
 """Simulated recordings for all candidates: one contact."""
@@ -122,7 +122,6 @@ class Search:
             No candidate detects the contacts of the simulated sensor.
         """
         self._began, self._folder = time.monotonic(), folder
-        self._refined = ("", "")
         look = fit(recording)
         self.say(f"fitted simulator: {look}")
         base = Candidate(DEFAULT).load(self.file, self.sensor)
@@ -130,7 +129,7 @@ class Search:
         known = [Candidate(DEFAULT), *candidates(base, recording.size, None if dots is None else dots.pitch)]
         tuned = Tuned(recording, look, self.goal, [], [], None)
         tuned.trials = self._first_round(known, tuned)
-        finalists = self._finalists(known, tuned.trials, base)
+        finalists = self._finalists(known, tuned.trials)
         if self._is_over(0.5):
             tuned.notes.append("out of time after the first round")
             names = {candidate.name for candidate in finalists}
@@ -166,21 +165,12 @@ class Search:
         tuned.rounds.append((len(trials), _frames(FIRST)))
         return trials
 
-    def _finalists(
-        self, known: Sequence[Candidate], trials: Sequence[Trial], base: Pipeline
-    ) -> list[Candidate]:
-        """Select the original, the most expensive, the best and the front, and the best with more reference
-        frames."""
+    def _finalists(self, known: Sequence[Candidate], trials: Sequence[Trial]) -> list[Candidate]:
+        """Select the original, the most expensive, the best and the front."""
         runs = {trial.name for trial in trials if trial.failure is None}
         best = [trial.name for trial in self.goal.order(trials) if trial.usable][:FINALISTS]
-        names = [*(candidate.name for candidate in known[:2]), *best, *front(trials, self.goal.kind)]
-        by_name = {candidate.name: candidate for candidate in known}
-        finalists = [by_name[name] for name in dict.fromkeys(names) if name in runs]
-        more = with_more_references(base, by_name[best[0]]) if best else None
-        if more is None:
-            return finalists
-        self._refined = (best[0], more.name)
-        return [*finalists, more]
+        chosen = {*(candidate.name for candidate in known[:2]), *best, *front(trials, self.goal.kind)}
+        return [candidate for candidate in known if candidate.name in chosen & runs]
 
     def _last_round(self, finalists: Sequence[Candidate], tuned: Tuned) -> list[Trial]:
         self.say(f"round 2: {len(finalists)} candidates, {_frames(LAST)} frames")
@@ -237,13 +227,7 @@ class Search:
         picked = (likely or fits) if goal.max_error is not None else fits
         # Keep the original unless the best is significantly faster.
         same = [trial for trial in picked if trial.name == DEFAULT and trial.ms.value <= picked[0].ms.high]
-        chosen = [*same, *picked][0].name if picked else None
-        # More reference frames take no time per frame: use them if they reduce the error by a tenth.
-        errors = {trial.name: trial.of(kind) for trial in fits}
-        plain, more = self._refined
-        if chosen in (plain, more) and errors.keys() >= {plain, more}:
-            chosen = more if errors[more] < 0.9 * errors[plain] else plain
-        return chosen
+        return [*same, *picked][0].name if picked else None
 
 
 def _frames(cases: Sequence[Case]) -> int:

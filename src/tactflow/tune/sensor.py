@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tactflow.bench.scenes import Case, Rendered
 from tactflow.doctor import measures
 from tactflow.doctor.observation import Observation
-from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.sim import Truth, open_scene
 from tactflow.sim.camera import SIZE
 from tactflow.tune.recording import Recording, change_between
@@ -33,8 +32,6 @@ LIGHTS: Final = {"photometric": 0.0, "mixed": 0.5, "bright": 1.0}
 """Light of the simulator -> share of the change at a contact common to all channels, 0 to 1."""
 DEPTHS: Final = (0.3, 0.5, 0.75, 1.0)
 """Relative depths of the simulated press among which the best match is selected."""
-NOISES: Final = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
-"""Noise levels tried before JPEG compression, grey levels."""
 FAINT: Final = 0.06
 """Minimum relative change of light at pixels that decide the type of light. Chosen by hand."""
 
@@ -44,16 +41,14 @@ class Look:
     """Simulator settings that reproduce the look of a sensor.
 
     size : (width, height) of the frames, px. query : scene settings, as for `open_scene`. noise : grey
-    levels.
-    blur : px, in addition to the simulator's own. jpeg : quality, 0 for none. levels : (3,) factors on the
-    simulator's light, BGR. contrast : of the dots, relative to the simulator's.
+    levels. blur : px, in addition to the simulator's own. levels : (3,) factors on the simulator's light,
+    BGR. contrast : of the dots, relative to the simulator's.
     """
 
     size: tuple[int, int]
     query: str
     noise: float = 0.0
     blur: float = 0.0
-    jpeg: int = 0
     levels: tuple[float, ...] = (1.0, 1.0, 1.0)
     contrast: float = 1.0
 
@@ -63,8 +58,6 @@ class Look:
             parts.append(f"dots of {100 * self.contrast:.0f} % contrast")
         if self.blur:
             parts.append(f"blur {self.blur:.1f} px")
-        if self.jpeg:
-            parts.append(f"JPEG of quality {self.jpeg}")
         return ", ".join(parts)
 
 
@@ -78,19 +71,17 @@ def fit(recording: Recording) -> Look:
     scale = math.sqrt(recording.size[0] * recording.size[1] / (SIZE[0] * SIZE[1]))
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
     plain = Look(size, f"{_dots(observation, scale)}&light={_light_of(recording)}")
-    simulated = compressed(light(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0), 0)
+    simulated = rounded(light(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0))
     levels = tuple(
         float(v) for v in _levels(observation.pairs[0].image) / np.maximum(_levels(simulated), 1.0)
     )
-    jpeg = 0 if observation.jpeg_step is None else round(measures.jpeg_quality(observation.jpeg_step))
-    noise = _noise_before(recording, jpeg) if jpeg else measures.noise_of(observation.pairs)
+    noise = measures.noise_of(observation.pairs)
     blur = measures.blur(observation.typical) or 0.0
     return Look(
         size,
         f"{plain.query}&depth={_depth(recording, plain, simulated)}",
         round(noise, 2),
         round(math.sqrt(max(blur**2 - (OWN_BLUR * scale) ** 2, 0.0)), 2),
-        jpeg,
         levels,
         round(_contrast_ratio(observation, simulated, levels), 2),
     )
@@ -109,28 +100,9 @@ def _dots(observation: Observation, scale: float) -> str:
     return f"{grid}&missing={min(missing, 0.5):.3f}"
 
 
-def _noise_before(recording: Recording, jpeg: int) -> float:
-    """Noise, grey levels, that after JPEG matches the frame-to-frame noise of the recording."""
-    pairs = [pair for pair in recording.observation.pairs if pair.after is not None]
-    target = float(
-        np.median([measures.temporal_noise(p.image, p.after) for p in pairs if p.after is not None])
-    )
-    plain = np.asarray(cv2.GaussianBlur(recording.observation.pairs[0].image, (0, 0), 2.0), np.float32)
-    rng = np.random.default_rng(0)
-    measured = []
-    for noise in NOISES:
-        frames = [compressed(plain + noise * rng.standard_normal(plain.shape), jpeg) for _ in range(2)]
-        measured.append(measures.temporal_noise(*frames))
-    return float(np.interp(target, np.maximum.accumulate(measured), NOISES))
-
-
-def compressed(light: NDArray[Any], jpeg: int) -> Image:
-    """(H, W, 3) uint8 from grey levels, after JPEG compression; quality 0 is none."""
-    image = np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
-    if not jpeg:
-        return image
-    data = np.frombuffer(encode_jpeg(image, jpeg), np.uint8)
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+def rounded(light: NDArray[Any]) -> Image:
+    """(H, W, 3) uint8 from grey levels."""
+    return np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
 
 
 def _levels(image: Image) -> NDArray[np.float64]:
@@ -188,7 +160,7 @@ def _depth(recording: Recording, plain: Look, untouched: Image) -> float:
     for depth in DEPTHS:
         scene = open_scene(f"press?{plain.query}&frames=60&noise=0&depth={depth}")
         deepest = max(range(60), key=lambda index: max((p.depth for p in scene.presses(index)), default=0.0))
-        changes[depth] = change_between(untouched, compressed(light(plain, scene, deepest), 0))
+        changes[depth] = change_between(untouched, rounded(light(plain, scene, deepest)))
     return min(changes, key=lambda depth: abs(math.log(max(changes[depth], 1e-3) / target)))
 
 
@@ -228,7 +200,7 @@ class Fitted(Rendered):
             if look.blur:
                 frame = np.asarray(cv2.GaussianBlur(frame, (0, 0), look.blur), np.float32)
             frame += np.float32(look.noise) * rng.standard_normal(frame.shape, dtype=np.float32)
-            self.frames[index] = compressed(frame, look.jpeg)
+            self.frames[index] = rounded(frame)
         self.frames.flush()
         self._truths: dict[Any, list[Truth]] = {}
         self._scale = width / SIZE[0], height / SIZE[1]

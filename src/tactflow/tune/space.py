@@ -16,9 +16,6 @@ MIN_SIDE: Final = 90
 """Minimum shorter side of the processed image, px: a contact of a tenth of it covers about 60 px."""
 MIN_PITCH: Final = 6.0
 """Minimum dot pitch, processed px; the smallest on a real gel is 7 (sts_torque160)."""
-REFERENCES: Final = 8
-"""Number of reference frames tried in addition to one: it reduces the noise of the dots' displacements by a
-third at no cost per frame."""
 
 Settings = Mapping[str, Any]
 DOWNSAMPLE: Final = "stages.preprocess.downsample"
@@ -77,12 +74,3 @@ def candidates(pipeline: Pipeline, size: tuple[int, int], pitch: float | None) -
         if fits or factor == 1:
             result.append(Candidate(", ".join(names), tuple(settings.items())))
     return result
-
-
-def with_more_references(pipeline: Pipeline, candidate: Candidate) -> Candidate | None:
-    """The candidate with more reference frames; None if its source has no such setting or it is set."""
-    source = pipeline.source
-    if source.component.name != "capture" or source.params.model_dump()["reference"] != 1:
-        return None
-    settings = (*candidate.settings, (f"stages.{source.id}.reference", REFERENCES))
-    return Candidate(f"{candidate.name}, reference of {REFERENCES} frames", settings)
