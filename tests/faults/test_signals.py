@@ -16,7 +16,6 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from tactflow.system.signals import INTERRUPTED
 from tests.clock import PATIENCE, until
 from tests.conftest import REPOSITORY
 from tests.faults.outputs import KINDS, settings_of
@@ -27,8 +26,6 @@ WRITES = ("jsonl", "images", "video .avi", "record", "parquet")
 SECONDS = 60.0
 """Length of what is played, s: longer than any test waits before it ends the run."""
 FPS = 30.0
-STARTING = 3.0
-"""Time in which a run starts, with a margin, s; measured 1 to 2 s."""
 
 
 def sinks_in(folder: Path) -> dict[str, dict[str, object]]:
@@ -39,8 +36,8 @@ def sinks_in(folder: Path) -> dict[str, dict[str, object]]:
     return found
 
 
-def ended(number: int, folder: Path, moment: float, *, starting: bool) -> Seen:
-    """End a run some seconds after its start, or after its first result; exit code and messages."""
+def ended(number: int, folder: Path, moment: float) -> Seen:
+    """End a run some seconds after its first result; exit code and messages."""
     source = array(folder, int(SECONDS * FPS))
     file = write_pipeline(folder, sinks_in(folder), source=str(source), fps=FPS, realtime=True)
     with subprocess.Popen(
@@ -50,10 +47,9 @@ def ended(number: int, folder: Path, moment: float, *, starting: bool) -> Seen:
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        if not starting:
-            # The film and the tables, each with a thread of its own, are the last that anything reaches.
-            film, tables = (folder / KINDS[kind].output for kind in ("video .avi", "parquet"))
-            until(lambda: film.exists() and film.stat().st_size and [*tables.glob("frames/part-*.parquet")])
+        # The film and the tables, each with a thread of its own, are the last that anything reaches.
+        film, tables = (folder / KINDS[kind].output for kind in ("video .avi", "parquet"))
+        until(lambda: film.exists() and film.stat().st_size and [*tables.glob("frames/part-*.parquet")])
         time.sleep(moment)
         process.send_signal(number)
         _, said = process.communicate(timeout=PATIENCE)
@@ -66,7 +62,7 @@ def ended_once(number: int) -> tuple[Seen, Mapping[str, str]]:
     """One run, ended up to 1 s after its first result, and what each sink left behind."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        seen = ended(number, folder, random.Random(number).uniform(0, 1), starting=False)
+        seen = ended(number, folder, random.Random(number).uniform(0, 1))
         return seen, {kind: KINDS[kind].look(folder / KINDS[kind].output) for kind in WRITES}
 
 
@@ -77,24 +73,6 @@ def test_what_a_sink_has_written_can_be_read_after_the_end(kind: str, number: in
     seen.must_be(-number if number == signal.SIGKILL else 0)
     # A number above 0 of lines, pictures or frames.
     assert kept[kind][0] in "123456789"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_ten_runs_that_are_ended_at_any_moment_leave_nothing_damaged(number: int, tmp_path: Path) -> None:
-    moments = random.Random(number)
-    for turn in range(10):
-        place = tmp_path / str(turn)
-        place.mkdir()
-        seen = ended(number, place, moments.uniform(0, 2 * STARTING), starting=True)
-        assert seen.said == ""
-        # While Python itself starts, the signal ends it.
-        assert seen.exit in ([-number] if number == signal.SIGKILL else [0, -number, INTERRUPTED])
-        for kind in WRITES:
-            output = place / KINDS[kind].output
-            is_empty = output.is_file() and output.stat().st_size == 0
-            if output.exists() and kind != "video .avi" and not is_empty:
-                KINDS[kind].look(output)
 
 
 @pytest.mark.slow

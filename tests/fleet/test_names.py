@@ -11,16 +11,6 @@ from tactflow.engine.errors import ConfigError
 from tactflow.fleet.names import with_name
 
 
-@pytest.mark.parametrize("path", [os.devnull, "/dev/stdout", "/dev/stderr"])
-def test_devices_are_the_same_for_all_sensors(path: str) -> None:
-    assert with_name(path, "a") == path
-
-
-def test_a_named_pipe_is_the_same_for_all_sensors(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    assert with_name(str(tmp_path / "pipe"), "a") == str(tmp_path / "pipe")
-
-
 @pytest.mark.parametrize("path", ["", ".", "..", "x/", "x/.", "{sensor}/", "there", "in-{sensor}"])
 def test_a_folder_is_no_file_for_each_sensor(
     path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -32,9 +22,10 @@ def test_a_folder_is_no_file_for_each_sensor(
         with_name(path, "a")
 
 
-@pytest.mark.parametrize(
-    ("path", "expected"),
-    [("-", "-"), ("out.jsonl", "out-a.jsonl"), ("x/{sensor}/o.json", "x/a/o.json"), ("plain", "plain-a")],
-)
+SHARED = [("-", "-"), ("/dev/stdout", "/dev/stdout"), (os.devnull, os.devnull)]
+NAMED = [("out.jsonl", "out-a.jsonl"), ("x/{sensor}/o.json", "x/a/o.json"), ("plain", "plain-a")]
+
+
+@pytest.mark.parametrize(("path", "expected"), SHARED + NAMED)
 def test_files_of_the_command_line_get_the_sensors_name(path: str, expected: str) -> None:
     assert with_name(path, "a") == expected
