@@ -75,37 +75,7 @@ _HOMES = {
 
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
-__all__ = [
-    "Absent",
-    "ConfigError",
-    "Contact",
-    "ContactDetector",
-    "Flow",
-    "Frame",
-    "MarkerStatus",
-    "MarkerTracker",
-    "Markers",
-    "Preprocessor",
-    "RemoteControl",
-    "Result",
-    "Sink",
-    "Source",
-    "Stage",
-    "StageParams",
-    "Subscriber",
-    "TactflowError",
-    "Tick",
-    "check",
-    "contact",
-    "detect_markers",
-    "draw",
-    "load",
-    "open_scene",
-    "run",
-    "stage",
-    "stream",
-    "to_frame",
-]
+__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> Any:

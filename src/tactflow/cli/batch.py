@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -21,7 +23,6 @@ from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.report import Section, write_report
-from tactflow.system.processors import processors
 from tactflow.system.signals import INTERRUPTED, ending_handled
 
 _FAILED_SHOWN = 20
@@ -141,7 +142,7 @@ class _Call:
         workers = (
             DaskCluster(args.scheduler)
             if args.scheduler is not None
-            else LocalProcesses(args.workers or processors())
+            else LocalProcesses(args.workers or _processors())
         )
         self._say(f"on {workers.description}")
         batch = Batch(store, scratch, request, workers, lambda: self.signals, args.fail_fast)
@@ -240,3 +241,8 @@ def _shard(text: str) -> tuple[int, int]:
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise argparse.ArgumentTypeError(f"required I/N with I from 1 to N, as in 2/8, got {text!r}")
     return int(found[1]), int(found[2])
+
+
+def _processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

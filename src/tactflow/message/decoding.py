@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, MarkerStatus, Scale, Slip
+
+T = TypeVar("T")
 
 _STATUS = {status.name.lower(): int(status) for status in MarkerStatus}
 _UNKNOWN = float("nan")
@@ -21,101 +23,86 @@ def decode_values(message: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str,
     Raises KeyError, TypeError or ValueError for what is no result message.
     """
     skipped = {str(port): str(reason) for port, reason in message["skipped"].items()}
+    contact = message["contact"]
+    parts = () if contact is None else tuple(map(_contact, message.get("contacts", ())))
     values: dict[str, Any] = {
-        "contact": _contact(message["contact"], message.get("contacts", ())),
-        "flow": _flow(message["flow"]),
-        "markers": _markers(message["markers"]),
-        "scale": _scale(message.get("scale")),
-        "depth": _depth(message["contact"]),
-        "slip": _slip(message.get("slip")),
-        "force": _force(message.get("force")),
+        "contact": None if contact is None else _contact(contact, parts if len(parts) > 1 else ()),
+        "flow": _optional(_flow, message["flow"]),
+        "markers": _optional(_markers, message["markers"]),
+        "scale": _optional(_scale, message.get("scale")),
+        "depth": None if contact is None or contact.get("depth_mm") is None else _depth(contact),
+        "slip": _optional(_slip, message.get("slip")),
+        "force": _optional(_force, message.get("force")),
     }
     absent = {port: Absent(skipped.get(port, "none")) for port, value in values.items() if value is None}
     return values | absent, skipped
 
 
-def _contact(whole: Any, all_contacts: Any = ()) -> Contact | None:
-    if whole is None:
-        return None
-    ellipse = whole.get("ellipse")
-    parts = [part for part in map(_contact, all_contacts) if part is not None]
+def _optional(decode: Callable[[Any], T], value: Any) -> T | None:
+    return None if value is None else decode(value)
+
+
+def _contact(contact: Any, separate: tuple[Contact, ...] = ()) -> Contact:
     return Contact(
-        area=float(whole["area"]),
-        center=_pair(whole["center"]),
-        angle=_optional(whole.get("angle")),
-        slope=_optional(whole.get("slope")),
-        hull=_points(whole["hull"]),
-        ellipse=None
-        if ellipse is None
-        else Ellipse(_pair(ellipse["center"]), _pair(ellipse["axes"]), _optional(ellipse["angle"])),
-        confidence=float(whole.get("confidence", 0.0)),
-        evidence=whole.get("evidence", "light"),
-        separate=tuple(parts) if len(parts) > 1 else (),
+        area=float(contact["area"]),
+        center=_pair(contact["center"]),
+        angle=_optional(float, contact.get("angle")),
+        slope=_optional(float, contact.get("slope")),
+        hull=_points(contact["hull"]),
+        ellipse=_optional(_ellipse, contact.get("ellipse")),
+        confidence=float(contact.get("confidence", 0.0)),
+        evidence=contact.get("evidence", "light"),
+        separate=separate,
     )
 
 
-def _depth(contact: Any) -> Depth | None:
-    if contact is None or contact.get("depth_mm") is None:
-        return None
+def _ellipse(ellipse: Any) -> Ellipse:
+    return Ellipse(_pair(ellipse["center"]), _pair(ellipse["axes"]), _optional(float, ellipse["angle"]))
+
+
+def _depth(contact: Any) -> Depth:
     return Depth(
         heights=np.zeros((0, 0), np.float32),
         greatest=float(contact["depth_mm"]),
-        greatest_stderr=_optional(contact.get("depth_mm_stderr")),
+        greatest_stderr=_optional(float, contact.get("depth_mm_stderr")),
         volume=float(contact["volume_mm3"]),
-        volume_stderr=_optional(contact.get("volume_mm3_stderr")),
+        volume_stderr=_optional(float, contact.get("volume_mm3_stderr")),
     )
 
 
-def _flow(flow: Any) -> Flow | None:
-    if flow is None:
-        return None
-    pairs = ("mean", "stderr", "shear")
+def _flow(flow: Any) -> Flow:
     numbers = ("rotation", "divergence", "residual", "rotation_stderr", "divergence_stderr", "shear_stderr")
-    values: dict[str, Any] = {key: _optional_pair(flow.get(key)) for key in pairs}
-    values |= {key: _optional(flow.get(key)) for key in numbers}
+    values: dict[str, Any] = {key: _optional(_pair, flow.get(key)) for key in ("mean", "stderr", "shear")}
+    values |= {key: _optional(float, flow.get(key)) for key in numbers}
     return Flow(count=int(flow["count"]), **values)
 
 
-def _markers(markers: Any) -> Markers | None:
-    if markers is None:
-        return None
-    position, status = _points(markers["position"]), markers["status"]
-    stderr = [_UNKNOWN if s is None else s for s in markers.get("stderr", [None] * len(status))]
+def _markers(markers: Any) -> Markers:
+    status = markers["status"]
     return Markers(
         origin=_points(markers["origin"]),
-        position=position,
+        position=_points(markers["position"]),
         status=np.array([_STATUS[name] for name in status], np.uint8),
-        stderr=np.array(stderr, np.float64),
+        # None becomes NaN: unknown.
+        stderr=np.array(markers.get("stderr", [None] * len(status)), np.float64),
     )
 
 
-def _scale(scale: Any) -> Scale | None:
-    if scale is None:
-        return None
+def _scale(scale: Any) -> Scale:
     return Scale(*_pair(scale["mm_per_px"]), (_UNKNOWN, _UNKNOWN), _pair(scale["origin"]))
 
 
-def _slip(slip: Any) -> Slip | None:
-    return None if slip is None else Slip(bool(slip["slipping"]), float(slip["stick_ratio"]))
+def _slip(slip: Any) -> Slip:
+    return Slip(bool(slip["slipping"]), float(slip["stick_ratio"]))
 
 
-def _force(force: Any) -> Force | None:
-    if force is None:
-        return None
+def _force(force: Any) -> Force:
     (x, y, z), (x_stderr, y_stderr, z_stderr) = force["value"], force["stderr"]
     return Force(
-        (_optional(x), _optional(y), float(z)),
-        (_optional(x_stderr), _optional(y_stderr), float(z_stderr)),
+        (_optional(float, x), _optional(float, y), float(z)),
+        (_optional(float, x_stderr), _optional(float, y_stderr), float(z_stderr)),
         bool(force["in_range"]),
     )
-
-
-def _optional(value: Any) -> float | None:
-    return None if value is None else float(value)
-
-
-def _optional_pair(pair: Any) -> tuple[float, float] | None:
-    return None if pair is None else _pair(pair)
 
 
 def _pair(pair: Any) -> tuple[float, float]:
