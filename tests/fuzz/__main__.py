@@ -57,7 +57,10 @@ class Findings:
         failed: list[BaseException] = []
         before, threading.excepthook = threading.excepthook, lambda of: failed.append(of.exc_value)
         faulthandler.dump_traceback_later(HANGS_AFTER, exit=True)
-        memory = _forget_peak()
+        if sys.platform == "linux":
+            # Measure the peak anew.
+            Path("/proc/self/clear_refs").write_text("5")
+        memory = _memory("VmRSS")
         try:
             parser.feed(data)
         except parser.refusals:
@@ -77,20 +80,10 @@ class Findings:
         current.unlink()
 
 
-def _forget_peak() -> int:
-    """Begin to measure the peak of this process' memory anew; what it has now, bytes (0 but on Linux)."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return 0
-    return _memory("VmRSS")
-
-
 def _memory(key: str) -> int:
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return 0
+    """What Linux says of this process' memory, bytes; 0 elsewhere."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else [f"{key} 0"]
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith(key))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -18,12 +18,10 @@ import zmq
 from mcap.writer import CompressionType, Writer
 
 from tactflow.calibration.file import Calibration, ScaleEntry
-from tactflow.cli import explain, listen
-from tactflow.cli.statistics import Statistics
+from tactflow.cli import listen
 from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame, Tick
-from tactflow.engine.plan import make_plan
 from tactflow.message.result import Result, encode_message
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
@@ -202,17 +200,6 @@ def calibrations(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object
     return [text, b"Z" + npz], read
 
 
-def statistics(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
-    """A statistics file, as `explain` shows it."""
-    node = {"runs": 3, "skips": {"no_contact": 2}, "p50_ms": 1.5, "p99_ms": 2.0, "total_ms": 4.5}
-    stages = {"capture": node, "hull": node, "preprocess": {**node, "runs": 0, "total_ms": None}}
-    ended = {"frames": 5, "dropped": 0, "wall_s": 1.0, "end": "eos", "latency_ms": {"p50": 1.0, "p99": None}}
-    pipeline = load_pipeline(REPOSITORY / "pipeline.yaml")
-    plan = make_plan(pipeline)
-    sample = json.dumps({**ended, "stages": stages, "sinks": {"zmq": node}}).encode()
-    return [sample], lambda path: list(explain.explanation(pipeline, plan, Statistics.read(path)))
-
-
 @contextmanager
 def of_file(
     make: Callable[[Path], tuple[Sequence[bytes], Callable[[Path], object]]], suffix: str, folder: Path
@@ -339,12 +326,8 @@ FILES = {
     bags: ".mcap",
     lerobot: ".json",
     calibrations: ".yaml",
-    statistics: ".json",
 }
 TARGETS: dict[str, Callable[[Path], AbstractContextManager[Parser]]] = {
     **{make.__name__: partial(of_file, make, suffix) for make, suffix in FILES.items()},
-    **{
-        function.__name__: cast(Any, function)
-        for function in (overrides, messages, subscriptions, commands, orders)
-    },
+    **{make.__name__: make for make in (overrides, messages, subscriptions, commands, orders)},
 }
