@@ -7,7 +7,7 @@ import socket as system_socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import pytest
 import zmq
@@ -44,10 +44,6 @@ def bare() -> Iterator[ControlSocket]:
     socket.close()
 
 
-def remote(endpoint: str, **options: Any) -> RemoteControl:
-    return RemoteControl(endpoint, **{"timeout": PATIENCE, **options})
-
-
 def test_a_run_does_what_it_is_told_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "pipeline.yaml").write_text(PIPELINE)
     monkeypatch.chdir(tmp_path)
@@ -56,7 +52,7 @@ def test_a_run_does_what_it_is_told_and_says_so(tmp_path: Path, monkeypatch: pyt
     thread.start()
     try:
         until(lambda: "zmq" in runner.nodes and cast(Zmq, runner.nodes["zmq"].sink).control_endpoint)
-        with remote(cast(Zmq, runner.nodes["zmq"].sink).control_endpoint or "") as run:
+        with RemoteControl(cast(Zmq, runner.nodes["zmq"].sink).control_endpoint or "", PATIENCE) as run:
             assert run.ping()["state"]["sensor"] == "main"
             assert run.record_start()["message"] == "recording to touch-001.mcap"
             assert run.record_start()["message"] == "is recording already to touch-001.mcap"
@@ -116,7 +112,7 @@ def test_a_command_that_fails_is_answered_and_ends_nothing(caplog: pytest.LogCap
 
     socket = ControlSocket(ANY_PORT, None, "main", Commands(cast(Control, Broken())))
     try:
-        with remote(socket.endpoint) as run:
+        with RemoteControl(socket.endpoint, PATIENCE) as run:
             with pytest.raises(RuntimeError, match="no space left"):
                 run.pause()
             with pytest.raises(RuntimeError, match=r"no record sink .* adds one"):
@@ -136,7 +132,7 @@ def test_what_is_too_long_or_no_request_is_dropped(bare: ControlSocket) -> None:
         junk.connect(bare.endpoint)
         for parts in ([b""], [b"", b"{}", b"{}"], [b"no delimiter"], [b"", b"x" * 100_000]):
             junk.send_multipart(parts)
-        with remote(bare.endpoint) as run:
+        with RemoteControl(bare.endpoint, PATIENCE) as run:
             assert run.ping()["ok"]
 
 

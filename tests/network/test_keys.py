@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from threading import Event, Thread
 
 import pytest
 from pydantic import ValidationError
@@ -30,15 +30,6 @@ MESSAGE = (
     b'tactflow.main {"schema":"tactflow.frame/1","sensor":"main","seq":1,"t":0.0,'
     b'"contact":null,"flow":null,"markers":null,"skipped":{}}'
 )
-PUBLISH = f"""
-import sys, time
-from tactflow.network.publisher import Publisher
-publisher = Publisher("{ANY_PORT}", 10, 32768, sys.argv[1])
-print(publisher.endpoint, flush=True)
-while True:
-    publisher.socket.send({MESSAGE!r})
-    time.sleep(0.01)
-"""
 
 
 @pytest.fixture
@@ -49,16 +40,19 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 
 @pytest.fixture
 def publisher(folders: tuple[Path, Path]) -> Iterator[str]:
-    """The address of another process that publishes with keys."""
-    command = [sys.executable, "-c", PUBLISH, str(folders[0])]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    try:
-        yield process.stdout.readline().strip()
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
+    """An address at which something is published all the time, with keys."""
+    publisher, end = Publisher(ANY_PORT, 10, 32768, str(folders[0])), Event()
+
+    def publish() -> None:
+        while not end.wait(0.01):
+            publisher.send(MESSAGE)
+
+    thread = Thread(target=publish)
+    thread.start()
+    yield publisher.endpoint
+    end.set()
+    thread.join()
+    publisher.close()
 
 
 def strangers_keys(folder: Path, laptop: Path) -> Path:
@@ -68,16 +62,23 @@ def strangers_keys(folder: Path, laptop: Path) -> Path:
     return stranger
 
 
-def test_another_process_reads_with_the_right_keys_and_not_with_wrong_ones_or_none(
+def test_results_are_read_with_the_right_keys_and_not_with_wrong_ones_or_none(
     publisher: str, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    with Subscriber(publisher, timeout=PATIENCE, keys=folders[1]) as messages:
-        assert messages.receive().seq == 1
     stranger = strangers_keys(tmp_path / "other", folders[1])
     for keys, reason in ((stranger, "does not admit these keys"), (None, "requires keys")):
         subscriber = Subscriber(publisher, timeout=PATIENCE, keys=keys)
         with subscriber, pytest.raises(PermissionError, match=reason):
             subscriber.receive()
+    # Nor does a subscriber take anything from a publisher whose key it does not have.
+    _, other = make_keys(tmp_path / "third", "laptop")
+    with (
+        Subscriber(publisher, timeout=PATIENCE, keys=folders[1]) as right,
+        Subscriber(publisher, timeout=0.05, keys=other) as wrong,
+    ):
+        assert [right.receive().seq for _ in range(50)] == [1] * 50
+        with pytest.raises((TimeoutError, PermissionError)):
+            wrong.receive()
 
 
 def test_only_commands_with_a_key_are_obeyed(folders: tuple[Path, Path], tmp_path: Path) -> None:
@@ -96,20 +97,6 @@ def test_only_commands_with_a_key_are_obeyed(folders: tuple[Path, Path], tmp_pat
             assert run.ping()["ok"]
     finally:
         sink.close()
-
-
-def test_a_subscriber_takes_nothing_from_a_publisher_whose_key_it_does_not_have(
-    publisher: str, folders: tuple[Path, Path], tmp_path: Path
-) -> None:
-    _, other = make_keys(tmp_path / "other", "laptop")
-    with (
-        Subscriber(publisher, timeout=PATIENCE, keys=folders[1]) as right,
-        Subscriber(publisher, timeout=0.05, keys=other) as wrong,
-    ):
-        for _ in range(50):
-            right.receive()
-        with pytest.raises((TimeoutError, PermissionError)):
-            wrong.receive()
 
 
 def test_nobody_is_admitted_while_nothing_checks_the_keys(folders: tuple[Path, Path]) -> None:
