@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +22,9 @@ from numpy.typing import NDArray
 from tactflow import __version__
 from tactflow.engine.errors import StageError
 from tactflow.system.extras import missing
-from tactflow.vision.types import Scale
 
 if TYPE_CHECKING:
-    import av
+    from collections.abc import Callable
 
     from tactflow.message.result import Result
 
@@ -33,19 +33,17 @@ log = logging.getLogger("tactflow")
 VERSION = "v3.0"
 """Of the layout, as LeRobot compares it."""
 TACTILE = "observation.tactile"
-PIXELS = {
-    f"{TACTILE}.contact": ["touching", "x", "y", "area", "angle"],
-    f"{TACTILE}.flow": ["known", "dx", "dy"],
+NAMES = {
+    "contact": ["touching", "x", "y", "area", "angle"],
+    "flow": ["known", "dx", "dy"],
+    "contact_mm": ["touching", "x_mm", "y_mm", "area_mm2"],
+    "flow_mm": ["known", "dx_mm", "dy_mm"],
+    "depth": ["known", "depth_mm", "volume_mm3"],
+    "force": ["known", "z_N", "in_range"],
+    "drag": ["known", "x_N", "y_N"],
 }
-"""Features and the names of their numbers, px. All are 0 where the first is 0."""
-CALIBRATED = {
-    f"{TACTILE}.contact_mm": ["touching", "x_mm", "y_mm", "area_mm2"],
-    f"{TACTILE}.flow_mm": ["known", "dx_mm", "dy_mm"],
-    f"{TACTILE}.depth": ["known", "depth_mm", "volume_mm3"],
-    f"{TACTILE}.force": ["known", "z_N", "in_range"],
-    f"{TACTILE}.drag": ["known", "x_N", "y_N"],
-}
-"""The same for recordings with a calibration, whatever parts it has."""
+"""Features and the names of their numbers: the first two in px, the others only with a calibration, whatever
+parts it has. All numbers are 0 where the first is 0."""
 INTEGERS = ("frame_index", "episode_index", "index", "task_index")
 """Integer columns that every dataset has, besides `timestamp`."""
 CHUNK = 1000
@@ -99,8 +97,7 @@ class DatasetWriter:
         self._frames = 0
         self._kind = self._camera = ""
         self._shape: tuple[int, ...] = ()
-        self._features: dict[str, list[str]] = {}
-        self._numbers: dict[str, list[NDArray[np.float64]]] = {}
+        self._numbers: dict[str, list[list[float]]] = {}
         self._pixels: list[NDArray[np.float64]] = []
 
     def add(self, results: Iterable[Result]) -> int:
@@ -116,20 +113,19 @@ class DatasetWriter:
         episode = len(self._episodes)
         file = f"chunk-{episode // CHUNK:03d}/file-{episode % CHUNK:03d}"
         rows: list[dict[str, Any]] = []
-        video: _Video | None = None
-        try:
+        encode: Callable[[NDArray[np.uint8] | None], None] | None = None
+        with ExitStack() as stack:
             for index, result in enumerate(at_rate(results, self._fps)):
                 image = self._check(result)
-                if self._is_video and video is None:
-                    video = _Video(self._folder / "videos" / self._camera / f"{file}.mp4", self._fps, image)
+                if self._is_video and encode is None:
+                    path = self._folder / "videos" / self._camera / f"{file}.mp4"
+                    encode = _open_video(stack, path, self._fps, image)
                 rows.append(self._row(result, image, index, episode))
-                if video is not None:
-                    video.write(image)
-            if video is not None:
-                video.finish()
-        finally:
-            if video is not None:
-                video.close()
+                if encode is not None:
+                    encode(image)
+            # Not after a write that failed, which would end the process.
+            if encode is not None:
+                encode(None)
         if not rows:
             raise StageError("there is no frame in it")
         self._write_rows(rows, self._folder / "data" / f"{file}.parquet")
@@ -165,8 +161,6 @@ class DatasetWriter:
         kind = f"{camera}, {size}, with{'' if calibrated else 'out'} calibration"
         if not self._kind:
             self._kind, self._camera, self._shape = kind, camera, image.shape
-            self._features = PIXELS | CALIBRATED if calibrated else PIXELS
-            self._numbers = {name: [] for name in self._features}
         if kind != self._kind:
             raise StageError(f"{kind}; those before are {self._kind}: make two datasets")
         if self._is_video and (image.shape[0] % 2 or image.shape[1] % 2):
@@ -174,11 +168,12 @@ class DatasetWriter:
         return image
 
     def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
-        row: dict[str, Any] = {**_in_pixels(result)}
-        if result.scale is not None:
-            row |= _calibrated(result, result.scale)
-        for name, values in self._numbers.items():
-            values.append(np.array(row[name]))
+        row: dict[str, Any] = {}
+        for name, numbers in _numbers(result).items():
+            row[f"{TACTILE}.{name}"] = values = (
+                [1.0, *map(float, numbers)] if numbers else [0.0] * len(NAMES[name])
+            )
+            self._numbers.setdefault(name, []).append(values)
         if index % SAMPLED == 0:
             # Mean, mean square, minimum and maximum of red, green, blue.
             rgb = image.reshape(-1, 3)[:, ::-1] / 255.0
@@ -191,7 +186,7 @@ class DatasetWriter:
     def _write_rows(self, rows: list[dict[str, Any]], path: Path) -> None:
         import pyarrow as pa
 
-        types = {name: pa.list_(pa.float32(), len(names)) for name, names in self._features.items()}
+        types = {f"{TACTILE}.{name}": pa.list_(pa.float32(), len(NAMES[name])) for name in self._numbers}
         if not self._is_video:
             types[self._camera] = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
         types |= {"timestamp": pa.float32(), **dict.fromkeys(INTEGERS, pa.int64())}
@@ -232,8 +227,9 @@ class DatasetWriter:
                 "has_audio": False,
             }
         features: dict[str, Any] = {self._camera: camera}
-        for name, names in self._features.items():
-            features[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
+        for name in self._numbers:
+            shape = [len(NAMES[name])]
+            features[f"{TACTILE}.{name}"] = {"dtype": "float32", "shape": shape, "names": NAMES[name]}
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INTEGERS}
         video_path = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -254,13 +250,13 @@ class DatasetWriter:
             "features": features,
         }
 
-    def _statistics(self) -> Mapping[str, Any]:
+    def _statistics(self) -> dict[str, Any]:
         """What training normalises by: of each number, and of each color (in [0, 1], red first)."""
         statistics: dict[str, Any] = {}
         for name, rows in self._numbers.items():
             values = np.array(rows)
             moments = {key: getattr(values, key)(0).tolist() for key in ("min", "max", "mean", "std")}
-            statistics[name] = moments | {"count": [len(values)]}
+            statistics[f"{TACTILE}.{name}"] = moments | {"count": [len(values)]}
         means, squares, lowest, highest = np.array(self._pixels).transpose(1, 0, 2)
         mean = means.mean(0)
         std = np.sqrt(np.maximum(squares.mean(0) - mean**2, 0))
@@ -292,63 +288,45 @@ def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
         yield before
 
 
-def _in_pixels(result: Result) -> dict[str, list[float]]:
-    """The numbers of `PIXELS`."""
-    contact, mean = result.contact, None if result.flow is None else result.flow.mean
-    angle = 0.0 if contact is None or contact.angle is None else math.radians(contact.angle)
-    return _zero_filled(PIXELS, [None if contact is None else [*contact.center, contact.area, angle], mean])
-
-
-def _calibrated(result: Result, scale: Scale) -> dict[str, list[float]]:
-    """The numbers of `CALIBRATED`."""
-    contact, depth, force = result.contact, result.depth, result.force
+def _numbers(result: Result) -> dict[str, Sequence[float] | None]:
+    """What each feature of a frame holds behind its first number; None where that is 0."""
+    contact, depth, force, scale = result.contact, result.depth, result.force, result.scale
     mean = None if result.flow is None else result.flow.mean
-    drag = [] if force is None else [part for part in force.value[:2] if part is not None]
-    values = [
-        None if contact is None else [*scale.point(contact.center), scale.area(contact.area)],
-        None if mean is None else scale.vector(mean),
-        None if depth is None else [depth.greatest, depth.volume],
-        None if force is None else [force.value[2], force.in_range],
-        drag if len(drag) == 2 else None,
-    ]
-    return _zero_filled(CALIBRATED, values)
+    found: dict[str, Sequence[float] | None] = dict.fromkeys(NAMES if scale else ("contact", "flow"))
+    found["flow"] = mean
+    if contact is not None:
+        found["contact"] = [*contact.center, contact.area, math.radians(contact.angle or 0.0)]
+    if scale is None:
+        return found
+    if contact is not None:
+        found["contact_mm"] = [*scale.point(contact.center), scale.area(contact.area)]
+    if mean is not None:
+        found["flow_mm"] = scale.vector(mean)
+    if depth is not None:
+        found["depth"] = [depth.greatest, depth.volume]
+    if force is not None:
+        x, y, z = force.value
+        found["force"] = [z, force.in_range]
+        found["drag"] = None if x is None or y is None else [x, y]
+    return found
 
 
-def _zero_filled(
-    features: Mapping[str, Sequence[str]], values: Iterable[Sequence[float] | None]
-) -> dict[str, list[float]]:
-    """For each feature 1 and its values, or zeros where there are none."""
-    return {
-        name: [0.0] * len(names) if numbers is None else [1.0, *map(float, numbers)]
-        for (name, names), numbers in zip(features.items(), values, strict=True)
-    }
+def _open_video(
+    stack: ExitStack, path: Path, fps: int, image: NDArray[np.uint8]
+) -> Callable[[NDArray[np.uint8] | None], None]:
+    """Begin an H.264 video; what adds a picture, (H, W, 3) uint8 BGR, or at None writes what is left."""
+    import av
 
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = stack.enter_context(av.open(str(path), "w"))
+    stream: av.VideoStream = file.add_stream("libx264", rate=fps, options=QUALITY)
+    stream.height, stream.width = image.shape[:2]
+    stream.pix_fmt = "yuv420p"
 
-class _Video:
-    """An H.264 video that grows picture by picture."""
+    def encode(image: NDArray[np.uint8] | None) -> None:
+        file.mux(stream.encode(None if image is None else av.VideoFrame.from_ndarray(image, format="bgr24")))
 
-    def __init__(self, path: Path, fps: int, image: NDArray[np.uint8]) -> None:
-        import av
-
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = av.open(str(path), "w")
-        self._stream: av.VideoStream = self._file.add_stream("libx264", rate=fps, options=QUALITY)
-        self._stream.height, self._stream.width = image.shape[:2]
-        self._stream.pix_fmt = "yuv420p"
-
-    def write(self, image: NDArray[np.uint8]) -> None:
-        """Add one picture, (H, W, 3) uint8 BGR."""
-        import av
-
-        self._file.mux(self._stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-
-    def finish(self) -> None:
-        """Write what is left; not after a write that failed, which would end the process."""
-        self._file.mux(self._stream.encode(None))
-
-    def close(self) -> None:
-        """Close the file, finished or not."""
-        self._file.close()
+    return encode
 
 
 def _write(table: Any, path: Path) -> None:
