@@ -11,20 +11,17 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import Camera, CameraRequest, Stream
-from tactflow.sources.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_image, open_recording
-from tactflow.sources.paths import exists, split_prefix
+from tactflow.sources.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_image, open_file
+from tactflow.sources.paths import locate, split_prefix
 from tactflow.sources.watch import Arrival, Watch, Watched
-from tactflow.system.files import expanded, is_utf8
+from tactflow.system.files import is_utf8
 from tactflow.system.plugins import plugins
 from tactflow.system.redaction import public_address
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
 
 __all__ = [
     "KINDS",
@@ -109,16 +106,53 @@ def open_source(
         return Simulated(spec)
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]+)://", spec)
     if scheme is not None:
-        return _open_stream(spec, scheme[1].lower(), watch)
-    if spec.isdecimal() or spec.startswith(("/dev/video", "/dev/v4l/")):
-        return _watched(partial(Camera, spec, camera), watch, f"camera {spec}")
-    name, _, query = (spec, "", "") if exists(spec, directory) else spec.partition("?")
-    if name.lower().endswith(".mcap") and not query.startswith("topic=") and not _is_pattern(name, directory):
+        name, word = public_address(spec), scheme[1].lower()
+        opener: Callable[[], FrameReader] = partial(Stream, spec)
+        if word not in _STREAMS:
+            hint = f"; for a file, leave out {word}://" if word == "file" else ""
+            raise SourceError(f"{name}: unknown kind of source {word}://{hint}; required one of: {KINDS}")
+    elif spec.isdecimal() or spec.startswith(("/dev/video", "/dev/v4l/")):
+        name, opener = f"camera {spec}", partial(Camera, spec, camera)
+    else:
+        return _open_recording(spec, directory, fps)
+    return opener() if watch is None else Watched(opener, watch, name)
+
+
+def _open_recording(spec: str, directory: Path | None, fps: float | None) -> FrameReader:
+    name, _, query = (spec, "", "") if locate(spec, directory) else spec.partition("?")
+    is_pattern = glob.has_magic(name) and locate(name, directory) is None
+    if name.lower().endswith(".mcap") and not query.startswith("topic=") and not is_pattern:
         from tactflow.sources.mcap import Recording
 
         return Recording(spec, directory)
-    opener = _plugin(name, directory)
-    return opener(spec, directory, fps) if opener is not None else open_recording(spec, directory, fps)
+    for key in _keys(name, directory, is_pattern):
+        for point in plugins(GROUP):
+            if point.name == key:
+                try:
+                    opener = cast(Callable[..., FrameReader], point.load())
+                except Exception as error:
+                    raise SourceError(
+                        f"{name}: the plug-in {point.value} cannot be loaded: {error}"
+                    ) from error
+                return opener(spec, directory, fps)
+    return open_file(spec, directory, fps)
+
+
+def _keys(name: str, directory: Path | None, is_pattern: bool) -> Iterator[str]:
+    """The names that a plug-in may have to open this."""
+    prefix, _ = split_prefix(name, directory)
+    if prefix:
+        yield prefix.removesuffix(":")
+        return
+    suffix = Path(name).suffix.lower()
+    if suffix not in _BUILT_IN and not is_pattern:
+        yield suffix
+    path = locate(name, directory)
+    if path is not None and path.is_dir():
+        with suppress(OSError):
+            files = sorted(path.iterdir())
+            if not any(map(is_image, files)):
+                yield from (file.name for file in files)
 
 
 def recording_suffixes() -> frozenset[str]:
@@ -129,51 +163,3 @@ def recording_suffixes() -> frozenset[str]:
     """
     registered = (point.name for point in plugins(GROUP))
     return VIDEO_SUFFIXES | {".npy", ".mcap"} | {name for name in registered if name.startswith(".")}
-
-
-def _open_stream(spec: str, scheme: str, watch: Watch | None) -> FrameReader:
-    address = public_address(spec)
-    if scheme in _STREAMS:
-        return _watched(partial(Stream, spec), watch, address)
-    hint = f"; for a file, leave out {scheme}://" if scheme == "file" else ""
-    raise SourceError(f"{address}: unknown kind of source {scheme}://{hint}; required one of: {KINDS}")
-
-
-def _watched(opener: Callable[[], FrameReader], watch: Watch | None, name: str) -> FrameReader:
-    return opener() if watch is None else Watched(opener, watch, name)
-
-
-def _is_pattern(name: str, directory: Path | None) -> bool:
-    return glob.has_magic(name) and not exists(name, directory)
-
-
-def _plugin(name: str, directory: Path | None) -> Callable[..., FrameReader] | None:
-    """What opens a file, folder or `word:PATH` that is not built in; None if nothing does."""
-    for key in _keys(name, directory):
-        for point in plugins(GROUP):
-            if point.name == key:
-                return _load(name, point)
-    return None
-
-
-def _load(name: str, point: EntryPoint) -> Callable[..., FrameReader]:
-    try:
-        return cast(Callable[..., FrameReader], point.load())
-    except Exception as error:
-        raise SourceError(f"{name}: the plug-in {point.value} cannot be loaded: {error}") from error
-
-
-def _keys(name: str, directory: Path | None) -> Iterator[str]:
-    """The names that a plug-in may have to open this."""
-    prefix, _ = split_prefix(name, directory)
-    if prefix:
-        yield prefix.removesuffix(":")
-        return
-    suffix = Path(name).suffix.lower()
-    if suffix not in _BUILT_IN and not _is_pattern(name, directory):
-        yield suffix
-    for base in (Path(), directory or Path()):
-        with suppress(OSError, ValueError):
-            files = sorted((base / expanded(name)).iterdir())
-            if not any(map(is_image, files)):
-                yield from (file.name for file in files)

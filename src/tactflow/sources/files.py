@@ -24,7 +24,7 @@ from tactflow.sources.base import (
     log,
     to_bgr,
 )
-from tactflow.sources.paths import find_path
+from tactflow.sources.paths import find_path, locate
 from tactflow.system.files import expanded
 
 IMAGE_SUFFIXES = frozenset(
@@ -149,24 +149,17 @@ class ImageFiles(FrameReader):
         self.first = files[0].name
         self._files = files
         self._read_first()
-        _warn_about_pages(files[0])
+        pages = cv2.imcount(str(files[0])) if files[0].suffix.lower() in (".tif", ".tiff") else 1
+        if pages > 1:
+            log.warning(
+                "%s: holds %d pictures, of which only the first is read; save each as a file of its own",
+                *(files[0], pages),
+            )
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         for index, path in enumerate(self._files):
             self._picture = str(path)
             yield read_image(path), index / (self.fps or DEFAULT_FPS)
-
-
-def _warn_about_pages(path: Path) -> None:
-    """Warn that only the first picture of a TIFF is read: some programs write a whole recording into one."""
-    if path.suffix.lower() not in (".tif", ".tiff"):
-        return
-    pages = cv2.imcount(str(path))
-    if pages > 1:
-        log.warning(
-            "%s: holds %d pictures, of which only the first is read; save each as a file of its own",
-            *(path, pages),
-        )
 
 
 def open_folder(folder: Path, fps: float | None = None) -> ImageFiles:
@@ -347,7 +340,7 @@ class VideoFile(CaptureReader):
             )
 
 
-def open_recording(spec: str, directory: Path | None = None, fps: float | None = None) -> FrameReader:
+def open_file(spec: str, directory: Path | None = None, fps: float | None = None) -> FrameReader:
     """Open images, an array or a video: a file, a folder or a pattern.
 
     Raises
@@ -355,7 +348,7 @@ def open_recording(spec: str, directory: Path | None = None, fps: float | None =
     SourceError
         If it is not there, or not a recording.
     """
-    if glob.has_magic(spec) and not expanded(spec).exists():
+    if glob.has_magic(spec) and locate(spec, directory) is None:
         return open_glob(spec, directory, fps)
     path = find_path(spec, directory)
     if path.is_dir():

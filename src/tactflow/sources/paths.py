@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import parse_qsl
 
@@ -12,9 +13,10 @@ from tactflow.engine.errors import SourceError
 from tactflow.system.files import expanded, is_device
 
 
-def exists(spec: str, directory: Path | None) -> bool:
-    """Whether a file or folder has this name, here or in `directory`."""
-    return any((base / expanded(spec)).exists() for base in (Path(), directory or Path()))
+def locate(spec: str, directory: Path | None) -> Path | None:
+    """The file or folder of this name, here or else in `directory`; None if there is none."""
+    paths = (base / expanded(spec) for base in (Path(), directory or Path()))
+    return next((path for path in paths if path.exists()), None)
 
 
 def split_prefix(spec: str, directory: Path | None) -> tuple[str, str]:
@@ -25,7 +27,7 @@ def split_prefix(spec: str, directory: Path | None) -> tuple[str, str]:
     """
     prefix, colon, path = spec.partition(":")
     # A single letter is a drive of Windows.
-    if len(prefix) < 2 or not colon or not prefix.isidentifier() or exists(spec.partition("?")[0], directory):
+    if len(prefix) < 2 or not colon or not prefix.isidentifier() or locate(spec.partition("?")[0], directory):
         return "", spec
     return prefix + colon, path
 
@@ -44,16 +46,13 @@ def find_path(spec: str, directory: Path | None) -> Path:
         If nothing is there; suggests files with similar names. If it is a pipe or a device: opening one may
         block for ever, and no signal ends that.
     """
-    path = expanded(spec)
-    candidates = [path]
-    if directory is not None and not path.is_absolute():
-        candidates.append(directory / path)
-    for candidate in candidates:
-        if candidate.exists():
-            if is_device(str(candidate)):
-                raise SourceError(f"{spec}: is a pipe or a device, not a file")
-            return candidate
-    raise SourceError(f"{spec}: no such file or folder{_suggestion(candidates)}")
+    path = locate(spec, directory)
+    if path is None:
+        candidates = dict.fromkeys(base / expanded(spec) for base in (Path(), directory or Path()))
+        raise SourceError(f"{spec}: no such file or folder{_suggestion(list(candidates))}")
+    if is_device(str(path)):
+        raise SourceError(f"{spec}: is a pipe or a device, not a file")
+    return path
 
 
 def _suggestion(candidates: list[Path]) -> str:
@@ -62,14 +61,11 @@ def _suggestion(candidates: list[Path]) -> str:
         # Climb to the first folder that exists, so that a typo in the middle of a path is found too.
         while not folder.is_dir() and folder.parent != folder:
             folder, wanted = folder.parent, folder.name
-        try:
-            names = sorted(entry.name for entry in folder.iterdir())
-        except OSError:
-            continue
-        close = difflib.get_close_matches(wanted, names, n=3, cutoff=0.6)
-        if close:
-            return "; did you mean " + " or ".join(str(folder / name) for name in close) + "?"
-    return f" (looked in {', '.join(dict.fromkeys(str(path.parent.absolute()) for path in candidates))})"
+        with suppress(OSError):
+            close = difflib.get_close_matches(wanted, sorted(os.listdir(folder)), n=3, cutoff=0.6)
+            if close:
+                return "; did you mean " + " or ".join(str(folder / name) for name in close) + "?"
+    return f" (looked in {', '.join(str(path.parent.absolute()) for path in candidates)})"
 
 
 def refuse_devices(path: Path) -> None:
@@ -105,7 +101,7 @@ def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> 
     ('bag.mcap', {'topic': '/gel/image'})
     """
     name, mark, query = spec.partition("?")
-    if not mark or exists(spec, directory):
+    if not mark or locate(spec, directory):
         return spec, {}
     settings: dict[str, str] = {}
     for key, value in parse_qsl(query.replace("+", "%2B"), keep_blank_values=True):
