@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,15 +11,14 @@ import yaml
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Mark
+from tactflow.system.files import read_limited
 
 Keys = tuple[str | int, ...]
 """Where a value stands in a document: keys of mappings and indices of lists, from the root."""
 
-MAX_BYTES: Final = 256 * 1024
-"""Size limit of a pipeline file: a hundred times the longest shipped one."""
 MAX_VALUES: Final = 100_000
 """Limit on the values of a document with its aliases written out, so that aliases of aliases cannot fill the
-memory. A file of `MAX_BYTES` without aliases hardly reaches it."""
+memory."""
 
 
 def shown(value: Any) -> str:
@@ -55,8 +55,6 @@ class Document:
         self.lines: list[str] = []
         self.marks: dict[Keys, Mark] = {(): Mark(file, line, line)}
         self.key_marks: dict[Keys, Mark] = {}
-        # What was changed later, from the outside or by `sensors:`, and where the new value was written.
-        self._changes: list[tuple[Keys, Mark | Keys]] = []
         self.mistakes: dict[tuple[Mark, str], None] = {}
 
     def get(self, *keys: str | int) -> Any:
@@ -82,20 +80,12 @@ class Document:
 
     def mark(self, *keys: str | int) -> Mark:
         """Where a value was written; for a missing value, where the mapping around it begins."""
-        for target, origin in reversed(self._changes):
-            if keys[: len(target)] == target:
-                return origin if isinstance(origin, Mark) else self.mark(*origin, *keys[len(target) :])
         while keys not in self.marks:
             keys = keys[:-1]
         return self.marks[keys]
 
     def key_mark(self, *keys: str | int) -> Mark:
         """Where the key of a value was written."""
-        for target, origin in reversed(self._changes):
-            if keys[: len(target)] == target:
-                if isinstance(origin, Mark):
-                    return self.key_marks.get(keys, origin) if keys == target else origin
-                return self.key_mark(*origin, *keys[len(target) :])
         return self.key_marks.get(keys) or self.mark(*keys)
 
     def set(self, keys: Keys, value: Any, mark: Mark) -> None:
@@ -116,12 +106,23 @@ class Document:
             parent = parent[place[-1]]
         place = (*place, _index(parent, keys[-1], place))
         parent[place[-1]] = value
-        self._changes.append((created or place, mark))
+        self._set_marks(created or place, mark, {}, {})
 
     def copy(self, source: Keys, target: Keys) -> None:
         """Put a value at another key of a mapping; it keeps its place."""
         self.mapping(*target[:-1])[str(target[-1])] = self.get(*source)
-        self._changes.append((target, source))
+        self.key_marks[target] = self.key_mark(*source)
+        self._set_marks(target, self.mark(*source), _below(source, self.marks), _below(source, self.key_marks))
+
+    def _set_marks(
+        self, place: Keys, mark: Mark, marks: Mapping[Keys, Mark], key_marks: Mapping[Keys, Mark]
+    ) -> None:
+        """Set the mark of a value that replaces another, and those of its parts and their keys."""
+        for all_marks, new in ((self.marks, marks), (self.key_marks, key_marks)):
+            for part in _below(place, all_marks):
+                del all_marks[*place, *part]
+            all_marks |= {(*place, *part): mark for part, mark in new.items()}
+        self.marks[place] = mark
 
     def report(self, keys: Keys, message: str, *, at_key: bool = False) -> None:
         """Record a mistake in a value, or in its key."""
@@ -145,6 +146,12 @@ class Document:
         if not 0 < mark.line <= len(self.lines):
             return head
         return f"{head}\n    {_printable(self.lines[mark.line - 1])}\n    {' ' * (mark.column - 1)}^"
+
+
+def _below(place: Keys, marks: Mapping[Keys, Mark]) -> dict[Keys, Mark]:
+    """The marks of the parts of the value at a place, by their keys from there on."""
+    size = len(place)
+    return {keys[size:]: mark for keys, mark in marks.items() if keys[:size] == place and len(keys) > size}
 
 
 def _index(parent: Any, key: str | int, place: Keys) -> str | int:
@@ -172,16 +179,12 @@ def read_document(path: Path) -> Document:
     if path.is_dir():
         raise ConfigError(f"{path} is a folder; required: a pipeline file (YAML)")
     try:
-        with path.open("rb") as stream:
-            # A device such as /dev/zero has no end.
-            data = stream.read(MAX_BYTES + 1)
+        data = read_limited(path)
     except FileNotFoundError:
         raise ConfigError(f"there is no file {path}") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(f"cannot read {path}: {reason}") from None
-    if len(data) > MAX_BYTES:
-        raise ConfigError(f"{path} is larger than {MAX_BYTES // 1024} KiB; required: a pipeline file (YAML)")
     document = Document(str(path), line=1)
     text = data.decode("utf-8-sig", "replace")
     document.lines = text.splitlines()

@@ -18,7 +18,7 @@ from tactflow.config.models import RESERVED
 from tactflow.engine.conformance import component, kind_of
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
-from tactflow.system.files import is_device
+from tactflow.system.files import read_limited
 from tactflow.system.plugins import plugins
 from tactflow.system.spelling import closest, did_you_mean
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 Section = Literal["stages", "sinks"]
-MAX_BYTES = 1 << 20
-"""Largest file of code, far above any that people write."""
 
 
 def resolve(use: str, section: Section, *folders: Path) -> Component:
@@ -149,9 +147,7 @@ def _load_file(folders: Sequence[Path], file: str) -> ModuleType:
         # The same folder may be given twice.
         paths = list(dict.fromkeys((folder / file).resolve() for folder in folders))
         path = next((path for path in paths if path.exists()), paths[0])
-        if is_device(str(path)) or (path.is_file() and path.stat().st_size > MAX_BYTES):
-            raise ConfigError(f"cannot read {file}: required a Python file of up to {MAX_BYTES >> 10} KiB")
-        source = path.read_bytes()
+        source = read_limited(path)
     except FileNotFoundError as error:
         places = " or ".join(map(str, paths))
         raise ConfigError(f"cannot read {file}: {error.strerror} ({places})") from None

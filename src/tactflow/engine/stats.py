@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import Counter, deque
+from bisect import bisect_left
+from collections import Counter
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any
-
-import numpy as np
 
 _BINS_PER_E = 50
 """Bins per factor e: a quantile is exact to +-1 %."""
 _SMALLEST = 1e-7
 _BINS = 26 * _BINS_PER_E
 """Shortest duration that is resolved, s, and the number of bins from there on: 26 factors of e, 5 h."""
-_WAITING = 256
-"""Durations that are sorted into bins together: 0.4 us each instead of 1.0 one by one (Python 3.11)."""
 
 
 class Durations:
@@ -24,47 +22,32 @@ class Durations:
 
     Covers 0.1 us to about 5 h; shorter and longer ones count in the outermost bins. Any thread may
     add and ask.
+
+    count : how many were counted. total : their sum, s.
     """
 
     def __init__(self) -> None:
-        self._bins = np.zeros(_BINS, np.int64)
-        self._total = 0.0
-        self._new: deque[float] = deque()
+        self.count = 0
+        self.total = 0.0
+        self._bins = [0] * _BINS
         self._lock = threading.Lock()
 
     def add(self, seconds: float) -> None:
         """Count one duration, s."""
-        self._new.append(seconds)
-        if len(self._new) >= _WAITING:
-            self._sort_in()
-
-    def _sort_in(self) -> None:
+        index = int(math.log(seconds / _SMALLEST) * _BINS_PER_E) if seconds > _SMALLEST else 0
         with self._lock:
-            new = [self._new.popleft() for _ in range(len(self._new))]
-            index = np.log(np.maximum(new, _SMALLEST) / _SMALLEST) * _BINS_PER_E
-            self._bins += np.bincount(np.minimum(index.astype(np.int64), _BINS - 1), minlength=_BINS)
-            self._total = sum(new, self._total)
-
-    @property
-    def count(self) -> int:
-        """How many were counted."""
-        self._sort_in()
-        return int(self._bins.sum())
-
-    @property
-    def total(self) -> float:
-        """Their sum, s."""
-        self._sort_in()
-        return self._total
+            self._bins[index if index < _BINS else -1] += 1
+            self.count += 1
+            self.total += seconds
 
     def quantile(self, q: float) -> float | None:
         """The duration that a share `q` in [0, 1] does not exceed, s; None when nothing was counted."""
-        self._sort_in()
-        counts = np.cumsum(self._bins)
+        with self._lock:
+            counts = list(accumulate(self._bins))
         if not counts[-1]:
             return None
-        index = int(np.searchsorted(counts, max(1, math.ceil(q * counts[-1]))))
-        return _SMALLEST * math.exp((index + 0.5) / _BINS_PER_E)
+        rank = max(1, math.ceil(q * counts[-1]))
+        return _SMALLEST * math.exp((bisect_left(counts, rank) + 0.5) / _BINS_PER_E)
 
     def milliseconds(self, q: float) -> float | None:
         """`quantile` in ms, rounded to 4 digits after the point."""

@@ -48,6 +48,20 @@ def is_device(text: str) -> bool:
     return found is not None and not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode)
 
 
+MAX_BYTES = 1 << 20
+"""Size limit of a file of code or YAML: far above any that people write."""
+
+
+def read_limited(path: Path) -> bytes:
+    """The bytes of a file of code or YAML. Raises OSError for one that is larger than `MAX_BYTES`."""
+    with path.open("rb") as stream:
+        # A device such as /dev/zero has no end.
+        data = stream.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise OSError(errno.EFBIG, f"larger than {MAX_BYTES >> 10} KiB")
+    return data
+
+
 def next_name(path: Path) -> Path:
     """The numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ...
 
