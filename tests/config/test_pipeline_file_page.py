@@ -12,7 +12,8 @@ import pytest
 import yaml
 
 from tactflow.cli.main import main
-from tactflow.config.models import Gate, OnError, PipelineFile, Queue, SinkEntry
+from tactflow.config.models import Gate, PipelineFile, SinkEntry
+from tactflow.engine.graph import OnError, Queue
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "pipeline-file.md").read_text()

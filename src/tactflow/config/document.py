@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import yaml
 
@@ -15,10 +15,6 @@ from tactflow.system.files import read_limited
 
 Keys = tuple[str | int, ...]
 """Where a value stands in a document: keys of mappings and indices of lists, from the root."""
-
-MAX_VALUES: Final = 100_000
-"""Limit on the values of a document with its aliases written out, so that aliases of aliases cannot fill the
-memory."""
 
 
 def shown(value: Any) -> str:
@@ -53,8 +49,8 @@ class Document:
     def __init__(self, file: str, root: Any = None, *, line: int = 0) -> None:
         self.root = root
         self.lines: list[str] = []
-        self.marks: dict[Keys, Mark] = {(): Mark(file, line, line)}
-        self.key_marks: dict[Keys, Mark] = {}
+        # Of each value where its key, and where it was written.
+        self.marks: dict[Keys, tuple[Mark, Mark]] = {(): (Mark(file, line, line),) * 2}
         self.mistakes: dict[tuple[Mark, str], None] = {}
 
     def get(self, *keys: str | int) -> Any:
@@ -80,13 +76,14 @@ class Document:
 
     def mark(self, *keys: str | int) -> Mark:
         """Where a value was written; for a missing value, where the mapping around it begins."""
-        while keys not in self.marks:
-            keys = keys[:-1]
-        return self.marks[keys]
+        return self._marks(keys)[1]
 
     def key_mark(self, *keys: str | int) -> Mark:
         """Where the key of a value was written."""
-        return self.key_marks.get(keys) or self.mark(*keys)
+        return self._marks(keys)[0]
+
+    def _marks(self, keys: Keys) -> tuple[Mark, Mark]:
+        return self.marks.get(keys) or (self.mark(*keys[:-1]),) * 2
 
     def set(self, keys: Keys, value: Any, mark: Mark) -> None:
         """Replace a value, or add it with the mappings around it.
@@ -106,23 +103,21 @@ class Document:
             parent = parent[place[-1]]
         place = (*place, _index(parent, keys[-1], place))
         parent[place[-1]] = value
-        self._set_marks(created or place, mark, {}, {})
+        place = created or place
+        key_mark, _ = self.marks.get(place, (mark, mark))
+        self._replace(place, {(): (key_mark, mark)})
 
     def copy(self, source: Keys, target: Keys) -> None:
         """Put a value at another key of a mapping; it keeps its place."""
         self.mapping(*target[:-1])[str(target[-1])] = self.get(*source)
-        self.key_marks[target] = self.key_mark(*source)
-        self._set_marks(target, self.mark(*source), _below(source, self.marks), _below(source, self.key_marks))
+        size = len(source)
+        parts = {keys[size:]: mark for keys, mark in self.marks.items() if keys[:size] == source}
+        self._replace(target, parts | {(): self._marks(source)})
 
-    def _set_marks(
-        self, place: Keys, mark: Mark, marks: Mapping[Keys, Mark], key_marks: Mapping[Keys, Mark]
-    ) -> None:
-        """Set the mark of a value that replaces another, and those of its parts and their keys."""
-        for all_marks, new in ((self.marks, marks), (self.key_marks, key_marks)):
-            for part in _below(place, all_marks):
-                del all_marks[*place, *part]
-            all_marks |= {(*place, *part): mark for part, mark in new.items()}
-        self.marks[place] = mark
+    def _replace(self, place: Keys, marks: Mapping[Keys, tuple[Mark, Mark]]) -> None:
+        """Set the marks of a value that replaces another, and of its parts: from it on, by their keys."""
+        others = {keys: mark for keys, mark in self.marks.items() if keys[: len(place)] != place}
+        self.marks = others | {(*place, *keys): mark for keys, mark in marks.items()}
 
     def report(self, keys: Keys, message: str, *, at_key: bool = False) -> None:
         """Record a mistake in a value, or in its key."""
@@ -146,12 +141,6 @@ class Document:
         if not 0 < mark.line <= len(self.lines):
             return head
         return f"{head}\n    {_printable(self.lines[mark.line - 1])}\n    {' ' * (mark.column - 1)}^"
-
-
-def _below(place: Keys, marks: Mapping[Keys, Mark]) -> dict[Keys, Mark]:
-    """The marks of the parts of the value at a place, by their keys from there on."""
-    size = len(place)
-    return {keys[size:]: mark for keys, mark in marks.items() if keys[:size] == place and len(keys) > size}
 
 
 def _index(parent: Any, key: str | int, place: Keys) -> str | int:
@@ -280,10 +269,7 @@ class _Values:
 
     def value(self, node: yaml.Node, keys: Keys) -> Any:
         """The plain value of a node that stands at `keys`."""
-        self._document.marks[keys] = self._mark(node)
-        if len(self._document.marks) > MAX_VALUES:
-            too_many = f"more than {MAX_VALUES} values, with aliases written out"
-            raise yaml.MarkedYAMLError(problem=too_many, problem_mark=node.start_mark)
+        self._document.marks[keys] = (self._mark(node),) * 2
         if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
             return self._mapping(node, keys)
         if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
@@ -318,7 +304,7 @@ class _Values:
         for key_node, value_node in node.value:
             place: Keys = (*keys, key_node.value)
             values[key_node.value] = self.value(value_node, place)
-            self._document.key_marks[place] = self._mark(key_node)
+            self._document.marks[place] = self._mark(key_node), self._mark(value_node)
         return values
 
     def _report(self, node: yaml.Node, message: str) -> None:

@@ -19,7 +19,7 @@ from tactflow.config.validation import validate
 from tactflow.config.wiring import Draft
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Gate, Node, OnError, Pipeline, Queue
+from tactflow.engine.graph import Gate, Node, OnError, Pipeline
 from tactflow.engine.plan import plan_problems
 from tactflow.system.files import expanded
 
@@ -254,9 +254,7 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
     assert draft.params is not None, "parameters that are wrong were reported"
     cls = draft.component.cls
     # A picture for people must never stop the run.
-    on_error = OnError("disable" if issubclass(cls, Sink) and cls.observer else "stop")
-    if entry.on_error:
-        on_error = OnError(entry.on_error.action, entry.on_error.budget)
+    default = OnError(action="disable" if issubclass(cls, Sink) and cls.observer else "stop")
     mark = draft.mark
     if draft.component.kind == "source" and not (origin := document.mark(*draft.keys, "source")).line:
         # What the command line makes it read may not be there: then the file is not to blame.
@@ -274,8 +272,8 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
         mark=mark,
         gates=tuple(gates),
         segment=entry.segment,
-        queue=Queue(entry.queue.capacity, entry.queue.when_full),
-        on_error=on_error,
+        queue=entry.queue,
+        on_error=entry.on_error or default,
         max_rate=entry.max_rate if isinstance(entry, SinkEntry) else None,
         marks={key: document.mark(*draft.keys, key) for key in marked},
     )

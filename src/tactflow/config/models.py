@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
-from tactflow.engine.graph import ErrorAction, FullPolicy
+from tactflow.engine.graph import ErrorAction, OnError, Queue
 
 STATISTICS = "stats"
 """The topic of a run's statistics, so that no sensor may have this name."""
@@ -49,28 +49,6 @@ class Part(BaseModel):
     """Base of all parts of a pipeline file: unknown keys are mistakes, and no value is converted."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-
-class Queue(Part):
-    """The bounded queue in front of a segment."""
-
-    capacity: int | None = Field(None, ge=1, description="frames it holds; null: the planner's choice")
-    when_full: FullPolicy | None = Field(
-        None,
-        description="block: whoever puts waits, nothing is lost; latest: only the newest frame is kept; "
-        "drop_oldest: the oldest frame makes room; null: the planner's choice",
-    )
-
-
-class OnError(Part):
-    """What happens when a stage or sink fails."""
-
-    action: ErrorAction = Field(
-        "stop",
-        description="stop: the run ends; skip_frame: the frame goes on without its outputs; disable: it is "
-        "not called again",
-    )
-    budget: int = Field(10, ge=0, description="frames that skip_frame may skip before the run ends")
 
 
 class Gate(Part):

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import BaseModel, Field
+
 from tactflow.engine.contract import Memory, StageParams
 from tactflow.engine.ports import Ports
 
@@ -70,23 +72,28 @@ class Gate:
     otherwise: Literal["absent", "repeat"] = "absent"
 
 
-@dataclass(frozen=True, slots=True)
-class Queue:
-    """The bounded queue in front of a node's segment; None leaves the choice to the planner.
+class Queue(BaseModel, frozen=True, extra="forbid", strict=True):
+    """The bounded queue in front of a segment."""
 
-    capacity : ticks that it holds. when_full : what happens to one more, see docs/pipeline-file.md.
-    """
+    capacity: int | None = Field(
+        default=None, ge=1, description="frames it holds; null: the planner's choice"
+    )
+    when_full: FullPolicy | None = Field(
+        default=None,
+        description="block: whoever puts waits, nothing is lost; latest: only the newest frame is kept; "
+        "drop_oldest: the oldest frame makes room; null: the planner's choice",
+    )
 
-    capacity: int | None = None
-    when_full: FullPolicy | None = None
 
+class OnError(BaseModel, frozen=True, extra="forbid", strict=True):
+    """What happens when a stage or sink fails."""
 
-@dataclass(frozen=True, slots=True)
-class OnError:
-    """What a failing stage or sink does. budget : frames that may be skipped before the run stops."""
-
-    action: ErrorAction = "stop"
-    budget: int = 10
+    action: ErrorAction = Field(
+        default="stop",
+        description="stop: the run ends; skip_frame: the frame goes on without its outputs; disable: it is "
+        "not called again",
+    )
+    budget: int = Field(default=10, ge=0, description="frames that skip_frame may skip before the run ends")
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +115,8 @@ class Node:
     mark: Mark
     gates: Sequence[Gate] = ()
     segment: str | None = None
-    queue: Queue = Queue()
-    on_error: OnError = OnError()
+    queue: Queue = field(default_factory=Queue)
+    on_error: OnError = field(default_factory=OnError)
     max_rate: float | None = None
     marks: Mapping[str, Mark] = field(default_factory=dict[str, Mark])
     passive_inputs: Mapping[str, Ref] = field(default_factory=dict[str, Ref])
