@@ -348,15 +348,6 @@ def test_two_sinks_do_not_write_the_same_file(second: str, clash: bool, load: Lo
         assert len(load(text).sinks) == 2
 
 
-def test_an_option_adds_no_second_sink_for_a_file_that_is_written_already(load: Load) -> None:
-    lines = "lines: {use: jsonl, path: out/a.jsonl, detail: true}"
-    option = {"--jsonl": {"use": "jsonl", "path": "out/a.jsonl"}}
-    kept = load(with_sinks(first=lines, second=""), extra_sinks=option)
-    assert [sink.id for sink in kept.sinks] == ["lines"]
-    with pytest.raises(ConfigError, match=r"--jsonl: .* writes .* already"):
-        load(with_sinks(first=lines[:-1] + ", max_rate: 5}", second=""), extra_sinks=option)
-
-
 @pytest.mark.parametrize("link", ["", "symbolic", "hard"])
 @pytest.mark.parametrize("name", ["press.npy", "press[1].npy"])
 def test_a_sink_never_writes_over_what_a_stage_reads(tmp_path: Path, link: str, name: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -60,7 +60,7 @@ def load_pipeline(
         draft.settings = document.mapping(*draft.keys)
         draft.params = _params(draft, document)
     calibration = _calibration(document, path.parent)
-    drafts = _check_files(drafts, extra_sinks or {}, path, calibration, document)
+    _check_files(drafts, path, calibration, document)
     wiring.connect(drafts, document)
     drafts = wiring.ordered(drafts, document)
     _check_needs(drafts, document)
@@ -171,54 +171,32 @@ def _params(draft: Draft, document: Document) -> StageParams | None:
 
 
 def _check_files(
-    drafts: Sequence[Draft],
-    options: Collection[str],
-    pipeline: Path,
-    calibration: Path | None,
-    document: Document,
-) -> list[Draft]:
-    """Report sinks that write the same file, or one that the run reads: source, reference, code, pipeline.
-
-    Returns the drafts without those that an option adds for a file which the same sink writes anyway.
-    """
+    drafts: Sequence[Draft], pipeline: Path, calibration: Path | None, document: Document
+) -> None:
+    """Report sinks that write the same file, or one that the run reads: source, reference, code, pipeline."""
     readers = {file_id(pipeline): "the pipeline file"}
     if calibration:
         readers[file_id(calibration)] = "the calibration"
-    readers |= {
-        file_id(path): f"what {dotted(draft.keys)} reads"
-        for draft in drafts
-        if draft.section == "stages" and draft.params is not None
-        for path in files_named(draft.params, pipeline.parent)
-    }
-    readers |= {
-        file_id(path): f"the code of {draft.id}"
-        for draft in drafts
-        if draft.component and (path := vars(sys.modules[draft.component.cls.__module__]).get("__file__"))
-    }
-    writers: dict[str, Draft] = {}
-    kept = []
     for draft in drafts:
-        written = files_written(draft.component.cls, draft.params) if draft.component and draft.params else []
-        shared = next((path for path in written if path in writers), None)
-        writer = writers[shared] if shared else None
-        if writer and draft.mark.file in options and _does_as_much(writer, draft):
-            continue
-        kept.append(draft)
-        if writer:
-            message = f"{writer.id} ({writer.mark}) writes {shared} already; choose another path"
-            document.report(draft.keys, message, at_key=True)
-        for path in written:
-            writers.setdefault(path, draft)
-            if file_id(path) and (reader := readers.get(file_id(path))):
-                message = f"{path} is {reader}; choose another path"
+        if draft.section == "stages" and draft.params is not None:
+            reader = f"what {dotted(draft.keys)} reads"
+            readers |= {file_id(path): reader for path in files_named(draft.params, pipeline.parent)}
+        module = sys.modules[draft.component.cls.__module__] if draft.component else None
+        if path := vars(module).get("__file__") if module else None:
+            readers[file_id(path)] = f"the code of {draft.id}"
+    writers: dict[str, Draft] = {}
+    for draft in drafts:
+        for path in (
+            files_written(draft.component.cls, draft.params) if draft.component and draft.params else ()
+        ):
+            writer = writers.setdefault(path, draft)
+            identity = file_id(path)
+            if writer is not draft:
+                message = f"{writer.id} ({writer.mark}) writes {path} already; choose another path"
                 document.report(draft.keys, message, at_key=True)
-    return kept
-
-
-def _does_as_much(writer: Draft, added: Draft) -> bool:
-    """Whether a sink writes everything that the added one, without settings of its own, would write."""
-    classes = {draft.component.cls for draft in (writer, added) if draft.component}
-    return len(classes) == 1 and "max_rate" not in writer.settings
+            elif identity is not None and identity in readers:
+                message = f"{path} is {readers[identity]}; choose another path"
+                document.report(draft.keys, message, at_key=True)
 
 
 def _calibration(document: Document, directory: Path) -> Path | None:
